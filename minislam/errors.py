@@ -1,0 +1,17 @@
+"""The errors a user can meet. Everything else is a bug of ours and may show a traceback."""
+
+
+class MinislamError(Exception):
+    """Base of all known errors: the command line prints its one sentence and exits with code 1."""
+
+
+class InputError(MinislamError):
+    """What was given cannot be used. The sentence says what was expected, found, and what to do."""
+
+
+class TrackingLost(MinislamError):
+    """The camera could not be followed through any usable part of the sequence."""
+
+
+class NumericalFailure(MinislamError):
+    """A solve produced no usable step; the state it started from is unchanged."""

@@ -1,0 +1,99 @@
+"""The pinhole camera: projection, back-projection, their Jacobians, and resizing."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion. The centre of the first pixel is (0, 0).
+
+    Focal lengths and principal point are in pixels of an image of `width` x `height`.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (self.fx > 0 and self.fy > 0):
+            raise InputError(
+                f"expected positive focal lengths, found fx={self.fx} fy={self.fy}; "
+                "give them in pixels with --fx and --fy"
+            )
+        if not (self.width >= 1 and self.height >= 1):
+            raise InputError(
+                f"expected an image of at least 1x1 pixels, found {self.width}x{self.height}"
+            )
+        if not (-0.5 <= self.cx <= self.width - 0.5 and -0.5 <= self.cy <= self.height - 0.5):
+            raise InputError(
+                f"expected a principal point inside the {self.width}x{self.height} image, found "
+                f"cx={self.cx} cy={self.cy}; check that calibration and images belong together"
+            )
+
+    def project(self, points_camera: Tensor) -> Tensor:
+        """Return pixels (..., 2) of points (..., 3) in front of the camera.
+
+        u = fx x / z + cx,  v = fy y / z + cy. The caller masks points with z <= 0.
+        """
+        x, y, z = points_camera.unbind(-1)
+        return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], -1)
+
+    def project_jacobian(self, points_camera: Tensor) -> Tensor:
+        """Return d(u, v)/d(x, y, z) (..., 2, 3) at points (..., 3)."""
+        x, y, z = points_camera.unbind(-1)
+        zero = torch.zeros_like(z)
+        rows = [self.fx / z, zero, -self.fx * x / z**2, zero, self.fy / z, -self.fy * y / z**2]
+        return torch.stack(rows, -1).reshape(*points_camera.shape[:-1], 2, 3)
+
+    def rays(self, pixels: Tensor) -> Tensor:
+        """Return the rays (..., 3) of pixels (..., 2), scaled to z = 1."""
+        x = (pixels[..., 0] - self.cx) / self.fx
+        y = (pixels[..., 1] - self.cy) / self.fy
+        return torch.stack([x, y, torch.ones_like(x)], -1)
+
+    def backproject(self, pixels: Tensor, depth: Tensor) -> Tensor:
+        """Return the points (..., 3) in the camera frame of pixels (..., 2) at z-depths (...)."""
+        return self.rays(pixels) * depth[..., None]
+
+    def backproject_jacobian(self, pixels: Tensor, depth: Tensor) -> Tensor:
+        """Return d(x, y, z)/d(u, v, depth) (..., 3, 3) at pixels (..., 2) and depths (...)."""
+        jacobian = pixels.new_zeros(*pixels.shape[:-1], 3, 3)
+        jacobian[..., 0, 0] = depth / self.fx
+        jacobian[..., 1, 1] = depth / self.fy
+        jacobian[..., :, 2] = self.rays(pixels)
+        return jacobian
+
+    def pixel_grid(
+        self,
+        stride: int = 1,  # px between neighbouring cells
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> Tensor:  # (ceil(H/stride), ceil(W/stride), 2)
+        """Return the pixel of each cell: the first is (0, 0), the next (stride, 0), and so on."""
+        u = torch.arange(0, self.width, stride, dtype=dtype, device=device)
+        v = torch.arange(0, self.height, stride, dtype=dtype, device=device)
+        return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """Return the camera of the same image resized: c -> (c + 0.5) s - 0.5 per axis."""
+        sx, sy = width / self.width, height / self.height
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return Camera(self.fx * sx, self.fy * sy, cx, cy, width, height)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> "Camera":
+        """Return the camera of the window of `width` x `height` that starts at (left, top)."""
+        return Camera(self.fx, self.fy, self.cx - left, self.cy - top, width, height)
+
+    def contains(self, pixels: Tensor, margin: float = 0.0) -> Tensor:
+        """Tell which pixels (..., 2) lie on the image, at least `margin` px inside its centres."""
+        u, v = pixels.unbind(-1)
+        inside_u = (u >= margin) & (u <= self.width - 1 - margin)
+        return inside_u & (v >= margin) & (v <= self.height - 1 - margin)

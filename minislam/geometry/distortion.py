@@ -1,0 +1,40 @@
+"""Lens distortion (Brown's model), removed once when an image is read."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from minislam.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class BrownDistortion:
+    """Radial (k1, k2, k3) and tangential (p1, p2) coefficients, in OpenCV's convention.
+
+    OpenCV, like this package, puts the centre of the first pixel at (0, 0).
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @property
+    def coefficients(self) -> np.ndarray:
+        """Return the coefficients (5,) in OpenCV's order k1, k2, p1, p2, k3."""
+        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
+
+    def undistortion_maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Return the two maps of cv2.remap that turn a raw image into that of `camera`."""
+        matrix = camera_matrix(camera)
+        size = (camera.width, camera.height)
+        return cv2.initUndistortRectifyMap(
+            matrix, self.coefficients, None, matrix, size, cv2.CV_32FC1
+        )
+
+
+def camera_matrix(camera: Camera) -> np.ndarray:
+    """Return the calibration matrix K (3, 3)."""
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])

@@ -1,0 +1,205 @@
+"""Rigid motions: SO(3) and SE(3), with exponential, logarithm and the left Jacobian.
+
+The formulas divide by the rotation angle, so near zero each coefficient is replaced by the first
+terms of its Taylor series. All functions take any number of leading batch dimensions and keep
+the dtype and device of their input.
+"""
+
+import torch
+from torch import Tensor
+
+# Below this angle the Taylor series is exact to float64 round-off and the closed form is not.
+_SMALL_ANGLE = 0.02  # radian
+
+
+def hat(vectors: Tensor) -> Tensor:
+    """Return the skew matrices of vectors (..., 3), so that hat(a) @ b = a x b."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return rows.reshape(*vectors.shape[:-1], 3, 3)
+
+
+def _rotation_coefficients(angle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 for angles t >= 0."""
+    small = angle < _SMALL_ANGLE
+    t = torch.where(small, torch.ones_like(angle), angle)
+    t2 = torch.where(small, angle, torch.zeros_like(angle)) ** 2
+    a = torch.where(small, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), t.sin() / t)
+    b = torch.where(
+        small, 0.5 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56))), (1 - t.cos()) / t**2
+    )
+    c = torch.where(
+        small, (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72))) / 6, (t - t.sin()) / t**3
+    )
+    return a, b, c
+
+
+def so3_exp(phi: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) of rotation vectors phi (..., 3) [rad] (Rodrigues)."""
+    angle = _safe_norm(phi)
+    a, b, _ = _rotation_coefficients(angle)
+    skew = hat(phi)
+    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
+    return eye + a[..., None, None] * skew + b[..., None, None] * skew @ skew
+
+
+def so3_log(rotations: Tensor) -> Tensor:
+    """Return the rotation vectors (..., 3) [rad] of rotations (..., 3, 3), angle in [0, pi].
+
+    It goes through the quaternion, whose largest component never vanishes: the matrix formula
+    phi = t / (2 sin t) * vee(R - R^T) loses all digits near t = pi.
+    """
+    q = quaternion_from_rotation(rotations)
+    q = torch.where(q[..., :1] < 0, -q, q)
+    sin_half = _safe_norm(q[..., 1:])
+    angle = 2 * torch.atan2(sin_half, q[..., 0])
+    # sin(t/2) ~ t/2 near the identity: the ratio tends to 2 and must not become 0/0.
+    small = sin_half < 1e-9
+    ratio = torch.where(small, torch.full_like(angle, 2.0), angle / sin_half.clamp_min(1e-30))
+    return ratio[..., None] * q[..., 1:]
+
+
+def quaternion_from_rotation(rotations: Tensor) -> Tensor:
+    """Return unit quaternions wxyz (..., 4) of rotations (..., 3, 3).
+
+    Of the four equivalent formulas it takes the one that divides by the largest component
+    (Shepperd's method), so no rotation, 180 degrees included, loses digits.
+    """
+    m = rotations
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    # Row k is 4 q_k q, for k = w, x, y, z.
+    w_row = torch.stack(
+        [
+            1 + trace,
+            m[..., 2, 1] - m[..., 1, 2],
+            m[..., 0, 2] - m[..., 2, 0],
+            m[..., 1, 0] - m[..., 0, 1],
+        ],
+        -1,
+    )
+    xy = m[..., 1, 0] + m[..., 0, 1]
+    xz = m[..., 2, 0] + m[..., 0, 2]
+    yz = m[..., 2, 1] + m[..., 1, 2]
+    x_row = torch.stack([w_row[..., 1], 1 + 2 * m[..., 0, 0] - trace, xy, xz], -1)
+    y_row = torch.stack([w_row[..., 2], xy, 1 + 2 * m[..., 1, 1] - trace, yz], -1)
+    z_row = torch.stack([w_row[..., 3], xz, yz, 1 + 2 * m[..., 2, 2] - trace], -1)
+    rows = torch.stack([w_row, x_row, y_row, z_row], -2)
+    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    chosen = rows.gather(-2, index).squeeze(-2)
+    return chosen / chosen.norm(dim=-1, keepdim=True)
+
+
+def rotation_from_quaternion(quats_wxyz: Tensor) -> Tensor:
+    """Return rotations (..., 3, 3) of quaternions wxyz (..., 4), which need not be unit."""
+    w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quats_wxyz.shape[:-1], 3, 3)
+
+
+def se3_exp(xi: Tensor) -> Tensor:
+    """Return the transforms (..., 4, 4) of tangent vectors xi = (rho, phi) (..., 6)."""
+    rho, phi = xi[..., :3], xi[..., 3:]
+    translation = (so3_left_jacobian(phi) @ rho[..., None]).squeeze(-1)
+    return make_transform(so3_exp(phi), translation)
+
+
+def se3_log(transforms: Tensor) -> Tensor:
+    """Return the tangent vectors (rho, phi) (..., 6) of transforms (..., 4, 4)."""
+    phi = so3_log(transforms[..., :3, :3])
+    rho = torch.linalg.solve(so3_left_jacobian(phi), transforms[..., :3, 3])
+    return torch.cat([rho, phi], -1)
+
+
+def se3_inverse(transforms: Tensor) -> Tensor:
+    """Return the inverse transforms (..., 4, 4): the transposed rotation, no general solve."""
+    rotation_t = transforms[..., :3, :3].transpose(-1, -2)
+    return make_transform(rotation_t, -(rotation_t @ transforms[..., :3, 3:]).squeeze(-1))
+
+
+def se3_adjoint(transforms: Tensor) -> Tensor:
+    """Return Ad(T) (..., 6, 6), defined by T exp(xi) T^-1 = exp(Ad(T) xi).
+
+    For xi = (rho, phi) it is [[R, hat(t) R], [0, R]].
+    """
+    rotation = transforms[..., :3, :3]
+    adjoint = transforms.new_zeros(*transforms.shape[:-2], 6, 6)
+    adjoint[..., :3, :3] = rotation
+    adjoint[..., 3:, 3:] = rotation
+    adjoint[..., :3, 3:] = hat(transforms[..., :3, 3]) @ rotation
+    return adjoint
+
+
+def so3_left_jacobian(phi: Tensor) -> Tensor:
+    """Return V(phi) (..., 3, 3), with exp((rho, phi)) = (exp(phi), V(phi) rho)."""
+    _, b, c = _rotation_coefficients(_safe_norm(phi))
+    skew = hat(phi)
+    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
+    return eye + b[..., None, None] * skew + c[..., None, None] * skew @ skew
+
+
+def se3_left_jacobian(xi: Tensor) -> Tensor:
+    """Return J (..., 6, 6), with exp(xi + d) = exp(J d) exp(xi) to first order in d.
+
+    J = [[V, Q], [0, V]] for xi = (rho, phi); Q collects the coupling of rho and phi (Barfoot,
+    State Estimation for Robotics, Eq. 7.86). Near zero angle the series sum ad^n / (n+1)! is used.
+    """
+    rho, phi = xi[..., :3], xi[..., 3:]
+    angle = _safe_norm(phi)[..., None, None]
+    small = angle < 0.3  # here the closed form divides differences by t^5
+    t = torch.where(small, torch.ones_like(angle), angle)
+    p, r = hat(phi), hat(rho)
+    c1 = (t - t.sin()) / t**3
+    c2 = (t**2 + 2 * t.cos() - 2) / (2 * t**4)
+    c3 = (2 * t - 3 * t.sin() + t * t.cos()) / (2 * t**5)
+    coupling = (
+        0.5 * r
+        + c1 * (p @ r + r @ p + p @ r @ p)
+        + c2 * (p @ p @ r + r @ p @ p - 3 * p @ r @ p)
+        + c3 * (p @ r @ p @ p + p @ p @ r @ p)
+    )
+    jacobian = xi.new_zeros(*xi.shape[:-1], 6, 6)
+    rotation_part = so3_left_jacobian(phi)
+    jacobian[..., :3, :3] = rotation_part
+    jacobian[..., 3:, 3:] = rotation_part
+    jacobian[..., :3, 3:] = torch.where(small, _coupling_series(p, r), coupling)
+    return jacobian
+
+
+def _coupling_series(p: Tensor, r: Tensor) -> Tensor:
+    """Return the upper right block of sum_n ad(xi)^n / (n+1)!, exact for small angles."""
+    power, coupling = torch.eye(3, dtype=p.dtype, device=p.device).expand_as(p), torch.zeros_like(p)
+    total, factorial = torch.zeros_like(p), 1.0
+    for n in range(1, 14):
+        # [[P, R], [0, P]]^n has the upper right block C_n = P C_(n-1) + R P^(n-1).
+        coupling = p @ coupling + r @ power
+        power = p @ power
+        factorial *= n + 1
+        total = total + coupling / factorial
+    return total
+
+
+def make_transform(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Assemble transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    transform = rotation.new_zeros(*rotation.shape[:-2], 4, 4)
+    transform[..., :3, :3] = rotation
+    transform[..., :3, 3] = translation
+    transform[..., 3, 3] = 1
+    return transform
+
+
+def transform_points(transforms: Tensor, points: Tensor) -> Tensor:
+    """Apply transforms (..., 4, 4) to points (..., N, 3)."""
+    return points @ transforms[..., :3, :3].transpose(-1, -2) + transforms[..., None, :3, 3]
+
+
+def _safe_norm(vectors: Tensor) -> Tensor:
+    """Return the norms (...) of vectors (..., 3) with gradient zero, not NaN, at the origin."""
+    squared = (vectors * vectors).sum(-1)
+    positive = squared > 0
+    return torch.where(positive, squared, torch.ones_like(squared)).sqrt() * positive

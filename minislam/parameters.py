@@ -1,0 +1,9 @@
+"""Named constants: the form every configuration dataclass is written in."""
+
+from dataclasses import field
+from typing import Any
+
+
+def parameter(default: Any, meaning: str) -> Any:
+    """Return a dataclass field whose meaning (symbol, unit, source) is also its help text."""
+    return field(default=default, metadata={"meaning": meaning})

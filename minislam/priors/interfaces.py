@@ -1,0 +1,58 @@
+"""What the system asks of an image before it knows any geometry: flow, features, depth.
+
+Each of the three has a classical implementation that needs no weights, and can be replaced by a
+pretrained network without any change elsewhere.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.records import Frame
+
+
+@dataclass(frozen=True)
+class FlowMatches:
+    """Where the grid cells of source frames are seen in target frames."""
+
+    targets: Tensor  # (E, h, w, 2) px, the matched position of each cell
+    confidences: Tensor  # (E, h, w, 2) in [0, 1], for u and for v; 0 where there is no match
+
+
+class FlowEstimator(Protocol):
+    """Dense correspondence between keyframes, started from a prediction."""
+
+    stride: int  # px between neighbouring grid cells
+
+    def add_frame(self, keyframe_index: int, image: Tensor) -> None:
+        """Register the image (H, W, 3) of a keyframe under its index."""
+
+    def remove_frame(self, keyframe_index: int) -> None:
+        """Forget a keyframe, for instance one that was culled."""
+
+    def match(
+        self,
+        edges_source: list[int],  # (E,) keyframe index
+        edges_target: list[int],  # (E,) keyframe index
+        predicted_targets: Tensor,  # (E, h, w, 2) px, present reprojection of every cell
+    ) -> FlowMatches:
+        """Match every cell of each source frame in the target frame of its edge."""
+
+
+class FeatureExtractor(Protocol):
+    """Dense image features, the only input of the uncertainty MLP."""
+
+    stride: int  # px per feature patch
+    dimension: int  # C
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Return the features (H // stride, W // stride, C) of an image (H, W, 3)."""
+
+
+class DepthPrior(Protocol):
+    """Metric depth of a single image."""
+
+    def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
+        """Return z-depth (H, W) float32 in world units, 0 where unknown, or None."""

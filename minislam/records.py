@@ -1,0 +1,80 @@
+"""The frozen things that the stages hand to each other."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from torch import Tensor
+
+from minislam.geometry import Camera
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One input image."""
+
+    frame_index: int  # position in the sequence as it is processed: 0, 1, 2, ...
+    timestamp: float  # second, as the source gives it
+    image: Tensor  # (H, W, 3) float32 RGB in [0, 1], undistorted, at the working size
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A frame that the tracker kept, as the mapper receives it."""
+
+    keyframe_index: int  # position among the keyframes: 0, 1, 2, ...
+    frame_index: int  # position among the frames
+    timestamp: float  # second
+    image: Tensor  # (H, W, 3) float32 RGB in [0, 1]
+    features: Tensor  # (h', w', C) float32, one vector per patch of the feature grid
+    depth: Tensor  # (H, W) float32 world units, 0 where unknown: the mapper's reference D~
+    T_camera_world: Tensor  # (4, 4) float64
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Stamped camera poses, in the order of their timestamps."""
+
+    timestamps: np.ndarray  # (N,) float64 second, strictly increasing
+    T_world_camera: np.ndarray  # (N, 4, 4) float64
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+
+class GroundTruth(Protocol):
+    """What a benchmark knows and the system must not see. Any answer may be None."""
+
+    trajectory: Trajectory | None  # in the benchmark's own world and at its own timestamps
+
+    def moving_mask(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) bool, True where a mover is seen."""
+
+    def static_image(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W, 3) float32: the same view without the movers and their shadows."""
+
+    def depth(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
+
+    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
+
+
+class Sequence(Protocol):
+    """A sequence that can be walked through as often as needed, in the same order."""
+
+    name: str  # short, usable as a folder name
+    description: str  # one line: what was found
+    camera: Camera  # of the undistorted images at the working size
+    warnings: list[str]  # what the user must know, for instance that the focal length is guessed
+    ground_truth: GroundTruth | None
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Walk through all frames in order."""
+
+    def frame(self, frame_index: int) -> Frame:
+        """Return one frame again."""

@@ -1,0 +1,18 @@
+"""Settings for every test: one thread (repeatable and not slower on a busy machine), quiet plots."""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+
+def pytest_configure(config) -> None:
+    """Set what the test process and the notebook kernels inherit."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("MPLCONFIGDIR", tempfile.gettempdir())
+    # Notebook kernels start in notebooks/, so a bare clone needs an absolute path to the package.
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    sys.path.insert(0, str(ROOT))
+    sys.path.insert(0, str(Path(__file__).parent))

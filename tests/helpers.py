@@ -1,0 +1,66 @@
+"""Shared by the tests: derivative checks with stated tolerances, and random transforms."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import se3_exp
+
+
+def generator(seed: int) -> torch.Generator:
+    """Return an explicit random source; no test uses the global one."""
+    return torch.Generator().manual_seed(seed)
+
+
+def numerical_jacobian(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-6):
+    """Return d function / d x by central differences, shape (*output, *input), float64."""
+    flat = x.detach().double().reshape(-1)
+    columns = []
+    for index in range(flat.numel()):
+        offset = torch.zeros_like(flat)
+        offset[index] = step * max(1.0, abs(float(flat[index])))
+        forward = function((flat + offset).reshape(x.shape))
+        backward = function((flat - offset).reshape(x.shape))
+        columns.append((forward - backward) / (2 * offset[index]))
+    return torch.stack(columns, -1).reshape(*columns[0].shape, *x.shape)
+
+
+def numerical_gradient(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-6):
+    """Return the gradient of a scalar function by central differences."""
+    return numerical_jacobian(lambda value: function(value).reshape(()), x, step)
+
+
+def assert_gradients_close(
+    actual: Tensor, expected: Tensor, relative: float = 1e-7, absolute: float = 1e-9
+) -> None:
+    """Assert element-wise closeness, relative L2 and direction of two gradients.
+
+    One criterion alone lets errors pass: a norm hides one wrong element among many large ones,
+    an element-wise test hides a small systematic error in all of them.
+    """
+    assert actual.shape == expected.shape, (actual.shape, expected.shape)
+    assert torch.isfinite(actual).all(), "gradient is not finite"
+    difference = (actual - expected).abs()
+    bound = absolute + 10 * relative * expected.abs()
+    scale = expected.norm()
+    worst = (difference - bound).max()
+    assert worst <= 10 * relative * scale, f"element differs by {float(difference.max()):.3e}"
+    if scale > absolute:
+        error = float((actual - expected).norm() / scale)
+        assert error <= relative, f"relative L2 error {error:.3e} > {relative:.1e}"
+        cosine = float((actual * expected).sum() / (actual.norm() * scale))
+        assert cosine >= 1 - max(1e-10, relative), f"cosine {cosine:.12f}"
+
+
+def random_transforms(count: int, regime: str, seed: int) -> Tensor:
+    """Return transforms (count, 4, 4) float64: "normal", "tiny" or "half_turn" rotations."""
+    source = generator(seed)
+    xi = torch.randn(count, 6, generator=source, dtype=torch.float64)
+    axis = xi[:, 3:] / xi[:, 3:].norm(dim=-1, keepdim=True)
+    angle = {
+        "normal": 3.0 * torch.rand(count, 1, generator=source, dtype=torch.float64),
+        "tiny": 1e-7 * torch.rand(count, 1, generator=source, dtype=torch.float64),
+        "half_turn": torch.pi - 1e-7 * torch.rand(count, 1, generator=source, dtype=torch.float64),
+    }[regime]
+    return se3_exp(torch.cat([xi[:, :3], angle * axis], -1))
