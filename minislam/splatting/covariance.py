@@ -1,0 +1,79 @@
+"""The shape of a Gaussian: Sigma = R(q) diag(s)^2 R(q)^T (Sec. 3.1), written as Sigma = L L^T.
+
+The factor L = R(q) diag(s) is all that the renderer needs: it turns with the camera, it projects
+linearly, and it keeps Sigma positive semi-definite by construction. Arrays here and in
+projection.py are component-first, (3, 3, N) and not (N, 3, 3): each component is one contiguous
+run of N numbers, and a formula per component is one fast pass over memory.
+"""
+
+import torch
+from torch import Tensor
+
+
+def rotations(
+    quats: Tensor,  # (4, N) w, x, y, z, any length but zero
+) -> Tensor:  # (3, 3, N)
+    """Return the rotation of each quaternion q / |q|."""
+    w, x, y, z = quats * _inverse_norms(quats)
+    result = quats.new_empty(3, 3, quats.shape[1])
+    result[0, 0] = 1 - 2 * (y * y + z * z)
+    result[0, 1] = 2 * (x * y - w * z)
+    result[0, 2] = 2 * (x * z + w * y)
+    result[1, 0] = 2 * (x * y + w * z)
+    result[1, 1] = 1 - 2 * (x * x + z * z)
+    result[1, 2] = 2 * (y * z - w * x)
+    result[2, 0] = 2 * (x * z - w * y)
+    result[2, 1] = 2 * (y * z + w * x)
+    result[2, 2] = 1 - 2 * (x * x + y * y)
+    return result
+
+
+def rotations_vjp(
+    quats: Tensor,  # (4, N)
+    v_rotations: Tensor,  # (3, 3, N)  dL/dR
+) -> Tensor:  # (4, N)  dL/dq
+    """Pull a gradient back from rotation matrices to quaternions.
+
+    With D = dL/dR, the derivative by w collects the antisymmetric differences of D, those by
+    x, y, z the symmetric sums and two diagonal entries. The last line is the derivative of
+    q / |q|: only the part across q can change a direction.
+    """
+    inverse_norms = _inverse_norms(quats)
+    unit = quats * inverse_norms
+    w, x, y, z = unit
+    d = v_rotations
+    anti_x, anti_y, anti_z = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]
+    sum_x, sum_y, sum_z = d[2, 1] + d[1, 2], d[0, 2] + d[2, 0], d[1, 0] + d[0, 1]
+    v_unit = torch.stack([
+        x * anti_x + y * anti_y + z * anti_z,
+        w * anti_x + y * sum_z + z * sum_y - 2 * x * (d[1, 1] + d[2, 2]),
+        w * anti_y + x * sum_z + z * sum_x - 2 * y * (d[0, 0] + d[2, 2]),
+        w * anti_z + x * sum_y + y * sum_x - 2 * z * (d[0, 0] + d[1, 1]),
+    ]).mul_(2)  # fmt: skip
+    return (v_unit - unit * (unit * v_unit).sum(0)) * inverse_norms
+
+
+def covariance_factors(
+    quats: Tensor,  # (4, N)
+    scales: Tensor,  # (3, N) world units
+) -> Tensor:  # (3, 3, N) world units
+    """Return L = R(q) diag(s), the factor of Sigma = L L^T."""
+    return rotations(quats) * scales
+
+
+def covariance_factors_vjp(
+    quats: Tensor,  # (4, N)
+    scales: Tensor,  # (3, N)
+    v_factors: Tensor,  # (3, 3, N)  dL/dL
+) -> tuple[Tensor, Tensor]:  # (4, N), (3, N)
+    """Pull a gradient back from the factors to quaternions and scales.
+
+    Column j of L is s_j times column j of R, so v_s_j = v_L_j . R_j and v_R_j = s_j v_L_j.
+    """
+    v_scales = (v_factors * rotations(quats)).sum(0)
+    return rotations_vjp(quats, v_factors * scales), v_scales
+
+
+def _inverse_norms(quats: Tensor) -> Tensor:
+    # Not norm(dim=0): that reduction is forty times slower on a leading dimension.
+    return (quats * quats).sum(0).rsqrt_()

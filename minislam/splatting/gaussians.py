@@ -1,0 +1,205 @@
+"""The map: one row per Gaussian in six tensors, and the Adam that lives and dies with the rows."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+from minislam.parameters import parameter
+
+
+@dataclass(frozen=True)
+class GaussianMap:
+    """Raw parameters, the values that the optimiser moves and that a PLY file stores."""
+
+    means: Tensor  # (N, 3) world units
+    quats_wxyz: Tensor  # (N, 4) any length but zero; the rotation is that of q / |q|
+    log_scales: Tensor  # (N, 3) log of the standard deviation in world units
+    opacity_logits: Tensor  # (N,) logit of the opacity
+    colors: Tensor  # (N, 3) linear RGB, used as it is
+    anchor_keyframe: Tensor  # (N,) int64, index of the keyframe a Gaussian was inserted for
+
+    def __post_init__(self) -> None:
+        count = len(self.means)
+        expected = [(count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,)]
+        for tensor_field, shape in zip(fields(self), expected, strict=True):
+            found = tuple(getattr(self, tensor_field.name).shape)
+            if found != shape:
+                raise InputError(
+                    f"expected {tensor_field.name} of shape {shape} in a map of {count} "
+                    f"Gaussians, found {found}; give one row per Gaussian in every tensor"
+                )
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def scales(self) -> Tensor:
+        """Return the standard deviations (N, 3) in world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """Return the opacities (N,) in (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """Return the tensors that are optimised, by name: all but `anchor_keyframe`."""
+        names = [tensor_field.name for tensor_field in fields(self)][:-1]
+        return {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def empty(
+        cls, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+    ) -> "GaussianMap":
+        """Return a map of no Gaussians."""
+        shapes = [(0, 3), (0, 4), (0, 3), (0,), (0, 3)]
+        tensors = [torch.zeros(shape, dtype=dtype, device=device) for shape in shapes]
+        return cls(*tensors, torch.zeros(0, dtype=torch.int64, device=device))
+
+    def concatenate(self, other: "GaussianMap") -> "GaussianMap":
+        """Return the map of both: the rows of `other` come last."""
+        return GaussianMap(
+            *[
+                torch.cat([ours, theirs])
+                for ours, theirs in zip(_rows(self), _rows(other), strict=True)
+            ]
+        )
+
+    def prune(self, keep: Tensor) -> "GaussianMap":
+        """Return the map of the rows where `keep` (N,) bool is True, in the same order."""
+        _check_mask(keep, len(self))
+        return GaussianMap(*[tensor[keep] for tensor in _rows(self)])
+
+    def detach(self) -> "GaussianMap":
+        """Return the same values cut from any graph."""
+        return GaussianMap(*[tensor.detach() for tensor in _rows(self)])
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of all six tensors as numpy arrays, by name."""
+        names = [tensor_field.name for tensor_field in fields(self)]
+        return {name: getattr(self, name).detach().cpu().numpy().copy() for name in names}
+
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: dict[str, np.ndarray],  # as `to_arrays` returns them
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> "GaussianMap":
+        """Build a map from arrays; `anchor_keyframe` may be missing and is then -1."""
+        raw = [
+            torch.tensor(arrays[tensor_field.name], dtype=dtype, device=device)
+            for tensor_field in fields(cls)[:-1]
+        ]
+        anchors = arrays.get("anchor_keyframe", np.full(len(raw[0]), -1))
+        return cls(*raw, torch.tensor(anchors, dtype=torch.int64, device=device))
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's step per parameter group. Source: official WildGS-SLAM, where not said otherwise.
+
+    The official code multiplies the steps of means and log-scales by a constant 6; it is included
+    here. Its colours are c = 0.28209 f + 0.5 with a step of 2.5e-3 for f; ours is the step of c.
+    """
+
+    means: float = parameter(9.6e-4, "step of the means [world units per iteration]")
+    quats_wxyz: float = parameter(1e-3, "step of the quaternions [per iteration]")
+    log_scales: float = parameter(6e-3, "step of the log-scales [per iteration]")
+    opacity_logits: float = parameter(5e-2, "step of the opacity logits [per iteration]")
+    colors: float = parameter(7.05e-4, "step of the colours [per iteration]")
+
+
+class MapOptimizer:
+    """Adam over the rows of a map; moments and step counts are kept per Gaussian.
+
+    A row that is added starts with zero moments and a step count of zero, so Adam's bias
+    correction holds for it too. With one count for all rows, as torch.optim.Adam has, the first
+    step of a late row would be (1 - beta1) / sqrt(1 - beta2) = 3.2 times too long.
+    """
+
+    BETAS = (0.9, 0.999)  # decay of the first and second moment, Adam's defaults
+    EPSILON = 1e-15  # floor of the denominator: 3DGS, gradients per pixel mean are tiny
+
+    def __init__(self, gaussians: GaussianMap, rates: LearningRates) -> None:
+        self.rates = rates
+        self._set_rows(gaussians)
+        self.reset_moments()
+
+    def _set_rows(self, gaussians: GaussianMap) -> None:
+        leaves = [t.detach().clone().requires_grad_() for t in gaussians.parameters.values()]
+        self.gaussians = GaussianMap(*leaves, gaussians.anchor_keyframe)
+
+    def reset_moments(self) -> None:
+        """Forget all moments and step counts, as for a new optimiser."""
+        parameters = self.gaussians.parameters
+        self._first = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
+        self._second = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
+        self._steps = torch.zeros_like(parameters["opacity_logits"].detach())  # (N,)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move every parameter that has a gradient, then drop the gradients."""
+        beta1, beta2 = self.BETAS
+        self._steps += 1
+        correction1 = 1 - beta1**self._steps  # (N,)
+        correction2 = (1 - beta2**self._steps).sqrt()
+        for name, values in self.gaussians.parameters.items():
+            if values.grad is None:
+                continue
+            first, second = self._first[name], self._second[name]
+            first.lerp_(values.grad, 1 - beta1)
+            second.mul_(beta2).addcmul_(values.grad, values.grad, value=1 - beta2)
+            rows = (-1,) + (1,) * (values.dim() - 1)
+            denominator = (second.sqrt() / correction2.view(rows)).add_(self.EPSILON)
+            rate = getattr(self.rates, name) / correction1.view(rows)
+            values.sub_(rate * first / denominator)
+        self.zero_grad()
+
+    def zero_grad(self) -> None:
+        """Drop the gradients of all parameters."""
+        for values in self.gaussians.parameters.values():
+            values.grad = None
+
+    def append(self, new: GaussianMap) -> None:
+        """Add rows with zero moments; those of the old rows stay."""
+        self._set_rows(self.gaussians.concatenate(new))
+        for moments in (self._first, self._second):
+            for name, rows in new.parameters.items():
+                moments[name] = torch.cat([moments[name], torch.zeros_like(rows)])
+        self._steps = torch.cat([self._steps, torch.zeros_like(new.opacity_logits)])
+
+    def prune(self, keep: Tensor) -> None:
+        """Keep the rows where `keep` (N,) bool is True, with their moments."""
+        self._set_rows(self.gaussians.prune(keep))
+        for moments in (self._first, self._second):
+            for name in moments:
+                moments[name] = moments[name][keep]
+        self._steps = self._steps[keep]
+
+    def replace(self, gaussians: GaussianMap, keep_moments: bool = True) -> None:
+        """Set new values for the same rows, for instance after a deformation of the map."""
+        if len(gaussians) != len(self.gaussians):
+            raise InputError(
+                f"expected {len(self.gaussians)} Gaussians, found {len(gaussians)}; "
+                "use append or prune to change the number of rows"
+            )
+        self._set_rows(gaussians)
+        if not keep_moments:
+            self.reset_moments()
+
+
+def _rows(gaussians: GaussianMap) -> list[Tensor]:
+    return [getattr(gaussians, tensor_field.name) for tensor_field in fields(gaussians)]
+
+
+def _check_mask(keep: Tensor, count: int) -> None:
+    if keep.dtype != torch.bool or tuple(keep.shape) != (count,):
+        raise InputError(
+            f"expected a bool mask of shape ({count},), found {keep.dtype} of shape "
+            f"{tuple(keep.shape)}; give True for every Gaussian to keep"
+        )

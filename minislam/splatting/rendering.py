@@ -1,0 +1,27 @@
+"""What a renderer returns, and the constants that its two implementations share."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+# World units. Nearer Gaussians are dropped: 1/z would blow them up over the whole image.
+NEAR_DEPTH = 0.05
+# px^2, added to both variances in the image so that no Gaussian falls between pixels (3DGS).
+LOW_PASS_VARIANCE = 0.3
+# The largest opacity of one Gaussian; keeps 1 - alpha away from zero (3DGS).
+MAX_OPACITY = 0.99
+# Fainter contributions to a pixel are dropped: less than one step of an 8-bit image (3DGS).
+MIN_ALPHA = 1 / 255
+# The linearised projection is evaluated at most this share of a half-image outside the border,
+# because it is a poor approximation there and grows without bound (3DGS: 1.3 half-images).
+VIEW_MARGIN = 0.3
+
+
+class Rendering(NamedTuple):
+    """One view of a map. `color`, `depth` and `opacity` carry gradients."""
+
+    color: Tensor  # (H, W, 3)
+    depth: Tensor  # (H, W) sum of weight * z in world units, NOT divided by the opacity
+    opacity: Tensor  # (H, W) in [0, 1], 1 - transmittance
+    radii: Tensor  # (N,) px, three standard deviations in the image; 0 where not visible
+    contribution: Tensor  # (N,) px, sum of a Gaussian's blending weight over all pixels
