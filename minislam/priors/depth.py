@@ -1,0 +1,207 @@
+"""Metric depth of single images without a network: simulated, from files, from a sensor, none.
+
+All are a `DepthPrior`: called with a frame and its camera they return z-depth (H, W) in world
+units, 0 where it is unknown, or None for a frame they know nothing about.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.parameters import parameter
+from minislam.records import Frame
+
+_ASPECT_TOLERANCE = 0.02  # relative; rounding a resized image to whole pixels stays below it
+
+DepthReader = Callable[[int], np.ndarray | None]  # frame_index -> (H, W) world units, 0 = unknown
+
+
+@dataclass(frozen=True)
+class SimulatedDepthConfig:
+    """How wrong a simulated depth network is; the sizes are those of good metric networks."""
+
+    scale_error: float = parameter(0.03, "standard deviation of one log factor per frame")
+    field_error: float = parameter(0.06, "standard deviation of a smooth log factor in the image")
+    field_cells: int = parameter(4, "bumps of that factor along the shorter image side")
+    gross_errors: int = parameter(2, "places per frame where the network is plainly wrong")
+    gross_error: float = parameter(0.3, "relative error at such a place, of either sign")
+    gross_radius: float = parameter(0.12, "radius of such a place [shorter image side]")
+
+
+class SimulatedDepth:
+    """The true depth of a synthetic scene with the errors of a monocular metric network.
+
+    The errors of a frame depend on the seed and the frame index alone, not on the order of calls.
+    """
+
+    def __init__(
+        self, truth: DepthReader, seed: int, config: SimulatedDepthConfig | None = None
+    ) -> None:
+        self.truth = truth
+        self.seed = seed
+        self.config = config or SimulatedDepthConfig()
+
+    def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
+        """Return the disturbed truth of a frame."""
+        truth = self.truth(frame.frame_index)
+        if truth is None:
+            return None
+        source = np.random.default_rng([self.seed, frame.frame_index])
+        height, width = truth.shape
+        log_factor = (
+            self.config.scale_error * source.standard_normal()
+            + self.config.field_error
+            * _smooth_noise(width, height, self.config.field_cells, source)
+            + self._gross(width, height, source)
+        )
+        return _as_depth(truth * np.exp(log_factor), frame, "the simulated depth")
+
+    def _gross(self, width: int, height: int, source: np.random.Generator) -> np.ndarray:
+        """Return the log factor (H, W) of the places that are plainly wrong."""
+        u, v = np.meshgrid(np.arange(width), np.arange(height))
+        radius = self.config.gross_radius * min(width, height)
+        total = np.zeros((height, width))
+        for _ in range(self.config.gross_errors):
+            centre_u, centre_v = source.uniform(0, width), source.uniform(0, height)
+            sign = source.choice([-1.0, 1.0])
+            distance = np.hypot(u - centre_u, v - centre_v) / radius
+            # Flat inside, falling to zero over the last third: networks err by whole objects.
+            profile = np.clip(3 * (1 - distance), 0, 1)
+            total += np.log1p(sign * self.config.gross_error) * profile
+        return total
+
+
+class FileDepth:
+    """Depth made elsewhere: a folder of .npy (world units) or 16-bit .png files.
+
+    A file belongs to the frame whose index is its name (`17.npy`, `00017.png`), or, when the
+    names of the input images are given, to the frame whose image has the same name.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        png_unit: float | None = None,  # world units of one count; TUM and Bonn: 1 / 5000 m
+        stems: list[str] | None = None,  # image name without ending, by frame_index
+    ) -> None:
+        self.folder = Path(folder)
+        self.png_unit = png_unit
+        if png_unit is not None and not png_unit > 0:
+            raise InputError(
+                f"expected a positive world unit per count for depth .png files, found {png_unit}; "
+                "for TUM and Bonn give 0.0002"
+            )
+        if not self.folder.is_dir():
+            raise InputError(
+                f"expected a folder of depth files, found nothing at {self.folder}; check the path"
+            )
+        # Sorted, so that of 17.npy and 17.png the same one wins on every machine.
+        files = sorted(p for p in self.folder.iterdir() if p.suffix.lower() in (".npy", ".png"))
+        self._files = _by_stem(files, stems) if stems is not None else _by_number(files)
+        if not self._files:
+            raise InputError(
+                f"expected .npy or .png files named by frame index or image name in {self.folder}, "
+                f"found {len(files)} such files and none that fits; name them like 00017.npy"
+            )
+
+    def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
+        """Read the depth of a frame, resized to its image, or return None if there is no file."""
+        path = self._files.get(frame.frame_index)
+        if path is None:
+            return None
+        depth = _read_npy(path) if path.suffix.lower() == ".npy" else self._read_png(path)
+        return _as_depth(depth, frame, str(path))
+
+    def _read_png(self, path: Path) -> np.ndarray:
+        if self.png_unit is None:
+            raise InputError(
+                f"expected the world units of one count for {path}, found none declared; "
+                "give it (TUM and Bonn: 0.0002) or store .npy files"
+            )
+        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
+            raise InputError(
+                f"expected a single-channel 16-bit .png of depth, found something else in {path}; "
+                "export depth, not its coloured picture"
+            )
+        return counts.astype(np.float32) * self.png_unit
+
+
+class SensorDepth:
+    """Depth of an RGB-D camera, as the sequence's own reader returns it."""
+
+    def __init__(self, reader: DepthReader) -> None:
+        self.reader = reader
+
+    def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
+        """Return the sensor's depth of a frame, or None where it has none."""
+        depth = self.reader(frame.frame_index)
+        return None if depth is None else _as_depth(depth, frame, "the sensor's depth")
+
+
+class NoDepth:
+    """No depth prior: the scale of the world is then arbitrary."""
+
+    def __call__(self, frame: Frame, camera: Camera) -> None:
+        """Return None."""
+        return None
+
+
+def _smooth_noise(
+    width: int, height: int, cells: int, source: np.random.Generator
+) -> np.ndarray:  # (H, W)
+    """Return smooth noise of mean 0 and standard deviation 1 over the image."""
+    cell = min(width, height) / cells
+    coarse = source.standard_normal((round(height / cell) + 1, round(width / cell) + 1))
+    noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    deviation = noise.std()
+    return (noise - noise.mean()) / (deviation if deviation > 0 else 1.0)
+
+
+def _by_number(files: list[Path]) -> dict[int, Path]:
+    return {int(path.stem): path for path in files if path.stem.isdecimal()}
+
+
+def _by_stem(files: list[Path], stems: list[str]) -> dict[int, Path]:
+    paths = {path.stem: path for path in files}
+    return {index: paths[stem] for index, stem in enumerate(stems) if stem in paths}
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    try:
+        depth = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(
+            f"expected a numpy array of depth, found an unreadable file {path}; write it again"
+        ) from error
+    depth = np.squeeze(depth)
+    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
+        raise InputError(
+            f"expected floating-point depth of shape (H, W) in {path}, found {depth.dtype} of "
+            f"shape {depth.shape}; store one depth map in world units per file"
+        )
+    return depth
+
+
+def _as_depth(depth: np.ndarray, frame: Frame, name: str) -> Tensor:
+    """Return depth as (H, W) float32 of the frame's size, with 0 for everything unusable."""
+    height, width = frame.image.shape[:2]
+    aspect = (depth.shape[1] / depth.shape[0]) / (width / height)
+    if abs(aspect - 1) > _ASPECT_TOLERANCE:
+        raise InputError(
+            f"expected {name} to show what the image of {width}x{height} shows, found "
+            f"{depth.shape[1]}x{depth.shape[0]} of another aspect ratio; crop it like the image"
+        )
+    depth = np.asarray(depth, np.float32)
+    if depth.shape != (height, width):
+        # Not bilinear: a mean over an object's edge is a depth where nothing is.
+        depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    usable = np.isfinite(depth) & (depth > 0)
+    return torch.from_numpy(np.where(usable, depth, np.float32(0))).to(frame.image.device)

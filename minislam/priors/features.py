@@ -1,0 +1,133 @@
+"""Dense image features without a network: colour, contrast and edges around each cell.
+
+The uncertainty MLP has to tell one object from another by appearance, and nothing more. For that,
+colour and texture statistics of the neighbourhood go a long way. What they cannot do is tell a
+grey person from a grey wall: for that, a pretrained network takes this file's place.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+from minislam.parameters import parameter
+
+# Centre and spread of each raw feature, rounded from statistics of everyday video (indoor and
+# outdoor, about a hundred frames). Without the centring all colours share one large common part
+# and every cosine similarity would be close to 1.
+_LAB_CENTRE = np.array([50.0, 4.0, 10.0], np.float32)  # Lab units of a float image: L is 0..100
+_LAB_SPREAD = np.array([23.0, 9.0, 14.0], np.float32)
+_CONTRAST_UNIT = np.array([1.0, 0.5, 0.5], np.float32)  # Lab units: contrasts below are noise
+_CONTRAST_CENTRE = np.array([1.9, 1.6, 1.9], np.float32)  # of log(1 + standard deviation / unit)
+_CONTRAST_SPREAD = np.array([0.9, 0.8, 0.9], np.float32)
+_EDGE_UNIT = 0.5  # Lab L per px: gradients below are noise
+_EDGE_CENTRE, _EDGE_SPREAD = 1.7, 0.7  # of log(1 + mean gradient / unit)
+_ORIENTATION_SPREAD = 0.1  # of the share of one orientation bin around 1 / bins
+
+
+@dataclass(frozen=True)
+class ClassicalFeaturesConfig:
+    """What the hand-made features look at."""
+
+    windows: tuple[int, ...] = parameter(
+        (1, 3, 5), "sides of the square windows whose statistics are taken [cells]"
+    )
+    orientation_bins: int = parameter(8, "bins of the edge orientation over 180 degrees")
+    texture_weight: float = parameter(
+        0.5, "weight of contrast and edges relative to colour, which survives a change of view"
+    )
+
+
+class ClassicalFeatures:
+    """Colour, contrast and edge orientation on a grid of cells: a `FeatureExtractor`."""
+
+    def __init__(
+        self,
+        stride: int = 14,  # px, size of a cell; 14 is the patch size of the paper's DINOv2
+        config: ClassicalFeaturesConfig | None = None,
+    ) -> None:
+        self.stride = stride
+        self.config = config or ClassicalFeaturesConfig()
+        self.dimension = len(self.config.windows) * (3 + 3 + self.config.orientation_bins + 1)
+
+    def __call__(
+        self,
+        image: Tensor,  # (H, W, 3) float32 RGB in [0, 1]
+    ) -> Tensor:  # (H // stride, W // stride, C) float32, each of length sqrt(C)
+        """Return one vector per cell; the cosine of two says how alike their surroundings look."""
+        height, width = image.shape[0] // self.stride, image.shape[1] // self.stride
+        if min(height, width) < 1:
+            raise InputError(
+                f"expected an image of at least {self.stride}x{self.stride} px for the features, "
+                f"found {image.shape[1]}x{image.shape[0]}; give a larger working size"
+            )
+        lab = cv2.cvtColor(image.detach().cpu().float().numpy(), cv2.COLOR_RGB2LAB)
+        mean = _cell_mean(lab, width, height)
+        mean_square = _cell_mean(lab * lab, width, height)
+        edges = _cell_mean(oriented_edges(lab[..., 0], self.config.orientation_bins), width, height)
+        groups = [self._describe(mean, mean_square, edges, side) for side in self.config.windows]
+        features = torch.from_numpy(np.concatenate(groups, -1).reshape(height, width, -1))
+        # Unit length on average per channel: what an MLP with standard initialisation expects.
+        length = features.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # never 0/0
+        return (features / length * self.dimension**0.5).to(image.device)
+
+    def _describe(
+        self,
+        mean: np.ndarray,  # (h, w, 3) Lab
+        mean_square: np.ndarray,  # (h, w, 3) Lab^2
+        edges: np.ndarray,  # (h, w, bins) Lab L per px
+        side: int,  # cells
+    ) -> np.ndarray:  # (h, w, 3 + 3 + bins + 1)
+        """Return the centred and scaled statistics of the window of `side` cells."""
+        mean, mean_square, edges = (_box(grid, side) for grid in (mean, mean_square, edges))
+        contrast = np.sqrt(np.maximum(mean_square - mean * mean, 0.0))  # round-off may be < 0
+        strength = edges.sum(-1, keepdims=True)
+        bins = edges.shape[-1]
+        # Where there is no edge, orientation is noise: the share fades to uniform.
+        share = (edges + _EDGE_UNIT / bins) / (strength + _EDGE_UNIT) - 1 / bins
+
+        color = (mean - _LAB_CENTRE) / _LAB_SPREAD
+        texture = [
+            (np.log1p(contrast / _CONTRAST_UNIT) - _CONTRAST_CENTRE) / _CONTRAST_SPREAD,
+            share / _ORIENTATION_SPREAD / np.sqrt(bins / 3, dtype=np.float32),
+            (np.log1p(strength / _EDGE_UNIT) - _EDGE_CENTRE) / _EDGE_SPREAD,
+        ]
+        weight = np.float32(self.config.texture_weight)
+        return np.concatenate([color, *(weight * part for part in texture)], -1)
+
+
+def oriented_edges(
+    brightness: np.ndarray,  # (H, W) float32
+    bins: int,
+) -> np.ndarray:  # (H, W, bins) float32, sums over bins to the gradient magnitude per px
+    """Split the gradient magnitude among orientation bins over 180 degrees, linearly."""
+    # The 3x3 Sobel kernel sums to 8 per unit slope.
+    du = cv2.Sobel(brightness, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    dv = cv2.Sobel(brightness, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    magnitude, angle = cv2.cartToPolar(du, dv)
+    position = (angle * np.float32(bins / np.pi)) % bins  # in bins; opposite directions are one
+    edges = np.empty((*brightness.shape, bins), np.float32)
+    for k in range(bins):
+        distance = np.abs(position - k)
+        distance = np.minimum(distance, bins - distance)
+        edges[..., k] = magnitude * np.maximum(1 - distance, 0)
+    return edges
+
+
+def _cell_mean(channels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return the mean (height, width, C) over cells spread evenly over an image (H, W, C)."""
+    means = [
+        cv2.resize(channels[..., c], (width, height), interpolation=cv2.INTER_AREA)
+        for c in range(channels.shape[-1])
+    ]
+    return np.stack(means, -1).reshape(height, width, -1)
+
+
+def _box(grid: np.ndarray, side: int) -> np.ndarray:
+    """Return the mean over side x side cells, kept 3D for a single channel too."""
+    if side == 1:
+        return grid
+    return cv2.blur(grid, (side, side), borderType=cv2.BORDER_REPLICATE).reshape(grid.shape)

@@ -1,0 +1,115 @@
+"""Classical features: same surface alike, different surfaces unlike, always finite."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from minislam.errors import InputError
+from minislam.priors.features import ClassicalFeatures, oriented_edges
+from tests.helpers import generator
+
+BINS = 8
+
+
+def textured(seed: int, rgb: tuple[float, float, float], height: int = 240, width: int = 320):
+    """Return a surface (H, W, 3) of one colour with blurred noise on it."""
+    noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
+    noise = 0.5 * cv2.GaussianBlur(noise, (0, 0), 2.5)
+    return np.clip(np.array(rgb, np.float32) * (1 + noise[..., None]), 0, 1)
+
+
+def cosine(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.cosine_similarity(a, b, dim=-1)
+
+
+# Known answers
+
+
+def test_shape_is_one_vector_per_full_cell_and_length_is_sqrt_of_the_dimension():
+    extractor = ClassicalFeatures()
+    features = extractor(torch.from_numpy(textured(0, (0.6, 0.3, 0.2), 250, 333)))
+    assert features.shape == (250 // 14, 333 // 14, extractor.dimension)
+    assert features.dtype == torch.float32
+    expected = torch.full(features.shape[:2], extractor.dimension**0.5)
+    torch.testing.assert_close(features.norm(dim=-1), expected)
+
+
+def test_a_vertical_ramp_falls_into_the_bin_of_ninety_degrees():
+    # Brightness grows by 2 per row, so the gradient is (0, 2): bin 90 / 180 * 8 = 4.
+    ramp = np.repeat(2.0 * np.arange(20, dtype=np.float32)[:, None], 20, 1)
+    edges = oriented_edges(ramp, BINS)[5:-5, 5:-5]
+    expected = np.zeros(BINS, np.float32)
+    expected[4] = 2
+    np.testing.assert_allclose(edges, np.broadcast_to(expected, edges.shape), atol=1e-3)
+
+
+def test_opposite_gradients_share_a_bin_and_bins_sum_to_the_magnitude():
+    image = textured(1, (0.5, 0.5, 0.5))[..., 0] * 100
+    edges = oriented_edges(image, BINS)
+    # cv2 computes angles to about 0.01 degree, hence the tolerance.
+    np.testing.assert_allclose(edges, oriented_edges(-image, BINS), atol=0.02)
+    du = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    dv = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    np.testing.assert_allclose(edges.sum(-1), np.hypot(du, dv), rtol=1e-4, atol=1e-4)
+
+
+# What the features are for
+
+
+def test_the_same_surface_from_two_views_is_alike_and_two_surfaces_are_not():
+    wall = textured(0, (0.75, 0.70, 0.60))
+    person = textured(1, (0.15, 0.25, 0.55))
+    moved = cv2.warpAffine(
+        wall, np.array([[1.1, 0.1, -23.0], [-0.1, 1.1, 9.0]]), (320, 240), borderMode=4
+    )
+    extractor = ClassicalFeatures()
+    first, second, other = (extractor(torch.from_numpy(im)) for im in (wall, moved, person))
+    assert cosine(first, second).median() > 0.9
+    assert cosine(first, other).median() < 0.3
+
+
+def test_an_object_in_the_image_is_separated_from_its_background():
+    image = textured(0, (0.7, 0.65, 0.5))
+    image[84:168, 112:224] = textured(1, (0.6, 0.15, 0.15))[84:168, 112:224]
+    features = ClassicalFeatures()(torch.from_numpy(image))
+    inside = features[7:11, 9:15].reshape(-1, features.shape[-1])
+    outside = features[13:, :].reshape(-1, features.shape[-1])
+    within = cosine(inside[:, None], inside[None]).mean()
+    across = cosine(inside[:, None], outside[None]).mean()
+    assert within > 0.75 > across, (within, across)
+
+
+# Identities
+
+
+def test_the_same_image_gives_the_same_bytes():
+    image = torch.from_numpy(textured(3, (0.4, 0.5, 0.3)))
+    assert torch.equal(ClassicalFeatures()(image), ClassicalFeatures()(image))
+
+
+# Degenerate input
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_constant_images_give_finite_features_of_full_length(value: float):
+    extractor = ClassicalFeatures()
+    features = extractor(torch.full((56, 70, 3), value))
+    assert torch.isfinite(features).all()
+    assert features.norm(dim=-1).min() > 0.99 * extractor.dimension**0.5
+
+
+def test_a_single_cell_and_another_stride_work():
+    assert ClassicalFeatures()(torch.rand(14, 14, 3, generator=generator(0))).shape[:2] == (
+        1,
+        1,
+    )
+    assert ClassicalFeatures(stride=8)(torch.zeros(48, 64, 3)).shape[:2] == (6, 8)
+
+
+# Errors
+
+
+def test_an_image_smaller_than_a_cell_is_refused_in_one_sentence():
+    with pytest.raises(InputError, match=r"at least 14x14 px.*found 20x13"):
+        ClassicalFeatures()(torch.zeros(13, 20, 3))
