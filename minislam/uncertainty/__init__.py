@@ -1,0 +1,16 @@
+"""Uncertainty (Sec. 3.2): an MLP learns, while the map grows, which image patches move."""
+
+from minislam.uncertainty.config import UncertaintyConfig
+from minislam.uncertainty.mlp import UncertaintyMLP
+from minislam.uncertainty.training import Misfit, UncertaintyTrainer, measure_misfit
+from minislam.uncertainty.weights import mapping_weight, tracking_weight
+
+__all__ = [
+    "Misfit",
+    "UncertaintyConfig",
+    "UncertaintyMLP",
+    "UncertaintyTrainer",
+    "mapping_weight",
+    "measure_misfit",
+    "tracking_weight",
+]

@@ -1,0 +1,65 @@
+"""The constants of the uncertainty MLP and of its loss."""
+
+from dataclasses import dataclass
+
+from minislam.errors import InputError
+from minislam.parameters import parameter
+
+
+@dataclass(frozen=True)
+class UncertaintyConfig:
+    """How beta is predicted and trained. "official" names the constants of the authors' code."""
+
+    enabled: bool = parameter(True, "off: every weight is 1 and nothing is trained (ablation a)")
+
+    hidden_units: int = parameter(64, "width of the two hidden layers [units], official")
+    dropout: float = parameter(0.2, "share of hidden units dropped in training [0, 1), official")
+    learning_rate: float = parameter(
+        2e-3, "Adam step of the MLP [1]; official 4e-4 for some 10^4 iterations, ours run 10^3"
+    )
+    weight_decay: float = parameter(1e-5, "L2 pull on the MLP's weights [1], official")
+
+    lambda_depth: float = parameter(
+        0.2, "lambda_1: weight of L_depth [1 per depth unit], official; 0 is ablation (b)"
+    )
+    lambda_variance: float = parameter(
+        1.0, "lambda_2: weight of L_reg_V [1], official 0.5 on a loss halved throughout"
+    )
+    lambda_log: float = parameter(0.5, "lambda_3: weight of L_reg_U = log beta [1], official")
+
+    ssim_gain: float = parameter(
+        668.42, "factor of (1-l)(1-s)(1-c) [1]: 100 + 900 b(0.3; 0.8), NeRF On-the-go"
+    )
+    loss_cap: float = parameter(
+        5.0, "cap of the SSIM and of the depth term [1], official: bounds beta by 2 sqrt(5)"
+    )
+    median_size: int = parameter(
+        3, "window of the median filter [cells], odd; official 5 on a grid twice as fine"
+    )
+    opacity_gate: float = parameter(
+        0.9, "cells rendered less opaque than this teach nothing [1], official"
+    )
+    far_factor: float = parameter(
+        10.0, "no depth term beyond this many median depths [1], official"
+    )
+
+    similarity: float = parameter(0.75, "cosine above which features are alike [1], official")
+    neighbours: int = parameter(128, "most alike cells that enter L_reg_V [cells], official")
+    variance_samples: int = parameter(
+        350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes"
+    )
+    neighbour_keyframes: int = parameter(
+        2, "keyframes before and after that L_reg_V looks at [keyframes], official"
+    )
+
+    def __post_init__(self) -> None:
+        if self.median_size < 1 or self.median_size % 2 == 0:
+            raise InputError(
+                f"expected an odd median window of at least 1 cell, found {self.median_size}; "
+                "set uncertainty.median_size to 1, 3 or 5"
+            )
+        if not 0 <= self.dropout < 1:
+            raise InputError(
+                f"expected a dropout share in [0, 1), found {self.dropout}; "
+                "set uncertainty.dropout, 0.2 by default"
+            )

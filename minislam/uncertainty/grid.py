@@ -1,0 +1,19 @@
+"""Between the image and the feature grid: two regular grids over the same area."""
+
+from torch import Tensor
+from torch.nn import functional
+
+
+def resample(
+    values: Tensor,  # (h, w)
+    height: int,  # rows wanted
+    width: int,  # columns wanted
+) -> Tensor:  # (height, width)
+    """Interpolate one grid at the cell centres of another one that covers the same area.
+
+    Both cover the image evenly: on an image of W px, the centre of column j of w' columns lies at
+    (j + 0.5) W / w' - 0.5. Bilinear, without smoothing when it goes down.
+    """
+    batch = values[None, None]
+    resampled = functional.interpolate(batch, (height, width), mode="bilinear", align_corners=False)
+    return resampled[0, 0]

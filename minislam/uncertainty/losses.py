@@ -1,0 +1,144 @@
+"""The terms of L_uncer, which trains the MLP and nothing else (Sec. 3.2).
+
+Everything that comes from the renderer is a constant here: L_uncer never moves a Gaussian.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.uncertainty.config import UncertaintyConfig
+from minislam.uncertainty.weights import clipped_beta
+
+SSIM_WINDOW = 7  # px, official; NeRF On-the-go uses a 5x5 box
+SSIM_SIGMA = 1.5  # px
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # stabilise l and c on flat patches of images in [0, 1]
+SSIM_C3 = SSIM_C2 / 2  # the usual choice, with which l c s is the classic SSIM
+STRUCTURE_CAP = 0.98  # of c and s: one perfect factor must not hide the two others
+
+
+def gaussian_blur(
+    images: Tensor,  # (..., H, W)
+    size: int,  # px, odd
+    sigma: float,  # px
+) -> Tensor:  # (..., H, W)
+    """Blur by a normalised Gaussian window, zero beyond the border, rows then columns."""
+    offsets = torch.arange(size, dtype=images.dtype, device=images.device) - size // 2
+    window = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    window = window / window.sum()
+    height, width = images.shape[-2:]
+    flat = images.reshape(-1, 1, height, width)
+    flat = functional.conv2d(flat, window[None, None, None, :], padding=(0, size // 2))
+    flat = functional.conv2d(flat, window[None, None, :, None], padding=(size // 2, 0))
+    return flat.reshape(images.shape)
+
+
+def ssim_components(
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    rendered: Tensor,  # (H, W, 3)
+) -> tuple[Tensor, Tensor, Tensor]:  # 3 x (H, W)
+    """Return luminance l, contrast c and structure s of the modified SSIM, means over channels.
+
+    l = (2 m1 m2 + C1) / (m1^2 + m2^2 + C1),  c = (2 d1 d2 + C2) / (d1^2 + d2^2 + C2) and
+    s = (d12 + C3) / (d1 d2 + C3), with local means m, deviations d and covariance d12.
+    """
+    first, second = image.permute(2, 0, 1), rendered.permute(2, 0, 1)
+    stack = torch.stack([first, second, first * first, second * second, first * second])
+    m1, m2, m11, m22, m12 = gaussian_blur(stack, SSIM_WINDOW, SSIM_SIGMA)
+
+    # E[x^2] - E[x]^2 can come out negative, and |d12| larger than d1 d2, by round-off.
+    smallest = torch.finfo(image.dtype).eps
+    d1 = (m11 - m1 * m1).clamp_min(smallest).sqrt()
+    d2 = (m22 - m2 * m2).clamp_min(smallest).sqrt()
+    d12 = (m12 - m1 * m2).clamp(-d1 * d2, d1 * d2)
+
+    luminance = (2 * m1 * m2 + SSIM_C1) / (m1 * m1 + m2 * m2 + SSIM_C1)
+    contrast = (2 * d1 * d2 + SSIM_C2) / (d1 * d1 + d2 * d2 + SSIM_C2)
+    structure = (d12 + SSIM_C3) / (d1 * d2 + SSIM_C3)
+    contrast, structure = contrast.clamp_max(STRUCTURE_CAP), structure.clamp_max(STRUCTURE_CAP)
+    return luminance.mean(0), contrast.mean(0), structure.mean(0)
+
+
+def modified_ssim_loss(
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    rendered: Tensor,  # (H, W, 3)
+    opacity: Tensor,  # (H, W) in [0, 1]
+    config: UncertaintyConfig,
+) -> Tensor:  # (H, W) in [0, config.loss_cap]
+    """Return L'_SSIM = gain (1 - l)(1 - c)(1 - s) per pixel, faded where nothing is rendered.
+
+    The product is far steeper than 1 - SSIM: near 0 on small misfits, large on another object.
+    First numerator of Eq. 4.
+    """
+    luminance, contrast, structure = ssim_components(image, rendered)
+    product = (1 - luminance) * (1 - contrast) * (1 - structure)
+    return (opacity * config.ssim_gain * product).clamp(0, config.loss_cap)
+
+
+def depth_loss(
+    rendered_depth: Tensor,  # (H, W) world units
+    reference_depth: Tensor,  # (H, W) world units, 0 where unknown
+    far_limit: float,  # world units; beyond it the reference says nothing
+) -> Tensor:  # (H, W) world units
+    """Return |D^ - D~| per pixel, 0 where the reference depth is unknown or far. Eq. 3."""
+    known = (reference_depth > 0) & (reference_depth < far_limit)
+    return torch.where(known, (rendered_depth - reference_depth).abs(), 0)
+
+
+def median_filter(
+    values: Tensor,  # (h, w)
+    size: int,  # cells, odd
+) -> Tensor:  # (h, w)
+    """Return the median over size x size windows, mirrored at the border.
+
+    It removes thin lines of misfit: an edge rendered half a pixel off is not a moving object.
+    """
+    margin = min(size // 2, values.shape[0] - 1, values.shape[1] - 1)
+    size = 2 * margin + 1
+    padded = functional.pad(values[None, None], [margin] * 4, mode="reflect")[0, 0]
+    windows = padded.unfold(0, size, 1).unfold(1, size, 1)
+    return windows.reshape(*values.shape, size * size).median(-1).values
+
+
+def log_regulariser(beta: Tensor) -> Tensor:
+    """Return L_reg_U = log beta: without it, beta -> infinity would explain everything away."""
+    return beta.log()
+
+
+def variance_regulariser(
+    beta_raw: Tensor,  # (n,) unclipped, so that cells under the floor feel it too
+    features: Tensor,  # (n, C)
+    config: UncertaintyConfig,
+) -> Tensor:  # ()
+    """Return L_reg_V, the mean variance of beta among cells whose features are alike (Eq. 4).
+
+    Each cell is compared with its most similar cells, itself included, of cosine > 0.75.
+    """
+    unit = functional.normalize(features.detach(), dim=-1)
+    similarity = unit @ unit.T
+    count = min(config.neighbours, len(beta_raw))
+    cosine, index = similarity.topk(count, dim=-1)
+    alike = (cosine > config.similarity).to(beta_raw)
+    # A cell is always alike to itself, even when its feature vector is zero.
+    alike[:, 0] = 1
+    neighbour_beta = beta_raw[index]
+    number = alike.sum(-1)
+    mean = (alike * neighbour_beta).sum(-1) / number
+    variance = (alike * (neighbour_beta - mean[:, None]) ** 2).sum(-1) / number
+    return variance.mean()
+
+
+def cell_loss(
+    beta_raw: Tensor,  # (h', w') with gradient to the MLP
+    misfit: Tensor,  # (h', w') L'_SSIM + lambda_1 L_depth, constant
+    opacity: Tensor,  # (h', w') in [0, 1]
+    config: UncertaintyConfig,
+) -> Tensor:  # (h', w')
+    """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell (Eq. 4).
+
+    With lambda_3 = 0.5 and misfit L it is smallest at beta = 2 sqrt(L). Cells that the map does
+    not cover yet give 0: a hole is not a moving object.
+    """
+    beta = clipped_beta(beta_raw)
+    loss = misfit.detach() / beta**2 + config.lambda_log * log_regulariser(beta)
+    return torch.where(opacity >= config.opacity_gate, loss, 0)

@@ -1,0 +1,99 @@
+"""Train the MLP on what the map fails to explain: one step of L_uncer (Eq. 4)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from minislam.uncertainty.config import UncertaintyConfig
+from minislam.uncertainty.grid import resample
+from minislam.uncertainty.losses import (
+    cell_loss,
+    depth_loss,
+    median_filter,
+    modified_ssim_loss,
+    variance_regulariser,
+)
+from minislam.uncertainty.mlp import UncertaintyMLP
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How badly the map explains a keyframe, on its feature grid. Constants: no gradient."""
+
+    ssim: Tensor  # (h', w') L'_SSIM after the median filter
+    depth: Tensor  # (h', w') L_depth in depth units, capped
+    opacity: Tensor  # (h', w') in [0, 1]
+
+
+@torch.no_grad()
+def measure_misfit(
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    reference_depth: Tensor,  # (H, W) world units, 0 where unknown
+    rendered_color: Tensor,  # (H, W, 3)
+    rendered_depth: Tensor,  # (H, W) world units
+    opacity: Tensor,  # (H, W) in [0, 1]
+    grid_shape: tuple[int, int],  # (h', w') cells
+    depth_unit: float,  # world units that count as 1 in L_depth
+    config: UncertaintyConfig,
+) -> Misfit:
+    """Compare a rendering with its keyframe and bring the misfit to the feature grid."""
+    ssim = modified_ssim_loss(image, rendered_color, opacity, config)
+    ssim = median_filter(resample(ssim, *grid_shape), config.median_size)
+
+    known = reference_depth > 0
+    # Without any reference depth there is no median, and every pixel is masked anyway.
+    median = float(reference_depth[known].median()) if known.any() else 1.0
+    depth = depth_loss(rendered_depth, reference_depth, config.far_factor * median) / depth_unit
+    depth = resample(depth.clamp_max(config.loss_cap), *grid_shape)
+    return Misfit(ssim, depth, resample(opacity, *grid_shape))
+
+
+def uncertainty_loss(
+    beta_raw: Tensor,  # (h', w') of the view, with gradient to the MLP
+    misfit: Misfit,
+    sample_beta_raw: Tensor,  # (n,) of cells drawn from the view and its neighbours
+    sample_features: Tensor,  # (n, C) of the same cells
+    config: UncertaintyConfig,
+) -> Tensor:  # ()
+    """Return L_uncer: the mean cell loss plus lambda_2 L_reg_V. Eq. 4."""
+    numerator = misfit.ssim + config.lambda_depth * misfit.depth
+    cells = cell_loss(beta_raw, numerator, misfit.opacity, config)
+    regulariser = variance_regulariser(sample_beta_raw, sample_features, config)
+    return cells.mean() + config.lambda_variance * regulariser
+
+
+class UncertaintyTrainer:
+    """Own the MLP, its Adam and its random source for a whole run."""
+
+    def __init__(self, feature_dimension: int, config: UncertaintyConfig, seed: int) -> None:
+        self.config = config
+        self.generator = torch.Generator().manual_seed(seed)
+        self.mlp = UncertaintyMLP(
+            feature_dimension, self.generator, config.hidden_units, config.dropout
+        )
+        self.optimizer = torch.optim.Adam(
+            self.mlp.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+
+    @torch.no_grad()
+    def predict(self, features: Tensor) -> Tensor:
+        """Return the raw beta (h', w') of features (h', w', C), without dropout or gradient."""
+        return self.mlp(features)
+
+    def step(
+        self,
+        features: Tensor,  # (h', w', C) of the sampled keyframe
+        misfit: Misfit,
+        nearby_features: Tensor,  # (n, C) cells of this keyframe and of its neighbours in time
+    ) -> float:
+        """Take one Adam step on L_uncer and return its value before the step."""
+        drawn = torch.randperm(len(nearby_features), generator=self.generator)
+        sample = nearby_features[drawn[: self.config.variance_samples].to(nearby_features.device)]
+        beta_raw = self.mlp(features, self.generator)
+        sample_beta_raw = self.mlp(sample, self.generator)
+        loss = uncertainty_loss(beta_raw, misfit, sample_beta_raw, sample, self.config)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        return float(loss.detach())

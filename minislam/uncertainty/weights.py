@@ -1,0 +1,62 @@
+"""The only place where beta becomes a weight.
+
+The paper weights residuals by 1 / beta^2 (Eq. 5 and 6). The official code, which we follow here,
+stretches beta first and caps or cuts the weight:
+
+    beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
+    tracking: w capped at 1,        mapping: w below 0.1 set to 0.
+
+So a cell counts fully in tracking below beta_raw = 0.47 and is invisible to mapping above 1.41.
+"""
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.uncertainty.grid import resample
+
+BETA_FLOOR = 0.1  # smallest beta, official: keeps 1 / beta^2 and log beta finite
+BETA_OFFSET = 1e-3  # added to the clipped beta, official
+TRAIN_FRACTION = 0.3  # x: position in NeRF On-the-go's schedule, held fixed by the official code
+SCHLICK_SLOPE = 0.8  # s: slope of that schedule at its end, official
+WEIGHT_SCALE = 0.5  # numerator of the weight, official
+TRACKING_CAP = 1.0  # a static cell must not count more than the flow's own confidence says
+MAPPING_CUT = 0.1  # below this the weight is 0: no slow leak of a mover over many iterations
+
+
+def schlick_bias(position: float, slope: float) -> float:
+    """Return x / (1 + (1 - x) (1/s - 2)), Schlick's bias of x in [0, 1]; s = 0.5 returns x."""
+    return position / (1 + (1 - position) * (1 / slope - 2))
+
+
+DATA_RATE = 1 + schlick_bias(TRAIN_FRACTION, SCHLICK_SLOPE)  # 1.6316
+
+
+def clipped_beta(beta_raw: Tensor) -> Tensor:
+    """Return max(beta_raw, 0.1) + 0.001, the beta of the loss (Eq. 4); shape and gradient kept."""
+    return beta_raw.clamp_min(BETA_FLOOR) + BETA_OFFSET
+
+
+def adjusted_beta(beta_raw: Tensor, camera: Camera) -> Tensor:
+    """Return the stretched beta (H, W) of a grid (h', w'), without gradient."""
+    beta = resample(clipped_beta(beta_raw.detach()), camera.height, camera.width)
+    return (beta - BETA_FLOOR) * DATA_RATE + BETA_FLOOR
+
+
+def mapping_weight(
+    beta_raw: Tensor,  # (h', w') output of the MLP
+    camera: Camera,
+) -> Tensor:  # (H, W) 0 or >= 0.1, at most 48.4
+    """Return the weight of each pixel in L_render (Eq. 6): 0.5 / beta_adj^2, cut at 0.1."""
+    weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2
+    return torch.where(weight < MAPPING_CUT, torch.zeros_like(weight), weight)
+
+
+def tracking_weight(
+    beta_raw: Tensor,  # (h', w') output of the MLP
+    camera: Camera,
+    stride: int,  # px between grid cells of the tracker
+) -> Tensor:  # (ceil(H / stride), ceil(W / stride)) in (0, 1]
+    """Return the weight of each tracker cell (Eq. 5), sampled at pixels (stride i, stride j)."""
+    weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera)[::stride, ::stride] ** 2
+    return weight.clamp_max(TRACKING_CAP)

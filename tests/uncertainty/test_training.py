@@ -1,0 +1,60 @@
+import torch
+
+from minislam.uncertainty import Misfit, UncertaintyConfig, UncertaintyTrainer, measure_misfit
+from tests.helpers import generator
+
+
+def two_object_misfit() -> tuple[torch.Tensor, Misfit]:
+    """A grid whose left half is explained by the map and whose right half is not."""
+    features = torch.zeros(6, 8, 4)
+    features[:, :4, 0] = 1
+    features[:, 4:, 1] = 1
+    features = features + 0.05 * torch.randn(6, 8, 4, generator=generator(0))
+    ssim = torch.zeros(6, 8)
+    ssim[:, 4:] = 2.0
+    return features, Misfit(ssim, torch.zeros(6, 8), torch.ones(6, 8))
+
+
+def test_the_mlp_learns_which_features_the_map_cannot_explain():
+    features, misfit = two_object_misfit()
+    trainer = UncertaintyTrainer(4, UncertaintyConfig(learning_rate=5e-3), seed=0)
+    losses = [trainer.step(features, misfit, features.reshape(-1, 4)) for _ in range(250)]
+    beta = trainer.predict(features)
+    assert losses[-1] < losses[0]
+    assert beta[:, :4].mean() < 0.4 and beta[:, 4:].mean() > 1.41
+
+
+def test_two_runs_with_one_seed_are_equal_to_the_bit():
+    features, misfit = two_object_misfit()
+    betas = []
+    for _ in range(2):
+        trainer = UncertaintyTrainer(4, UncertaintyConfig(), seed=3)
+        for _ in range(5):
+            trainer.step(features, misfit, features.reshape(-1, 4))
+        betas.append(trainer.predict(features))
+    assert torch.equal(betas[0], betas[1])
+
+
+def test_misfit_carries_no_gradient_back_to_the_rendering():
+    image = torch.rand(16, 16, 3, generator=generator(1))
+    color = torch.rand(16, 16, 3, generator=generator(2)).requires_grad_()
+    depth = torch.full((16, 16), 2.0, requires_grad=True)
+    opacity = torch.ones(16, 16, requires_grad=True)
+    misfit = measure_misfit(
+        image, torch.ones(16, 16), color, depth, opacity, (4, 4), 0.5, UncertaintyConfig()
+    )
+    trainer = UncertaintyTrainer(3, UncertaintyConfig(), seed=0)
+    features = torch.rand(4, 4, 3, generator=generator(3))
+    trainer.step(features, misfit, features.reshape(-1, 3))
+    assert color.grad is None and depth.grad is None and opacity.grad is None
+    # |2 - 1| in units of 0.5.
+    torch.testing.assert_close(misfit.depth, torch.full((4, 4), 2.0))
+
+
+def test_no_reference_depth_leaves_only_the_ssim_term():
+    image = torch.rand(16, 16, 3, generator=generator(1))
+    nothing = torch.zeros(16, 16)
+    misfit = measure_misfit(
+        image, nothing, image, nothing + 2, nothing + 1, (4, 4), 1.0, UncertaintyConfig()
+    )
+    assert misfit.depth.max() == 0 and misfit.ssim.max() == 0

@@ -1,0 +1,84 @@
+import pytest
+import torch
+
+from minislam.geometry import Camera
+from minislam.uncertainty.weights import (
+    DATA_RATE,
+    adjusted_beta,
+    clipped_beta,
+    mapping_weight,
+    schlick_bias,
+    tracking_weight,
+)
+
+CAMERA = Camera(20.0, 20.0, 15.5, 11.5, 32, 24)
+
+
+def grid(value: float) -> torch.Tensor:
+    return torch.full((3, 4), value, dtype=torch.float64)
+
+
+# Known answers
+
+
+def test_schlick_bias_and_the_constants_made_from_it():
+    assert schlick_bias(0.3, 0.8) == pytest.approx(0.6315789, abs=1e-7)
+    assert DATA_RATE == pytest.approx(1.6315789, abs=1e-7)
+    assert 100 + 900 * schlick_bias(0.3, 0.8) == pytest.approx(668.4211, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("beta_raw", "mapping", "tracking"),
+    [
+        (0.05, 48.4075, 1.0),
+        (0.3, 2.73, 1.0),
+        (0.5, 0.879, 0.879),
+        (0.693, 0.437, 0.437),
+        (1.0, 0.203, 0.203),
+        (1.40, 0.101, 0.101),
+        (1.42, 0.0, 0.098),
+        (2.0, 0.0, 0.049),
+        (4.47, 0.0, 0.010),
+    ],
+)
+def test_weight_table(beta_raw, mapping, tracking):
+    assert float(mapping_weight(grid(beta_raw), CAMERA)[5, 7]) == pytest.approx(mapping, rel=6e-3)
+    weight = float(tracking_weight(grid(beta_raw), CAMERA, 8)[1, 2])
+    assert weight == pytest.approx(tracking, abs=5e-4)
+
+
+def test_smallest_adjusted_beta_is_0_1016():
+    assert float(adjusted_beta(grid(0.02), CAMERA).min()) == pytest.approx(0.101632, abs=1e-6)
+
+
+def test_thresholds_of_full_trust_and_of_invisibility():
+    assert float(tracking_weight(grid(0.4711), CAMERA, 8).min()) == pytest.approx(1, abs=1e-3)
+    assert float(tracking_weight(grid(0.475), CAMERA, 8).max()) < 1
+    assert float(mapping_weight(grid(1.4079), CAMERA).min()) > 0
+    assert float(mapping_weight(grid(1.4083), CAMERA).max()) == 0
+
+
+# Identities
+
+
+def test_bias_with_slope_one_half_is_the_identity():
+    assert schlick_bias(0.37, 0.5) == pytest.approx(0.37)
+
+
+def test_tracking_weight_is_sampled_at_the_pixels_of_the_camera_grid():
+    beta = torch.linspace(0.3, 2.0, 12).reshape(3, 4)
+    weight = tracking_weight(beta, CAMERA, 5)
+    pixels = CAMERA.pixel_grid(5).long()
+    full = (0.5 / adjusted_beta(beta, CAMERA) ** 2).clamp_max(1)
+    assert torch.equal(weight, full[pixels[..., 1], pixels[..., 0]])
+
+
+# Gradients
+
+
+def test_no_gradient_flows_through_a_weight_but_it_does_through_the_loss_beta():
+    beta = grid(0.5).requires_grad_()
+    assert not mapping_weight(beta, CAMERA).requires_grad
+    assert not tracking_weight(beta, CAMERA, 8).requires_grad
+    clipped_beta(beta).sum().backward()
+    assert torch.equal(beta.grad, torch.ones_like(beta))
