@@ -1,0 +1,229 @@
+"""Classical optical flow (OpenCV's DIS) behind the FlowEstimator interface.
+
+Dense inverse search finds small displacements well and large ones badly. So the target image is
+first warped by the displacement that geometry predicts, DIS finds what is left, and the two are
+composed ("warp-compose"). Confidence is forward-backward agreement times texture.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.parameters import parameter
+from minislam.priors.interfaces import FlowMatches
+
+
+@dataclass(frozen=True)
+class ClassicalFlowConfig:
+    """Constants of the classical flow."""
+
+    stride: int = parameter(8, "distance between grid cells [px], as DROID-SLAM")
+    consistency_scale: float = parameter(
+        0.6, "forward-backward error at which confidence falls to exp(-1/2) [px]"
+    )
+    texture_scale: float = parameter(
+        2e-4, "smaller eigenvalue of the structure tensor that halves confidence [1/px^2]"
+    )
+    workers: int = parameter(2, "threads that compute flows side by side; no effect on the result")
+
+
+class ClassicalFlow:
+    """DIS flow between registered keyframes, started from a predicted reprojection."""
+
+    def __init__(self, config: ClassicalFlowConfig = ClassicalFlowConfig()) -> None:
+        # DIS splits the image in one stripe per OpenCV thread and does not propagate matches
+        # across them: with more than one, the result would depend on the machine.
+        cv2.setNumThreads(1)
+        self.config = config
+        self.stride = config.stride
+        self._images: dict[int, np.ndarray] = {}
+        self._textures: dict[int, np.ndarray] = {}
+
+    def add_frame(self, keyframe_index: int, image: Tensor) -> None:
+        """Register the image (H, W, 3) of a keyframe under its index."""
+        gray = grayscale(image)
+        self._images[keyframe_index] = gray
+        self._textures[keyframe_index] = texture_confidence(gray, self.config)
+
+    def remove_frame(self, keyframe_index: int) -> None:
+        """Forget a keyframe."""
+        del self._images[keyframe_index], self._textures[keyframe_index]
+
+    def match(
+        self,
+        edges_source: list[int],  # (E,) keyframe index
+        edges_target: list[int],  # (E,) keyframe index
+        predicted_targets: Tensor,  # (E, h, w, 2) px
+    ) -> FlowMatches:
+        """Match every grid cell of each source in its target; see FlowEstimator.match."""
+        edges = list(zip(edges_source, edges_target, strict=True))
+        predictions = predicted_targets.numpy().astype(np.float32)
+        with ThreadPoolExecutor(self.config.workers) as pool:
+            flows = list(pool.map(self._edge_flow, edges, predictions))
+        flow_of = dict(zip(edges, flows, strict=True))
+
+        def measure(edge: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+            source, target = edge
+            forward, backward = flow_of[edge], flow_of.get((target, source))
+            if backward is None:
+                backward = reverse_flow(self._images[source], self._images[target], forward)
+            return grid_matches(forward, backward, self._textures[source], self.config)
+
+        with ThreadPoolExecutor(self.config.workers) as pool:
+            measured = list(pool.map(measure, edges))
+        dtype = predicted_targets.dtype
+        targets = torch.from_numpy(np.stack([m[0] for m in measured])).to(dtype)
+        confidence = torch.from_numpy(np.stack([m[1] for m in measured])).to(dtype)
+        return FlowMatches(targets, confidence[..., None].expand(targets.shape))
+
+    def _edge_flow(self, edge: tuple[int, int], predicted: np.ndarray) -> np.ndarray:
+        source, target = self._images[edge[0]], self._images[edge[1]]
+        return composed_flow(source, target, dense_from_grid(predicted, source.shape, self.stride))
+
+    def start_chain(self, image: Tensor) -> "FlowChain":
+        """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
+        return FlowChain(grayscale(image), self.config)
+
+
+class FlowChain:
+    """The flow from one reference frame to the newest frame, carried from frame to frame.
+
+    The previous frame's flow predicts the next one, so a displacement of any length is followed
+    as long as each step of it is short. It needs no pose: it starts the pose.
+    """
+
+    def __init__(
+        self,
+        reference: np.ndarray,
+        config: ClassicalFlowConfig,
+        increment: np.ndarray | None = None,
+    ) -> None:
+        self.config = config
+        self._reference = reference
+        self._texture = texture_confidence(reference, config)
+        self._flow = np.zeros((*reference.shape, 2), np.float32)
+        self._increment = np.zeros_like(self._flow) if increment is None else increment
+        self._newest = reference
+
+    def advance(self, image: Tensor) -> FlowMatches:
+        """Follow the reference into the next frame; return matches with E = 1."""
+        gray = grayscale(image)
+        # A steady hand continues its motion, a shaking one does not: try both, keep the better.
+        starts = [self._flow, self._flow + self._increment]
+        errors = [
+            np.abs(warp(gray, start).astype(np.int16) - self._reference).mean() for start in starts
+        ]
+        flow = composed_flow(self._reference, gray, starts[int(np.argmin(errors))])
+        backward = reverse_flow(self._reference, gray, flow)
+        targets, confidence = grid_matches(flow, backward, self._texture, self.config)
+        self._increment, self._flow, self._newest = flow - self._flow, flow, gray
+        matched = torch.from_numpy(targets)[None]
+        return FlowMatches(
+            matched, torch.from_numpy(confidence)[None, ..., None].expand(matched.shape)
+        )
+
+    def restarted(self) -> "FlowChain":
+        """Return a chain that starts at the newest frame and expects the same motion to go on."""
+        return FlowChain(self._newest, self.config, self._increment)
+
+
+def grayscale(image: Tensor) -> np.ndarray:
+    """Return the 8-bit luminance (H, W) of an image (H, W, 3) in [0, 1]."""
+    rgb = (image.numpy() * 255 + 0.5).astype(np.uint8)
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+
+
+def texture_confidence(gray: np.ndarray, config: ClassicalFlowConfig) -> np.ndarray:
+    """Return how well each grid cell can be located (h, w), in [0, 1).
+
+    On a bare wall forward and backward flow agree on anything, so agreement alone is no
+    confidence. The smaller eigenvalue of the structure tensor says whether a displacement in
+    any direction would be noticed.
+    """
+    scaled = gray.astype(np.float32) / 255
+    gx = cv2.Scharr(scaled, cv2.CV_32F, 1, 0) / 32  # 32: sum of the kernel's positive weights x 2
+    gy = cv2.Scharr(scaled, cv2.CV_32F, 0, 1) / 32
+    window = (7, 7)
+    xx, yy, xy = (cv2.boxFilter(p, -1, window) for p in (gx * gx, gy * gy, gx * gy))
+    smaller = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    smaller = np.maximum(smaller[:: config.stride, :: config.stride], 0)
+    return smaller / (smaller + config.texture_scale)
+
+
+def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
+    """Return the dense flow (H, W, 2) that interpolates grid target positions (h, w, 2) [px]."""
+    cells = np.mgrid[: grid_targets.shape[0], : grid_targets.shape[1]].astype(np.float32)
+    grid_flow = grid_targets - stride * np.stack([cells[1], cells[0]], -1)
+    column, row = np.meshgrid(
+        np.arange(shape[1], dtype=np.float32) / stride,
+        np.arange(shape[0], dtype=np.float32) / stride,
+    )
+    return cv2.remap(grid_flow, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def pixel_maps(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the column and row of every pixel, each (H, W) float32."""
+    return np.meshgrid(np.arange(shape[1], dtype=np.float32), np.arange(shape[0], dtype=np.float32))
+
+
+def warp(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """Return image(p + flow(p)); positions outside the image take the nearest border pixel."""
+    column, row = pixel_maps(flow.shape[:2])
+    return cv2.remap(
+        image, column + flow[..., 0], row + flow[..., 1], cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+
+
+def residual_flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the DIS flow (H, W, 2) with source(p) = target(p + flow(p)), found from zero."""
+    # One object per call: DIS keeps its buffers inside, so objects cannot be shared by threads.
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return dis.calc(source, target, None)
+
+
+def composed_flow(source: np.ndarray, target: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the flow from source to target (H, W, 2), started from `start` by warp-compose.
+
+    With W(p) = target(p + start(p)) and source(p) = W(p + r(p)), the target position of p is
+    p + r(p) + start(p + r(p)).
+    """
+    remainder = residual_flow(source, warp(target, start))
+    return remainder + warp(start, remainder)
+
+
+def reverse_flow(source: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Return the flow from target to source (H, W, 2), started at the inverse of `forward`.
+
+    The inverse is a fixed point: b(q) = -forward(q + b(q)); three rounds bring a smooth field
+    well inside what DIS corrects by itself.
+    """
+    inverse = -forward
+    for _ in range(3):
+        inverse = -warp(forward, inverse)
+    return composed_flow(target, source, inverse)
+
+
+def grid_matches(
+    forward: np.ndarray,  # (H, W, 2) px, flow source to target
+    backward: np.ndarray,  # (H, W, 2) px, flow target to source
+    texture: np.ndarray,  # (h, w) in [0, 1)
+    config: ClassicalFlowConfig,
+) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
+    """Sample a flow on the grid and judge it: forward-backward agreement, texture, on the image."""
+    height, width = forward.shape[:2]
+    stride = config.stride
+    column, row = (m[::stride, ::stride] for m in pixel_maps((height, width)))
+    flow = forward[::stride, ::stride]
+    target_u, target_v = column + flow[..., 0], row + flow[..., 1]
+    returned = cv2.remap(
+        backward, target_u, target_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    squared_error = ((flow + returned) ** 2).sum(-1)
+    agreement = np.exp(-0.5 * squared_error / config.consistency_scale**2)
+    inside = (target_u >= 0) & (target_u <= width - 1) & (target_v >= 0) & (target_v <= height - 1)
+    return np.stack([target_u, target_v], -1), agreement * texture * inside

@@ -1,0 +1,271 @@
+"""Dense bundle adjustment, Eq. (5): poses and disparities from optical flow.
+
+    sum_edges || p~_ij - proj(T_j T_i^-1, d_i) ||^2_(Sigma_ij / beta_i^2)
+        + sum_i lambda_4 M_i (d_i - 1 / D~_i)^2
+
+Gauss-Newton with Levenberg-Marquardt damping. Each disparity appears in one source frame only,
+so the disparity block of the normal equations is diagonal and is eliminated exactly (Schur
+complement); what is left is a dense system of 6 unknowns per free pose:
+
+    [ H   E ] [ xi ]   [ g ]        (H - E C^-1 E^T) xi = g - E C^-1 s
+    [ E^T C ] [ dd ] = [ s ]   =>   dd = C^-1 (s - E^T xi)
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera, se3_adjoint, se3_exp
+from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
+
+MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
+MAX_DAMPING = 1e6  # relative; beyond it a step is no longer worth taking
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Everything that stays fixed while poses and disparities move."""
+
+    camera: Camera
+    rays: Tensor  # (N, 3) of the grid cells, z = 1
+    edges_source: Tensor  # (E,) int64 keyframe index, sorted or not
+    edges_target: Tensor  # (E,) int64
+    targets: Tensor  # (E, 2, N) px, flow targets p~
+    weights: Tensor  # (E, 2, N) Sigma / beta^2, >= 0
+    prior_disparities: Tensor  # (K, N) 1 / D~ [1/world unit]
+    prior_weights: Tensor  # (K, N) lambda_4 M [px^2 per disparity^2], 0 where there is no prior
+    free_poses: Tensor  # (K,) bool
+    free_disparities: Tensor  # (K,) bool
+    robust_scale: float | None = None  # px, width of the Cauchy weight; None: plain least squares
+
+
+@dataclass(frozen=True)
+class BundleReport:
+    """What a bundle adjustment did."""
+
+    converged: bool  # the last steps no longer lowered the cost, or all iterations were used well
+    cost_before: float  # px^2
+    cost_after: float  # px^2, never larger than cost_before
+    iterations: int  # accepted steps
+    damping: float  # at the end
+    reason: str  # one phrase
+
+
+@dataclass(frozen=True)
+class BundleState:
+    """The unknowns."""
+
+    T_camera_world: Tensor  # (K, 4, 4) float64
+    disparities: Tensor  # (K, N) 1/world unit
+
+
+@dataclass(frozen=True)
+class _NormalEquations:
+    cost: float
+    pose_pose: Tensor  # H (6P, 6P) float64
+    pose_gradient: Tensor  # g (6P,) float64
+    disparity_diagonal: Tensor  # C (K, N)
+    disparity_gradient: Tensor  # s (K, N)
+    source_blocks: list[tuple[int, Tensor, Tensor]]  # per source k: k, rows (R,), E_k (R, N)
+
+
+def bundle_adjust(
+    problem: BundleProblem,
+    state: BundleState,
+    iterations: int,
+    damping: float = 1e-4,  # relative (Levenberg-Marquardt), raised on failure
+    absolute_damping: float = 1e-6,  # px^2 per squared unit step: holds directions nobody sees
+) -> tuple[BundleState, BundleReport]:
+    """Minimise Eq. (5) and return the new state with a report.
+
+    A step that fails or raises the cost is thrown away and tried again with ten times the
+    damping; if none helps, the state is returned as it was, with the reason.
+    """
+    equations = _normal_equations(problem, state)
+    cost_before, accepted, reason = equations.cost, 0, "all iterations used"
+    converged = True
+    level = damping
+    while accepted < iterations:
+        candidate = _damped_step(problem, state, equations, level, absolute_damping)
+        trial = None if candidate is None else _normal_equations(problem, candidate)
+        if trial is not None and trial.cost <= equations.cost:
+            settled = equations.cost - trial.cost <= 1e-9 * equations.cost
+            state, equations, accepted = candidate, trial, accepted + 1
+            level = max(level / 10, damping)
+            if settled:
+                reason = "cost settled"
+                break
+            continue
+        level *= 10
+        if level > MAX_DAMPING:
+            # Already at the minimum no step lowers the cost: that is convergence, not failure.
+            converged = candidate is not None
+            reason = "no step lowers the cost" if converged else "normal equations are singular"
+            break
+    report = BundleReport(converged, cost_before, equations.cost, accepted, level, reason)
+    return state, report
+
+
+def motion_only_adjust(
+    problem: BundleProblem, state: BundleState, iterations: int, damping: float = 1e-4
+) -> tuple[BundleState, BundleReport]:
+    """Minimise over the free poses with all disparities held."""
+    held = torch.zeros_like(problem.free_disparities)
+    return bundle_adjust(replace(problem, free_disparities=held), state, iterations, damping)
+
+
+def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
+    """Return the residuals p~ - p (E, 2, N) [px] and the weights (E, 2, N) with Cauchy applied."""
+    residual, weight, _, _ = _weighted_residuals(problem, state)
+    return residual, weight
+
+
+def _weighted_residuals(problem: BundleProblem, state: BundleState):
+    dtype = problem.targets.dtype
+    transforms = relative_transforms(
+        state.T_camera_world, problem.edges_source, problem.edges_target
+    )
+    linear = reproject_with_jacobians(
+        transforms.to(dtype), state.disparities[problem.edges_source], problem.rays, problem.camera
+    )
+    residual = problem.targets - linear.positions
+    weight = problem.weights * linear.valid[:, None]
+    if problem.robust_scale is None:
+        return residual, weight, linear, transforms
+    squared = residual.square().sum(1, keepdim=True)
+    return residual, weight / (1 + squared / problem.robust_scale**2), linear, transforms
+
+
+def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
+    """Return Eq. (5) in px^2, with the Cauchy loss c^2 log(1 + r^2 / c^2) if it is robust."""
+    weight = problem.weights * valid[:, None]
+    if problem.robust_scale is None:
+        flow_cost = (weight * residual.square()).sum(dtype=torch.float64)
+    else:
+        scale2 = problem.robust_scale**2
+        loss = scale2 * torch.log1p(residual.square().sum(1) / scale2)
+        flow_cost = (weight.mean(1) * loss).sum(dtype=torch.float64)
+    difference = state.disparities - problem.prior_disparities
+    return float(flow_cost + (problem.prior_weights * difference.square()).sum(dtype=torch.float64))
+
+
+def _normal_equations(problem: BundleProblem, state: BundleState) -> _NormalEquations:
+    residual, weight, linear, transforms = _weighted_residuals(problem, state)
+    cost = _cost(problem, state, residual, linear.valid)
+    edges, cells = residual.shape[0], residual.shape[2]
+    J = linear.J_target
+    weighted_J = (J * weight[:, None]).reshape(edges, 6, 2 * cells)
+    A = (weighted_J @ J.reshape(edges, 6, 2 * cells).mT).double()  # (E, 6, 6)
+    b = (weighted_J @ residual.reshape(edges, 2 * cells, 1)).squeeze(-1).double()  # (E, 6)
+
+    adjoint = se3_adjoint(transforms)
+    H, g = _assemble_poses(problem, A, b, adjoint)
+
+    free = problem.free_disparities[problem.edges_source].to(J.dtype)
+    J_disparity = linear.J_disparity * free[:, None, None]
+    weighted_Jd = weight * J_disparity
+    E_target = (J * weighted_Jd[:, None]).sum(2)  # (E, 6, N)
+    E_source = -adjoint.mT.to(J.dtype) @ E_target
+    held_prior = problem.prior_weights * problem.free_disparities[:, None]
+    C = held_prior.clone()
+    s = held_prior * (problem.prior_disparities - state.disparities)
+    C.index_add_(0, problem.edges_source, (weighted_Jd * J_disparity).sum(1))
+    s.index_add_(0, problem.edges_source, (weighted_Jd * residual).sum(1))
+    blocks = _source_blocks(problem, E_target, E_source)
+    return _NormalEquations(cost, H, g, C, s, blocks)
+
+
+def _pose_slots(problem: BundleProblem) -> Tensor:
+    """Return for every keyframe its position among the free poses, -1 for a fixed one."""
+    slots = torch.cumsum(problem.free_poses.long(), 0) - 1
+    return torch.where(problem.free_poses, slots, torch.full_like(slots, -1))
+
+
+def _assemble_poses(
+    problem: BundleProblem, A: Tensor, b: Tensor, adjoint: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Scatter J^T W J = A and J^T W r = b of the targets to the free poses, source parts included.
+
+    With J_source = -J_target Ad: H_st = -Ad^T A, H_ss = Ad^T A Ad, g_s = -Ad^T b.
+    """
+    slots = _pose_slots(problem)
+    count = int(problem.free_poses.sum())
+    # One extra slot collects what belongs to fixed poses and is cut off afterwards.
+    source, target = slots[problem.edges_source] % (count + 1), slots[problem.edges_target] % (count + 1)
+    A_source = -adjoint.mT @ A  # rows of the source, columns of the target
+    H = torch.zeros((count + 1) ** 2, 6, 6, dtype=torch.float64)
+    width = count + 1
+    H.index_add_(0, target * width + target, A)
+    H.index_add_(0, source * width + target, A_source)
+    H.index_add_(0, target * width + source, A_source.mT)
+    H.index_add_(0, source * width + source, -A_source @ adjoint)
+    g = torch.zeros(width, 6, dtype=torch.float64)
+    g.index_add_(0, target, b)
+    g.index_add_(0, source, -(adjoint.mT @ b[..., None]).squeeze(-1))
+    H = H.reshape(width, width, 6, 6)[:count, :count].permute(0, 2, 1, 3)
+    return H.reshape(6 * count, 6 * count), g[:count].reshape(-1)
+
+
+def _source_blocks(
+    problem: BundleProblem, E_target: Tensor, E_source: Tensor
+) -> list[tuple[int, Tensor, Tensor]]:
+    """Collect for each source frame the coupling of its disparities with the free poses.
+
+    The rows of E_k belong to frame k itself (summed over its edges) and to its targets, so the
+    Schur complement is one small matrix product per source frame.
+    """
+    slots = _pose_slots(problem)
+    offsets = torch.arange(6)
+    blocks = []
+    for source in torch.unique(problem.edges_source).tolist():
+        if not problem.free_disparities[source]:
+            continue
+        members = torch.nonzero(problem.edges_source == source).squeeze(1)
+        target_slots = slots[problem.edges_target[members]]
+        movable = target_slots >= 0
+        rows, parts = [], []
+        if slots[source] >= 0:
+            rows.append(slots[source] * 6 + offsets)
+            parts.append(E_source[members].sum(0))
+        if movable.any():
+            rows.append((target_slots[movable, None] * 6 + offsets).reshape(-1))
+            parts.append(E_target[members[movable]].reshape(-1, E_target.shape[2]))
+        if rows:
+            blocks.append((source, torch.cat(rows), torch.cat(parts)))
+    return blocks
+
+
+def _damped_step(
+    problem: BundleProblem,
+    state: BundleState,
+    equations: _NormalEquations,
+    damping: float,
+    absolute_damping: float,
+) -> BundleState | None:
+    """Solve the damped normal equations; return the moved state, or None if they are singular."""
+    C = equations.disparity_diagonal * (1 + damping)
+    observed = C > 0
+    inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
+    S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
+    for source, rows, E in equations.source_blocks:
+        scaled = E * inverse_C[source]
+        S.index_put_((rows[:, None], rows[None, :]), -(scaled @ E.mT).double(), accumulate=True)
+        b.index_add_(0, rows, -(scaled @ equations.disparity_gradient[source]).double())
+    S.diagonal().mul_(1 + damping).add_(absolute_damping)
+    factor, failure = torch.linalg.cholesky_ex(S)
+    if failure:
+        return None
+    xi = torch.cholesky_solve(b[:, None], factor).squeeze(1)
+    if not torch.isfinite(xi).all():
+        return None
+
+    step = equations.disparity_gradient.clone()
+    for source, rows, E in equations.source_blocks:
+        step[source] -= xi[rows].to(E.dtype) @ E
+    disparities = state.disparities + inverse_C * step
+    clamped = disparities.clamp_min(MIN_DISPARITY)
+    moved = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
+    poses = state.T_camera_world.clone()
+    poses[problem.free_poses] = se3_exp(xi.reshape(-1, 6)) @ poses[problem.free_poses]
+    return BundleState(poses, moved)

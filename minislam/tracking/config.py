@@ -1,0 +1,46 @@
+"""Constants of the tracker."""
+
+from dataclasses import dataclass
+
+from minislam.parameters import parameter
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Lengths in px belong to a 320x240 image and are scaled with the image diagonal."""
+
+    keyframe_flow: float = parameter(18.0, "mean flow since the last keyframe that makes one [px]")
+    keyframe_interval: int = parameter(
+        8, "a keyframe at the latest after so many frames [frames], paper supplement"
+    )
+    warmup_keyframes: int = parameter(12, "keyframes of the two-stage initialisation, paper Sec. 3.3")
+    warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
+    warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
+    window: int = parameter(10, "newest keyframes that the local BA moves")
+    neighbourhood: int = parameter(3, "every keyframe is linked with so many predecessors")
+    proximity_edges: int = parameter(2, "further links of a new keyframe, nearest by flow distance")
+    proximity_distance: float = parameter(60.0, "largest flow distance of a proximity link [px]")
+    rounds: int = parameter(2, "rounds of flow and BA per keyframe")
+    iterations: int = parameter(3, "Gauss-Newton steps per round")
+    robust_scale: float = parameter(
+        2.0, "width of the Cauchy weight inside Sigma [px]; 0: plain least squares"
+    )
+    lambda_disparity_prior: float = parameter(
+        0.005,
+        "lambda_4: disparity prior, times fx^2, so that it weighs a disparity error by the pixels "
+        "that a unit baseline would turn it into [-], Eq. 5",
+    )
+    final_rounds: int = parameter(3, "rounds of the final global BA")
+    final_iterations: int = parameter(4, "Gauss-Newton steps per round of the final global BA")
+    final_edges: int = parameter(6, "further links per keyframe in the final global BA")
+    final_distance: float = parameter(45.0, "largest flow distance of such a link [px]")
+    final_prior: bool = parameter(False, "keep the disparity prior in the final BA (an ablation)")
+    rotation_share: float = parameter(
+        0.75, "beta of the flow distance: share of the full motion, the rest without rotation [-]"
+    )
+    min_matched_share: float = parameter(
+        0.1, "a frame with less of its flow confirmed backwards is lost [-]"
+    )
+    max_disparity_error: float = parameter(
+        0.05, "relative disagreement of two views of a point that still counts as agreement [-]"
+    )

@@ -1,0 +1,154 @@
+"""The frame graph: which keyframes are compared, and what the flow between them measured."""
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.priors.interfaces import FlowMatches
+from minislam.tracking.reprojection import relative_transforms, reproject, scaled_points
+
+# A pair whose cells mostly leave the view has no meaningful distance. [-], as in DROID-SLAM.
+MIN_VISIBLE_SHARE = 0.75
+FAR = 1000.0  # px, the distance of such a pair
+
+
+class FrameGraph:
+    """Directed edges (source, target) between keyframes, each with its flow measurement."""
+
+    def __init__(self) -> None:
+        self.edges_source: list[int] = []
+        self.edges_target: list[int] = []
+        self.targets: list[Tensor] = []  # per edge (2, N) px
+        self.confidences: list[Tensor] = []  # per edge (2, N) in [0, 1]
+        self._position: dict[tuple[int, int], int] = {}
+
+    def __len__(self) -> int:
+        return len(self.edges_source)
+
+    def __contains__(self, edge: tuple[int, int]) -> bool:
+        return edge in self._position
+
+    def record(self, edges: list[tuple[int, int]], matches: FlowMatches) -> None:
+        """Store the matches of these edges, adding the edges that are new."""
+        targets = matches.targets.flatten(1, 2).mT.contiguous()
+        confidences = matches.confidences.flatten(1, 2).mT.contiguous()
+        for edge, target, confidence in zip(edges, targets, confidences, strict=True):
+            position = self._position.setdefault(edge, len(self))
+            if position == len(self):
+                self.edges_source.append(edge[0])
+                self.edges_target.append(edge[1])
+                self.targets.append(target)
+                self.confidences.append(confidence)
+            else:
+                self.targets[position], self.confidences[position] = target, confidence
+
+    def edges(self) -> list[tuple[int, int]]:
+        """Return all edges, in the order they were added."""
+        return list(zip(self.edges_source, self.edges_target, strict=True))
+
+    def select(self, first: int) -> list[int]:
+        """Return the positions of the edges with an end at keyframe `first` or later."""
+        return [p for p, edge in enumerate(self.edges()) if max(edge) >= first]
+
+
+def neighbourhood_edges(first: int, count: int, radius: int) -> list[tuple[int, int]]:
+    """Link every keyframe in [first, count) with its `radius` predecessors, in both directions."""
+    pairs = [(i, j) for i in range(first, count) for j in range(max(0, i - radius), i)]
+    return both_directions(pairs)
+
+
+def both_directions(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return each pair followed by its reverse."""
+    return [edge for i, j in pairs for edge in ((i, j), (j, i))]
+
+
+def proximity_pairs(
+    distances: Tensor,  # (K, K) px, symmetric
+    taken: list[tuple[int, int]],  # edges that exist already
+    candidates: range,  # the newer keyframe of a pair
+    max_distance: float,  # px
+    limit_per_keyframe: int,
+    suppression: int = 2,  # keyframes
+) -> list[tuple[int, int]]:
+    """Pick pairs (newer, older) by increasing flow distance, with non-maximum suppression.
+
+    Around every pair that is taken, the pairs (i + a, j + b) with
+    |a| + |b| <= min(|i - j| - 2, suppression) are passed over: they would repeat what it says,
+    and a longer baseline says more.
+    """
+    free = torch.ones_like(distances, dtype=torch.bool)
+    for i, j in taken:
+        _suppress(free, max(i, j), min(i, j), suppression)
+    order = sorted(
+        (float(distances[i, j]), i, j)
+        for i in candidates
+        for j in range(i)
+        if float(distances[i, j]) <= max_distance
+    )
+    chosen: list[tuple[int, int]] = []
+    used = dict.fromkeys(candidates, 0)
+    for _, i, j in order:
+        if free[i, j] and used[i] < limit_per_keyframe:
+            chosen.append((i, j))
+            used[i] += 1
+            _suppress(free, i, j, suppression)
+    return chosen
+
+
+def _suppress(free: Tensor, i: int, j: int, suppression: int) -> None:
+    radius = max(min(abs(i - j) - 2, suppression), 0)
+    for a in range(-radius, radius + 1):
+        reach = radius - abs(a)
+        if 0 <= i + a < len(free):
+            free[i + a, max(0, j - reach) : j + reach + 1] = False
+
+
+def flow_distances(
+    T_camera_world: Tensor,  # (K, 4, 4)
+    disparities: Tensor,  # (K, N)
+    rays: Tensor,  # (N, 3)
+    pixels: Tensor,  # (N, 2) px
+    camera: Camera,
+    rotation_share: float,  # beta
+) -> Tensor:  # (K, K) px
+    """Return how far apart keyframes are, as the mean flow that their geometry predicts.
+
+    D = beta |flow| + (1 - beta) |flow without rotation|, averaged over the visible cells and
+    both directions: a pure rotation brings no parallax, so it should count, but less.
+    """
+    count = len(T_camera_world)
+    source, target = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
+    transforms = relative_transforms(T_camera_world, source.reshape(-1), target.reshape(-1))
+    transforms = transforms.to(disparities.dtype)
+    translations = torch.eye(4, dtype=transforms.dtype).repeat(len(transforms), 1, 1)
+    translations[:, :3, 3] = transforms[:, :3, 3]
+    total, visible = 0.0, 0.0
+    for motion, share in ((transforms, rotation_share), (translations, 1 - rotation_share)):
+        positions, valid = reproject(motion, disparities[source.reshape(-1)], rays, camera)
+        length = (positions - pixels.T).norm(dim=1)
+        total = total + share * (length * valid).sum(1)
+        visible = visible + share * valid.sum(1)
+    distance = torch.where(
+        visible >= MIN_VISIBLE_SHARE * len(rays), total / visible.clamp_min(1), FAR
+    ).reshape(count, count)
+    return 0.5 * (distance + distance.T)
+
+
+def splat_disparities(
+    T_target_source: Tensor,  # (4, 4)
+    disparities: Tensor,  # (N,) of the source
+    rays: Tensor,  # (N, 3)
+    camera: Camera,
+    grid: tuple[int, int],  # (h, w)
+    stride: int,  # px
+) -> Tensor:  # (N,) of the target, 0 in cells that nothing falls on
+    """Carry disparities to another view; where several points meet, the nearest one wins."""
+    transform = T_target_source[None].to(disparities.dtype)
+    depth_ratio = scaled_points(transform, disparities[None], rays)[0, 2]
+    positions, valid = reproject(transform, disparities[None], rays, camera)
+    cells = (positions[0] / stride).round().long()
+    inside = (cells[0] >= 0) & (cells[0] < grid[1]) & (cells[1] >= 0) & (cells[1] < grid[0])
+    kept = inside & valid[0]
+    index = cells[1][kept] * grid[1] + cells[0][kept]
+    carried = torch.zeros_like(disparities)
+    return carried.scatter_reduce_(0, index, (disparities / depth_ratio)[kept], "amax")

@@ -1,0 +1,41 @@
+"""The tracker's memory: one row per keyframe, growing as long as the sequence does."""
+
+import torch
+from torch import Tensor
+
+from minislam.records import Frame
+
+
+class KeyframeStore:
+    """Everything the tracker knows of its keyframes."""
+
+    def __init__(self, cells: int) -> None:
+        self.frames: list[Frame] = []
+        self.features: list[Tensor] = []  # (h', w', C)
+        self.metric_depths: list[Tensor | None] = []  # (H, W) D~, 0 where unknown
+        self.T_camera_world = torch.zeros(0, 4, 4, dtype=torch.float64)  # (K, 4, 4)
+        self.disparities = torch.zeros(0, cells)  # (K, N) 1/world unit
+        self.prior_disparities = torch.zeros(0, cells)  # (K, N) 1/D~, 0 where unknown
+        self.static_weights = torch.zeros(0, cells)  # (K, N) what beta leaves of a cell's weight
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def append(
+        self,
+        frame: Frame,
+        features: Tensor,  # (h', w', C)
+        metric_depth: Tensor | None,  # (H, W)
+        T_camera_world: Tensor,  # (4, 4)
+        disparities: Tensor,  # (N,)
+        prior_disparities: Tensor,  # (N,)
+    ) -> None:
+        """Add one keyframe, at first with full trust in every cell."""
+        self.frames.append(frame)
+        self.features.append(features)
+        self.metric_depths.append(metric_depth)
+        self.T_camera_world = torch.cat([self.T_camera_world, T_camera_world[None].double()])
+        self.disparities = torch.cat([self.disparities, disparities[None]])
+        self.prior_disparities = torch.cat([self.prior_disparities, prior_disparities[None]])
+        trusted = torch.ones_like(disparities)
+        self.static_weights = torch.cat([self.static_weights, trusted[None]])

@@ -1,0 +1,103 @@
+"""Where a cell of one keyframe is seen in another, and how that position moves.
+
+A cell with ray rho = K^-1 (u, v, 1) and disparity d is the point rho / d. In the target camera,
+multiplied by d (which no projection notices),
+
+    X = R rho + d t,    T_target_source = (R, t),
+
+so a disparity of zero, a point at infinity, needs no special case. X_z is the ratio of the two
+depths.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera, se3_inverse
+
+# A point four times closer to the target than to the source is seen at a scale where no flow
+# is reliable, and its derivatives explode. [-], as in DROID-SLAM.
+MIN_DEPTH_RATIO = 0.25
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Reprojections of E edges with N cells each, with derivatives.
+
+    The source pose needs no derivative of its own: T_target_source = T_t T_s^-1 turns a step
+    xi_s of the source into the step -Ad(T_target_source) xi_s of the target, so
+    J_source = -J_target Ad(T_target_source), with one 6x6 matrix for all cells of an edge.
+    """
+
+    positions: Tensor  # (E, 2, N) px
+    valid: Tensor  # (E, N) bool: the depth ratio is large enough
+    J_target: Tensor  # (E, 6, 2, N) px per unit of xi_target
+    J_disparity: Tensor  # (E, 2, N) px per unit of the source's disparity
+
+
+def relative_transforms(
+    T_camera_world: Tensor,  # (K, 4, 4)
+    edges_source: Tensor,  # (E,) int64
+    edges_target: Tensor,  # (E,) int64
+) -> Tensor:  # (E, 4, 4)
+    """Return T_target_source of every edge."""
+    return T_camera_world[edges_target] @ se3_inverse(T_camera_world[edges_source])
+
+
+def scaled_points(
+    T_target_source: Tensor,  # (E, 4, 4)
+    disparities: Tensor,  # (E, N) of the source cells
+    rays: Tensor,  # (N, 3) of the source cells, z = 1
+) -> Tensor:  # (E, 3, N)
+    """Return X = R rho + d t for every cell of every edge."""
+    rotated = T_target_source[:, :3, :3] @ rays.T
+    return rotated + T_target_source[:, :3, 3:] * disparities[:, None]
+
+
+def reproject(
+    T_target_source: Tensor,  # (E, 4, 4)
+    disparities: Tensor,  # (E, N)
+    rays: Tensor,  # (N, 3)
+    camera: Camera,
+) -> tuple[Tensor, Tensor]:  # (E, 2, N) px, (E, N) bool
+    """Return the position of every source cell in the target image, and whether it is valid."""
+    x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
+    valid = z >= MIN_DEPTH_RATIO
+    inverse_z = torch.where(valid, z, torch.ones_like(z)).reciprocal()
+    u = camera.fx * x * inverse_z + camera.cx
+    v = camera.fy * y * inverse_z + camera.cy
+    return torch.stack([u, v], 1), valid
+
+
+def reproject_with_jacobians(
+    T_target_source: Tensor,  # (E, 4, 4)
+    disparities: Tensor,  # (E, N)
+    rays: Tensor,  # (N, 3)
+    camera: Camera,
+) -> Linearisation:
+    """Return the reprojection with its derivatives (notebook 05 derives them).
+
+    A left step (rho, phi) of the target moves X by d rho + phi x X; with a = X / X_z and
+    e = d / X_z the rows of J_target are
+
+        fx (e, 0, -e a_x,  -a_x a_y,  1 + a_x^2,  -a_y)
+        fy (0, e, -e a_y,  -1 - a_y^2,  a_x a_y,   a_x),
+
+    and X moves by t when d grows by one.
+    """
+    x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
+    valid = z >= MIN_DEPTH_RATIO
+    # Invalid points get zero weight from the caller; one keeps their numbers finite.
+    inverse_z = torch.where(valid, z, torch.ones_like(z)).reciprocal()
+    ax, ay, e = x * inverse_z, y * inverse_z, disparities * inverse_z
+    zero = torch.zeros_like(ax)
+    row_u = torch.stack([e, zero, -e * ax, -ax * ay, 1 + ax * ax, -ay], 1)
+    row_v = torch.stack([zero, e, -e * ay, -1 - ay * ay, ax * ay, ax], 1)
+    J_target = torch.stack([camera.fx * row_u, camera.fy * row_v], 2)
+    tx, ty, tz = T_target_source[:, :3, 3, None].unbind(1)
+    J_disparity = torch.stack(
+        [camera.fx * (tx - tz * ax) * inverse_z, camera.fy * (ty - tz * ay) * inverse_z], 1
+    )
+    positions = torch.stack([camera.fx * ax + camera.cx, camera.fy * ay + camera.cy], 1)
+    return Linearisation(positions, valid, J_target, J_disparity)
