@@ -1,0 +1,99 @@
+"""Intrinsics: from a file, from a known benchmark, or guessed and said so."""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from minislam.data.files import data_rows, finite_numbers, read_text
+from minislam.errors import InputError
+from minislam.geometry import BrownDistortion, Camera
+
+# Focal length over the longer image side when nothing is known. Phone and consumer cameras film
+# with 0.75 to 0.95 (a 26-30 mm equivalent lens, a little cropped by stabilisation); 0.85 is in the
+# middle and means a field of view of 61 degrees.
+GUESSED_FOCAL_RATIO = 0.85
+
+# Two aspect ratios closer than this belong to the same picture, resized and rounded to pixels.
+_ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Intrinsics of the raw images, as found: the image size may be unknown."""
+
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px
+    cy: float  # px
+    size: tuple[int, int] | None = None  # (width, height) px of the images it was made for
+    distortion: BrownDistortion = field(default_factory=BrownDistortion)
+    origin: str = "calibration"  # where it comes from, for messages
+
+    def camera_for(self, width: int, height: int) -> Camera:
+        """Return the camera of raw images of `width` x `height`."""
+        made_for = self.size or (width, height)
+        try:
+            camera = Camera(self.fx, self.fy, self.cx, self.cy, *made_for)
+        except InputError as error:
+            raise InputError(f"{self.origin}: {error}") from error
+        if abs(made_for[0] * height / (made_for[1] * width) - 1) > _ASPECT_TOLERANCE:
+            raise InputError(
+                f"expected images of {made_for[0]}x{made_for[1]} px or a resized version of that "
+                f"({self.origin}), found {width}x{height}; calibration and images do not match"
+            )
+        return camera.resized(width, height)
+
+
+# Measured by the makers of the TUM RGB-D benchmark for 640x480 images.
+_TUM_CAMERAS = {
+    "1": (517.3, 516.5, 318.6, 255.3, BrownDistortion(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": (520.9, 521.0, 325.1, 249.7, BrownDistortion(0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": (535.4, 539.2, 320.1, 247.6, BrownDistortion()),
+}
+_TUM_SIZE = (640, 480)
+_TUM_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)[_ -]?([123])(?!\d)", re.IGNORECASE)
+
+
+def known_tum_camera(text: str) -> Calibration | None:
+    """Return the intrinsics of the TUM camera that a name or note speaks of (freiburg1, fr3...)."""
+    found = _TUM_NAME.search(text)
+    if found is None:
+        return None
+    fx, fy, cx, cy, distortion = _TUM_CAMERAS[found[1]]
+    return Calibration(fx, fy, cx, cy, _TUM_SIZE, distortion, f"TUM fr{found[1]} intrinsics")
+
+
+def guessed_calibration(width: int, height: int) -> Calibration:
+    """Return a guess for images whose camera is unknown: see GUESSED_FOCAL_RATIO."""
+    focal = GUESSED_FOCAL_RATIO * max(width, height)
+    return Calibration(focal, focal, (width - 1) / 2, (height - 1) / 2, origin="guessed intrinsics")
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read `fx fy cx cy [width height [k1 k2 p1 p2 k3]]` from a text file."""
+    return parse_calibration(read_text(path), str(path))
+
+
+def parse_calibration(text: str, name: str) -> Calibration:
+    """Parse the content of a calibration file; `name` goes into the errors."""
+    fields = [field for _, row in data_rows(text) for field in row.replace(",", " ").split()]
+    if len(fields) not in (4, 6, 11):
+        raise InputError(
+            "expected 4, 6 or 11 numbers, fx fy cx cy [width height [k1 k2 p1 p2 k3]], found "
+            f"{len(fields)} in {name}; add or remove numbers"
+        )
+    numbers = finite_numbers(fields, name)
+    size = None
+    if len(numbers) >= 6:
+        size = (int(numbers[4]), int(numbers[5]))
+        if size != (numbers[4], numbers[5]) or min(size) < 1:
+            raise InputError(
+                f"expected width and height as positive whole numbers, found {fields[4]} and "
+                f"{fields[5]} in {name}; correct them"
+            )
+    if min(numbers[:2]) <= 0:
+        raise InputError(
+            f"expected positive focal lengths, found fx={fields[0]} fy={fields[1]} in {name}; "
+            "give them in pixels"
+        )
+    return Calibration(*numbers[:4], size, BrownDistortion(*numbers[6:]), name)

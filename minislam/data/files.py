@@ -1,0 +1,104 @@
+"""Files: whole or not at all when written, one sentence when they cannot be read."""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from minislam.errors import InputError
+
+
+def atomic_write(path: Path | str, content: bytes) -> None:
+    """Write a file so that a crash leaves the old file or the new one, never half of one.
+
+    The bytes go to a temporary file in the same folder (os.replace is atomic only within one
+    file system), reach the disk (fsync), and then take the final name.
+    """
+    path = Path(path)
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        if temporary.is_file():
+            temporary.unlink()
+        raise InputError(
+            f"expected to be able to write {path}, but the system says: {error.strerror or error}; "
+            "choose an output folder that is writable and has space left"
+        ) from error
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write a UTF-8 text file atomically, with Unix line ends on every system."""
+    atomic_write(path, text.encode("utf-8"))
+
+
+def write_json(path: Path | str, content: Any) -> None:
+    """Write JSON atomically; NaN and infinity, which JSON does not know, become null."""
+    text = json.dumps(_without_nonfinite(content), indent=2, allow_nan=False, ensure_ascii=False)
+    write_text(path, text + "\n")
+
+
+def read_bytes(path: Path | str) -> bytes:
+    """Return the content of a file, or say in one sentence why it cannot be read."""
+    try:
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"expected a readable file {path}, but the system says: {reason}; check the path"
+        ) from error
+
+
+def read_text(path: Path | str) -> str:
+    """Return a UTF-8 text file; a byte order mark and Windows line ends are accepted."""
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"expected a UTF-8 text file, but byte {error.start} of {path} is not text; "
+            "check that this is the right file"
+        ) from error
+
+
+def read_json(path: Path | str) -> Any:
+    """Return the content of a JSON file."""
+    try:
+        return json.loads(read_text(path))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(
+            f"expected JSON in {path}, but found a mistake: {error}; correct it or delete the file"
+        ) from error
+
+
+def data_rows(text: str) -> list[tuple[int, str]]:
+    """Return (line number, content) of the lines that are neither empty nor comments (#)."""
+    stripped = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
+    return [(number, line) for number, line in stripped if line and not line.startswith("#")]
+
+
+def finite_numbers(fields: list[str], where: str) -> list[float]:
+    """Return the fields as finite numbers; `where` (file and line) goes into the error."""
+    try:
+        numbers = [float(field) for field in fields]
+    except ValueError:
+        numbers = [math.nan]
+    if not all(math.isfinite(number) for number in numbers):
+        shown = " ".join(fields)[:80]
+        raise InputError(f"expected finite numbers in {where}, found '{shown}'; correct this line")
+    return numbers
+
+
+def _without_nonfinite(content: Any) -> Any:
+    """Return a copy of nested lists and dictionaries with NaN and infinity replaced by None."""
+    if isinstance(content, dict):
+        return {str(key): _without_nonfinite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_without_nonfinite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content

@@ -1,0 +1,89 @@
+"""Image files: decoding whatever cameras write, and encoding PNG."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from minislam.data.files import read_bytes
+from minislam.errors import InputError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_JPEG_SIGNATURE = b"\xff\xd8\xff"
+_JPEG_START_OF_SCAN, _JPEG_END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
+
+
+def is_image(path: Path) -> bool:
+    """Tell by its name whether a file is a picture; hidden files never are."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def natural_key(name: str) -> list[tuple[int, int | str]]:
+    """Return a sort key that puts frame9 before frame10."""
+    parts = re.split(r"(\d+)", name)
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Return the pictures of a folder in natural order, whatever order the system lists them."""
+    images = [path for path in folder.iterdir() if is_image(path) and path.is_file()]
+    return sorted(images, key=lambda path: (natural_key(path.name), path.name))
+
+
+def read_color(path: Path) -> np.ndarray:  # (H, W, 3) uint8 RGB
+    """Read a picture. Grey becomes RGB, alpha is dropped, 16 bits are reduced to 8.
+
+    The orientation that phones note in the EXIF header is applied.
+    """
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
+    """Read a black and white picture: white is True."""
+    return _decode(path, cv2.IMREAD_GRAYSCALE) > 127
+
+
+def read_depth(path: Path, units_per_metre: float) -> np.ndarray:  # (H, W) float32 metre
+    """Read a 16-bit depth picture, 0 where unknown. TUM files store 5000 units per metre."""
+    depth = _decode(path, cv2.IMREAD_UNCHANGED)
+    if depth.ndim != 2 or depth.dtype != np.uint16:
+        raise InputError(
+            f"expected a 16-bit single-channel depth image, found {depth.dtype} of shape "
+            f"{depth.shape} in {path}; export depth as 16-bit PNG"
+        )
+    return depth.astype(np.float32) / np.float32(units_per_metre)
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """Return PNG bytes of (H, W, 3) RGB or (H, W), either float in [0, 1], uint8 or uint16."""
+    if image.dtype.kind == "f":
+        image = np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, png = cv2.imencode(".png", image)
+    return png.tobytes()
+
+
+def _decode(path: Path, mode: int) -> np.ndarray:
+    content = read_bytes(path)
+    if _is_complete(content):
+        decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
+        if decoded is not None:
+            return decoded
+    raise InputError(
+        f"expected a whole PNG or JPEG image, but {path} ({len(content)} bytes) is damaged, cut "
+        "short or of another kind; replace or remove it"
+    )
+
+
+def _is_complete(content: bytes) -> bool:
+    """Tell whether the closing marker is there: some decoders fill a cut image with grey."""
+    if content.startswith(_PNG_SIGNATURE):
+        return b"IEND" in content
+    if content.startswith(_JPEG_SIGNATURE):
+        # A thumbnail in the header has its own end marker, so the LAST scan must be closed.
+        return content.rfind(_JPEG_END_OF_IMAGE) > content.rfind(_JPEG_START_OF_SCAN) > 0
+    return False

@@ -1,0 +1,115 @@
+"""From the raw image to the working image: undistort, cut to what was seen, resize, crop."""
+
+import cv2
+import numpy as np
+
+from minislam.errors import InputError
+from minislam.geometry import BrownDistortion, Camera
+
+# Trackers, networks and feature grids work on cells of 8 px, so both sides are multiples of it.
+SIZE_MULTIPLE = 8  # px
+MINIMUM_SIDE = 16  # px; smaller images hold no pair of grid cells
+
+
+class ImagePreparation:
+    """Turns raw images of one size into working images, all of them by the same steps.
+
+    The camera goes through the same steps exactly. Depth and masks are moved without blending:
+    the mean of two depths is a surface that does not exist.
+    """
+
+    def __init__(
+        self,
+        raw_camera: Camera,
+        distortion: BrownDistortion,
+        size: tuple[int, int] | None,  # (width, height) px of the working image, None: choose
+        pixels: int,  # about width * height of the working image when it is chosen
+    ) -> None:
+        self.raw_size = (raw_camera.width, raw_camera.height)
+        if min(self.raw_size) < MINIMUM_SIDE:
+            raise InputError(
+                f"expected images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px, found "
+                f"{raw_camera.width}x{raw_camera.height}; use larger images"
+            )
+        self._maps, self._window = None, (0, 0, *self.raw_size)
+        if np.any(distortion.coefficients):
+            self._maps = distortion.undistortion_maps(raw_camera)
+            self._window = seen_window(*self._maps, self.raw_size)
+        seen_size = self._window[2:]
+        size = size or working_size(*seen_size, pixels)
+        # The smallest enlargement that covers the wanted size; what stands over is cropped.
+        scale = max(size[0] / seen_size[0], size[1] / seen_size[1])
+        self._resized = (
+            max(round(scale * seen_size[0]), size[0]),
+            max(round(scale * seen_size[1]), size[1]),
+        )
+        self._crop = ((self._resized[0] - size[0]) // 2, (self._resized[1] - size[1]) // 2)
+        self.camera = (
+            raw_camera.cropped(*self._window).resized(*self._resized).cropped(*self._crop, *size)
+        )
+
+    def color(self, raw: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8 -> (H', W', 3) float32
+        """Prepare a colour image: values in [0, 1]."""
+        image = self._undistorted(raw, cv2.INTER_LINEAR)
+        if (image.shape[1], image.shape[0]) != self._resized:
+            image = cv2.resize(image, self._resized, interpolation=cv2.INTER_AREA)
+        return self._cropped(image).astype(np.float32) / np.float32(255)
+
+    def nearest(self, raw: np.ndarray) -> np.ndarray:  # (H, W) -> (H', W'), same type
+        """Prepare a depth image or a mask: every value is one of the raw values."""
+        as_numbers = raw.astype(np.uint8) if raw.dtype == bool else raw
+        image = self._undistorted(as_numbers, cv2.INTER_NEAREST)
+        # cv2's nearest neighbour is off by up to half a pixel; these are the true centres.
+        columns, rows = (
+            ((np.arange(new) + 0.5) * old / new).astype(int)
+            for new, old in zip(self._resized, self._window[2:], strict=True)
+        )
+        return np.ascontiguousarray(self._cropped(image[rows][:, columns])).astype(raw.dtype)
+
+    def _undistorted(self, raw: np.ndarray, interpolation: int) -> np.ndarray:
+        if self._maps is not None:
+            raw = cv2.remap(raw, *self._maps, interpolation)
+        left, top, width, height = self._window
+        return raw[top : top + height, left : left + width]
+
+    def _cropped(self, image: np.ndarray) -> np.ndarray:
+        left, top = self._crop
+        return image[top : top + self.camera.height, left : left + self.camera.width]
+
+
+def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
+    """Choose a working size: the same aspect, about `pixels` in all, multiples of 8, no larger."""
+    scale = min(1.0, (pixels / (width * height)) ** 0.5)
+
+    def side(length: int) -> int:
+        cells = min(round(length * scale / SIZE_MULTIPLE), length // SIZE_MULTIPLE)
+        return max(cells * SIZE_MULTIPLE, MINIMUM_SIDE)
+
+    return side(width), side(height)
+
+
+def seen_window(
+    map_x: np.ndarray,  # (H, W) px, where each undistorted pixel is taken from
+    map_y: np.ndarray,  # (H, W) px
+    raw_size: tuple[int, int],
+) -> tuple[int, int, int, int]:  # left, top, width, height px
+    """Return a window of the undistorted image without pixels that no camera saw.
+
+    Left in, they would be a black frame that stands still while the camera moves. The side with
+    the largest share of such pixels loses one row or column until none is left.
+    """
+    width, height = raw_size
+    unseen = (map_x < 0) | (map_x > width - 1) | (map_y < 0) | (map_y > height - 1)
+    left, top, right, bottom = 0, 0, width, height
+    while right - left >= MINIMUM_SIDE and bottom - top >= MINIMUM_SIDE:
+        inside = unseen[top:bottom, left:right]
+        shares = [inside[:, 0], inside[0], inside[:, -1], inside[-1]]
+        worst = int(np.argmax([share.mean() for share in shares]))
+        if not shares[worst].any():
+            return left, top, right - left, bottom - top
+        left, top = left + (worst == 0), top + (worst == 1)
+        right, bottom = right - (worst == 2), bottom - (worst == 3)
+    raise InputError(
+        "expected a lens distortion that leaves part of the image visible, but nothing would be "
+        "left; check the order k1 k2 p1 p2 k3 and the signs"
+    )

@@ -1,0 +1,31 @@
+"""What a reader found, before any frame is chosen or resized."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from minislam.data.calibration import Calibration
+from minislam.data.sources import ImageSource
+from minislam.records import Trajectory
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Raw images with timestamps, and whatever else lies beside them.
+
+    The lists of paths have one entry per image, None where there is no such file.
+    """
+
+    name: str  # short, usable as a folder name
+    kind: str  # what it is, for the description
+    images: ImageSource
+    timestamps: np.ndarray  # (N,) float64 second, strictly increasing
+    calibration: Calibration | None = None  # None: unknown
+    trajectory: Trajectory | None = None  # ground truth
+    depth_paths: list[Path | None] = field(default_factory=list)
+    mask_paths: list[Path | None] = field(default_factory=list)
+    static_paths: list[Path | None] = field(default_factory=list)
+    novel_views: list[tuple[np.ndarray, Path]] = field(default_factory=list)  # (T_world_camera, .)
+    notes: list[str] = field(default_factory=list)  # more for the description
+    warnings: list[str] = field(default_factory=list)

@@ -1,0 +1,199 @@
+"""Open whatever the user names: a folder, a video, or a synthetic sequence."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from minislam.data.calibration import Calibration, guessed_calibration, read_calibration
+from minislam.data.folder import read_image_folder, read_video
+from minislam.data.images import read_color, read_depth, read_mask
+from minislam.data.options import InputOptions
+from minislam.data.preparation import ImagePreparation
+from minislam.data.recording import Recording
+from minislam.data.tum import is_tum_folder, read_tum_folder
+from minislam.errors import InputError
+from minislam.records import Frame, Trajectory
+
+_SYNTHETIC_FRAMES = 100
+_SYNTHETIC_SIZE = (320, 240)  # px
+
+
+def open_sequence(source: str, options: InputOptions | None = None) -> "RecordedSequence":
+    """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED]`.
+
+    What a folder is, is decided by what lies in it, not by its name.
+    """
+    options = options or InputOptions()
+    if source.startswith("synth:"):
+        return _open_synthetic(source, options)
+    path = Path(source).expanduser()
+    if path.is_file():
+        last = None
+        if options.max_frames is not None:
+            last = options.start + options.stride * (options.max_frames - 1) + 1
+        return RecordedSequence(read_video(path, last), options)
+    if not path.is_dir():
+        raise InputError(
+            f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
+            f"{source} does not exist; check the path"
+        )
+    recording = read_tum_folder(path) if is_tum_folder(path) else read_image_folder(path)
+    return RecordedSequence(recording, options)
+
+
+class RecordedSequence:
+    """The chosen frames of a recording at the working size: a `minislam.records.Sequence`."""
+
+    def __init__(self, recording: Recording, options: InputOptions) -> None:
+        self._recording, self._depth_scale = recording, options.depth_scale
+        chosen = range(options.start, len(recording.images), options.stride)
+        self._chosen = chosen[: options.max_frames]
+        if len(self._chosen) == 0:
+            raise InputError(
+                f"expected frames from number {options.start} on, but {recording.name} has "
+                f"{len(recording.images)}; choose a smaller start"
+            )
+        height, width = recording.images.read(self._chosen[0]).shape[:2]
+        calibration, guessed = _calibration(recording, options, width, height)
+        raw_camera = calibration.camera_for(width, height)
+        self._prepare = ImagePreparation(
+            raw_camera, calibration.distortion, options.size, options.pixels
+        )
+        self.name = recording.name
+        self.camera = self._prepare.camera
+        self.warnings = list(recording.warnings)
+        if guessed:
+            self.warnings.append(
+                f"the focal length is unknown: {calibration.fx:.0f} px guessed for {width}x{height}"
+                " images, trajectory and map may be bent; give --fx or a calibration file"
+            )
+        size = f"{width}x{height} -> {self.camera.width}x{self.camera.height} px"
+        counts = f"{len(self)} of {len(recording.images)} images"
+        parts = [counts, *recording.notes, size, calibration.origin]
+        self.description = f"{recording.kind}: {', '.join(parts)}"
+        has_truth = any([*recording.mask_paths, *recording.static_paths, recording.novel_views])
+        known = recording.trajectory is not None or has_truth
+        self.ground_truth = RecordedTruth(self) if known else None
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self.frame(frame_index) for frame_index in range(len(self)))
+
+    def frame(self, frame_index: int) -> Frame:
+        """Return one frame; timestamps are those of the source, whatever the stride."""
+        index = self.source_index(frame_index)
+        raw = self._recording.images.read(index)
+        image = self._color(raw, self._recording.images.label(index))
+        timestamp = float(self._recording.timestamps[index])
+        return Frame(frame_index, timestamp, torch.from_numpy(image))
+
+    def source_index(self, frame_index: int) -> int:
+        """Return the position of a frame in the source, before start and stride."""
+        if not 0 <= frame_index < len(self):
+            raise IndexError(f"frame {frame_index} of a sequence of {len(self)}")
+        return self._chosen[frame_index]
+
+    def sensor_depth(self, frame_index: int) -> np.ndarray | None:
+        """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
+        path = self._path(self._recording.depth_paths, frame_index)
+        if path is None:
+            return None
+        raw = read_depth(path, self._depth_scale)
+        self._require_size(raw, str(path))
+        return self._prepare.nearest(raw)
+
+    def _color(self, raw: np.ndarray, label: str) -> np.ndarray:
+        self._require_size(raw, label)
+        return self._prepare.color(raw)
+
+    def _path(self, paths: list[Path | None], frame_index: int) -> Path | None:
+        index = self.source_index(frame_index)
+        return paths[index] if index < len(paths) else None
+
+    def _require_size(self, raw: np.ndarray, label: str) -> None:
+        width, height = self._prepare.raw_size
+        if raw.shape[:2] != (height, width):
+            raise InputError(
+                f"expected images of one size, {width}x{height} as the first, found "
+                f"{raw.shape[1]}x{raw.shape[0]} in {label}; remove or resize the odd ones"
+            )
+
+
+class RecordedTruth:
+    """The truth that lies beside a recording: a `minislam.records.GroundTruth`."""
+
+    def __init__(self, sequence: RecordedSequence) -> None:
+        self._sequence, self._recording = sequence, sequence._recording
+        self.trajectory: Trajectory | None = self._recording.trajectory
+
+    def moving_mask(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) bool, True where a mover is seen."""
+        path = self._sequence._path(self._recording.mask_paths, frame_index)
+        if path is None:
+            return None
+        raw = read_mask(path)
+        self._sequence._require_size(raw, str(path))
+        return self._sequence._prepare.nearest(raw)
+
+    def static_image(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W, 3) float32: the same view without the movers and their shadows."""
+        path = self._sequence._path(self._recording.static_paths, frame_index)
+        return None if path is None else self._sequence._color(read_color(path), str(path))
+
+    def depth(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
+        return self._sequence.sensor_depth(frame_index)
+
+    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
+        views = self._recording.novel_views
+        return [(pose, self._sequence._color(read_color(path), str(path))) for pose, path in views]
+
+
+def _calibration(
+    recording: Recording, options: InputOptions, width: int, height: int
+) -> tuple[Calibration, bool]:
+    """Return the calibration, and whether its focal length is a guess.
+
+    What the user says on the command line wins over files, files over known names, names over
+    the guess.
+    """
+    found = read_calibration(Path(options.calibration)) if options.calibration else None
+    found = found or recording.calibration
+    calibration = found or guessed_calibration(width, height)
+    given = {"fx": options.fx, "fy": options.fy or options.fx, "cx": options.cx, "cy": options.cy}
+    given = {name: value for name, value in given.items() if value is not None}
+    if given:
+        scaled = calibration.camera_for(width, height)
+        base = {name: getattr(scaled, name) for name in ("fx", "fy", "cx", "cy")}
+        origin = f"{' '.join(given)} given, {calibration.origin}"
+        if found is None and options.fx is not None:
+            origin = "intrinsics given"
+        calibration = replace(calibration, **(base | given), size=(width, height), origin=origin)
+    return calibration, found is None and options.fx is None
+
+
+def _open_synthetic(source: str, options: InputOptions) -> RecordedSequence:
+    """Render a synthetic sequence, or take it from the cache, and open it."""
+    import data_synth  # only here: real footage needs no scene generator
+
+    name, _, seed = source.removeprefix("synth:").partition(":")
+    if name not in data_synth.SEQUENCES or not (seed == "" or seed.isdecimal()):
+        raise InputError(
+            f"expected synth:NAME or synth:NAME:SEED with NAME one of "
+            f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"
+        )
+    frames = _SYNTHETIC_FRAMES
+    if options.max_frames is not None:
+        frames = options.start + options.stride * options.max_frames
+    size = options.size or _SYNTHETIC_SIZE
+    folder = Path(data_synth.cached_sequence(name, int(seed or 0), frames, size))
+    recording = replace(
+        read_tum_folder(folder), name=f"{name}-{seed or 0}", kind=f"synthetic sequence {name}"
+    )
+    return RecordedSequence(recording, options)
