@@ -1,0 +1,164 @@
+"""Gaussian maps as PLY files in the layout that 3D Gaussian viewers agree on.
+
+The values are raw: opacity is a logit, scales are natural logarithms of the standard deviations
+in world units, rotations are quaternions w x y z, and colours are the zeroth coefficient of a
+spherical-harmonics expansion. Activated values would make viewers show fog, or nothing.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from minislam.data.files import atomic_write, read_bytes
+from minislam.errors import InputError
+
+_SH_C0 = 0.28209479177387814  # Y_00 = 1 / (2 sqrt(pi)): colour = 0.5 + Y_00 * f_dc
+
+# exp(20) world units is larger than any scene, exp(-20) smaller than any surface; values beyond
+# are mistakes (scales that were not logarithms), and some viewers hang on them.
+MAX_LOG_SCALE = 20.0
+_MAX_HEADER = 65536  # byte
+
+
+@dataclass(frozen=True)
+class GaussianArrays:
+    """The raw values of N Gaussians, as plain arrays."""
+
+    means: np.ndarray  # (N, 3) world units
+    log_scales: np.ndarray  # (N, 3) natural logarithm of world units
+    quats_wxyz: np.ndarray  # (N, 4) need not be normalised
+    opacity_logits: np.ndarray  # (N,)
+    colors: np.ndarray  # (N, 3) RGB in [0, 1]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def write_ply(path: Path | str, gaussians: GaussianArrays, sh_degree: int = 0) -> None:
+    """Write a Gaussian map. `sh_degree` 3 pads with zeros for viewers that insist on it."""
+    atomic_write(path, encode_ply(gaussians, sh_degree))
+
+
+def read_ply(path: Path | str) -> GaussianArrays:
+    """Read a Gaussian map; of spherical harmonics only the mean colour is kept."""
+    return decode_ply(read_bytes(path), str(path))
+
+
+def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
+    """Return the bytes of a PLY file of a Gaussian map."""
+    if sh_degree not in (0, 1, 2, 3):
+        raise InputError(f"expected an SH degree from 0 to 3, found {sh_degree}; choose 0 or 3")
+    _validate(gaussians, "the map")
+    names = property_names(sh_degree)
+    count = len(gaussians)
+    table = np.zeros((count, len(names)), dtype="<f4")
+    columns = {name: column for column, name in enumerate(names)}
+
+    def fill(first: str, values: np.ndarray) -> None:
+        values = values.reshape(count, -1)
+        table[:, columns[first] : columns[first] + values.shape[1]] = values
+
+    fill("x", gaussians.means)
+    # Viewers clamp colours outside [0, 1] in different ways, so it is done here.
+    fill("f_dc_0", (np.clip(gaussians.colors, 0, 1) - 0.5) / _SH_C0)
+    fill("opacity", gaussians.opacity_logits)
+    fill("scale_0", gaussians.log_scales)
+    fill("rot_0", _normalised(gaussians.quats_wxyz))
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    return ("\n".join(lines) + "\n").encode("ascii") + table.tobytes()
+
+
+def property_names(sh_degree: int) -> list[str]:
+    """Return the names of the properties in the order of the original implementation."""
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{number}" for number in range(rest)]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    return names
+
+
+def decode_ply(content: bytes, name: str) -> GaussianArrays:
+    """Return the Gaussians in the bytes of a PLY file; `name` goes into the errors."""
+    count, names, start = _parse_header(content, name)
+    body = content[start:]
+    if len(body) != 4 * count * len(names):
+        raise InputError(
+            f"expected {4 * count * len(names)} bytes for {count} Gaussians, found {len(body)} in "
+            f"{name}; the file is cut short or damaged"
+        )
+    table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
+
+    def take(*wanted: str) -> np.ndarray:
+        return table[:, [names.index(one) for one in wanted]].copy()
+
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged values are refused below
+        gaussians = GaussianArrays(
+            means=take("x", "y", "z"),
+            log_scales=take("scale_0", "scale_1", "scale_2"),
+            quats_wxyz=take("rot_0", "rot_1", "rot_2", "rot_3"),
+            opacity_logits=take("opacity")[:, 0],
+            colors=take("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(_SH_C0) + np.float32(0.5),
+        )
+    _validate(gaussians, name)
+    return gaussians
+
+
+def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
+    """Return the number of Gaussians, the property names and where the values start."""
+    end = content.find(b"end_header\n", 0, _MAX_HEADER)
+    lines = content[: max(end, 0)].decode("ascii", errors="replace").splitlines()
+    wanted = ["ply", "format binary_little_endian 1.0"]
+    lines = [line for line in lines if not line.startswith(("comment", "obj_info"))]
+    if lines[:2] != wanted or len(lines) < 3:
+        raise InputError(
+            f"expected a binary little-endian PLY file with Gaussians, found another kind of file "
+            f"in {name}; give a map.ply"
+        )
+    element = lines[2].split()
+    fields = [line.split() for line in lines[3:]]
+    plain = all(len(field) == 3 and field[:2] == ["property", "float"] for field in fields)
+    names = [field[2] for field in fields] if plain else []
+    missing = sorted(set(property_names(0)) - {"nx", "ny", "nz"} - set(names))
+    counted = len(element) == 3 and element[:2] == ["element", "vertex"] and element[2].isdecimal()
+    if missing or not counted or len(set(names)) != len(names):
+        raise InputError(
+            "expected 'element vertex N' and the float properties of 3D Gaussians, found a header "
+            f"without {', '.join(missing[:3]) or 'them, or with doubles'} in {name}; "
+            "give a map.ply"
+        )
+    return int(element[2]), names, end + len(b"end_header\n")
+
+
+def _validate(gaussians: GaussianArrays, name: str) -> None:
+    """Refuse values that would hang or blind a viewer."""
+    arrays = {
+        "means": gaussians.means,
+        "log_scales": gaussians.log_scales,
+        "quats_wxyz": gaussians.quats_wxyz,
+        "opacity_logits": gaussians.opacity_logits,
+        "colors": gaussians.colors,
+    }
+    for what, values in arrays.items():
+        bad = int((~np.isfinite(values)).sum())
+        if bad:
+            raise InputError(
+                f"expected finite {what} in {name}, found {bad} values that are NaN or infinite; "
+                "remove these Gaussians"
+            )
+    if np.any(np.abs(gaussians.log_scales) >= MAX_LOG_SCALE):
+        worst = float(np.abs(gaussians.log_scales).max())
+        raise InputError(
+            f"expected |log scale| < {MAX_LOG_SCALE:g} in {name}, found {worst:.3g}; store scales "
+            "as natural logarithms"
+        )
+    if len(gaussians) and np.linalg.norm(gaussians.quats_wxyz.astype(float), axis=1).min() < 1e-12:
+        raise InputError(
+            f"expected quaternions other than zero in {name}, found a zero one; it is no rotation"
+        )
+
+
+def _normalised(quats_wxyz: np.ndarray) -> np.ndarray:
+    quats_wxyz = quats_wxyz.astype(np.float64)
+    return quats_wxyz / np.linalg.norm(quats_wxyz, axis=1, keepdims=True)

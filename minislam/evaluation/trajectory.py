@@ -1,0 +1,174 @@
+"""Errors of an estimated trajectory against the truth: ATE and RPE, as evo computes them."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from minislam.errors import InputError
+from minislam.geometry.alignment import Similarity, identity_similarity, umeyama
+from minislam.records import Trajectory
+
+# Two poses whose timestamps differ by more do not belong together (evo's default).
+DEFAULT_MAX_DIFFERENCE = 0.01  # second
+
+
+class Alignment(Enum):
+    """What may be fitted before the comparison. A monocular estimate has no scale of its own."""
+
+    NONE = "no alignment"
+    SCALE = "scale correction only"
+    SE3 = "SE(3) Umeyama alignment"
+    SIM3 = "Sim(3) Umeyama alignment"
+
+
+@dataclass(frozen=True)
+class TrajectoryError:
+    """The comparison of an estimate with the truth."""
+
+    statistics: dict[str, float]  # max, mean, median, min, rmse, sse, std
+    errors: np.ndarray  # (N,) one per pair, units of the truth
+    similarity: Similarity  # maps the estimate to the truth
+    estimate: Trajectory  # (N) the paired poses, mapped
+    truth: Trajectory  # (N) the paired poses
+
+
+def absolute_trajectory_error(
+    estimate: Trajectory,
+    truth: Trajectory,
+    alignment: Alignment = Alignment.SIM3,
+    max_difference: float = DEFAULT_MAX_DIFFERENCE,  # second
+    offset: float = 0.0,  # second, added to the timestamps of the estimate
+) -> TrajectoryError:
+    """Return the distances between estimated and true camera centres (ATE)."""
+    estimate, truth = paired(estimate, truth, max_difference, offset)
+    similarity = fit_alignment(estimate, truth, alignment)
+    aligned = Trajectory(estimate.timestamps, similarity.transform_poses(estimate.T_world_camera))
+    errors = np.linalg.norm(centres(aligned) - centres(truth), axis=1)
+    return TrajectoryError(statistics(errors), errors, similarity, aligned, truth)
+
+
+def relative_pose_error(
+    estimate: Trajectory,
+    truth: Trajectory,
+    step: int = 1,  # poses between the two ends of each compared motion
+    max_difference: float = DEFAULT_MAX_DIFFERENCE,  # second
+    offset: float = 0.0,  # second, added to the timestamps of the estimate
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of the motions between poses `step` apart (RPE).
+
+    With motions Q = truth_i^-1 truth_(i+step) and P likewise of the estimate, the error is
+    E = Q^-1 P. Returned are |translation of E| and the angle of E [rad], one per motion; the
+    motions follow each other without overlap. Align the scale first where it is unknown.
+    """
+    if step < 1:
+        raise InputError(f"expected a step of at least 1 pose, found {step}; choose a larger one")
+    estimate, truth = paired(estimate, truth, max_difference, offset)
+    first = np.arange(0, len(truth) - step, step)
+    if len(first) == 0:
+        raise InputError(
+            f"expected more than {step} paired poses, found {len(truth)}; choose a smaller step"
+        )
+    true_motion, motion = (
+        np.linalg.inv(poses[first]) @ poses[first + step]
+        for poses in (truth.T_world_camera, estimate.T_world_camera)
+    )
+    error = np.linalg.inv(true_motion) @ motion
+    # Half the norm of vee(R - R^T) is sin(angle): with the trace it keeps small angles exact.
+    skew = error[:, [2, 0, 1], [1, 2, 0]] - error[:, [1, 2, 0], [2, 0, 1]]
+    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    angles = np.arctan2(np.linalg.norm(skew, axis=1) / 2, cosine)
+    return np.linalg.norm(error[:, :3, 3], axis=1), angles
+
+
+def straight_line_error(truth: Trajectory) -> float:
+    """Return the ATE (rmse) of the best straight line walked at constant speed.
+
+    An estimate that is not clearly better than this has not followed the camera at all: the
+    line is fitted to the truth itself, by least squares in position over time.
+    """
+    time = truth.timestamps - truth.timestamps.mean()
+    design = np.stack([np.ones_like(time), time], axis=1)
+    line, *_ = np.linalg.lstsq(design, centres(truth), rcond=None)
+    return statistics(np.linalg.norm(centres(truth) - design @ line, axis=1))["rmse"]
+
+
+def paired(
+    estimate: Trajectory, truth: Trajectory, max_difference: float, offset: float = 0.0
+) -> tuple[Trajectory, Trajectory]:
+    """Return the poses of both trajectories that belong together, in order of time."""
+    of_estimate, of_truth = associate(
+        estimate.timestamps + offset, truth.timestamps, max_difference
+    )
+    if len(of_estimate) == 0:
+        raise InputError(
+            f"expected timestamps of estimate and truth within {max_difference:g} s of each "
+            f"other, found none (estimate {_span(estimate)}, truth {_span(truth)}); check that "
+            "the files belong together, or use --t_offset and --t_max_diff"
+        )
+    return (
+        Trajectory(estimate.timestamps[of_estimate], estimate.T_world_camera[of_estimate]),
+        Trajectory(truth.timestamps[of_truth], truth.T_world_camera[of_truth]),
+    )
+
+
+def associate(
+    first: np.ndarray,  # (N,) second, increasing
+    second: np.ndarray,  # (M,) second, increasing
+    max_difference: float,  # second
+) -> tuple[np.ndarray, np.ndarray]:  # (K,) and (K,) int, positions in the first and the second
+    """Pair timestamps: each one of the shorter list with the nearest of the longer.
+
+    Pairs farther apart than `max_difference` are left out.
+    """
+    if len(first) > len(second):
+        of_second, of_first = associate(second, first, max_difference)
+        return of_first, of_second
+    if len(first) == 0:
+        return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
+    after = np.searchsorted(second, first).clip(max=len(second) - 1)
+    before = (after - 1).clip(min=0)
+    earlier_is_nearer = np.abs(second[before] - first) <= np.abs(second[after] - first)
+    nearest = np.where(earlier_is_nearer, before, after)
+    kept = np.flatnonzero(np.abs(second[nearest] - first) <= max_difference)
+    return kept, nearest[kept]
+
+
+def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Similarity:
+    """Return the similarity that maps the paired estimate to the truth."""
+    if alignment is Alignment.NONE:
+        return identity_similarity()
+    with_scale = alignment is not Alignment.SE3
+    fitted = umeyama(centres(estimate), centres(truth), with_scale)
+    if alignment is Alignment.SCALE:
+        return Similarity(fitted.scale, np.eye(3), np.zeros(3))
+    return fitted
+
+
+def statistics(errors: np.ndarray) -> dict[str, float]:
+    """Return the usual statistics of errors (N,), under the names that evo prints."""
+    return {
+        "max": float(errors.max()),
+        "mean": float(errors.mean()),
+        "median": float(np.median(errors)),
+        "min": float(errors.min()),
+        "rmse": float(np.sqrt((errors**2).mean())),
+        "sse": float((errors**2).sum()),
+        "std": float(errors.std()),
+    }
+
+
+def centres(trajectory: Trajectory) -> np.ndarray:
+    """Return the camera centres (N, 3) in the world."""
+    return trajectory.T_world_camera[:, :3, 3]
+
+
+def path_length(trajectory: Trajectory) -> float:
+    """Return the length of the way the camera went, in world units."""
+    return float(np.linalg.norm(np.diff(centres(trajectory), axis=0), axis=1).sum())
+
+
+def _span(trajectory: Trajectory) -> str:
+    if len(trajectory) == 0:
+        return "empty"
+    return f"{trajectory.timestamps[0]:.3f} to {trajectory.timestamps[-1]:.3f} s"
