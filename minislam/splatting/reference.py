@@ -15,8 +15,8 @@ from minislam.splatting.rendering import (
     MAX_OPACITY,
     MIN_ALPHA,
     NEAR_DEPTH,
-    VIEW_MARGIN,
     Rendering,
+    tangent_limits,
 )
 
 
@@ -93,15 +93,6 @@ def project_covariances(
     to_pixels = camera.project_jacobian(limited) @ T_camera_world[:3, :3]  # J W, (N, 2, 3)
     projected = to_pixels @ covariances_world @ to_pixels.transpose(-1, -2)
     return projected + LOW_PASS_VARIANCE * torch.eye(2).to(projected)
-
-
-def tangent_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the smallest and the largest (x/z, y/z) at which the projection is linearised."""
-    margin_x = VIEW_MARGIN * camera.width / 2
-    margin_y = VIEW_MARGIN * camera.height / 2
-    lower = ((-0.5 - margin_x - camera.cx) / camera.fx, (-0.5 - margin_y - camera.cy) / camera.fy)
-    right, bottom = camera.width - 0.5 + margin_x, camera.height - 0.5 + margin_y
-    return lower, ((right - camera.cx) / camera.fx, (bottom - camera.cy) / camera.fy)
 
 
 def gaussian_alphas(

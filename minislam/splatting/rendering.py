@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from minislam.geometry import Camera
+
 # World units. Nearer Gaussians are dropped: 1/z would blow them up over the whole image.
 NEAR_DEPTH = 0.05
 # px^2, added to both variances in the image so that no Gaussian falls between pixels (3DGS).
@@ -25,3 +27,12 @@ class Rendering(NamedTuple):
     opacity: Tensor  # (H, W) in [0, 1], 1 - transmittance
     radii: Tensor  # (N,) px, three standard deviations in the image; 0 where not visible
     contribution: Tensor  # (N,) px, sum of a Gaussian's blending weight over all pixels
+
+
+def tangent_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the smallest and the largest (x/z, y/z) at which the projection is linearised."""
+    margin_x = VIEW_MARGIN * camera.width / 2
+    margin_y = VIEW_MARGIN * camera.height / 2
+    lower = ((-0.5 - margin_x - camera.cx) / camera.fx, (-0.5 - margin_y - camera.cy) / camera.fy)
+    right, bottom = camera.width - 0.5 + margin_x, camera.height - 0.5 + margin_y
+    return lower, ((right - camera.cx) / camera.fx, (bottom - camera.cy) / camera.fy)

@@ -1,0 +1,152 @@
+"""Which Gaussians touch which tile, front to back: the lists that the compositing walks along."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.splatting.rendering import MIN_ALPHA
+
+TILE = 8  # px, side of a tile; 8 wastes fewest pixels per list entry (4 and 16 are 20 % slower)
+PIXELS = TILE * TILE
+# Tiles composited together. Blocks of this many tiles and CHUNK slots stay in a core's L2 cache.
+GROUP = 256
+
+
+class TileGroup(NamedTuple):
+    """Tiles with lists of similar length, padded to the longest."""
+
+    tiles: Tensor  # (B,) int64, tile index, row by row
+    length: int  # K, slots per tile
+    first_slot: int  # where its K * B slots start, slot-major: (K, B)
+
+
+class TileLists(NamedTuple):
+    """All slots of all groups. A padding slot holds the index N, one past the last Gaussian."""
+
+    groups: list[TileGroup]
+    slot_gaussian: Tensor  # (S,) int64
+    slot_tile: Tensor  # (S,) int64
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Return the number of tile rows and columns that cover the image."""
+    return -(-camera.height // TILE), -(-camera.width // TILE)
+
+
+def build_tile_lists(
+    means2d: Tensor,  # (2, N) px, front to back
+    conics: Tensor,  # (3, N) px^-2
+    covariances2d: Tensor,  # (3, N) px^2
+    opacities: Tensor,  # (N,)
+    camera: Camera,
+) -> TileLists:
+    """List the Gaussians of every tile, keeping their order from front to back."""
+    gaussian, tile = _entries(means2d, conics, covariances2d, opacities, camera)
+    rows, columns = tile_grid(camera)
+    order = _stable_argsort(tile, rows * columns)
+    gaussian = gaussian[order]
+    counts = torch.bincount(tile, minlength=rows * columns)
+    starts = counts.cumsum(0) - counts
+
+    # Neighbours in this order have lists of similar length, so that little padding is needed.
+    by_length = counts.argsort(stable=True)
+    by_length = by_length[counts[by_length] > 0]
+    if len(by_length) == 0:
+        return TileLists([], gaussian, tile)
+    padding = torch.full((1,), means2d.shape[1], dtype=torch.int64, device=tile.device)
+    gaussian_or_padding = torch.cat([gaussian, padding])
+    groups, slot_gaussians, slot_tiles, first_slot = [], [], [], 0
+    for tiles in by_length.split(GROUP):
+        length = int(counts[tiles[-1]])
+        position = torch.arange(length, device=tile.device)[:, None]
+        entry = torch.where(position < counts[tiles], starts[tiles] + position, len(gaussian))
+        groups.append(TileGroup(tiles, length, first_slot))
+        slot_gaussians.append(gaussian_or_padding[entry.view(-1)])
+        slot_tiles.append(tiles.repeat(length))
+        first_slot += length * len(tiles)
+    return TileLists(groups, torch.cat(slot_gaussians), torch.cat(slot_tiles))
+
+
+def _entries(
+    means2d: Tensor, conics: Tensor, covariances2d: Tensor, opacities: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:  # (E,), (E,)
+    """Return all pairs (Gaussian, tile) that overlap, ordered by Gaussian.
+
+    alpha reaches MIN_ALPHA on the ellipse d^T Q d = level, level = 2 ln(o / MIN_ALPHA). Per row
+    of tiles, the columns that this ellipse meets are known in closed form: no tile is listed in
+    vain, which a bounding box would do for every fifth one.
+    """
+    # The small constant keeps what rounding may lift over the threshold.
+    level = 2 * (opacities / MIN_ALPHA).log() + 1e-3
+    visible = level > 0
+    level = level.clamp_min(0)
+    half_height = (level * covariances2d[2]).sqrt()
+    top = (means2d[1] - half_height).ceil().clamp(0, camera.height)
+    bottom = (means2d[1] + half_height).floor().clamp(-1, camera.height - 1)
+    first_row = top.div(TILE, rounding_mode="floor").long()
+    row_count = bottom.div(TILE, rounding_mode="floor").long() - first_row + 1
+    row_count = torch.where(visible & (top <= bottom), row_count, 0)
+    gaussian, row = _expand(first_row, row_count)
+
+    left, right = _column_spans(means2d, conics, covariances2d, level, top, bottom, gaussian, row)
+    left = left.ceil().clamp(0, camera.width)
+    right = right.floor().clamp(-1, camera.width - 1)
+    first_column = left.div(TILE, rounding_mode="floor").long()
+    column_count = right.div(TILE, rounding_mode="floor").long() - first_column + 1
+    column_count = torch.where(left <= right, column_count, 0)
+    span, column = _expand(first_column, column_count)
+    _, columns = tile_grid(camera)
+    return gaussian[span], row[span] * columns + column
+
+
+def _column_spans(
+    means2d: Tensor,  # (2, N)
+    conics: Tensor,  # (3, N)
+    covariances2d: Tensor,  # (3, N)
+    level: Tensor,  # (N,)
+    top: Tensor,  # (N,) first and
+    bottom: Tensor,  # (N,) last pixel row of the ellipse
+    gaussian: Tensor,  # (R,) int64, for each (Gaussian, row of tiles)
+    row: Tensor,  # (R,) int64
+) -> tuple[Tensor, Tensor]:  # (R,), (R,) px
+    """Return the leftmost and rightmost u that the ellipse reaches within each row of tiles.
+
+    At height y over the centre the ellipse spans x = -(b/a) y -+ sqrt(a level - det Q y^2) / a.
+    Its right end lies at y = -b ex / c, ex = sqrt(level xx); if the row does not contain that
+    point the extreme is on the nearest border of the row. The left end mirrors it.
+    """
+    a, b, c = conics
+    slope = b / a
+    # det Q / a^2 = 1 / (det Sigma' a^2) = 1 / (a yy), since a = yy / det Sigma'.
+    table = torch.stack([
+        means2d[0], means2d[1], top, bottom, slope,
+        level / a, 1 / (a * covariances2d[2]), -b / c * (level * covariances2d[0]).sqrt(),
+    ])  # fmt: skip
+    u, v, top, bottom, slope, reach, shrink, y_right = table.index_select(1, gaussian)
+    low = torch.maximum(top, (row * TILE).to(v)) - v
+    high = torch.minimum(bottom, (row * TILE + TILE - 1).to(v)) - v
+    y_at_right = torch.minimum(torch.maximum(y_right, low), high)
+    y_at_left = torch.minimum(torch.maximum(-y_right, low), high)
+    right = u - slope * y_at_right + (reach - shrink * y_at_right**2).clamp_min(0).sqrt()
+    left = u - slope * y_at_left - (reach - shrink * y_at_left**2).clamp_min(0).sqrt()
+    return left, right
+
+
+def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (index, value) of first[i], first[i] + 1, ... with count[i] values for each i."""
+    index = torch.repeat_interleave(count)
+    starts = count.cumsum(0) - count
+    within = torch.arange(len(index), device=index.device) - (starts - first)[index]
+    return index, within
+
+
+def _stable_argsort(keys: Tensor, limit: int) -> Tensor:
+    """Return the stable sorting order of integer keys in [0, limit)."""
+    if keys.is_cuda:
+        return keys.argsort(stable=True)
+    # numpy sorts 16-bit integers by radix, six times faster than torch sorts 64-bit ones.
+    narrow = np.uint16 if limit <= 1 << 16 else np.int64
+    return torch.from_numpy(np.argsort(keys.numpy().astype(narrow), kind="stable"))
