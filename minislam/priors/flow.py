@@ -86,49 +86,50 @@ class ClassicalFlow:
 
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
-        return FlowChain(grayscale(image), self.config)
+        gray = grayscale(image)
+        standing = np.zeros((*gray.shape, 2), np.float32)
+        return FlowChain(gray, gray, standing, standing, self.config)
 
 
 class FlowChain:
     """The flow from one reference frame to the newest frame, carried from frame to frame.
 
     The previous frame's flow predicts the next one, so a displacement of any length is followed
-    as long as each step of it is short. It needs no pose: it starts the pose.
+    as long as each step of it is short. It needs no pose: it starts the pose. A chain is never
+    changed: the next frame gives a new one, and a bad frame can be passed over.
     """
 
     def __init__(
         self,
-        reference: np.ndarray,
+        reference: np.ndarray,  # (H, W) uint8
+        newest: np.ndarray,  # (H, W) uint8
+        flow: np.ndarray,  # (H, W, 2) px, reference to newest
+        increment: np.ndarray,  # (H, W, 2) px, how much of it the last frame added
         config: ClassicalFlowConfig,
-        increment: np.ndarray | None = None,
     ) -> None:
-        self.config = config
-        self._reference = reference
-        self._texture = texture_confidence(reference, config)
-        self._flow = np.zeros((*reference.shape, 2), np.float32)
-        self._increment = np.zeros_like(self._flow) if increment is None else increment
-        self._newest = reference
+        self._reference, self._newest = reference, newest
+        self._flow, self._increment = flow, increment
+        self._config = config
 
-    def advance(self, image: Tensor) -> FlowMatches:
-        """Follow the reference into the next frame; return matches with E = 1."""
+    def advanced(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
+        """Return the chain and the matches (E = 1) from the reference to this next image."""
         gray = grayscale(image)
         # A steady hand continues its motion, a shaking one does not: try both, keep the better.
         starts = [self._flow, self._flow + self._increment]
-        errors = [
-            np.abs(warp(gray, start).astype(np.int16) - self._reference).mean() for start in starts
-        ]
+        errors = [cv2.absdiff(warp(gray, start), self._reference).mean() for start in starts]
         flow = composed_flow(self._reference, gray, starts[int(np.argmin(errors))])
         backward = reverse_flow(self._reference, gray, flow)
-        targets, confidence = grid_matches(flow, backward, self._texture, self.config)
-        self._increment, self._flow, self._newest = flow - self._flow, flow, gray
+        texture = texture_confidence(self._reference, self._config)
+        targets, confidence = grid_matches(flow, backward, texture, self._config)
+        chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
         matched = torch.from_numpy(targets)[None]
-        return FlowMatches(
-            matched, torch.from_numpy(confidence)[None, ..., None].expand(matched.shape)
-        )
+        confidences = torch.from_numpy(confidence)[None, ..., None].expand(matched.shape)
+        return chain, FlowMatches(matched, confidences)
 
     def restarted(self) -> "FlowChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
-        return FlowChain(self._newest, self.config, self._increment)
+        standing = np.zeros_like(self._flow)
+        return FlowChain(self._newest, self._newest, standing, self._increment, self._config)
 
 
 def grayscale(image: Tensor) -> np.ndarray:

@@ -21,6 +21,16 @@ class FlowMatches:
     confidences: Tensor  # (E, h, w, 2) in [0, 1], for u and for v; 0 where there is no match
 
 
+class FlowChain(Protocol):
+    """Flow from a reference frame, followed from frame to frame without any geometry."""
+
+    def advanced(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
+        """Return the chain, and the matches (E = 1), from the reference to this next image."""
+
+    def restarted(self) -> "FlowChain":
+        """Return a chain whose reference is the newest image of this one."""
+
+
 class FlowEstimator(Protocol):
     """Dense correspondence between keyframes, started from a prediction."""
 
@@ -39,6 +49,9 @@ class FlowEstimator(Protocol):
         predicted_targets: Tensor,  # (E, h, w, 2) px, present reprojection of every cell
     ) -> FlowMatches:
         """Match every cell of each source frame in the target frame of its edge."""
+
+    def start_chain(self, image: Tensor) -> FlowChain:
+        """Return a chain whose reference is this image (H, W, 3)."""
 
 
 class FeatureExtractor(Protocol):

@@ -20,6 +20,7 @@ from minislam.geometry import Camera, se3_adjoint, se3_exp
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
+DISPARITY_DAMPING = 1e-2  # share of the mean diagonal C that is added to all of it [-]
 MAX_DAMPING = 1e6  # relative; beyond it a step is no longer worth taking
 
 
@@ -244,8 +245,10 @@ def _damped_step(
     absolute_damping: float,
 ) -> BundleState | None:
     """Solve the damped normal equations; return the moved state, or None if they are singular."""
-    C = equations.disparity_diagonal * (1 + damping)
+    C = equations.disparity_diagonal
     observed = C > 0
+    # Cells that hardly any flow constrains would jump to wherever the linearisation points.
+    C = C * (1 + damping) + DISPARITY_DAMPING * C.sum() / observed.sum().clamp_min(1)
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
     S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
     for source, rows, E in equations.source_blocks:

@@ -1,0 +1,38 @@
+"""The cells of the tracker: every `stride`-th pixel of the image."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The cells of the tracker: every `stride`-th pixel of the image."""
+
+    camera: Camera
+    stride: int  # px
+    shape: tuple[int, int]  # (h, w)
+    pixels: Tensor  # (N, 2) px
+    rays: Tensor  # (N, 3), z = 1
+
+    @classmethod
+    def of(cls, camera: Camera, stride: int) -> "Grid":
+        """Return the grid of a camera."""
+        pixels = camera.pixel_grid(stride)
+        height, width = pixels.shape[:2]
+        flat = pixels.reshape(-1, 2)
+        return cls(camera, stride, (height, width), flat, camera.rays(flat))
+
+    def sample(self, values: Tensor, positions: Tensor) -> Tensor:
+        """Sample cell values (..., N, C) at pixel positions (..., N, 2), bilinear, border held."""
+        height, width = self.shape
+        image = values.reshape(-1, height, width, values.shape[-1]).permute(0, 3, 1, 2)
+        extent = positions.new_tensor([width - 1, height - 1]) * self.stride
+        normalised = (2 * positions / extent - 1).reshape(len(image), 1, -1, 2)
+        sampled = torch.nn.functional.grid_sample(
+            image, normalised.to(image.dtype), align_corners=True, padding_mode="border"
+        )
+        return sampled[:, :, 0].mT.reshape(*positions.shape[:-1], values.shape[-1])

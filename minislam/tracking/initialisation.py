@@ -1,0 +1,175 @@
+"""The first geometry: poses and disparities of the warm-up keyframes, from flow alone.
+
+A hypothesis is a guess of the first keyframe's disparities. It fixes the pose of the second
+keyframe, whose disparities follow, and so on along the chain. Rotation and sideways translation
+look alike in a small field of view, so a bad guess can settle in a wrong basin with small
+residuals: several hypotheses are carried through the same bundle adjustment and compared.
+"""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from minislam.geometry.distortion import camera_matrix
+from minislam.priors.interfaces import FlowMatches
+from minislam.tracking.bundle_adjustment import (
+    BundleProblem,
+    BundleState,
+    bundle_adjust,
+    motion_only_adjust,
+)
+from minislam.tracking.frame_graph import splat_disparities
+from minislam.tracking.grid import Grid
+
+ESSENTIAL_THRESHOLD = 0.7  # px, RANSAC inlier distance to the epipolar line
+POSE_ITERATIONS = 12  # Gauss-Newton steps of a pose that starts from flow
+MIN_CELLS_FOR_ESSENTIAL = 40  # confident cells; five define the matrix, noise wants many more
+DISPARITY_SPREAD = 20.0  # largest ratio of a triangulated disparity to the median, both ways
+
+
+def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> FlowMatches:
+    """Return the matches a -> c from matches a -> b and b -> c (E = 1 each)."""
+    middle = first.targets.reshape(1, -1, 2)
+    flow = second.targets.reshape(1, -1, 2) - grid.pixels
+    confidence = second.confidences.reshape(1, -1, 2)
+    targets = middle + grid.sample(flow, middle)
+    confidences = first.confidences.reshape(1, -1, 2) * grid.sample(confidence, middle)
+    shape = first.targets.shape
+    return FlowMatches(targets.reshape(shape), confidences.reshape(shape))
+
+
+def start_pose(
+    grid: Grid,
+    matches: FlowMatches,  # E = 1, source to target
+    disparities: Tensor,  # (N,) of the source
+    trust: Tensor,  # (N,) in [0, 1] of the source cells
+    T_source_world: Tensor,  # (4, 4)
+    starts: list[Tensor],  # candidates (4, 4) for T_target_world
+    robust_scale: float | None,  # px
+) -> tuple[Tensor, float]:
+    """Return T_target_world (4, 4) that explains the flow best, and its cost [px^2].
+
+    Gauss-Newton on six unknowns from several starts; the cheapest end is kept.
+    """
+    ends = []
+    for start in starts:
+        problem = BundleProblem(
+            camera=grid.camera,
+            rays=grid.rays,
+            edges_source=torch.tensor([0]),
+            edges_target=torch.tensor([1]),
+            targets=matches.targets.flatten(1, 2).mT,
+            weights=matches.confidences.flatten(1, 2).mT * trust,
+            prior_disparities=torch.zeros(2, len(grid.rays)),
+            prior_weights=torch.zeros(2, len(grid.rays)),
+            free_poses=torch.tensor([False, True]),
+            free_disparities=torch.tensor([False, False]),
+            robust_scale=robust_scale,
+        )
+        state = BundleState(torch.stack([T_source_world, start]), disparities.expand(2, -1))
+        state, report = motion_only_adjust(problem, state, POSE_ITERATIONS)
+        ends.append((report.cost_after, state.T_camera_world[1]))
+    cost, pose = min(ends, key=lambda end: end[0])
+    return pose, cost
+
+
+def carry_disparities(
+    grid: Grid, T_target_source: Tensor, disparities: Tensor
+) -> Tensor:  # (N,) of the target
+    """Return disparities of a new keyframe from those of the last; holes take the nearest cell."""
+    carried = splat_disparities(
+        T_target_source, disparities, grid.rays, grid.camera, grid.shape, grid.stride
+    ).reshape(grid.shape)
+    empty = carried.numpy() == 0
+    if empty.all():
+        return disparities.median().expand(len(disparities)).clone()
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return carried[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])].reshape(-1)
+
+
+def triangulate(grid: Grid, T_target_source: Tensor, matches: FlowMatches) -> Tensor:  # (N,)
+    """Return the disparities that best explain matches under a known motion.
+
+    With the matched ray (a, b, 1), (R rho + d t) must be parallel to it: two equations that are
+    linear in d, solved by least squares.
+    """
+    rotated = grid.rays @ T_target_source[:3, :3].T.to(grid.rays.dtype)
+    t = T_target_source[:3, 3].to(grid.rays.dtype)
+    seen = grid.camera.rays(matches.targets.reshape(-1, 2))[:, :2]
+    factor = t[:2] - seen * t[2]
+    value = seen * rotated[:, 2:] - rotated[:, :2]
+    disparities = (factor * value).sum(1) / factor.square().sum(1).clamp_min(1e-12)
+    confident = (matches.confidences.reshape(-1, 2)[:, 0] > 0.5) & (disparities > 0)
+    if not confident.any():
+        return torch.ones_like(disparities)
+    typical = disparities[confident].median()
+    usable = confident & (disparities < DISPARITY_SPREAD * typical)
+    usable &= disparities > typical / DISPARITY_SPREAD
+    return torch.where(usable, disparities, typical) / typical
+
+
+def essential_disparities(grid: Grid, matches: FlowMatches) -> Tensor | None:  # (N,)
+    """Return disparities of the source from an essential matrix, median 1, or None."""
+    confident = matches.confidences.reshape(-1, 2)[:, 0] > 0.5
+    if int(confident.sum()) < MIN_CELLS_FOR_ESSENTIAL:
+        return None
+    source = grid.pixels[confident].double().numpy()
+    target = matches.targets.reshape(-1, 2)[confident].double().numpy()
+    matrix = camera_matrix(grid.camera)
+    cv2.setRNGSeed(0)
+    essential, inliers = cv2.findEssentialMat(
+        source, target, matrix, cv2.RANSAC, 0.999, ESSENTIAL_THRESHOLD
+    )
+    if essential is None or essential.shape != (3, 3):
+        return None
+    _, rotation, translation, _ = cv2.recoverPose(essential, source, target, matrix, mask=inliers)
+    T_target_source = np.eye(4)
+    T_target_source[:3, :3], T_target_source[:3, 3] = rotation, translation[:, 0]
+    return triangulate(grid, torch.from_numpy(T_target_source), matches)
+
+
+def first_disparity_hypotheses(grid: Grid, from_first: list[FlowMatches]) -> Iterator[Tensor]:
+    """Yield guesses (N,) of the first keyframe's disparities: a wall, then essential matrices."""
+    yield torch.ones(len(grid.rays))
+    for matches in from_first[:3]:
+        disparities = essential_disparities(grid, matches)
+        if disparities is not None:
+            yield disparities
+
+
+def chain_state(
+    grid: Grid,
+    chain: list[FlowMatches],  # K - 1 matches, keyframe k to k + 1
+    first_disparities: Tensor,  # (N,)
+    known_disparities: Tensor,  # (K, N), 0 where there is no depth prior
+    robust_scale: float | None,  # px
+) -> BundleState:
+    """Return poses and disparities of K keyframes, each from its predecessor."""
+    identity = torch.eye(4, dtype=torch.float64)
+    poses, disparities = [identity], [first_disparities]
+    for index, matches in enumerate(chain):
+        last, depths = poses[-1], disparities[-1]
+        starts = [last]
+        if index > 0:
+            starts.append(last @ torch.linalg.inv(poses[-2]) @ last)
+        trust = torch.ones_like(depths)
+        pose, _ = start_pose(grid, matches, depths, trust, last, starts, robust_scale)
+        carried = carry_disparities(grid, pose @ torch.linalg.inv(last), depths)
+        known = known_disparities[index + 1]
+        poses.append(pose)
+        disparities.append(torch.where(known > 0, known, carried))
+    return BundleState(torch.stack(poses), torch.stack(disparities))
+
+
+def best_hypothesis(
+    problem: BundleProblem, states: list[BundleState], iterations: int
+) -> tuple[BundleState, int, list[float]]:
+    """Adjust every hypothesis on the same measurements; return the best, its place, all costs."""
+    adjusted = [bundle_adjust(problem, state, iterations) for state in states]
+    costs = [report.cost_after for _, report in adjusted]
+    best = int(np.argmin(costs))
+    return adjusted[best][0], best, costs
