@@ -1,0 +1,81 @@
+"""The command line: write one sequence, or list them."""
+
+import argparse
+import re
+import sys
+from pathlib import Path
+
+from .errors import SynthError
+from .scenes import SUMMARIES
+from .sequence import Progress
+from .writing import write_sequence
+
+EXIT_KNOWN_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+BAR_WIDTH = 40  # characters
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.list:
+        for name, summary in SUMMARIES.items():
+            print(f"{name:<12}{summary}")
+        return 0
+    if options.name is None or options.out is None:
+        parser.error("name a sequence and a folder: python -m data_synth crowd --out data/crowd")
+    try:
+        size = parse_size(options.size)
+        folder = write_sequence(
+            options.name, options.seed, options.frames, size, options.out, progress_printer()
+        )
+    except SynthError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_KNOWN_ERROR
+    except OSError as error:
+        print(f"error: could not write {options.out}: {error.strerror}", file=sys.stderr)
+        return EXIT_KNOWN_ERROR
+    except KeyboardInterrupt:
+        print("interrupted: nothing was written", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    print(f"{options.name}, seed {options.seed}, {options.frames} frames: {folder}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m data_synth",
+        description="Render a synthetic sequence with known truth into a TUM RGB-D folder.",
+    )
+    parser.add_argument("name", nargs="?", help="the sequence; --list shows them")
+    parser.add_argument("--out", type=Path, help="the folder to write")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="another camera path and other textures"
+    )
+    parser.add_argument("--frames", type=int, default=100, help="at 30 Hz (default 100)")
+    parser.add_argument("--size", default="320x240", help="width x height [px] (default 320x240)")
+    parser.add_argument("--list", action="store_true", help="list the sequences")
+    return parser
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return (width, height) from a text like 320x240."""
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not found:
+        raise SynthError(f"--size is width x height in pixels, like 320x240, not {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def progress_printer() -> Progress:
+    """Return a bar on a terminal; elsewhere a plain line for every tenth of the way."""
+    on_terminal = sys.stderr.isatty()
+
+    def show(done: int, total: int) -> None:
+        if on_terminal:
+            bar = "#" * (BAR_WIDTH * done // total)
+            end = "\n" if done == total else ""
+            print(f"\r[{bar:<{BAR_WIDTH}}] {done}/{total}", end=end, file=sys.stderr, flush=True)
+        elif 10 * done // total > 10 * (done - 1) // total:
+            print(f"{100 * done // total} % ({done} of {total} frames)", file=sys.stderr)
+
+    return show
