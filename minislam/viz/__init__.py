@@ -1,0 +1,27 @@
+"""Figures (matplotlib, no window needed) and the HTML report of a run."""
+
+from minislam.viz.figures import (
+    ate_over_time,
+    keyframe_strip,
+    loss_curves,
+    overview,
+    trajectory_plot,
+)
+from minislam.viz.report import build_report
+from minislam.viz.style import beta_to_rgb, depth_to_rgb, figure_png, new_figure, show_image
+from minislam.viz.window import show_figure
+
+__all__ = [
+    "ate_over_time",
+    "beta_to_rgb",
+    "build_report",
+    "depth_to_rgb",
+    "figure_png",
+    "keyframe_strip",
+    "loss_curves",
+    "new_figure",
+    "overview",
+    "show_figure",
+    "show_image",
+    "trajectory_plot",
+]

@@ -1,0 +1,131 @@
+"""The sub-command `minislam eval`, in the grammar of `evo_ape tum`.
+
+Nothing heavy is imported before a comparison is really asked for: `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from minislam.evaluation import Alignment, TrajectoryError
+
+
+def add_eval_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
+    """Add `eval` to the sub-commands of a parser."""
+    parser = subparsers.add_parser(
+        "eval",
+        help="compare an estimated trajectory with the truth",
+        description="Absolute trajectory error (ATE) of an estimate, both files in TUM format. "
+        "Without -a, -s and --no_align a Sim(3) is fitted first, since a monocular estimate has "
+        "no scale of its own.",
+    )
+    parser.add_argument("reference", help="ground truth, TUM format")
+    parser.add_argument("estimate", help="estimated trajectory, TUM format")
+    parser.add_argument("-a", "--align", action="store_true", help="fit rotation and translation")
+    parser.add_argument("-s", "--correct_scale", action="store_true", help="fit the scale")
+    parser.add_argument("--no_align", action="store_true", help="fit nothing")
+    parser.add_argument(
+        "--t_max_diff", type=float, default=0.01, help="largest difference of timestamps [s], 0.01"
+    )
+    parser.add_argument(
+        "--t_offset", type=float, default=0.0, help="added to the estimate's timestamps [s], 0"
+    )
+    parser.add_argument("-p", "--plot", action="store_true", help="show the trajectories")
+    parser.add_argument("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
+    parser.add_argument("--save_results", metavar="FILE.json", help="write the numbers to a file")
+    parser.add_argument("-v", "--verbose", action="store_true", help="say more")
+    parser.add_argument("--silent", action="store_true", help="print nothing")
+    parser.set_defaults(run=run_eval)
+    return parser
+
+
+def run_eval(args: argparse.Namespace) -> int:
+    """Compare two trajectory files; return the exit code."""
+    from minislam.data.trajectory import read_trajectory
+    from minislam.evaluation.trajectory import absolute_trajectory_error
+
+    estimate, truth = read_trajectory(args.estimate), read_trajectory(args.reference)
+    alignment = _alignment(args)
+    result = absolute_trajectory_error(
+        estimate, truth, alignment, args.t_max_diff, offset=args.t_offset
+    )
+    if not args.silent:
+        print(_printout(args, result, alignment, len(estimate), len(truth)))
+    if args.save_results:
+        _save_results(args, result, alignment)
+    if args.plot or args.save_plot:
+        _plot(args, result)
+    return 0
+
+
+def _alignment(args: argparse.Namespace) -> Alignment:
+    """Return what the flags ask to fit; nothing asked means Sim(3)."""
+    from minislam.errors import InputError
+    from minislam.evaluation.trajectory import Alignment
+
+    if args.no_align and (args.align or args.correct_scale):
+        raise InputError("expected either --no_align or -a / -s, found both; leave one out")
+    if args.no_align:
+        return Alignment.NONE
+    if args.align == args.correct_scale:
+        return Alignment.SIM3
+    return Alignment.SE3 if args.align else Alignment.SCALE
+
+
+def _printout(
+    args: argparse.Namespace,
+    result: TrajectoryError,
+    alignment: Alignment,
+    estimate_poses: int,
+    truth_poses: int,
+) -> str:
+    """Return the table as evo prints it, with the alignment named above it."""
+    by_default = not (args.align or args.correct_scale or args.no_align)
+    reason = ", the default for monocular estimates" if by_default else ""
+    lines = ["APE w.r.t. translation part (m)", f"(with {alignment.value}{reason})", ""]
+    if args.verbose:
+        similarity = result.similarity
+        rows = "\n".join("  " + " ".join(f"{x: .6f}" for x in row) for row in similarity.rotation)
+        shift = " ".join(f"{x:.6f}" for x in similarity.translation)
+        lines += [
+            f"{len(result.errors)} pairs ({estimate_poses} estimated, {truth_poses} true poses)",
+            f"scale {similarity.scale:.6f}, translation {shift}, rotation\n{rows}",
+            "",
+        ]
+    lines += [f"{name:>10}\t{result.statistics[name]:.6f}" for name in sorted(result.statistics)]
+    return "\n".join(lines)
+
+
+def _save_results(args: argparse.Namespace, result: TrajectoryError, alignment: Alignment) -> None:
+    from minislam.data.files import write_json
+
+    write_json(
+        args.save_results,
+        {
+            "reference": args.reference,
+            "estimate": args.estimate,
+            "alignment": alignment.value,
+            "pairs": len(result.errors),
+            "scale": result.similarity.scale,
+            "rotation": result.similarity.rotation.tolist(),
+            "translation": result.similarity.translation.tolist(),
+            "ate_translation": result.statistics,
+            "timestamps_seconds": result.truth.timestamps.tolist(),
+            "errors": result.errors.tolist(),
+        },
+    )
+
+
+def _plot(args: argparse.Namespace, result: TrajectoryError) -> None:
+    from minislam.data.files import atomic_write
+    from minislam.viz import figure_png, show_figure, trajectory_plot
+
+    figure = trajectory_plot(result.estimate, result.truth, unit="m")
+    if args.save_plot:
+        path = Path(args.save_plot)
+        atomic_write(path if path.suffix else path.with_suffix(".png"), figure_png(figure))
+    if args.plot:
+        show_figure(figure)

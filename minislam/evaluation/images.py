@@ -1,0 +1,71 @@
+"""Similarity of two images: PSNR and SSIM. LPIPS needs a network and is not here."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import convolve1d
+
+from minislam.errors import InputError
+
+# Wang et al. 2004: an 11x11 Gaussian window, and constants that keep flat areas from 0/0.
+_SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5  # px
+_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2  # for values in [0, 1]
+
+
+def psnr(
+    image: ArrayLike,  # (H, W, 3) or (H, W) in [0, 1]
+    reference: ArrayLike,  # the same shape
+    mask: ArrayLike | None = None,  # (H, W) bool, True where pixels count; None: everywhere
+) -> float:  # dB, infinite for equal images
+    """Return the peak signal-to-noise ratio, -10 log10 of the mean squared difference."""
+    image, reference = _checked(image, reference)
+    squared = (image - reference) ** 2
+    if mask is not None:
+        mask = np.asarray(mask, dtype=bool)
+        if mask.shape != squared.shape[:2] or not mask.any():
+            raise InputError(
+                f"expected a mask of {squared.shape[:2]} with at least one pixel, found "
+                f"{mask.shape} with {int(mask.sum())}; choose another mask or leave it out"
+            )
+        squared = squared[mask]
+    error = float(squared.mean())
+    return float("inf") if error == 0 else float(-10 * np.log10(error))
+
+
+def ssim(
+    image: ArrayLike,  # (H, W, 3) or (H, W) in [0, 1]
+    reference: ArrayLike,  # the same shape
+) -> float:  # at most 1
+    """Return the mean structural similarity over all windows that lie inside the image."""
+    x, y = _checked(image, reference)
+    if min(x.shape[:2]) < _SSIM_WINDOW:
+        raise InputError(
+            f"expected images of at least {_SSIM_WINDOW}x{_SSIM_WINDOW} px, found "
+            f"{x.shape[1]}x{x.shape[0]}; SSIM compares windows of that size"
+        )
+    mean_x, mean_y = _window_mean(x), _window_mean(y)
+    variance_x = _window_mean(x * x) - mean_x**2
+    variance_y = _window_mean(y * y) - mean_y**2
+    covariance = _window_mean(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + _SSIM_C1) / (mean_x**2 + mean_y**2 + _SSIM_C1)
+    structure = (2 * covariance + _SSIM_C2) / (variance_x + variance_y + _SSIM_C2)
+    return float((luminance * structure).mean())
+
+
+def _window_mean(values: np.ndarray) -> np.ndarray:
+    """Return Gaussian means of (H, W, ...), for the (H-10, W-10, ...) windows that fit."""
+    half = _SSIM_WINDOW // 2
+    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / _SSIM_SIGMA) ** 2)
+    weights /= weights.sum()
+    mean = convolve1d(convolve1d(values, weights, axis=0), weights, axis=1)
+    return mean[half:-half, half:-half]
+
+
+def _checked(image: ArrayLike, reference: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    if image.shape != reference.shape or image.ndim not in (2, 3):
+        raise InputError(
+            f"expected two images of one size, found {image.shape} and {reference.shape}; "
+            "render at the size of the reference"
+        )
+    # A renderer may overshoot; what is shown and stored is clipped, so that is compared.
+    return np.clip(image, 0, 1), np.clip(reference, 0, 1)

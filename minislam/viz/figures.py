@@ -1,0 +1,117 @@
+"""The figures of runs, reports and notebooks: one function per kind, each returns a Figure."""
+
+from collections.abc import Mapping
+from collections.abc import Sequence as Series
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from minislam.records import Trajectory
+from minislam.viz.style import (
+    ESTIMATE_STYLE,
+    STRIP,
+    TRUTH_STYLE,
+    WIDE,
+    beta_to_rgb,
+    depth_to_rgb,
+    new_figure,
+    show_image,
+)
+
+
+def keyframe_strip(
+    image: np.ndarray,  # (H, W, 3) RGB in [0, 1], what the camera saw
+    depth: np.ndarray,  # (H, W) world units, 0 where unknown
+    beta: np.ndarray,  # (h, w) > 0
+    render: np.ndarray,  # (H, W, 3) RGB, the static map from the same pose
+    title: str = "",
+) -> Figure:
+    """Draw one keyframe: input, depth, uncertainty, render."""
+    figure = new_figure(STRIP)
+    pictures = {
+        "input": image,
+        "depth": depth_to_rgb(depth),
+        "uncertainty beta": beta_to_rgb(beta),
+        "render": render,
+    }
+    for axes, (name, picture) in zip(figure.subplots(1, 4), pictures.items(), strict=True):
+        show_image(axes, picture, name)
+    if title:
+        figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def trajectory_plot(
+    estimate: Trajectory, truth: Trajectory | None = None, unit: str = "world units"
+) -> Figure:
+    """Draw camera centres in the planes x-z and x-y; align the estimate before."""
+    figure = new_figure(WIDE)
+    for axes, second in zip(figure.subplots(1, 2), (2, 1), strict=True):
+        _draw_path(axes, estimate, truth, second, unit)
+    return figure
+
+
+def ate_over_time(
+    timestamps: np.ndarray,  # (N,) second
+    errors: np.ndarray,  # (N,)
+    unit: str = "world units",
+) -> Figure:
+    """Draw the distance between estimated and true camera centre over time."""
+    figure = new_figure(WIDE)
+    axes = figure.subplots()
+    axes.plot(timestamps - timestamps[0], errors, color=ESTIMATE_STYLE["color"])
+    rmse = float(np.sqrt(np.mean(np.square(errors))))
+    axes.axhline(rmse, color="tab:red", linewidth=1, label=f"rmse {rmse:.4g}")
+    axes.set(xlabel="time [s]", ylabel=f"position error [{unit}]", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    return figure
+
+
+def loss_curves(history: Mapping[str, Series[float]]) -> Figure:
+    """Draw loss values per iteration, one curve per name; the scale is logarithmic."""
+    figure = new_figure(WIDE)
+    axes = figure.subplots()
+    for name, values in history.items():
+        axes.plot(np.arange(len(values)), values, label=name, linewidth=1)
+    axes.set(xlabel="iteration", ylabel="loss")
+    if any(np.any(np.asarray(values) > 0) for values in history.values()):
+        axes.set_yscale("log", nonpositive="mask")
+    if history:
+        axes.legend(frameon=False, fontsize=8)
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def overview(
+    image: np.ndarray,  # (H, W, 3) RGB in [0, 1]
+    beta: np.ndarray,  # (h, w) > 0
+    render: np.ndarray,  # (H, W, 3) RGB
+    estimate: Trajectory,
+    truth: Trajectory | None = None,
+    unit: str = "world units",
+) -> Figure:
+    """Draw a run in one picture: input, uncertainty, static render, trajectory."""
+    figure = new_figure((12.0, 2.6))
+    axes = figure.subplots(1, 4)
+    show_image(axes[0], image, "input frame")
+    show_image(axes[1], beta_to_rgb(beta), "uncertainty beta")
+    show_image(axes[2], render, "static map, same view")
+    _draw_path(axes[3], estimate, truth, 2, unit)
+    return figure
+
+
+def _draw_path(
+    axes: Axes, estimate: Trajectory, truth: Trajectory | None, second: int, unit: str
+) -> None:
+    """Draw coordinate x against y (second = 1) or z (second = 2), both at one scale."""
+    if truth is not None:
+        centres = truth.T_world_camera[:, :3, 3]
+        axes.plot(centres[:, 0], centres[:, second], label="ground truth", **TRUTH_STYLE)
+    centres = estimate.T_world_camera[:, :3, 3]
+    axes.plot(centres[:, 0], centres[:, second], label="estimate", **ESTIMATE_STYLE)
+    axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[second]} [{unit}]")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize=8)

@@ -1,0 +1,73 @@
+"""One look for all figures: sizes, colours, and bytes that do not change from run to run."""
+
+import io
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+WIDE, SQUARE, STRIP = (9.0, 3.0), (4.0, 4.0), (9.0, 2.0)  # inch
+
+TRUTH_STYLE = {"color": "black", "linestyle": "--", "linewidth": 1.2}
+ESTIMATE_STYLE = {"color": "tab:blue", "linestyle": "-", "linewidth": 1.4}
+DYNAMIC_COLOR = "tab:orange"
+DEPTH_COLORMAP, BETA_COLORMAP, ERROR_COLORMAP = "viridis", "magma", "RdBu_r"
+
+_DPI = 100  # dots per inch
+_UNKNOWN_RGB = (0.25, 0.25, 0.25)  # where there is no depth
+_QUANTILES = (0.02, 0.98)  # a few wild values must not take the whole colour range
+# A range at least this wide keeps the noise of a frame without movers from filling all colours.
+_LEAST_BETA_RATIO = 4.0
+
+
+def new_figure(size: tuple[float, float]) -> Figure:
+    """Return an empty figure (inches) that belongs to no window and no global state."""
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def figure_png(figure: Figure, dpi: float = _DPI) -> bytes:
+    """Return a figure as PNG: the same bytes for the same figure, without date or version."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def show_image(axes: Axes, image: np.ndarray, title: str) -> None:
+    """Draw (H, W, 3) RGB in [0, 1] without axes."""
+    axes.imshow(np.clip(image, 0, 1), interpolation="nearest")
+    axes.set_title(title, fontsize=9)
+    axes.set_axis_off()
+
+
+def depth_to_rgb(
+    depth: np.ndarray,  # (H, W) world units, 0 where unknown
+    limits: tuple[float, float] | None = None,  # world units; None: from the values
+) -> np.ndarray:  # (H, W, 3) in [0, 1]
+    """Colour a depth map: viridis from near to far, grey where unknown."""
+    depth = np.asarray(depth, dtype=np.float64)
+    known = np.isfinite(depth) & (depth > 0)
+    low, high = limits or (np.quantile(depth[known], _QUANTILES) if known.any() else (0.0, 1.0))
+    colored = _mapped(np.where(known, depth, low), low, high, DEPTH_COLORMAP)
+    colored[~known] = _UNKNOWN_RGB
+    return colored
+
+
+def beta_to_rgb(
+    beta: np.ndarray,  # (h, w) > 0
+    limits: tuple[float, float] | None = None,  # None: from the values
+) -> np.ndarray:  # (h, w, 3) in [0, 1]
+    """Colour an uncertainty map: magma over log beta, dark is certain."""
+    beta = np.asarray(beta, dtype=np.float64)
+    low, high = limits or np.quantile(beta, _QUANTILES)
+    low = max(low, np.finfo(np.float64).tiny)
+    high = max(high, _LEAST_BETA_RATIO * low)
+    return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), BETA_COLORMAP)
+
+
+def _mapped(values: np.ndarray, low: float, high: float, colormap: str) -> np.ndarray:
+    scaled = np.clip((values - low) / max(high - low, 1e-12), 0, 1)
+    return colormaps[colormap](scaled)[..., :3]
