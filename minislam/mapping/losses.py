@@ -1,0 +1,107 @@
+"""The terms of L_render, which moves the Gaussians and nothing else (Sec. 3.4)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from minislam.mapping.config import MappingConfig
+from minislam.splatting import GaussianMap, Rendering
+from minislam.uncertainty.losses import SSIM_C1, SSIM_C2, depth_loss, gaussian_blur
+
+SSIM_WINDOW = 11  # px, the usual window of SSIM, as in 3DGS
+SSIM_SIGMA = 1.5  # px
+# Summed RGB. Darker pixels are the empty border that undistortion leaves, official.
+BLACK = 0.01
+
+
+@dataclass(frozen=True)
+class RenderLoss:
+    """L_render and its parts."""
+
+    total: Tensor  # () Eq. 6
+    color: Tensor  # () weighted mean of L_color
+    depth: Tensor  # () weighted mean of L_depth, in metres as `MappingConfig` means them
+    isotropic: Tensor  # () L_iso, likewise
+
+
+def ssim_loss(
+    rendered: Tensor,  # (H, W, 3)
+    image: Tensor,  # (H, W, 3) RGB in [0, 1], constant
+) -> Tensor:  # (H, W) in [0, 2]
+    """Return 1 - SSIM per pixel, mean over channels: a map, so that each pixel has its weight."""
+    x, y = rendered.permute(2, 0, 1), image.permute(2, 0, 1)
+    # The two that need no gradient are kept apart: a third less work in the backward pass.
+    mean_y, mean_yy = gaussian_blur(torch.stack([y, y * y]), SSIM_WINDOW, SSIM_SIGMA)
+    moving = gaussian_blur(torch.stack([x, x * x, x * y]), SSIM_WINDOW, SSIM_SIGMA)
+    mean_x, mean_xx, mean_xy = moving
+    variance_x, variance_y = mean_xx - mean_x * mean_x, mean_yy - mean_y * mean_y
+    covariance = mean_xy - mean_x * mean_y
+    numerator = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
+    denominator = (mean_x * mean_x + mean_y * mean_y + SSIM_C1) * (
+        variance_x + variance_y + SSIM_C2
+    )
+    return (1 - numerator / denominator).mean(0)
+
+
+def color_loss(
+    rendered: Tensor,  # (H, W, 3)
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    lambda_ssim: float,  # share of SSIM in [0, 1]
+) -> Tensor:  # (H, W)
+    """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. 7."""
+    absolute = (rendered - image).abs().mean(-1)
+    loss = (1 - lambda_ssim) * absolute
+    if lambda_ssim > 0:
+        loss = loss + lambda_ssim * ssim_loss(rendered, image)
+    return torch.where(image.sum(-1) > BLACK, loss, 0)
+
+
+def weighted_depth_loss(
+    rendered_depth: Tensor,  # (H, W) world units
+    reference_depth: Tensor,  # (H, W) world units, 0 where unknown
+    weight: Tensor,  # (H, W) static weight
+    far_limit: float,  # world units
+    floater_margin: float,  # world units
+) -> Tensor:  # (H, W) world units
+    """Return the weighted |D^ - D~| (Eq. 3); floaters count even where beta is large.
+
+    A mover hides the static scene, so it is always NEARER than the scene. Where the map has a
+    surface far in front of the reference, it is the map that is wrong, whatever beta says.
+    """
+    loss = depth_loss(rendered_depth, reference_depth, far_limit)
+    floater = reference_depth > rendered_depth.detach() + floater_margin
+    return torch.where(floater, loss, weight * loss)
+
+
+def isotropic_loss(scales: Tensor) -> Tensor:
+    """Return the mean over Gaussians and axes of |s - mean_axis(s)|, of scales (N, 3)."""
+    return (scales - scales.mean(-1, keepdim=True)).abs().mean()
+
+
+def render_loss(
+    gaussians: GaussianMap,
+    rendering: Rendering,
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    reference_depth: Tensor,  # (H, W) world units, 0 where unknown
+    weight: Tensor,  # (H, W) static weight 0.5 / beta^2, without gradient
+    median_depth: float,  # world units, of the scene
+    config: MappingConfig,
+) -> RenderLoss:
+    """Return (lambda_5 L_color + lambda_6 L_depth) / beta^2 + lambda_7 L_iso. Eq. 6.
+
+    Means run over all pixels. The factor 1/2 of lambda_5 and lambda_6 is that of the weight.
+    """
+    metre = median_depth / config.metric_median
+    color = (weight * color_loss(rendering.color, image, config.lambda_ssim)).mean()
+    depth = weighted_depth_loss(
+        rendering.depth,
+        reference_depth,
+        weight,
+        config.far_factor * median_depth,
+        config.floater_margin * median_depth,
+    )
+    depth = depth.mean() / metre
+    isotropic = isotropic_loss(gaussians.scales) / metre
+    total = config.color_share * color + (1 - config.color_share) * depth
+    return RenderLoss(total + config.lambda_isotropic * isotropic, color, depth, isotropic)

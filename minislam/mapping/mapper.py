@@ -1,0 +1,287 @@
+"""The mapper: it owns the Gaussian map, the keyframes and the uncertainty MLP."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.mapping.config import MappingConfig
+from minislam.mapping.deformation import deform_rigidly, rescale_to_depths
+from minislam.mapping.density import ScreenGradients, densify, useful_rows
+from minislam.mapping.insertion import draw_pixels, gaussians_at_pixels, insertable_pixels
+from minislam.mapping.losses import RenderLoss, render_loss
+from minislam.mapping.views import MappedKeyframe, View
+from minislam.mapping.window import sampling_probabilities, update_window
+from minislam.records import Keyframe
+from minislam.splatting import GaussianMap, MapOptimizer, Rendering, render
+from minislam.uncertainty import (
+    UncertaintyConfig,
+    UncertaintyMLP,
+    UncertaintyTrainer,
+    mapping_weight,
+    measure_misfit,
+)
+
+Progress = Callable[[int, int], None]  # called with the iterations done and their number
+
+
+@dataclass
+class MappingHistory:
+    """One entry per iteration, for plots."""
+
+    render: list[float] = field(default_factory=list)  # L_render
+    color: list[float] = field(default_factory=list)  # weighted L_color
+    depth: list[float] = field(default_factory=list)  # weighted L_depth
+    isotropic: list[float] = field(default_factory=list)  # L_iso
+    uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
+    gaussians: list[int] = field(default_factory=list)  # size of the map
+
+    def add(self, loss: RenderLoss, uncertainty: float, gaussians: int) -> None:
+        """Append one iteration."""
+        self.render.append(float(loss.total.detach()))
+        self.color.append(float(loss.color.detach()))
+        self.depth.append(float(loss.depth.detach()))
+        self.isotropic.append(float(loss.isotropic.detach()))
+        self.uncertainty.append(uncertainty)
+        self.gaussians.append(gaussians)
+
+
+class Mapper:
+    """Grow and optimise the map of the static scene, and train the MLP on what does not fit."""
+
+    def __init__(
+        self,
+        camera: Camera,  # of the keyframe images
+        config: MappingConfig,
+        uncertainty: UncertaintyConfig,
+        feature_dimension: int,  # C
+        seed: int,
+    ) -> None:
+        self.camera = camera
+        self.config = config
+        self.uncertainty = uncertainty
+        self.keyframes: list[MappedKeyframe] = []
+        self.window: list[int] = []  # positions in `keyframes`, newest first
+        self.median_depth = 1.0  # world units; set by the first keyframes, then fixed
+        self.history = MappingHistory()
+        self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed)
+        self._generator = torch.Generator().manual_seed(seed + 1)
+        self._optimizer = MapOptimizer(GaussianMap.empty(), config.rates)
+        self._gradients = ScreenGradients(0)
+        self._iteration = 0
+        self._frozen_until = 0
+        scale = config.image_scale
+        self._online_camera = camera.resized(
+            max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
+        )
+
+    @property
+    def gaussians(self) -> GaussianMap:
+        """Return the map, without gradients."""
+        return self._optimizer.gaussians.detach()
+
+    @property
+    def mlp(self) -> UncertaintyMLP:
+        """Return the uncertainty MLP."""
+        return self._trainer.mlp
+
+    def predict_beta(self, features: Tensor) -> Tensor:
+        """Return the raw beta (h', w') of features (h', w', C)."""
+        return self._trainer.predict(features)
+
+    @torch.no_grad()
+    def render(self, T_camera_world: Tensor, camera: Camera | None = None) -> Rendering:
+        """Render the map from a pose (4, 4), without gradients."""
+        return render(self.gaussians, camera or self.camera, T_camera_world.float())
+
+    def initialise(self, keyframes: list[Keyframe], progress: Progress | None = None) -> None:
+        """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
+        if not keyframes:
+            raise InputError("expected at least one keyframe to start the map from, found none")
+        depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in keyframes])
+        if len(depths) == 0:
+            raise InputError(
+                "expected some known depth in the first keyframes, found none; give a depth "
+                "prior, or let the tracker's disparities reach the mapper"
+            )
+        self.median_depth = float(depths.median())
+        for keyframe in keyframes:
+            self.keyframes.append(MappedKeyframe.from_record(keyframe))
+            self._insert(len(self.keyframes) - 1)
+        count = len(self.keyframes)
+        self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
+        uniform = torch.full((count,), 1 / count, dtype=torch.float64)
+        self._optimise(self.config.init_iterations, uniform, self._online_camera, progress)
+
+    def integrate(self, keyframe: Keyframe, progress: Progress | None = None) -> None:
+        """Add one keyframe: window, insertion, then optimisation of map and MLP."""
+        if not self.keyframes:
+            raise InputError("expected an initialised map, found none; call initialise first")
+        self.keyframes.append(MappedKeyframe.from_record(keyframe))
+        new = len(self.keyframes) - 1
+        self.window = update_window(
+            self.window,
+            new,
+            {position: self._seen(position) for position in [new, *self.window]},
+            torch.stack([k.T_camera_world for k in self.keyframes]),
+            self.config.window_size,
+            self.config.window_overlap,
+        )
+        self._insert(new)
+        probabilities = sampling_probabilities(
+            len(self.keyframes), self.window, self.config.window_share
+        )
+        iterations = self.config.keyframe_iterations
+        self._optimise(iterations, probabilities, self._online_camera, progress)
+
+    def update_keyframes(
+        self,
+        T_camera_world: Tensor,  # (K, 4, 4) float64, of all keyframes in the map, in their order
+        depths: list[Tensor | None] | None = None,  # K new reference depths, None where unchanged
+    ) -> None:
+        """Take over new poses and depths: the map moves with its anchor keyframes.
+
+        Adam's moments are kept: a bundle adjustment moves the map by little.
+        """
+        count = len(self.keyframes)
+        if len(T_camera_world) != count or (depths is not None and len(depths) != count):
+            raise InputError(
+                f"expected poses and depths of the {count} keyframes in the map, found "
+                f"{len(T_camera_world)}; give all of them in the order of their integration"
+            )
+        old = torch.stack([keyframe.T_camera_world for keyframe in self.keyframes])
+        rows = self._anchor_rows()
+        gaussians = self.gaussians
+        if depths is not None:
+            before = [keyframe.depth for keyframe in self.keyframes]
+            after = [b if d is None else d for b, d in zip(before, depths, strict=True)]
+            gaussians = rescale_to_depths(gaussians, rows, old, before, after, self.camera)
+            for keyframe, depth in zip(self.keyframes, after, strict=True):
+                keyframe.set_depth(depth)
+        gaussians = deform_rigidly(gaussians, rows, old, T_camera_world.double())
+        self._optimizer.replace(gaussians)
+        for keyframe, pose in zip(self.keyframes, T_camera_world.double(), strict=True):
+            keyframe.T_camera_world = pose
+
+    def refine(self, iterations: int, progress: Progress | None = None) -> None:
+        """Optimise map and MLP over all keyframes, the last part at full image size."""
+        count = len(self.keyframes)
+        uniform = torch.full((count,), 1 / count, dtype=torch.float64)
+        full = round(iterations * self.config.refine_full_share)
+        self._optimise(iterations - full, uniform, self._online_camera, progress)
+        self._optimise(full, uniform, self.camera, progress)
+
+    def _anchor_rows(self) -> Tensor:
+        """Return (N,) the position in `keyframes` of each Gaussian's anchor."""
+        indices = torch.tensor([keyframe.keyframe_index for keyframe in self.keyframes])
+        return torch.searchsorted(indices, self._optimizer.gaussians.anchor_keyframe)
+
+    def _weight(self, keyframe: MappedKeyframe, camera: Camera) -> Tensor:
+        """Return the static weight (H, W) of a keyframe; 1 with uncertainty switched off."""
+        if not self.uncertainty.enabled:
+            return torch.ones(camera.height, camera.width)
+        return mapping_weight(self.predict_beta(keyframe.features), camera)
+
+    @torch.no_grad()
+    def _seen(self, position: int) -> Tensor:
+        """Return (N,) bool, the Gaussians that contribute to a keyframe."""
+        pose = self.keyframes[position].T_camera_world
+        rendering = self.render(pose, self._online_camera)
+        return rendering.contribution > self.config.visible_contribution
+
+    @torch.no_grad()
+    def _insert(self, position: int) -> None:
+        """Add Gaussians for what a keyframe sees and the map does not explain."""
+        keyframe = self.keyframes[position]
+        config = self.config.insertion
+        rendering = self.render(keyframe.T_camera_world) if len(self.gaussians) else None
+        weight = self._weight(keyframe, self.camera)
+        far = config.far_factor * self.median_depth
+        allowed = insertable_pixels(keyframe.depth, far, weight, rendering, config)
+        pixels = draw_pixels(allowed, config.cell, self._generator)
+        new = gaussians_at_pixels(
+            pixels,
+            keyframe.image,
+            keyframe.depth,
+            self.camera,
+            keyframe.T_camera_world,
+            keyframe.keyframe_index,
+            config,
+        )
+        self._optimizer.append(new)
+        self._gradients = ScreenGradients(len(self.gaussians))
+
+    def _optimise(
+        self,
+        iterations: int,
+        probabilities: Tensor,  # (K,) of the keyframes
+        camera: Camera,  # size at which the keyframes are rendered
+        progress: Progress | None,
+    ) -> None:
+        for done in range(iterations):
+            drawn = torch.multinomial(probabilities, 1, generator=self._generator)
+            self._step(int(drawn), camera)
+            if (self._iteration % self.config.density.interval) == 0:
+                self._change_density()
+            if progress is not None:
+                progress(done + 1, iterations)
+
+    def _step(self, position: int, camera: Camera) -> None:
+        """Take one step of the map on L_render and one of the MLP on L_uncer."""
+        keyframe = self.keyframes[position]
+        view = keyframe.view(camera)
+        gaussians = self._optimizer.gaussians
+        offsets = torch.zeros(len(gaussians), 2, requires_grad=True)
+        pose = keyframe.T_camera_world.float()
+        rendering = render(gaussians, camera, pose, screen_offsets=offsets)
+        weight = self._weight(keyframe, camera)
+        loss = render_loss(
+            gaussians, rendering, view.image, view.depth, weight, self.median_depth, self.config
+        )
+        loss.total.backward()
+        self._gradients.add(offsets.grad, rendering.radii, camera)
+        self._optimizer.rates = self._rates()
+        self._optimizer.step()
+
+        uncertainty = math.nan
+        if self.uncertainty.enabled and self._iteration >= self._frozen_until:
+            uncertainty = self._train_mlp(position, view, rendering)
+        self.history.add(loss, uncertainty, len(gaussians))
+        self._iteration += 1
+
+    def _rates(self):
+        """Return the step lengths of this iteration: that of the means decays, log-linear."""
+        config = self.config
+        progress = min(1.0, self._iteration / config.rate_iterations)
+        decay = math.exp(progress * math.log(config.means_rate_end))
+        return replace(config.rates, means=config.means_rate * self.median_depth * decay)
+
+    def _train_mlp(self, position: int, view: View, rendering: Rendering) -> float:
+        """Take one step of the MLP on a rendering, as a constant, and return L_uncer."""
+        features = self.keyframes[position].features
+        misfit = measure_misfit(
+            view.image,
+            view.depth,
+            rendering.color.detach(),
+            rendering.depth.detach(),
+            rendering.opacity.detach(),
+            tuple(features.shape[:2]),
+            self.median_depth / self.config.metric_median,
+            self.uncertainty,
+        )
+        reach = self.uncertainty.neighbour_keyframes
+        nearby = self.keyframes[max(0, position - reach) : position + reach + 1]
+        cells = torch.cat([k.features.reshape(-1, features.shape[-1]) for k in nearby])
+        return self._trainer.step(features, misfit, cells)
+
+    def _change_density(self) -> None:
+        """Clone, split and prune, then let the map settle before the MLP learns again."""
+        config = self.config.density
+        densify(self._optimizer, self._gradients.mean, self.median_depth, config, self._generator)
+        self._optimizer.prune(useful_rows(self.gaussians, self.median_depth, config))
+        self._gradients = ScreenGradients(len(self.gaussians))
+        self._frozen_until = self._iteration + self.config.freeze_iterations

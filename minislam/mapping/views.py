@@ -1,0 +1,75 @@
+"""Keyframes as the mapper stores them: one pose, and images at several sizes."""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.geometry import Camera
+from minislam.records import Keyframe
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe at one size."""
+
+    camera: Camera
+    image: Tensor  # (h, w, 3) RGB in [0, 1]
+    depth: Tensor  # (h, w) world units, 0 where unknown
+
+
+@dataclass
+class MappedKeyframe:
+    """A keyframe in the map. The pose and the reference depth change when tracking says so."""
+
+    keyframe_index: int
+    features: Tensor  # (h', w', C)
+    image: Tensor  # (H, W, 3)
+    depth: Tensor  # (H, W) world units, 0 where unknown
+    T_camera_world: Tensor  # (4, 4) float64
+    _views: dict[tuple[int, int], View] = field(default_factory=dict)
+
+    @classmethod
+    def from_record(cls, keyframe: Keyframe) -> "MappedKeyframe":
+        """Take over what the tracker handed out."""
+        return cls(
+            keyframe.keyframe_index,
+            keyframe.features,
+            keyframe.image,
+            keyframe.depth,
+            keyframe.T_camera_world.double(),
+        )
+
+    def view(self, camera: Camera) -> View:
+        """Return the keyframe at the size of `camera`, made once."""
+        size = (camera.height, camera.width)
+        if size not in self._views:
+            image = shrink_image(self.image, *size)
+            self._views[size] = View(camera, image, shrink_depth(self.depth, *size))
+        return self._views[size]
+
+    def set_depth(self, depth: Tensor) -> None:
+        """Replace the reference depth (H, W)."""
+        self.depth = depth
+        self._views.clear()
+
+
+def shrink_image(image: Tensor, height: int, width: int) -> Tensor:
+    """Return the image (height, width, 3) of the means over the pixels that each new one covers."""
+    if image.shape[:2] == (height, width):
+        return image
+    return _area_mean(image.permute(2, 0, 1), height, width).permute(1, 2, 0).contiguous()
+
+
+def shrink_depth(depth: Tensor, height: int, width: int) -> Tensor:
+    """Return the depth (height, width) of the means over KNOWN pixels, 0 where there is none."""
+    if depth.shape == (height, width):
+        return depth
+    known = (depth > 0).to(depth)
+    total, share = _area_mean(torch.stack([depth * known, known]), height, width)
+    return torch.where(share > 0, total / share.clamp_min(torch.finfo(depth.dtype).eps), 0)
+
+
+def _area_mean(channels: Tensor, height: int, width: int) -> Tensor:
+    return functional.adaptive_avg_pool2d(channels[None], (height, width))[0]

@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from minislam.geometry import Camera
+from minislam.mapping import DensityConfig
+from minislam.mapping.density import ScreenGradients, densify, split, useful_rows
+from minislam.splatting import GaussianMap, LearningRates, MapOptimizer
+from tests.helpers import generator
+
+CONFIG = DensityConfig()
+
+
+def map_of(scales: list[float], opacity_logit: float = 2.0) -> GaussianMap:
+    count = len(scales)
+    return GaussianMap(
+        torch.arange(count * 3.0).reshape(count, 3),
+        torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4).clone(),
+        torch.tensor(scales).log()[:, None].expand(count, 3).clone(),
+        torch.full((count,), opacity_logit),
+        torch.full((count, 3), 0.5),
+        torch.arange(count),
+    )
+
+
+# Known answers
+
+
+def test_screen_gradient_is_in_half_images_and_counts_only_views_that_see():
+    gradients = ScreenGradients(2)
+    camera = Camera(10.0, 10.0, 4.0, 2.0, 20, 10)
+    gradients.add(torch.tensor([[0.3, 0.0], [1.0, 1.0]]), torch.tensor([2.0, 0.0]), camera)
+    gradients.add(torch.tensor([[0.0, 0.2], [1.0, 1.0]]), torch.tensor([2.0, 0.0]), camera)
+    # (0.3 * 10 + 0.2 * 5) / 2 = 2.
+    assert gradients.mean.tolist() == pytest.approx([2.0, 0.0])
+
+
+def test_small_ones_are_cloned_and_large_ones_split():
+    optimizer = MapOptimizer(map_of([0.01, 0.01, 0.5]), LearningRates())
+    gradients = torch.tensor([1.0, 0.0, 1.0])
+    added = densify(optimizer, gradients, 1.0, CONFIG, generator(0))
+    gaussians = optimizer.gaussians
+    assert added == 2 and len(gaussians) == 5
+    # The large one is gone; a clone and two children, with the anchors of their parents.
+    assert gaussians.anchor_keyframe.tolist() == [0, 1, 0, 2, 2]
+    assert torch.equal(gaussians.means[2], gaussians.means[0])
+    torch.testing.assert_close(gaussians.scales[3:], torch.full((2, 3), 0.5 / 1.6))
+
+
+def test_faint_huge_and_broken_gaussians_are_not_useful():
+    gaussians = map_of([0.01, 0.01, 5.0, 0.01])
+    gaussians.opacity_logits[1] = -5
+    gaussians.means[3, 0] = torch.nan
+    assert useful_rows(gaussians, 1.0, CONFIG).tolist() == [True, False, False, False]
+
+
+# Identities
+
+
+def test_children_are_spread_like_their_parent():
+    parents = map_of([1.0] * 4000)
+    parents.means.zero_()
+    children = split(parents, 1.6, generator(1))
+    assert children.means.mean(0).abs().max() < 0.05
+    torch.testing.assert_close(children.means.std(0), torch.ones(3), rtol=0.05, atol=0)
+
+
+def test_no_more_than_the_largest_number_of_gaussians():
+    config = replace(CONFIG, max_gaussians=6)
+    optimizer = MapOptimizer(map_of([0.01] * 5), LearningRates())
+    gradients = torch.tensor([1.0, 5.0, 2.0, 3.0, 4.0])
+    assert densify(optimizer, gradients, 1.0, config, generator(0)) == 1
+    assert optimizer.gaussians.anchor_keyframe[-1] == 1
+    assert densify(optimizer, torch.ones(6), 1.0, config, generator(0)) == 0
+
+
+# Degenerate input
+
+
+def test_an_empty_map_stays_empty():
+    optimizer = MapOptimizer(GaussianMap.empty(), LearningRates())
+    assert densify(optimizer, torch.zeros(0), 1.0, CONFIG, generator(0)) == 0
+    assert useful_rows(optimizer.gaussians, 1.0, CONFIG).tolist() == []

@@ -1,0 +1,142 @@
+import pytest
+import torch
+
+from minislam.mapping import MappingConfig
+from minislam.mapping.losses import (
+    color_loss,
+    isotropic_loss,
+    render_loss,
+    ssim_loss,
+    weighted_depth_loss,
+)
+from minislam.splatting import GaussianMap, Rendering
+from tests.helpers import assert_gradients_close, generator, numerical_gradient
+
+
+def random_image(seed: int, height: int = 13, width: int = 15) -> torch.Tensor:
+    return torch.rand(height, width, 3, generator=generator(seed), dtype=torch.float64)
+
+
+# Known answers
+
+
+def test_ssim_of_two_constant_images_by_hand():
+    # Away from the border both variances vanish: SSIM = (2 a b + C1) / (a^2 + b^2 + C1).
+    first, second = torch.full((31, 31, 3), 0.2), torch.full((31, 31, 3), 0.6)
+    expected = 1 - (2 * 0.12 + 1e-4) / (0.04 + 0.36 + 1e-4)
+    assert float(ssim_loss(first, second)[15, 15]) == pytest.approx(expected, abs=1e-4)
+
+
+def test_color_loss_mixes_l1_and_ssim_and_skips_black_pixels():
+    image, rendered = random_image(0), random_image(1)
+    image[0, 0] = 0
+    loss = color_loss(rendered, image, 0.2)
+    expected = 0.8 * (rendered - image).abs().mean(-1) + 0.2 * ssim_loss(rendered, image)
+    assert loss[0, 0] == 0
+    torch.testing.assert_close(loss[1:], expected[1:])
+
+
+def test_depth_loss_ignores_beta_only_for_floaters():
+    reference = torch.tensor([[4.0, 4.0, 0.0, 40.0]])
+    rendered = torch.tensor([[3.5, 1.0, 3.0, 3.0]])
+    weight = torch.tensor([[0.1, 0.1, 1.0, 1.0]])
+    loss = weighted_depth_loss(rendered, reference, weight, 20.0, 1.0)
+    torch.testing.assert_close(loss, torch.tensor([[0.05, 3.0, 0.0, 0.0]]))
+
+
+def test_isotropic_loss_by_hand():
+    # Mean 2: distances 1, 0, 1; a ball costs nothing.
+    scales = torch.tensor([[1.0, 2.0, 3.0], [5.0, 5.0, 5.0]])
+    assert float(isotropic_loss(scales)) == pytest.approx(2 / 6)
+
+
+def one_gaussian() -> GaussianMap:
+    return GaussianMap(
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.zeros(1, 3),
+        torch.zeros(1),
+        torch.zeros(1, 3),
+        torch.zeros(1, dtype=torch.int64),
+    )
+
+
+def rendering_of(color: torch.Tensor, depth: torch.Tensor) -> Rendering:
+    return Rendering(color, depth, torch.ones_like(depth), torch.ones(1), torch.ones(1))
+
+
+# Identities
+
+
+def test_ssim_loss_of_equal_images_is_zero():
+    image = random_image(2)
+    assert float(ssim_loss(image, image).abs().max()) < 1e-12
+
+
+def test_pixels_of_weight_zero_do_not_pull_at_the_rendering_at_all():
+    # The SSIM part too is weighted per pixel: beyond its window nothing reaches the mover.
+    image, reference = random_image(3, 40, 40), torch.full((40, 40), 2.0, dtype=torch.float64)
+    weight = torch.ones(40, 40, dtype=torch.float64)
+    weight[:, 20:] = 0
+    color = random_image(4, 40, 40).requires_grad_()
+    depth = torch.full((40, 40), 1.9, dtype=torch.float64).requires_grad_()
+    loss = render_loss(
+        one_gaussian(), rendering_of(color, depth), image, reference, weight, 2.0, MappingConfig()
+    )
+    loss.total.backward()
+    assert color.grad[:, 26:].abs().max() == 0 and depth.grad[:, 20:].abs().max() == 0
+    assert (color.grad[:, :20].abs() > 0).float().mean() > 0.99
+
+
+def test_world_units_do_not_change_the_loss():
+    image, color = random_image(5), random_image(6)
+    depth, reference = random_image(7)[..., 0] + 2, random_image(8)[..., 0] + 2
+    weight, config = torch.ones(13, 15, dtype=torch.float64), MappingConfig()
+    losses = []
+    for unit in [1.0, 250.0]:
+        rendering = rendering_of(color, depth * unit)
+        loss = render_loss(
+            one_gaussian(), rendering, image, reference * unit, weight, 2.5 * unit, config
+        )
+        losses.append(float(loss.total))
+    assert losses[0] == pytest.approx(losses[1], rel=1e-9)
+
+
+# Gradients
+
+
+def test_color_loss_gradient_agrees_with_finite_differences():
+    image, rendered = random_image(9, 6, 7), random_image(10, 6, 7)
+    weight = random_image(11, 6, 7)[..., 0]
+    leaf = rendered.clone().requires_grad_()
+    (weight * color_loss(leaf, image, 0.2)).sum().backward()
+    expected = numerical_gradient(lambda x: (weight * color_loss(x, image, 0.2)).sum(), rendered)
+    assert_gradients_close(leaf.grad, expected, relative=1e-6)
+
+
+def test_isotropic_gradient_agrees_with_finite_differences():
+    scales = random_image(12, 4, 1)[:, 0]
+    leaf = scales.clone().requires_grad_()
+    isotropic_loss(leaf).backward()
+    assert_gradients_close(leaf.grad, numerical_gradient(isotropic_loss, scales), relative=1e-6)
+
+
+# Degenerate input
+
+
+def test_black_images_and_unknown_depth_give_zero_and_finite_gradients():
+    black = torch.zeros(12, 12, 3)
+    color = torch.zeros(12, 12, 3, requires_grad=True)
+    depth = torch.zeros(12, 12, requires_grad=True)
+    weight = torch.ones(12, 12)
+    loss = render_loss(
+        one_gaussian(),
+        rendering_of(color, depth),
+        black,
+        torch.zeros(12, 12),
+        weight,
+        1.0,
+        MappingConfig(),
+    )
+    loss.total.backward()
+    assert loss.total == 0 and torch.isfinite(color.grad).all()

@@ -1,0 +1,216 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from minislam.errors import InputError
+from minislam.geometry import se3_exp
+from minislam.mapping import InsertionConfig, Mapper, MappingConfig
+from minislam.uncertainty import UncertaintyConfig
+from tests.mapping.plane_scene import CAMERA, GRID, wall_keyframe
+
+CONFIG = MappingConfig(
+    image_scale=1.0,
+    init_iterations=60,
+    keyframe_iterations=5,
+    insertion=InsertionConfig(cell=2),
+)
+UNCERTAINTY = UncertaintyConfig(learning_rate=5e-3)
+
+
+def make_mapper(
+    config: MappingConfig = CONFIG, uncertainty: UncertaintyConfig = UNCERTAINTY
+) -> Mapper:
+    return Mapper(CAMERA, config, uncertainty, feature_dimension=3, seed=0)
+
+
+def psnr(first: torch.Tensor, second: torch.Tensor) -> float:
+    return float(-10 * ((first - second) ** 2).mean().log10())
+
+
+# Known answers
+
+
+def test_a_static_wall_is_learnt_and_seen_from_between_the_keyframes():
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0), wall_keyframe(2)])
+    held_out = wall_keyframe(1)
+    rendering = mapper.render(held_out.T_camera_world)
+    inner = (slice(2, -2), slice(2, -2))
+    assert psnr(rendering.color[inner], held_out.image[inner]) > 25
+    assert (rendering.depth[inner] - 2).abs().mean() < 0.1
+    assert mapper.history.uncertainty[-1] < mapper.history.uncertainty[0]
+
+
+def test_a_mover_becomes_uncertain_and_fades_from_the_map():
+    # The square is elsewhere in each keyframe: no static map can explain it.
+    mapper = make_mapper(replace(CONFIG, init_iterations=250))
+    mapper.initialise([wall_keyframe(k, mover_column=4 + 6 * k) for k in range(4)])
+    beta = mapper.predict_beta(wall_keyframe(0, mover_column=4).features)
+    assert beta[2, 1] > 3 * beta[0, 0]
+    empty = wall_keyframe(1)
+    assert psnr(mapper.render(empty.T_camera_world).color, empty.image) > 18
+
+
+def test_a_half_size_image_has_half_the_pixels_and_the_same_means():
+    mapper = make_mapper(replace(CONFIG, image_scale=0.5, init_iterations=1))
+    mapper.initialise([wall_keyframe(0)])
+    camera = CAMERA.resized(16, 12)
+    view = mapper.keyframes[0].view(camera)
+    assert view.image.shape == (12, 16, 3) and view.depth.shape == (12, 16)
+    torch.testing.assert_close(view.image[0, 0], wall_keyframe(0).image[:2, :2].mean((0, 1)))
+
+
+def test_shrinking_depth_averages_known_pixels_only():
+    keyframe = wall_keyframe(0)
+    keyframe.depth[0, 0] = 0
+    keyframe.depth[:2, 2:4] = 0
+    mapper = make_mapper(replace(CONFIG, image_scale=0.5, init_iterations=1))
+    mapper.initialise([keyframe])
+    depth = mapper.keyframes[0].view(CAMERA.resized(16, 12)).depth
+    assert float(depth[0, 0]) == pytest.approx(2.0) and depth[0, 1] == 0
+
+
+# Identities
+
+
+def test_two_runs_with_one_seed_are_equal_to_the_bit():
+    maps = []
+    for _ in range(2):
+        mapper = make_mapper(replace(CONFIG, init_iterations=10))
+        mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+        mapper.integrate(wall_keyframe(2))
+        mapper.refine(4)
+        maps.append(mapper)
+    first, second = maps
+    assert torch.equal(first.gaussians.means, second.gaussians.means)
+    assert torch.equal(first.mlp.weights[0], second.mlp.weights[0])
+    assert first.history.render == second.history.render
+
+
+def test_a_rigid_motion_of_all_keyframes_moves_the_map_with_them():
+    mapper = make_mapper(replace(CONFIG, init_iterations=10))
+    mapper.initialise([wall_keyframe(k) for k in range(3)])
+    old = torch.stack([keyframe.T_camera_world for keyframe in mapper.keyframes])
+    before = mapper.render(old[1]).color
+    motion = se3_exp(torch.tensor([0.3, 0.1, -0.2, 0.1, 0.4, 0.2], dtype=torch.float64))
+    mapper.update_keyframes(old @ motion)
+    after = mapper.render((old @ motion)[1]).color
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-4)
+
+
+def test_new_reference_depths_reach_map_and_views():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    mapper.initialise([wall_keyframe(0)])
+    poses = wall_keyframe(0).T_camera_world[None]
+    mapper.update_keyframes(poses, [torch.full((24, 32), 4.0)])
+    assert float(mapper.gaussians.means[:, 2].median()) == pytest.approx(4.0, rel=0.02)
+    assert float(mapper.keyframes[0].view(CAMERA).depth[0, 0]) == 4.0
+    mapper.update_keyframes(poses, [None])
+    assert float(mapper.keyframes[0].view(CAMERA).depth[0, 0]) == 4.0
+
+
+def test_covered_pixels_are_not_inserted_again():
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0)])
+    count = len(mapper.gaussians)
+    mapper.integrate(wall_keyframe(1))
+    # 0.1 to the right at depth 2 and 30 px of focal length uncovers 1.5 of 32 columns.
+    assert len(mapper.gaussians) - count < 0.25 * count
+
+
+# Gradients
+
+
+def test_each_loss_trains_only_its_own_side():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+    weights = [p.detach().clone() for p in mapper.mlp.parameters()]
+    means = mapper.gaussians.means.clone()
+
+    mapper._frozen_until = 10**9  # only L_render steps: the MLP must not move nor get a gradient
+    for parameter in mapper.mlp.parameters():
+        parameter.grad = None
+    mapper.refine(2)
+    assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
+    assert all(torch.equal(a, b) for a, b in zip(weights, mapper.mlp.parameters(), strict=True))
+    assert not torch.equal(means, mapper.gaussians.means)
+
+    leaves = mapper._optimizer.gaussians.parameters.values()
+    rendering = mapper.render(mapper.keyframes[0].T_camera_world)
+    mapper._train_mlp(0, mapper.keyframes[0].view(CAMERA), rendering)
+    assert all(leaf.grad is None for leaf in leaves)
+    assert not torch.equal(weights[0], mapper.mlp.weights[0])
+
+
+def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
+    mapper = make_mapper(replace(CONFIG, init_iterations=3), UncertaintyConfig(enabled=False))
+    mapper.initialise([wall_keyframe(0)])
+    assert torch.equal(mapper._weight(mapper.keyframes[0], CAMERA), torch.ones(24, 32))
+    assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
+
+
+# Degenerate input
+
+
+def test_sparse_depth_and_arbitrary_units_are_enough():
+    keyframes = []
+    for index in range(2):
+        keyframe = wall_keyframe(index)
+        depth = torch.zeros_like(keyframe.depth)
+        depth[::2, ::3] = 1000 * keyframe.depth[::2, ::3]
+        pose = keyframe.T_camera_world.clone()
+        pose[:3, 3] *= 1000
+        keyframes.append(replace(keyframe, depth=depth, T_camera_world=pose))
+    mapper = make_mapper()
+    mapper.initialise(keyframes)
+    assert mapper.median_depth == 2000
+    rendering = mapper.render(keyframes[0].T_camera_world)
+    inner = (slice(4, -4), slice(4, -4))
+    assert psnr(rendering.color[inner], keyframes[0].image[inner]) > 20
+
+
+def test_a_black_keyframe_without_depth_changes_nothing_for_the_worse():
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0)])
+    black = replace(wall_keyframe(1), image=torch.zeros(24, 32, 3), depth=torch.zeros(24, 32))
+    mapper.integrate(black)
+    assert torch.isfinite(mapper.gaussians.means).all()
+    first = wall_keyframe(0)
+    assert psnr(mapper.render(first.T_camera_world).color, first.image) > 20
+
+
+def test_one_keyframe_per_frame_index_gap_keeps_its_anchor():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    mapper.initialise([replace(wall_keyframe(0), keyframe_index=3)])
+    mapper.integrate(replace(wall_keyframe(3), keyframe_index=7))
+    assert set(mapper.gaussians.anchor_keyframe.tolist()) == {3, 7}
+    assert set(mapper._anchor_rows().tolist()) == {0, 1}
+
+
+def test_progress_counts_to_the_end():
+    calls = []
+    mapper = make_mapper(replace(CONFIG, init_iterations=3))
+    mapper.initialise([wall_keyframe(0)], lambda done, total: calls.append((done, total)))
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert GRID == tuple(mapper.predict_beta(wall_keyframe(0).features).shape)
+
+
+# Errors
+
+
+def test_impossible_calls_are_refused_in_one_sentence():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    with pytest.raises(InputError, match="initialise first"):
+        mapper.integrate(wall_keyframe(0))
+    with pytest.raises(InputError, match="at least one keyframe"):
+        mapper.initialise([])
+    with pytest.raises(InputError, match="some known depth"):
+        mapper.initialise([replace(wall_keyframe(0), depth=torch.zeros(24, 32))])
+    mapper.initialise([wall_keyframe(0)])
+    with pytest.raises(InputError, match="1 keyframes in the map, found 2"):
+        mapper.update_keyframes(torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+    with pytest.raises(InputError, match="image scale"):
+        MappingConfig(image_scale=0.0)
+    with pytest.raises(InputError, match="window of at least 3"):
+        MappingConfig(window_size=2)
