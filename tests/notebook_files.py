@@ -1,0 +1,48 @@
+"""Notebooks as files: where they are, how one is stored, and how a student copy is made."""
+
+import copy
+import json
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
+
+
+def load(path: Path) -> dict:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def source(cell: dict) -> str:
+    return "".join(cell["source"])
+
+
+def cleaned(notebook: dict) -> dict:
+    """Return the notebook without what differs from run to run: timings, versions, random ids."""
+    result = copy.deepcopy(notebook)
+    for number, cell in enumerate(result["cells"]):
+        cell["metadata"] = {}
+        cell["id"] = f"cell-{number:02d}"
+    result["metadata"] = {
+        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+        "language_info": {"name": "python"},
+    }
+    result["nbformat"], result["nbformat_minor"] = 4, 5
+    return result
+
+
+def without_solutions(notebook: dict) -> dict:
+    """Return the copy for students: each solution becomes `raise NotImplementedError`."""
+    result = copy.deepcopy(notebook)
+    for cell in result["cells"]:
+        if cell["cell_type"] == "code":
+            text = SOLUTION.sub(r"\1raise NotImplementedError  # your code here", source(cell))
+            cell["source"] = text.splitlines(keepends=True)
+            cell["outputs"], cell["execution_count"] = [], None
+    return result
+
+
+def as_text(notebook: dict) -> str:
+    return json.dumps(notebook, indent=1, ensure_ascii=False, sort_keys=True) + "\n"

@@ -1,0 +1,44 @@
+"""Run notebooks from top to bottom and store them with their outputs.
+
+python -m tests.refresh_notebooks                    all of them
+python -m tests.refresh_notebooks 01 03              those whose names start so
+python -m tests.refresh_notebooks --student out/     copies without solutions, not run
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.notebook_files import NOTEBOOKS, ROOT, as_text, cleaned, load, without_solutions
+
+
+def execute(path: Path) -> None:
+    """Run a notebook in a fresh kernel and store it in place."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--inplace"]
+    subprocess.run([*command, "--log-level=WARN", str(path)], check=True, env=environment)
+    store(path, cleaned(load(path)))
+
+
+def store(path: Path, notebook: dict) -> None:
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(as_text(notebook), encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def main(arguments: list[str]) -> None:
+    if arguments[:1] == ["--student"]:
+        folder = Path(arguments[1])
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in NOTEBOOKS:
+            store(folder / path.name, without_solutions(load(path)))
+        return
+    for path in NOTEBOOKS:
+        if not arguments or path.name.startswith(tuple(arguments)):
+            print(path.name, flush=True)
+            execute(path)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
