@@ -49,9 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("name", nargs="?", help="the sequence; --list shows them")
     parser.add_argument("--out", type=Path, help="the folder to write")
-    parser.add_argument(
-        "--seed", type=int, default=0, help="another camera path and other textures"
-    )
+    parser.add_argument("--seed", type=int, default=0, help="another path, other textures")
     parser.add_argument("--frames", type=int, default=100, help="at 30 Hz (default 100)")
     parser.add_argument("--size", default="320x240", help="width x height [px] (default 320x240)")
     parser.add_argument("--list", action="store_true", help="list the sequences")

@@ -244,7 +244,7 @@ def umbrella(
     side = np.array([0.0, 0.0, 1.0]) if abs((tip - grip)[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     T_world_stick = frame_along(grip, tip, side)
     length = float(np.linalg.norm(tip - grip))
-    radius = 0.08 + 0.6 * openness
+    radius = 0.08 + 0.52 * openness
     height = 0.62 - 0.3 * openness
     T_stick_dome = upright([0.0, 0.0, length / 2 - height])
     return [

@@ -72,13 +72,16 @@ class HandheldPath:
     phases: Array  # (3,) [rad]
     target: Array  # (3,) [m]
     target_reach: Array  # (3,) [m]
+    follow: float  # share of its own way by which the camera shifts its target; < 0 turns more
     tremble: Array  # (6, 4): amplitude [m, rad], frequency [Hz], phase [rad], second phase [rad]
 
     def __call__(self, time: float) -> Array:
         """Return T_world_camera (4, 4) at a time [s]."""
         angle = 2 * np.pi * self.cycles * time / CLIP_SECONDS + self.phases
-        position = self.centre + self.reach * np.sin(angle)
+        swing = self.reach * np.sin(angle)
+        position = self.centre + swing
         target = self.target + self.target_reach * np.sin(0.7 * angle + 1.0)
+        target = target + self.follow * swing
         amplitude, frequency, first, second = self.tremble.T
         shake = np.sin(2 * np.pi * frequency * time + first)
         shake = amplitude * (shake + 0.5 * np.sin(2 * np.pi * 1.83 * frequency * time + second))
@@ -99,7 +102,7 @@ def handheld_path(rng: np.random.Generator, centre: Array, target: Array) -> Han
     cycles = np.array([0.95, 0.75, 1.2]) * rng.uniform(0.9, 1.1, 3)
     phases = np.array([rng.uniform(-0.5, 0.5), rng.uniform(0, 6.28), rng.uniform(0, 6.28)])
     tremble = np.empty((6, 4))
-    tremble[:, 0] = np.repeat([0.003, 0.004], 3) * rng.uniform(0.7, 1.3, 6)
+    tremble[:, 0] = np.repeat([0.003, 0.006], 3) * rng.uniform(0.7, 1.3, 6)
     tremble[:, 1] = rng.uniform(1.2, 2.6, 6)
     tremble[:, 2:] = rng.uniform(0, 2 * np.pi, (6, 2))
     wanted = rng.uniform(4.2, 4.8)
@@ -109,6 +112,7 @@ def handheld_path(rng: np.random.Generator, centre: Array, target: Array) -> Han
         "phases": phases,
         "target": np.asarray(target) + rng.uniform(-0.12, 0.12, 3),
         "target_reach": np.array([0.22, 0.0, 0.1]) * rng.uniform(0.6, 1.2, 3),
+        "follow": -rng.uniform(0.25, 0.4),
         "tremble": tremble,
     }
     # The length is nearly proportional to the reach: a few corrections meet it.

@@ -172,7 +172,12 @@ _LIVING_ROOM_PICTURES = (
 )
 
 
-def workshop(rng: np.random.Generator, low_texture: bool = False) -> Room:
+def bare_room(rng: np.random.Generator) -> Room:
+    """Furnish the warm room in plain colours: little for a tracker to hold on to."""
+    return living_room(rng, low_texture=True)
+
+
+def workshop(rng: np.random.Generator) -> Room:
     """Furnish the cool room: a bench, crates, barrels, a cupboard, a pin board."""
     hue = 0.53 + rng.uniform(-0.03, 0.03)
     palette = [
@@ -183,12 +188,8 @@ def workshop(rng: np.random.Generator, low_texture: bool = False) -> Room:
         colour(hue + 0.03, 0.45, 0.34),
         colour(hue, 0.05, 0.95),
     ]
-    if low_texture:
-        covers = [surfaces.plaster(rng, (0.8, 0.8), tone) for tone in palette[:5]]
-    else:
-        covers = [surfaces.furniture(rng, tone) for tone in palette[:5]]
-    build = _Builder(rng, palette, covers)
-    build.parts.append(_shell(rng, palette, colour(hue + 0.05, 0.1, 0.5), low_texture))
+    build = _Builder(rng, palette, [surfaces.furniture(rng, tone) for tone in palette[:5]])
+    build.parts.append(_shell(rng, palette, colour(hue + 0.05, 0.15, 0.45), False))
 
     bench_top, y = (2.2, 0.62, 0.06), NORTH - 0.36
     bench = upright([-0.6, y, 0.82])
@@ -213,7 +214,7 @@ def workshop(rng: np.random.Generator, low_texture: bool = False) -> Room:
     build.clutter(build.block(stool, (1.5, 0.45)), stool, 1)
     mat = surfaces.rug(rng, (1.8, 1.2), palette[1:])
     build.add(Box((1.8, 1.2, 0.012)), upright([0.3, 0.6, 0.006], -0.15), mat)
-    for wall, along, up, size in _WORKSHOP_PICTURES[: 2 if low_texture else None]:
+    for wall, along, up, size in _WORKSHOP_PICTURES:
         build.picture(wall, along, up, size)
     return Room(
         parts=tuple(build.parts),
