@@ -1,7 +1,7 @@
 """Intrinsics: from a file, from a known benchmark, or guessed and said so."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from minislam.data.files import data_rows, finite_numbers, read_text
@@ -71,7 +71,7 @@ def guessed_calibration(width: int, height: int) -> Calibration:
 
 def read_calibration(path: Path) -> Calibration:
     """Read `fx fy cx cy [width height [k1 k2 p1 p2 k3]]` from a text file."""
-    return parse_calibration(read_text(path), str(path))
+    return replace(parse_calibration(read_text(path), str(path)), origin=path.name)
 
 
 def parse_calibration(text: str, name: str) -> Calibration:

@@ -36,7 +36,7 @@ def keyframe_strip(
         "render": render,
     }
     for axes, (name, picture) in zip(figure.subplots(1, 4), pictures.items(), strict=True):
-        show_image(axes, picture, name)
+        show_image(axes, picture, name, image.shape[:2])
     if title:
         figure.suptitle(title, fontsize=10)
     return figure
@@ -96,7 +96,7 @@ def overview(
     figure = new_figure((12.0, 2.6))
     axes = figure.subplots(1, 4)
     show_image(axes[0], image, "input frame")
-    show_image(axes[1], beta_to_rgb(beta), "uncertainty beta")
+    show_image(axes[1], beta_to_rgb(beta), "uncertainty beta", image.shape[:2])
     show_image(axes[2], render, "static map, same view")
     _draw_path(axes[3], estimate, truth, 2, unit)
     return figure

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 WIDE, SQUARE, STRIP = (9.0, 3.0), (4.0, 4.0), (9.0, 2.0)  # inch
 
-TRUTH_STYLE = {"color": "black", "linestyle": "--", "linewidth": 1.2}
+TRUTH_STYLE = {"color": "black", "linestyle": "--", "linewidth": 1.2, "zorder": 3}  # on top
 ESTIMATE_STYLE = {"color": "tab:blue", "linestyle": "-", "linewidth": 1.4}
 DYNAMIC_COLOR = "tab:orange"
 DEPTH_COLORMAP, BETA_COLORMAP, ERROR_COLORMAP = "viridis", "magma", "RdBu_r"
@@ -36,9 +36,16 @@ def figure_png(figure: Figure, dpi: float = _DPI) -> bytes:
     return buffer.getvalue()
 
 
-def show_image(axes: Axes, image: np.ndarray, title: str) -> None:
-    """Draw (H, W, 3) RGB in [0, 1] without axes."""
-    axes.imshow(np.clip(image, 0, 1), interpolation="nearest")
+def show_image(
+    axes: Axes,
+    image: np.ndarray,  # (h, w, 3) RGB in [0, 1]
+    title: str,
+    size: tuple[int, int] | None = None,  # (H, W) px to stretch a coarse grid to
+) -> None:
+    """Draw a picture without axes."""
+    height, width = size or image.shape[:2]
+    area = (-0.5, width - 0.5, height - 0.5, -0.5)  # the centre of the first pixel is (0, 0)
+    axes.imshow(np.clip(image, 0, 1), interpolation="nearest", extent=area)
     axes.set_title(title, fontsize=9)
     axes.set_axis_off()
 

@@ -1,0 +1,96 @@
+"""Intrinsics from files, from known benchmarks, and the guess."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from minislam.data.calibration import (
+    guessed_calibration,
+    known_tum_camera,
+    parse_calibration,
+    read_calibration,
+)
+from minislam.errors import InputError
+from minislam.geometry import BrownDistortion, Camera
+
+# Known answers
+
+
+def test_four_six_and_eleven_numbers(tmp_path: Path):
+    path = tmp_path / "calibration.txt"
+    path.write_bytes(b"\xef\xbb\xbf# fx fy cx cy\r\n500 501 320 240\r\n")
+    assert read_calibration(path).camera_for(640, 480) == Camera(500, 501, 320, 240, 640, 480)
+    six = parse_calibration("500, 501, 320, 240, 640, 480", "six")
+    assert six.size == (640, 480)
+    eleven = parse_calibration("500 501 320 240 640 480 0.1 0.2 0.3 0.4 0.5", "eleven")
+    assert eleven.distortion == BrownDistortion(0.1, 0.2, 0.3, 0.4, 0.5)
+
+
+def test_a_calibration_is_carried_to_images_resized_by_half():
+    calibration = parse_calibration("500 500 319.5 239.5 640 480", "c")
+    assert calibration.camera_for(320, 240) == Camera(250, 250, 159.5, 119.5, 320, 240)
+
+
+@pytest.mark.parametrize(
+    "text, camera",
+    [
+        ("rgbd_dataset_freiburg1_desk", "fr1"),
+        ("fr2_desk", "fr2"),
+        ("Freiburg3 walking_xyz", "fr3"),
+        ("tum_fr3", "fr3"),
+        ("africa_fr10", None),
+        ("suffr1ce", None),
+        ("freiburg", None),
+    ],
+)
+def test_tum_cameras_are_known_by_name(text: str, camera: str | None):
+    found = known_tum_camera(text)
+    assert (found and found.origin) == (camera and f"TUM {camera} intrinsics")
+
+
+def test_fr3_has_no_distortion_and_fr1_has():
+    assert not np.any(known_tum_camera("fr3").distortion.coefficients)
+    assert known_tum_camera("fr1").distortion.k1 == 0.2624
+
+
+def test_the_guess_is_a_field_of_view_of_about_sixty_degrees():
+    for width, height in ((1280, 720), (720, 1280)):
+        camera = guessed_calibration(width, height).camera_for(width, height)
+        angle = 2 * np.degrees(np.arctan(max(width, height) / 2 / camera.fx))
+        assert 55 < angle < 65
+        assert (camera.cx, camera.cy) == ((width - 1) / 2, (height - 1) / 2)
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "found 0"),
+        ("500 500 320", "found 3"),
+        ("500 500 320 240 640", "found 5"),
+        ("500 500 320 240 640 480 0.1", "found 7"),
+        ("500 abc 320 240", "finite"),
+        ("500 nan 320 240", "finite"),
+        ("-500 500 320 240", "positive focal"),
+        ("500 0 320 240", "positive focal"),
+        ("500 500 320 240 640.5 480", "whole"),
+        ("500 500 320 240 0 480", "whole"),
+    ],
+)
+def test_wrong_calibrations_name_the_file(text: str, message: str):
+    with pytest.raises(InputError, match=message) as caught:
+        parse_calibration(text, "kinect.txt")
+    assert "kinect.txt" in str(caught.value)
+
+
+def test_a_centre_outside_the_image_is_refused():
+    with pytest.raises(InputError, match=r"cal.*principal point inside"):
+        parse_calibration("500 500 700 240", "cal").camera_for(640, 480)
+
+
+def test_images_of_another_shape_are_refused():
+    with pytest.raises(InputError, match="do not match"):
+        parse_calibration("500 500 320 240 640 480", "cal").camera_for(1280, 720)

@@ -1,0 +1,110 @@
+"""Files are written whole or not at all, and unreadable ones give one sentence."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from minislam.data import files
+from minislam.data.files import (
+    atomic_write,
+    data_rows,
+    finite_numbers,
+    read_bytes,
+    read_json,
+    read_text,
+    write_json,
+)
+from minislam.errors import InputError
+
+# Known answers
+
+
+def test_a_file_is_replaced_and_nothing_else_is_left(tmp_path: Path):
+    path = tmp_path / "map.ply"
+    atomic_write(path, b"old")
+    atomic_write(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_json_has_no_nan(tmp_path: Path):
+    write_json(tmp_path / "m.json", {"psnr": float("inf"), "list": [1, float("nan")], "name": "ä"})
+    assert read_json(tmp_path / "m.json") == {"psnr": None, "list": [1, None], "name": "ä"}
+
+
+def test_rows_skip_comments_and_blank_lines_but_keep_their_numbers():
+    assert data_rows("# head\r\n\r\n 1 2 \r\n#x\n3\n") == [(3, "1 2"), (5, "3")]
+
+
+def test_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path: Path):
+    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf1 2\r\n3 4\r\n")
+    assert data_rows(read_text(tmp_path / "a.txt")) == [(1, "1 2"), (2, "3 4")]
+
+
+# A crash between the two steps
+
+
+def test_a_writer_killed_before_the_exchange_leaves_the_old_file(tmp_path: Path):
+    path = tmp_path / "trajectory.txt"
+    path.write_bytes(b"old")
+    program = (
+        "import os, sys\n"
+        "from minislam.data import files\n"
+        "os.replace = lambda *_: os._exit(9)\n"
+        "files.atomic_write(sys.argv[1], b'new' * 1000)\n"
+    )
+    root = Path(files.__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    ended = subprocess.run([sys.executable, "-c", program, str(path)], env=environment)
+    assert ended.returncode == 9
+    assert path.read_bytes() == b"old"
+    atomic_write(path, b"newer")  # what the dead writer left is no obstacle
+    assert path.read_bytes() == b"newer"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_exchange_leaves_no_temporary_file(tmp_path: Path, monkeypatch):
+    path = tmp_path / "trajectory.txt"
+    path.write_bytes(b"old")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(files.os, "replace", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        atomic_write(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# Errors
+
+
+def test_writing_where_there_is_no_folder_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="be able to write"):
+        atomic_write(tmp_path / "missing" / "a.txt", b"")
+
+
+def test_missing_and_binary_files_are_named(tmp_path: Path):
+    with pytest.raises(InputError, match=r"nothing\.txt"):
+        read_bytes(tmp_path / "nothing.txt")
+    with pytest.raises(InputError, match="check the path"):
+        read_bytes("a\0b")
+    (tmp_path / "b.txt").write_bytes(b"1 2 \xff\xfe")
+    with pytest.raises(InputError, match=r"byte 4 of .*b\.txt"):
+        read_text(tmp_path / "b.txt")
+
+
+def test_broken_json_is_named(tmp_path: Path):
+    (tmp_path / "c.json").write_text('{"a": 1,}')
+    with pytest.raises(InputError, match=r"c\.json.*line 1"):
+        read_json(tmp_path / "c.json")
+
+
+@pytest.mark.parametrize("field", ["nan", "inf", "-Infinity", "1e999", "abc", "0x10", "1,5"])
+def test_only_finite_numbers_pass(field: str):
+    with pytest.raises(InputError, match="line 4 of x"):
+        finite_numbers(["1", field], "line 4 of x")

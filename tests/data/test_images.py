@@ -1,0 +1,117 @@
+"""Pictures as cameras write them: accepted kinds, and damaged files."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recordings import picture, save
+
+from minislam.data.images import (
+    encode_png,
+    list_images,
+    natural_key,
+    read_color,
+    read_depth,
+    read_mask,
+)
+from minislam.errors import InputError
+
+# Known answers
+
+
+def test_png_is_read_as_rgb(tmp_path: Path):
+    image = picture(3)
+    np.testing.assert_array_equal(read_color(save(tmp_path / "a.png", image)), image)
+
+
+def test_grey_alpha_and_sixteen_bits_become_rgb(tmp_path: Path):
+    grey = picture(1)[..., 0]
+    expected = np.repeat(grey[..., None], 3, axis=2)
+    np.testing.assert_array_equal(read_color(save(tmp_path / "grey.png", grey)), expected)
+    alpha = np.dstack([picture(1)[..., ::-1], np.full_like(grey, 128)])  # BGRA
+    np.testing.assert_array_equal(read_color(save(tmp_path / "alpha.png", alpha)), picture(1))
+    deep = picture(1).astype(np.uint16) * 257  # 255 -> 65535
+    np.testing.assert_array_equal(read_color(save(tmp_path / "deep.png", deep)), picture(1))
+
+
+def test_depth_is_in_metres_and_zero_stays_unknown(tmp_path: Path):
+    path = save(tmp_path / "d.png", np.array([[0, 5000], [10000, 65535]], np.uint16))
+    np.testing.assert_allclose(read_depth(path, 5000), [[0, 1], [2, 13.107]])
+    assert read_depth(path, 5000).dtype == np.float32
+
+
+def test_mask_is_true_where_white(tmp_path: Path):
+    path = save(tmp_path / "m.png", np.array([[0, 255], [127, 128]], np.uint8))
+    np.testing.assert_array_equal(read_mask(path), [[False, True], [False, True]])
+
+
+def test_natural_order_of_300_files(tmp_path: Path):
+    names = [f"frame {number}.png" for number in range(300)]
+    for name in np.random.default_rng(0).permutation(names):
+        save(tmp_path / str(name), picture(0, 8, 8))
+    save(tmp_path / ".hidden.png", picture(0, 8, 8))
+    (tmp_path / "notes.txt").write_text("no picture")
+    assert [path.name for path in list_images(tmp_path)] == names
+
+
+def test_names_of_all_kinds_can_be_compared():
+    names = ["10.png", "a2.png", "2.png", "a10.png", "", "1a.png", "²3.png", "٣.png"]
+    assert sorted(names, key=natural_key)[0] == ""
+    assert sorted(["b10", "b9", "a11"], key=natural_key) == ["a11", "b9", "b10"]
+
+
+# Identities
+
+
+def test_encoded_png_is_read_back(tmp_path: Path):
+    image = picture(5)
+    for version in (image, image.astype(np.float32) / 255, image.astype(np.float64) / 255):
+        (tmp_path / "x.png").write_bytes(encode_png(version))
+        np.testing.assert_array_equal(read_color(tmp_path / "x.png"), image)
+    assert encode_png(image) == encode_png(image)
+
+
+def test_unicode_spaces_and_percent_in_names(tmp_path: Path):
+    path = save(tmp_path / "été 50 % 画像.png", picture(2))
+    np.testing.assert_array_equal(read_color(path), picture(2))
+
+
+# Errors
+
+
+def damaged(tmp_path: Path, kind: str) -> Path:
+    if kind == "text":
+        path = tmp_path / "text.png"
+        path.write_text("I am not a picture.")
+        return path
+    suffix = kind.split()[1]
+    path = save(tmp_path / f"damaged.{suffix}", picture(1, 64, 48))
+    content = path.read_bytes()
+    path.write_bytes(b"" if kind.startswith("empty") else content[: int(len(content) * 0.7)])
+    return path
+
+
+@pytest.mark.parametrize("kind", ["text", "cut png", "cut jpg", "empty png", "empty jpg"])
+def test_damaged_pictures_are_refused_with_their_name(tmp_path: Path, kind: str):
+    path = damaged(tmp_path, kind)
+    with pytest.raises(InputError, match=path.name):
+        read_color(path)
+
+
+def test_a_cut_jpeg_with_a_whole_thumbnail_is_refused(tmp_path: Path):
+    content = save(tmp_path / "a.jpg", picture(1, 64, 48)).read_bytes()
+    # An application segment of the header carries a small JPEG of its own, end marker included.
+    thumbnail = cv2.imencode(".jpg", picture(2, 16, 16))[1].tobytes()
+    segment = b"\xff\xe5" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    whole = content[:2] + segment + content[2:]
+    (tmp_path / "whole.jpg").write_bytes(whole)
+    assert read_color(tmp_path / "whole.jpg").shape == (48, 64, 3)
+    (tmp_path / "cut.jpg").write_bytes(whole[:-40])
+    with pytest.raises(InputError, match="cut"):
+        read_color(tmp_path / "cut.jpg")
+
+
+def test_colour_is_no_depth(tmp_path: Path):
+    with pytest.raises(InputError, match="16-bit single-channel"):
+        read_depth(save(tmp_path / "c.png", picture(0)), 5000)
