@@ -56,7 +56,7 @@ def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
     columns = {name: column for column, name in enumerate(names)}
 
     def fill(first: str, values: np.ndarray) -> None:
-        values = values.reshape(count, -1)
+        values = values if values.ndim == 2 else values[:, None]
         table[:, columns[first] : columns[first] + values.shape[1]] = values
 
     fill("x", gaussians.means)

@@ -1,5 +1,6 @@
 """Trajectories in the TUM format: `timestamp tx ty tz qx qy qz qw`, camera to world."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ def parse_trajectory(text: str, name: str) -> Trajectory:
                 f"expected 8 columns, {_COLUMNS}, found {len(fields)} in {where}; correct this line"
             )
         numbers = finite_numbers(fields, where)
-        if not abs(np.linalg.norm(numbers[4:]) - 1) <= _QUATERNION_NORM_TOLERANCE:
+        if not abs(math.hypot(*numbers[4:]) - 1) <= _QUATERNION_NORM_TOLERANCE:
             raise InputError(
                 f"expected a unit quaternion qx qy qz qw, found {' '.join(fields[4:])} in {where}; "
                 "check the order of the columns"

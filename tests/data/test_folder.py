@@ -1,0 +1,63 @@
+"""Image folders: order, timestamps, names."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import picture, save
+
+from minislam.data.folder import folder_name, read_image_folder
+from minislam.errors import InputError
+
+# Known answers
+
+
+@pytest.mark.parametrize("inner", ["", "images", "rgb"])
+def test_images_in_natural_order_counted_at_thirty_hertz(tmp_path: Path, inner: str):
+    for number in (10, 9, 1):
+        save(tmp_path / inner / f"frame{number}.jpg", picture(number))
+    save(tmp_path / inner / ".frame0.jpg", picture(0))
+    recording = read_image_folder(tmp_path)
+    assert [path.name for path in recording.images.paths] == [f"frame{n}.jpg" for n in (1, 9, 10)]
+    np.testing.assert_allclose(recording.timestamps, [0, 1 / 30, 2 / 30])
+    assert "counted at 30" in recording.notes[0]
+
+
+def test_numeric_names_are_the_timestamps(tmp_path: Path):
+    for name in ("7.50.png", "12.PNG".lower(), "101.jpeg"):
+        save(tmp_path / name, picture(0))
+    np.testing.assert_array_equal(read_image_folder(tmp_path).timestamps, [7.5, 12, 101])
+
+
+def test_a_calibration_beside_the_images_is_used(tmp_path: Path):
+    save(tmp_path / "images/a.png", picture(0))
+    (tmp_path / "calibration.txt").write_text("50 50 20 16")
+    assert read_image_folder(tmp_path).calibration.fx == 50
+
+
+@pytest.mark.parametrize(
+    "path, name", [("a/my video", "my_video"), ("x/..hidden", "hidden"), ("x/é 1.5", "é_1.5")]
+)
+def test_names_can_be_used_for_folders(path: str, name: str):
+    assert folder_name(Path(path)) == name
+
+
+# Errors
+
+
+def test_an_empty_folder_is_refused_and_the_likely_mistake_named(tmp_path: Path):
+    with pytest.raises(InputError, match="found none"):
+        read_image_folder(tmp_path)
+    (tmp_path / "clip").mkdir()
+    with pytest.raises(InputError, match=r"perhaps you mean .*clip"):
+        read_image_folder(tmp_path)
+    (tmp_path / "walk.MP4").write_bytes(b"")
+    with pytest.raises(InputError, match=r"give the video itself, .*walk\.MP4"):
+        read_image_folder(tmp_path)
+
+
+def test_two_files_with_one_stamp_are_refused(tmp_path: Path):
+    save(tmp_path / "01.png", picture(0))
+    save(tmp_path / "1.png", picture(0))
+    with pytest.raises(InputError, match=r"01\.png and 1\.png|1\.png and 01\.png"):
+        read_image_folder(tmp_path)

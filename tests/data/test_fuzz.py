@@ -1,0 +1,92 @@
+"""Two thousand random mutations of a valid file per parser: finite values, or InputError."""
+
+import random
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from minislam.data.calibration import parse_calibration
+from minislam.data.ply import GaussianArrays, decode_ply, encode_ply
+from minislam.data.trajectory import parse_trajectory
+from minislam.data.tum import parse_image_list
+from minislam.errors import InputError
+
+MUTATIONS = 2000
+_TEXT_PIECES = [
+    "nan", "inf", "-", "1e400", "#", "\n", " ", "\t", ",", "\0", "0", "-1", "\ufeff", "é", "1_0",
+]  # fmt: skip
+
+
+def mutated_text(text: str, source: random.Random) -> str:
+    """Return the text with one to three pieces deleted, doubled or replaced."""
+    for _ in range(source.randint(1, 3)):
+        start = source.randrange(len(text) + 1)
+        end = min(len(text), start + source.randint(0, 12))
+        piece = source.choice([*_TEXT_PIECES, "", text[start:end] * 2])
+        text = text[:start] + piece + text[end:]
+    return text
+
+
+def mutated_bytes(content: bytes, source: random.Random) -> bytes:
+    """Return the bytes with one to three bytes changed, ranges removed or doubled."""
+    changed = bytearray(content)
+    for _ in range(source.randint(1, 3)):
+        start = source.randrange(max(len(changed), 1))
+        end = start + source.randint(1, 8)
+        random_bytes = bytes(source.randrange(256) for _ in range(end - start))
+        changed[start:end] = source.choice([b"", random_bytes, changed[start:end] * 2])
+    return bytes(changed)
+
+
+def check_list(text: str) -> None:
+    stamps, names = parse_image_list(text, "x")
+    assert np.isfinite(stamps).all() and (np.diff(stamps) > 0).all() and len(stamps) == len(names)
+
+
+def check_trajectory(text: str) -> None:
+    trajectory = parse_trajectory(text, "x")
+    assert np.isfinite(trajectory.T_world_camera).all()
+    assert (np.diff(trajectory.timestamps) > 0).all()
+
+
+def check_calibration(text: str) -> None:
+    camera = parse_calibration(text, "x").camera_for(64, 48)
+    values = [camera.fx, camera.fy, camera.cx, camera.cy]
+    assert np.isfinite(values).all() and camera.fx > 0
+
+
+LIST = "# timestamp filename\n1.5 rgb/1.5.png\n2.25 rgb/2.25.png\n3.0 rgb/3.0.png\n"
+TRAJECTORY = "# timestamp ...\n1.0 0.1 0.2 0.3 0 0 0.6 0.8\n2.0 1.1 0.2 0.3 1 0 0 0\n"
+CALIBRATION = "# fx fy cx cy\n50.5 50.5 31.5 23.5 64 48 0.1 -0.2 0.001 0.002 0.05\n"
+
+
+@pytest.mark.parametrize(
+    "check, valid",
+    [(check_list, LIST), (check_trajectory, TRAJECTORY), (check_calibration, CALIBRATION)],
+)
+def test_mutated_text_files(check: Callable[[str], None], valid: str):
+    source, refused = random.Random(0), 0
+    check(valid)
+    for _ in range(MUTATIONS):
+        try:
+            check(mutated_text(valid, source))
+        except InputError:
+            refused += 1
+    assert 0 < refused < MUTATIONS
+
+
+def test_mutated_maps():
+    values = np.random.default_rng(0).normal(size=(4, 14)).astype(np.float32)
+    arrays = GaussianArrays(values[:, :3], values[:, 3:6], values[:, 6:10], values[:, 10],
+                            values[:, 11:])  # fmt: skip
+    valid, source, refused = encode_ply(arrays), random.Random(0), 0
+    for _ in range(MUTATIONS):
+        try:
+            read = decode_ply(mutated_bytes(valid, source), "x")
+        except InputError:
+            refused += 1
+            continue
+        for array in (read.means, read.log_scales, read.quats_wxyz, read.colors):
+            assert np.isfinite(array).all()
+    assert 0 < refused < MUTATIONS

@@ -1,0 +1,157 @@
+"""open_sequence: what is found, which frames are chosen, where the camera comes from."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import picture, save, tum_folder, video
+
+from minislam.data import InputOptions, open_sequence
+from minislam.errors import InputError
+from minislam.geometry import Camera
+
+# Known answers
+
+
+def test_a_tum_folder_with_all_extras(tmp_path: Path):
+    sequence = open_sequence(str(tum_folder(tmp_path / "desk")))
+    assert len(sequence) == 6 and sequence.name == "desk" and sequence.warnings == []
+    assert sequence.camera == Camera(40, 41, 23, 16, 48, 32)
+    assert sequence.description == (
+        "TUM RGB-D folder: 6 of 6 images, 6 depth, ground truth 0.5 s, 48x32 -> 48x32 px, "
+        "calibration.txt"
+    )
+    frame = sequence.frame(2)
+    np.testing.assert_array_equal(frame.image.numpy(), picture(2).astype(np.float32) / 255)
+    truth = sequence.ground_truth
+    assert truth.moving_mask(2)[:, :24].all() and not truth.moving_mask(2)[:, 24:].any()
+    np.testing.assert_allclose(truth.depth(2), np.float32(5002 / 5000))
+    np.testing.assert_allclose(truth.static_image(2), picture(20) / 255, atol=1e-6)
+    views = truth.novel_views()
+    assert views[1][0][1, 3] == 1 and views[1][1].shape == (32, 48, 3)
+
+
+def test_start_and_stride_keep_the_timestamps_of_the_source(tmp_path: Path):
+    options = InputOptions(start=1, stride=2, max_frames=2)
+    sequence = open_sequence(str(tum_folder(tmp_path)), options)
+    frames = list(sequence)
+    assert [frame.frame_index for frame in frames] == [0, 1]
+    np.testing.assert_allclose([frame.timestamp for frame in frames], [100.1, 100.3])
+    np.testing.assert_allclose(sequence.sensor_depth(1), np.float32(5003 / 5000))
+
+
+def test_a_video_keeps_the_time_of_skipped_frames(tmp_path: Path):
+    options = InputOptions(start=2, stride=3, max_frames=3)
+    sequence = open_sequence(str(video(tmp_path / "v.mp4", rate=10)), options)
+    frames = list(sequence)
+    np.testing.assert_allclose([frame.timestamp for frame in frames], [0.2, 0.5, 0.8])
+    again = sequence.frame(0)
+    np.testing.assert_array_equal(again.image.numpy(), frames[0].image.numpy())
+    assert abs(float(frames[2].image[50, 80, 0]) * 255 - 160) <= 4
+
+
+def test_an_unknown_focal_length_is_guessed_and_said(tmp_path: Path):
+    for number in range(3):
+        save(tmp_path / f"{number}.png", picture(number, 64, 48))
+    sequence = open_sequence(str(tmp_path))
+    assert sequence.camera.fx == pytest.approx(0.85 * 64)
+    assert len(sequence.warnings) == 1 and "--fx" in sequence.warnings[0]
+    assert sequence.ground_truth is None and sequence.sensor_depth(0) is None
+
+
+def test_what_the_user_gives_wins(tmp_path: Path):
+    folder = str(tum_folder(tmp_path / "a"))
+    assert open_sequence(folder, InputOptions(fx=60.0)).camera == Camera(60, 60, 23, 16, 48, 32)
+    assert open_sequence(folder, InputOptions(cx=20.0)).camera == Camera(40, 41, 20, 16, 48, 32)
+    (tmp_path / "other.txt").write_text("100 100 47.5 31.5 96 64")
+    given = InputOptions(calibration=str(tmp_path / "other.txt"))
+    assert open_sequence(folder, given).camera == Camera(50, 50, 23.5, 15.5, 48, 32)
+    (tmp_path / "a/calibration.txt").unlink()
+    guessed = open_sequence(folder)
+    known = open_sequence(folder, InputOptions(fx=60.0))
+    assert len(guessed.warnings) == 1 and known.warnings == []
+    assert known.camera == Camera(60, 60, 23.5, 15.5, 48, 32)
+
+
+def test_the_size_given_is_exact(tmp_path: Path):
+    folder = str(tum_folder(tmp_path))
+    sequence = open_sequence(folder, InputOptions(size=(20, 17)))
+    frame = sequence.frame(0)
+    assert frame.image.shape == (17, 20, 3)
+    assert sequence.ground_truth.moving_mask(0).shape == (17, 20)
+    assert sequence.sensor_depth(0).shape == (17, 20)
+
+
+def test_a_synthetic_sequence_is_read_with_its_truth(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path))
+    options = InputOptions(max_frames=3, size=(64, 48))
+    sequence = open_sequence("synth:static:3", options)
+    assert sequence.name == "static-3" and len(sequence) == 3 and sequence.warnings == []
+    assert sequence.camera.width == 64
+    assert len(sequence.ground_truth.trajectory) == 3
+    assert not sequence.ground_truth.moving_mask(0).any()
+    np.testing.assert_allclose(sequence.frame(1).timestamp, 1 / 30, atol=1e-6)
+
+
+# Identities
+
+
+def test_walking_twice_gives_the_same_frames(tmp_path: Path):
+    sequence = open_sequence(str(tum_folder(tmp_path)))
+    for first, second in zip(sequence, sequence, strict=True):
+        assert first.timestamp == second.timestamp
+        np.testing.assert_array_equal(first.image.numpy(), second.image.numpy())
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    "source", ["missing", "synth:nobody", "synth:crowd:x", "synth:", "empty", "notes.txt"]
+)
+def test_wrong_sources_give_one_sentence(tmp_path: Path, monkeypatch, source: str):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").write_text("hello")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="expected") as caught:
+        open_sequence(source)
+    assert source in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_images_of_another_size_are_named(tmp_path: Path):
+    save(tmp_path / "1.png", picture(1))
+    save(tmp_path / "2.png", picture(1, 32, 48))
+    sequence = open_sequence(str(tmp_path))
+    with pytest.raises(InputError, match=r"one size, 48x32.*found 32x48 in .*2\.png"):
+        list(sequence)
+
+
+def test_one_pixel_images_are_refused(tmp_path: Path):
+    save(tmp_path / "1.png", picture(1, 1, 1))
+    with pytest.raises(InputError, match="found 1x1"):
+        open_sequence(str(tmp_path))
+
+
+def test_a_start_behind_the_end_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="has 6; choose a smaller start"):
+        open_sequence(str(tum_folder(tmp_path)), InputOptions(start=6))
+
+
+@pytest.mark.parametrize(
+    "field, value",
+    [
+        ("start", -1), ("stride", 0), ("max_frames", 0), ("size", (8, 240)), ("fx", float("nan")),
+        ("depth_scale", 0.0), ("pixels", 0),
+    ],
+)  # fmt: skip
+def test_impossible_options_are_refused(field: str, value: object):
+    with pytest.raises(InputError, match="expected"):
+        replace(InputOptions(), **{field: value})
+
+
+def test_a_frame_outside_the_sequence_is_an_index_error(tmp_path: Path):
+    sequence = open_sequence(str(tum_folder(tmp_path)))
+    for index in (-1, 6):
+        with pytest.raises(IndexError):
+            sequence.frame(index)

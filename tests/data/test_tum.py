@@ -1,0 +1,109 @@
+"""TUM RGB-D folders and the extras of a synthetic sequence."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import picture, save, tum_folder
+
+from minislam.data.tum import is_tum_folder, parse_image_list, read_tum_folder
+from minislam.errors import InputError
+
+# Known answers
+
+
+def test_everything_in_the_folder_is_found(tmp_path: Path):
+    recording = read_tum_folder(tum_folder(tmp_path / "my run"))
+    assert recording.name == "my_run"
+    np.testing.assert_allclose(recording.timestamps, 100 + np.arange(6) / 10)
+    assert [path.stem for path in recording.depth_paths] == [f"100.{n}00000" for n in range(6)]
+    assert all(recording.mask_paths) and all(recording.static_paths)
+    assert len(recording.trajectory) == 6 and len(recording.novel_views) == 2
+    assert recording.calibration.fx == 40
+
+
+def test_a_folder_without_lists_is_recognised_by_its_stamps(tmp_path: Path):
+    for number in range(3):
+        save(tmp_path / f"rgb/13.{number}50.png", picture(number))
+    assert is_tum_folder(tmp_path)
+    np.testing.assert_allclose(read_tum_folder(tmp_path).timestamps, [13.05, 13.15, 13.25])
+
+
+def test_frame_numbers_are_not_stamps(tmp_path: Path):
+    save(tmp_path / "rgb/00001.png", picture(0))
+    assert not is_tum_folder(tmp_path)
+
+
+def test_depth_is_associated_by_nearest_stamp(tmp_path: Path):
+    tum_folder(tmp_path)
+    near, far = "depth/100.000000.png", "depth/100.300000.png"
+    (tmp_path / "depth.txt").write_text(f"100.015 {near}\n100.33 {far}\n")
+    paths = read_tum_folder(tmp_path).depth_paths
+    assert paths == [tmp_path / near, None, None, None, None, None]
+
+
+@pytest.mark.parametrize("where", ["README.md", "rgb.txt", "folder"])
+def test_the_camera_is_known_by_name(tmp_path: Path, where: str):
+    folder = tum_folder(tmp_path / ("rgbd_freiburg2_xyz" if where == "folder" else "desk"))
+    (folder / "calibration.txt").unlink()
+    if where == "README.md":
+        (folder / "README.md").write_text("# TUM fr2_desk\n")
+    if where == "rgb.txt":
+        text = (folder / "rgb.txt").read_text()
+        (folder / "rgb.txt").write_text("# file: 'rgbd_dataset_freiburg2_desk.bag'\n" + text)
+    assert read_tum_folder(folder).calibration.fx == 520.9
+
+
+def test_names_with_spaces_percent_and_unicode(tmp_path: Path):
+    folder = tmp_path / "日本 50% à"
+    save(folder / "rgb/le chat 1.png", picture(1))
+    (folder / "rgb.txt").write_text("1.5 rgb/le chat 1.png\n", encoding="utf-8")
+    recording = read_tum_folder(folder)
+    assert recording.images.read(0).shape == (32, 48, 3)
+    assert recording.name == "日本_50_à"
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("1.0\n", "timestamp filename.*line 1 of rgb.txt"),
+        ("one a.png\n", "finite numbers in line 1"),
+        ("nan a.png\n", "finite numbers in line 1"),
+        ("1 a.png\n\n1 b.png\n", "increase.*line 3 of rgb.txt"),
+        ("2 a.png\n1 b.png\n", "increase.*line 2"),
+    ],
+)
+def test_wrong_lists_name_the_line(text: str, message: str):
+    with pytest.raises(InputError, match=message):
+        parse_image_list(text, "rgb.txt")
+
+
+def test_a_missing_image_is_named(tmp_path: Path):
+    folder = tum_folder(tmp_path)
+    (folder / "rgb/100.200000.png").unlink()
+    with pytest.raises(InputError, match=r"100\.200000\.png does not exist"):
+        read_tum_folder(folder)
+
+
+def test_an_empty_list_is_refused(tmp_path: Path):
+    (tmp_path / "rgb.txt").write_text("# nothing\n")
+    with pytest.raises(InputError, match="found none"):
+        read_tum_folder(tmp_path)
+
+
+def test_wrong_ground_truth_names_file_and_line(tmp_path: Path):
+    folder = tum_folder(tmp_path)
+    with open(folder / "groundtruth.txt", "a") as file:
+        file.write("200 nan 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match=r"line 8 of .*groundtruth\.txt"):
+        read_tum_folder(folder)
+
+
+def test_a_novel_pose_without_image_is_refused(tmp_path: Path):
+    folder = tum_folder(tmp_path)
+    (folder / "novel/1.png").unlink()
+    with pytest.raises(InputError, match="index 1"):
+        read_tum_folder(folder)
