@@ -24,18 +24,21 @@ from torch import Tensor
 from minislam.splatting.rendering import MIN_ALPHA
 from minislam.splatting.tiles import PIXELS, TILE
 
-CHUNK = 8  # slots per step; two blocks of CHUNK * GROUP * PIXELS float32 fill half of a 2 MB cache
+CHUNK = 16  # slots per step; a block of CHUNK * GROUP * PIXELS float32 is 1 MB
 
 
-class Scratch:
-    """Work space for the largest block, allocated once per image."""
+class Workspace:
+    """What all groups of an image share: the monomials, and buffers for the largest block."""
 
     def __init__(self, tiles: int, like: Tensor) -> None:
         self._buffers = [like.new_empty((CHUNK + 1) * tiles * PIXELS) for _ in range(4)]
+        self.monomials = monomials(like)  # (6, P)
+        # 2^(x log2 e), because exp is forty times slower than exp2 where its result underflows.
+        self.monomials_log2 = self.monomials * math.log2(math.e)
 
-    def block(self, number: int, slots: int, tiles: int) -> Tensor:
-        """Return buffer `number` as an array (slots, tiles, PIXELS)."""
-        return self._buffers[number][: slots * tiles * PIXELS].view(slots, tiles, PIXELS)
+    def block(self, number: int, rows: int, columns: int) -> Tensor:
+        """Return buffer `number` as an array (rows, columns, PIXELS)."""
+        return self._buffers[number][: rows * columns * PIXELS].view(rows, columns, PIXELS)
 
 
 class GroupOutput(NamedTuple):
@@ -103,49 +106,45 @@ def ellipse_vjp(
 
 def composite(
     coefficients: Tensor,  # (6, K * B) from `exponents`, slot-major
-    features: Tensor,  # (4, K * B)
+    features: Tensor,  # (B, K, 4)
     background: Tensor,  # (4,)
     inside: Tensor,  # (B, P) 1 on the image, 0 on pixels beyond its border
-    scratch: Scratch,
+    workspace: Workspace,
 ) -> GroupOutput:
     """Composite a group of tiles from front to back. Eq. (2)."""
-    tiles = len(inside)
-    slots = coefficients.shape[1] // tiles
-    basis = monomials(inside)
+    tiles, slots, _ = features.shape
     checkpoints = inside.new_empty(-(-slots // CHUNK), tiles, PIXELS)
-    checkpoints[0] = inside
+    checkpoints[0] = inside  # T = 0 beyond the border: nothing is shown or counted there
     out = inside.new_zeros(tiles, 4, PIXELS)
-    contribution = inside.new_empty(slots, tiles)
-    features = features.view(4, slots, tiles)
+    light = inside.new_empty(slots + 1, tiles)  # T_k summed over the pixels of a tile
     steps = features.diff(dim=1, prepend=torch.zeros_like(features[:, :1]))  # f_k - f_{k-1}
 
     for chunk, first in enumerate(range(0, slots, CHUNK)):
         last = min(first + CHUNK, slots)
-        _, T = _alphas_and_transmittances(
-            coefficients[:, first * tiles : last * tiles], basis, checkpoints[chunk], scratch
-        )
-        tile_steps = steps[:, first:last].permute(2, 0, 1).contiguous()  # (B, 4, n)
-        out.baddbmm_(tile_steps, T[:-1].transpose(0, 1))
-        contribution[first:last] = T.sum(2).diff(dim=0).neg_()
+        span = slice(first * tiles, last * tiles)
+        _, T = _alphas_and_transmittances(coefficients[:, span], checkpoints[chunk], workspace)
+        out.baddbmm_(steps[:, first:last].transpose(1, 2), T[:-1].transpose(0, 1))
+        torch.sum(T, 2, out=light[first : last + 1])
         if last < slots:
             checkpoints[chunk + 1] = T[-1]
-    out.addcmul_((background[:, None] - features[:, -1]).T[:, :, None], T[-1][:, None])
-    return GroupOutput(out, T[-1].clone(), contribution, checkpoints)
+    transmittance = T[-1].clone()
+    out.addcmul_((background - features[:, -1])[:, :, None], transmittance[:, None])
+    return GroupOutput(out, transmittance, light[:-1] - light[1:], checkpoints)
 
 
 def composite_vjp(
     coefficients: Tensor,  # (6, K * B)
-    features: Tensor,  # (4, K * B)
+    features: Tensor,  # (B, K, 4)
     background: Tensor,  # (4,)
     checkpoints: Tensor,  # (ceil(K / CHUNK), B, P)
     v_out: Tensor,  # (B, 4, P)
     v_transmittance: Tensor,  # (B, P)  dL/dT_K
-    v_slots: Tensor,  # (10, K * B) out: gradients of the coefficients and of the features
-    scratch: Scratch,
-) -> None:
-    """Pull gradients of a group's pixels back to its slots, from back to front. Eq. (2).
+    workspace: Workspace,
+) -> tuple[Tensor, Tensor]:  # (6, K * B), (B, K, 4)
+    """Pull gradients of a group's pixels back to coefficients and features. Eq. (2).
 
-    Let R_k be v_out . (what slot k and all behind it would show if T restarted at 1 there):
+    From back to front, let R_k be v_out . (what slot k and all behind it would show if T
+    restarted at 1 there):
 
         R_K = f_background . v_out + v_T_K,
         R_k = R_{k+1} + alpha_k (f_k . v_out - R_{k+1}),
@@ -154,49 +153,45 @@ def composite_vjp(
 
     Nowhere is anything divided by 1 - alpha.
     """
-    tiles = len(v_transmittance)
-    slots = coefficients.shape[1] // tiles
-    basis = monomials(v_out)
-    features = features.view(4, slots, tiles)
-    v_coefficients, v_features = v_slots[:6], v_slots[6:].view(4, slots, tiles)
+    tiles, slots, _ = features.shape
+    v_coefficients = torch.empty_like(coefficients)
+    v_features = torch.empty_like(features)
     v_out_t = v_out.transpose(1, 2).contiguous()
     R_behind = (background @ v_out).add_(v_transmittance)
 
     for chunk in reversed(range(len(checkpoints))):
         first, last = chunk * CHUNK, min((chunk + 1) * CHUNK, slots)
         count, span = last - first, slice(first * tiles, last * tiles)
-        alphas, T = _alphas_and_transmittances(
-            coefficients[:, span], basis, checkpoints[chunk], scratch
-        )
-        v_weights = scratch.block(2, count, tiles)  # f_k . v_out
-        tile_features = features[:, first:last].permute(2, 1, 0).contiguous()  # (B, n, 4)
-        torch.bmm(tile_features, v_out, out=v_weights.transpose(0, 1))
-        R = scratch.block(3, count + 1, tiles)
+        alphas, T = _alphas_and_transmittances(coefficients[:, span], checkpoints[chunk], workspace)
+        v_weights = workspace.block(2, tiles, count)  # f_k . v_out; bmm cannot fill (n, B, P)
+        torch.bmm(features[:, first:last], v_out, out=v_weights)
+        R = workspace.block(3, count + 1, tiles)
         R[-1] = R_behind
+        R_k, v_weights_k, alphas_k = R.unbind(0), v_weights.unbind(1), alphas.unbind(0)
         for k in reversed(range(count)):
-            torch.lerp(R[k + 1], v_weights[k], alphas[k], out=R[k])
+            torch.lerp(R_k[k + 1], v_weights_k[k], alphas_k[k], out=R_k[k])
         R_behind = R[0].clone()
 
-        v_log_alphas = torch.sub(R[:-1], R[1:], out=v_weights).mul_(T[:-1])
-        v_coefficients[:, span] = basis @ v_log_alphas.view(-1, PIXELS).T
-        shown = torch.bmm(T.transpose(0, 1), v_out_t)  # (B, count + 1, 4)
-        v_features[:, first:last] = (shown[:, :-1] - shown[:, 1:]).permute(2, 1, 0)
+        v_log_alphas = torch.sub(R[:-1], R[1:], out=alphas).mul_(T[:-1])
+        v_coefficients[:, span] = workspace.monomials @ v_log_alphas.view(-1, PIXELS).T
+        shown = torch.bmm(T.transpose(0, 1), v_out_t)  # (B, n + 1, 4)
+        torch.sub(shown[:, :-1], shown[:, 1:], out=v_features[:, first:last])
+    return v_coefficients, v_features
 
 
 def _alphas_and_transmittances(
     coefficients: Tensor,  # (6, n * B)
-    basis: Tensor,  # (6, P)
     T_first: Tensor,  # (B, P)
-    scratch: Scratch,
+    workspace: Workspace,
 ) -> tuple[Tensor, Tensor]:  # (n, B, P), (n + 1, B, P)
     """Return alpha of n slots and T before, between and after them."""
     tiles = len(T_first)
     count = coefficients.shape[1] // tiles
-    alphas, T = scratch.block(0, count, tiles), scratch.block(1, count + 1, tiles)
-    # 2^(x log2 e), because exp is forty times slower than exp2 where its result underflows.
-    torch.mm(coefficients.T, basis * math.log2(math.e), out=alphas.view(-1, PIXELS))
+    alphas, T = workspace.block(0, count, tiles), workspace.block(1, count + 1, tiles)
+    torch.mm(coefficients.T, workspace.monomials_log2, out=alphas.view(-1, PIXELS))
     torch.nn.functional.threshold_(alphas.exp2_(), MIN_ALPHA, 0.0)
     T[0] = T_first
+    T_k, alphas_k = T.unbind(0), alphas.unbind(0)  # once: to index makes a view every time
     for k in range(count):
-        torch.addcmul(T[k], T[k], alphas[k], value=-1, out=T[k + 1])
+        torch.addcmul(T_k[k], T_k[k], alphas_k[k], value=-1, out=T_k[k + 1])
     return alphas, T

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_exp, se3_left_jacobian
 from minislam.splatting.compositing import (
-    Scratch,
+    Workspace,
     composite,
     composite_vjp,
     ellipse_vjp,
@@ -43,7 +43,7 @@ from minislam.splatting.rendering import (
     Rendering,
     tangent_limits,
 )
-from minislam.splatting.tiles import PIXELS, TILE, TileLists, build_tile_lists, tile_grid
+from minislam.splatting.tiles import PIXELS, TILE, TileGroup, TileLists, build_tile_lists, tile_grid
 
 # ln of the opacity of a padding slot. Finite, because 0 * inf would be NaN in a matrix product.
 _LOG_OPACITY_OF_PADDING = -1e4
@@ -82,7 +82,7 @@ def render(
             twist,
             screen_offsets,
             T_camera_world.detach().to(like),
-            background.detach().to(like),
+            torch.cat([background.detach(), torch.zeros(1)]).to(like),  # at depth 0: adds nothing
             camera,
         )
     )
@@ -109,8 +109,8 @@ class _Composited(NamedTuple):
     lists: TileLists
     offsets: Tensor  # (2, S) px, mean minus tile centre
     coefficients: Tensor  # (6, S)
-    features: Tensor  # (4, S)
-    checkpoints: list[Tensor]  # per group (C, B, P)
+    features: list[Tensor]  # per group (B, K, 4)
+    checkpoints: list[Tensor]  # per group (chunks, B, P)
 
 
 class _Render(torch.autograd.Function):
@@ -120,8 +120,8 @@ class _Render(torch.autograd.Function):
     def forward(
         ctx, means, quats, scales, opacities, colors, twist, offsets2d, T, background, camera
     ):
-        if twist is not None:
-            T = se3_exp(twist) @ T
+        if twist is not None and twist.any():
+            T = se3_exp(twist).to(T) @ T
         with _denormals_flushed():
             projected = _project(means, quats, scales, opacities, offsets2d, T, camera)
             features = torch.cat(
@@ -233,8 +233,9 @@ def _project_vjp(
     v_means = v_quats = v_scales = v_opacities = v_colors = v_twist = v_offsets = None
     if needs_twist:
         v_left = to_camera_twist_vjp(p.points_camera, p.camera_factors, v_points, v_camera_factors)
-        # exp(twist + d) = exp(J d) exp(twist): J is the identity at twist = 0.
-        v_twist = se3_left_jacobian(twist).T.to(v_left) @ v_left
+        # exp(twist + d) = exp(J d) exp(twist), and J is the identity at twist = 0.
+        v_twist = se3_left_jacobian(twist).T.to(v_left) @ v_left if twist.any() else v_left
+        v_twist = v_twist.to(twist)
     if needs_means or needs_quats or needs_scales:
         v_world, v_factors = to_camera_vjp(T_camera_world, v_points, v_camera_factors)
         v_means = rows(v_world)
@@ -255,7 +256,7 @@ def _project_vjp(
 def _composite(
     projected: _Projected,
     features: Tensor,  # (4, V)
-    background: Tensor,  # (3,)
+    background: Tensor,  # (4,)
     camera: Camera,
 ) -> tuple[_Composited, Tensor, Tensor]:  # ..., (5, H, W), (V,)
     """Composite all tiles; return colour, depth and opacity, and the weight of each Gaussian."""
@@ -267,50 +268,51 @@ def _composite(
     slots = torch.cat([table, padding], 1).index_select(1, lists.slot_gaussian)
     offsets = slots[:2] - _tile_centres(camera, features)[:, lists.slot_tile]
     coefficients = exponents(offsets, slots[2:5], slots[5])
-    features = slots[6:]
 
-    background = torch.cat([background, background.new_zeros(1)])  # nothing lies at depth 0
-    inside = _inside(camera, features)
-    canvas = features.new_empty(len(inside), 5, PIXELS)
+    inside = _to_tiles(features.new_ones(1, camera.height, camera.width), camera)[:, 0]
+    canvas = features.new_zeros(len(inside), 5, PIXELS)
     canvas[:, :4] = background[:, None]
-    canvas[:, 4] = 0
     contribution = features.new_zeros(len(p.index) + 1)
-    scratch = Scratch(max((len(group.tiles) for group in lists.groups), default=0), features)
-    checkpoints = []
+    workspace = Workspace(lists.largest_group, features)
+    group_features, checkpoints = [], []
     for group in lists.groups:
-        span = slice(group.first_slot, group.first_slot + group.length * len(group.tiles))
+        group_features.append(_tile_major(slots[6:, group.span], group))
         out = composite(
-            coefficients[:, span], features[:, span], background, inside[group.tiles], scratch
-        )
+            coefficients[:, group.span], group_features[-1], background,
+            inside[group.tiles], workspace,
+        )  # fmt: skip
         canvas[group.tiles, :4] = out.features
         canvas[group.tiles, 4] = 1 - out.transmittance
-        contribution.index_add_(0, lists.slot_gaussian[span], out.contribution.view(-1))
+        contribution.index_add_(0, lists.slot_gaussian[group.span], out.contribution.view(-1))
         checkpoints.append(out.checkpoints)
-    composited = _Composited(lists, offsets, coefficients, features, checkpoints)
+    composited = _Composited(lists, offsets, coefficients, group_features, checkpoints)
     return composited, _from_tiles(canvas, camera), contribution[:-1]
 
 
 def _composite_vjp(
     composited: _Composited,
-    background: Tensor,  # (3,)
+    background: Tensor,  # (4,)
     v_image: Tensor,  # (5, H, W)  dL/d(color, depth, opacity)
     camera: Camera,
 ) -> Tensor:  # (10, S)
     """Pull image gradients back to the slots: six moments about the mean, four features."""
     c = composited
-    background = torch.cat([background, background.new_zeros(1)])
     v_canvas = _to_tiles(v_image, camera)
-    v_slots = torch.empty_like(c.coefficients[:1]).expand(10, -1).contiguous()
-    scratch = Scratch(max((len(group.tiles) for group in c.lists.groups), default=0), v_image)
-    for group, checkpoints in zip(c.lists.groups, c.checkpoints, strict=True):
-        span = slice(group.first_slot, group.first_slot + group.length * len(group.tiles))
+    v_slots = c.coefficients.new_empty(10, c.coefficients.shape[1])
+    workspace = Workspace(c.lists.largest_group, v_image)
+    for number, group in enumerate(c.lists.groups):
         v_group = v_canvas[group.tiles]
-        composite_vjp(
-            c.coefficients[:, span], c.features[:, span], background, checkpoints,
-            v_group[:, :4].contiguous(), -v_group[:, 4], v_slots[:, span], scratch,
+        v_coefficients, v_features = composite_vjp(
+            c.coefficients[:, group.span], c.features[number], background, c.checkpoints[number],
+            v_group[:, :4].contiguous(), -v_group[:, 4], workspace,
         )  # fmt: skip
-    v_slots[:6] = exponents_vjp(c.offsets, v_slots[:6])
+        v_slots[:6, group.span] = exponents_vjp(c.offsets[:, group.span], v_coefficients)
+        v_slots[6:, group.span] = v_features.permute(2, 1, 0).reshape(4, -1)
     return v_slots
+
+
+def _tile_major(values: Tensor, group: TileGroup) -> Tensor:  # (C, K * B) -> (B, K, C)
+    return values.view(len(values), group.length, -1).permute(2, 1, 0).contiguous()
 
 
 def _radii(projected: _Projected, lists: TileLists) -> Tensor:  # (V,) px
@@ -326,10 +328,6 @@ def _tile_centres(camera: Camera, like: Tensor) -> Tensor:  # (2, tiles) px
     u = torch.arange(columns).to(like) * TILE + (TILE - 1) / 2
     v = torch.arange(rows).to(like) * TILE + (TILE - 1) / 2
     return torch.stack([u.repeat(rows), v.repeat_interleave(columns)])
-
-
-def _inside(camera: Camera, like: Tensor) -> Tensor:  # (tiles, P) 1 on the image, else 0
-    return _to_tiles(like.new_ones(1, camera.height, camera.width), camera)[:, 0]
 
 
 def _to_tiles(image: Tensor, camera: Camera) -> Tensor:  # (C, H, W) -> (tiles, C, P)

@@ -20,7 +20,7 @@ class TileGroup(NamedTuple):
 
     tiles: Tensor  # (B,) int64, tile index, row by row
     length: int  # K, slots per tile
-    first_slot: int  # where its K * B slots start, slot-major: (K, B)
+    span: slice  # of its K * B slots, slot-major: (K, B)
 
 
 class TileLists(NamedTuple):
@@ -29,6 +29,11 @@ class TileLists(NamedTuple):
     groups: list[TileGroup]
     slot_gaussian: Tensor  # (S,) int64
     slot_tile: Tensor  # (S,) int64
+
+    @property
+    def largest_group(self) -> int:
+        """Return the number of tiles in the largest group."""
+        return max((len(group.tiles) for group in self.groups), default=0)
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
@@ -63,10 +68,11 @@ def build_tile_lists(
         length = int(counts[tiles[-1]])
         position = torch.arange(length, device=tile.device)[:, None]
         entry = torch.where(position < counts[tiles], starts[tiles] + position, len(gaussian))
-        groups.append(TileGroup(tiles, length, first_slot))
+        end = first_slot + length * len(tiles)
+        groups.append(TileGroup(tiles, length, slice(first_slot, end)))
         slot_gaussians.append(gaussian_or_padding[entry.view(-1)])
         slot_tiles.append(tiles.repeat(length))
-        first_slot += length * len(tiles)
+        first_slot = end
     return TileLists(groups, torch.cat(slot_gaussians), torch.cat(slot_tiles))
 
 
