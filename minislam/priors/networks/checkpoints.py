@@ -1,0 +1,176 @@
+"""Official checkpoint files: read safely, recognised by their keys, complained about in words.
+
+The networks of this folder are plain functions over `Weights`, a dictionary of tensors under
+their official names. There is no tree of modules to mirror: sizes are read from the shapes, and
+a name is written where it is used. Running a network once on a tiny image therefore checks a
+file completely: a missing tensor is named, and a tensor that was never asked for is unexpected.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.errors import InputError
+
+_CONTAINERS = ("model_state_dict", "state_dict", "model")  # where trainers put the weights
+_DATA_PARALLEL = "module."  # what torch's DistributedDataParallel puts before every name
+
+
+class Weights:
+    """The tensors of a checkpoint whose names start with a prefix."""
+
+    def __init__(self, tensors: dict[str, Tensor], file: str, prefix: str = "") -> None:
+        self.file = file  # for messages
+        self.prefix = prefix
+        self._tensors = tensors
+        self._used: set[str] = set()
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Return one tensor by the rest of its name."""
+        full = self.prefix + name
+        if full not in self._tensors:
+            raise InputError(
+                f"expected the tensor {full} in {self.file}, found {len(self._tensors)} others; "
+                "the file is not complete or belongs to another version of the network"
+            )
+        self._used.add(full)
+        return self._tensors[full]
+
+    def __contains__(self, name: str) -> bool:
+        return self.prefix + name in self._tensors
+
+    def __iter__(self) -> Iterator[str]:
+        """Walk through the names below the prefix, without it."""
+        return (n[len(self.prefix) :] for n in self._tensors if n.startswith(self.prefix))
+
+    def below(self, prefix: str) -> "Weights":
+        """Return the part whose names start with one more prefix."""
+        part = Weights(self._tensors, self.file, self.prefix + prefix)
+        part._used = self._used
+        return part
+
+    def count(self, pattern: str) -> int:
+        """Return how many of pattern.format(0), pattern.format(1), ... are there in a row."""
+        number = 0
+        while any(name.startswith(pattern.format(number)) for name in self):
+            number += 1
+        return number
+
+    def unused(self) -> list[str]:
+        """Return the names no one has asked for so far."""
+        return sorted(name for name in self._tensors if name not in self._used)
+
+    @property
+    def device(self) -> torch.device:
+        """Return where the tensors are, and where networks built on them run."""
+        return next(iter(self._tensors.values())).device
+
+    def linear(self, name: str, x: Tensor) -> Tensor:
+        """Apply a linear layer, with its bias if it has one."""
+        return functional.linear(x, self[f"{name}.weight"], self._bias(name))
+
+    def conv(self, name: str, x: Tensor, stride: int = 1, padding: int | None = None) -> Tensor:
+        """Apply a convolution; without `padding` it keeps the size (odd kernels, stride 1)."""
+        weight = self[f"{name}.weight"]
+        padding = weight.shape[-1] // 2 if padding is None else padding
+        return functional.conv2d(x, weight, self._bias(name), stride, padding)
+
+    def upconv(self, name: str, x: Tensor) -> Tensor:
+        """Apply a transposed convolution whose stride is its kernel's size."""
+        weight = self[f"{name}.weight"]
+        return functional.conv_transpose2d(x, weight, self._bias(name), stride=weight.shape[-1])
+
+    def layer_norm(self, name: str, x: Tensor, epsilon: float) -> Tensor:
+        """Normalise over the last dimension."""
+        weight, bias = self[f"{name}.weight"], self[f"{name}.bias"]
+        return functional.layer_norm(x, weight.shape, weight, bias, epsilon)
+
+    def _bias(self, name: str) -> Tensor | None:
+        return self[f"{name}.bias"] if f"{name}.bias" in self else None
+
+
+def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Weights:
+    """Read a checkpoint file of plain tensors to a device; nothing in it is executed."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"expected a checkpoint file, found nothing at {path}; check the path")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # a broken file can break the reader anywhere
+        raise InputError(
+            f"expected a PyTorch checkpoint of plain tensors, found {path} ({path.stat().st_size} "
+            f"bytes), which cannot be read as one ({type(error).__name__}); download it again"
+        ) from error
+    for name in _CONTAINERS:
+        if isinstance(content, dict) and isinstance(content.get(name), dict):
+            content = content[name]
+    tensors = content.items() if isinstance(content, dict) else []
+    named = {
+        name.removeprefix(_DATA_PARALLEL): tensor.float()
+        for name, tensor in tensors
+        if isinstance(tensor, Tensor)
+    }
+    if not named:
+        raise InputError(
+            f"expected named tensors in {path}, found none; give the file with the weights"
+        )
+    return Weights(named, str(path))
+
+
+def describe(weights: Weights) -> str:
+    """Say in a few words which network a checkpoint belongs to, by the names in it."""
+    if "update.gru.convz.weight" in weights:
+        return "DROID-SLAM"
+    if "depth_model.decoder.token2feature.read_0.readoper.project_patch.weight" in weights:
+        width = weights["depth_model.encoder.patch_embed.proj.weight"].shape[0]
+        return f"Metric3D v2 (ViT of width {width})"
+    if "depth_head.scratch.output_conv1.weight" in weights:
+        width = weights["pretrained.patch_embed.proj.weight"].shape[0]
+        return f"Depth Anything V2 (ViT of width {width})"
+    if "patch_embed.proj.weight" in weights and "blocks.0.ls1.gamma" in weights:
+        width = weights["patch_embed.proj.weight"].shape[0]
+        maker = "FiT3D" if is_timm_layout(weights) else "DINOv2"
+        registers = {"register_tokens", "reg_token"} & set(weights)
+        return f"{maker} (ViT of width {width}, {'with' if registers else 'no'} registers)"
+    if "lin0.model.1.weight" in weights:
+        return "LPIPS linear weights"
+    if "features.0.weight" in weights:
+        return "an image classifier of torchvision"
+    names = sorted(weights)
+    return f"something unknown ({len(names)} tensors, the first is {names[0]})"
+
+
+def is_timm_layout(weights: Weights) -> bool:
+    """Tell a ViT of the timm library (FiT3D) from one of DINOv2: only DINOv2 has a mask token."""
+    return "mask_token" not in weights
+
+
+def require(weights: Weights, kind: str) -> None:
+    """Refuse a checkpoint of another network; `kind` is how `describe` begins."""
+    found = describe(weights)
+    if not found.startswith(tuple(kind.split(" or "))):
+        raise InputError(
+            f"expected a {kind} checkpoint, found {weights.file}, which looks like {found}; "
+            "give the file that belongs to this network"
+        )
+
+
+def probe(weights: Weights, run_once: Callable[[], object], ignored: tuple[str, ...] = ()) -> None:
+    """Check a file by running its network once: every tensor fits, is there, and is needed."""
+    try:
+        with torch.inference_mode():
+            run_once()
+    except RuntimeError as error:
+        raise InputError(
+            f"expected the shapes of {describe(weights)} in {weights.file}, found tensors that do "
+            f"not fit together ({str(error).splitlines()[0]}); it is another version"
+        ) from error
+    extra = [name for name in weights.unused() if not name.endswith(ignored)]
+    if extra:
+        raise InputError(
+            f"expected only the tensors of {describe(weights)} in {weights.file}, found "
+            f"{len(extra)} more, such as {extra[0]}; it is another version of the network"
+        )

@@ -1,0 +1,67 @@
+"""DINOv2 and FiT3D: the features of the paper's uncertainty MLP.
+
+FiT3D is DINOv2 made consistent across views; its files come in the layout of the timm library.
+"""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.errors import InputError
+from minislam.priors.networks.checkpoints import (
+    Weights,
+    is_timm_layout,
+    load_checkpoint,
+    probe,
+    require,
+)
+from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
+
+
+class DinoFeatures:
+    """The patch tokens of the last block, after the final norm: a `FeatureExtractor`."""
+
+    stride = PATCH
+
+    def __init__(self, weights: Weights) -> None:
+        require(weights, "DINOv2 or FiT3D")
+        self.device = weights.device
+        self._transformer = VisionTransformer(weights, position_resize_of(weights))
+        self.dimension = self._transformer.width
+
+    def __call__(
+        self,
+        image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    ) -> Tensor:  # (H // 14, W // 14, C) float32
+        """Return one feature per patch of 14 px; the image is stretched to whole patches."""
+        rows, cols = image.shape[0] // PATCH, image.shape[1] // PATCH
+        if min(rows, cols) < 1:
+            raise InputError(
+                f"expected an image of at least {PATCH}x{PATCH} px for the features, "
+                f"found {image.shape[1]}x{image.shape[0]}; give a larger working size"
+            )
+        with torch.inference_mode():
+            size = (PATCH * rows, PATCH * cols)
+            whole = functional.interpolate(normalise(image, self.device), size, mode="bilinear")
+            patches = self._transformer(whole)[0].patches[0]
+        return patches.permute(1, 2, 0).to(image.device).clone()  # clone: leaves inference mode
+
+
+def position_resize_of(weights: Weights) -> PositionResize:
+    """Return how a features checkpoint was trained to resize its positions.
+
+    The file does not say so, but the three published kinds differ in what it contains.
+    """
+    antialias = is_timm_layout(weights) or "register_tokens" in weights
+    return PositionResize.ANTIALIAS if antialias else PositionResize.OFFSET
+
+
+def load_dino_features(path: Path | str, device: torch.device | str = "cpu") -> DinoFeatures:
+    """Read a DINOv2 or FiT3D checkpoint and check it on a tiny image."""
+    weights = load_checkpoint(path, device)
+    features = DinoFeatures(weights)
+    # The mask token is used in training only.
+    probe(weights, lambda: features(torch.zeros(PATCH, PATCH, 3)), ignored=("mask_token",))
+    return features

@@ -1,0 +1,138 @@
+"""The vision transformer of DINOv2, on which FiT3D and both depth networks are built.
+
+Patches of 14x14 px become tokens, preceded by one class token and by four "registers" in some
+checkpoints. A block adds to the tokens first what they read from each other (attention), then
+what each makes of itself (MLP):
+
+    x <- x + ls1 * proj(attention(norm1(x)))
+    x <- x + ls2 * fc2(gelu(fc1(norm2(x))))
+"""
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.errors import InputError
+from minislam.priors.networks.checkpoints import Weights
+
+PATCH = 14  # px
+_HEAD_WIDTH = 64  # channels per attention head, at every size of the network
+_EPSILON = 1e-6  # of every layer norm of the transformer; torch's default is another
+_TRAINED_GRID = 37  # patches per side of the 518 px images of the training
+_OFFSET = 0.1  # patches added to the size before the scale is computed, see PositionResize
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)  # RGB, of the images all these networks were trained on
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class PositionResize(Enum):
+    """How the table of positions is brought to another image size.
+
+    Networks were trained with one or the other, and the checkpoint does not say with which.
+    """
+
+    OFFSET = "offset"  # bicubic with the factor (n + 0.1) / 37: DINOv2 and the depth networks
+    ANTIALIAS = "antialias"  # bicubic, smoothed when shrinking: registers, and timm (FiT3D)
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """What a block of the transformer gives out, after the final norm."""
+
+    leading: Tensor  # (B, 1 + registers, C), the class token first
+    patches: Tensor  # (B, C, rows, cols)
+
+
+class VisionTransformer:
+    """A ViT-S, -B or -L with patches of 14 px, in the layout of DINOv2 or of timm."""
+
+    def __init__(self, weights: Weights, position_resize: PositionResize) -> None:
+        self.weights = weights
+        self.position_resize = position_resize
+        # Metric3D stores all blocks in one chunk.
+        self._block = "blocks.0.{}." if "blocks.0.0.norm1.weight" in weights else "blocks.{}."
+        self.depth = weights.count(self._block)
+        if f"{self._block.format(0)}mlp.w12.weight" in weights:
+            raise InputError(
+                f"expected a ViT-S, -B or -L, found a ViT-giant in {weights.file}; "
+                "give the small or the large checkpoint"
+            )
+        class_token, positions = weights["cls_token"], weights["pos_embed"]
+        if positions.shape[1] == _TRAINED_GRID**2 + 1:
+            # DINOv2 keeps the class token's position in row 0; timm has already added it.
+            class_token, positions = class_token + positions[:, :1], positions[:, 1:]
+        if positions.shape[1] != _TRAINED_GRID**2:
+            raise InputError(
+                f"expected {_TRAINED_GRID}x{_TRAINED_GRID} positions in {weights.file}, found "
+                f"{positions.shape[1]}; only networks with patches of {PATCH} px are supported"
+            )
+        leading = [class_token]
+        leading += [weights[n] for n in ("register_tokens", "reg_token") if n in weights]
+        self._leading = torch.cat(leading, 1)
+        self._positions = positions.unflatten(1, (_TRAINED_GRID, _TRAINED_GRID)).movedim(-1, 1)
+        self.width = positions.shape[-1]
+
+    def __call__(
+        self,
+        image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 14
+        taps: tuple[int, ...] | None = None,  # blocks to read, counted from 0
+    ) -> list[Tokens]:
+        """Return the normed tokens after the given blocks, or after the last one."""
+        taps = (self.depth - 1,) if taps is None else taps
+        patches = self.weights.conv("patch_embed.proj", image, stride=PATCH, padding=0)
+        rows, cols = patches.shape[-2:]
+        patches = patches + self._resized_positions(rows, cols)
+        leading = self._leading.expand(len(image), -1, -1)
+        tokens = torch.cat([leading, patches.flatten(2).mT], 1)
+        readings = {}
+        for index in range(self.depth):
+            tokens = _transformer_block(self.weights.below(self._block.format(index)), tokens)
+            if index in taps:
+                readings[index] = self._read(tokens, rows, cols)
+        return [readings[index] for index in taps]
+
+    def _read(self, tokens: Tensor, rows: int, cols: int) -> Tokens:
+        normed = self.weights.layer_norm("norm", tokens, _EPSILON)
+        count = self._leading.shape[1]
+        patches = normed[:, count:].mT.unflatten(2, (rows, cols))
+        return Tokens(normed[:, :count], patches)
+
+    def _resized_positions(self, rows: int, cols: int) -> Tensor:
+        """Return the positions (1, C, rows, cols)."""
+        table = self._positions
+        if rows == cols == _TRAINED_GRID:
+            return table
+        if self.position_resize is PositionResize.ANTIALIAS:
+            return functional.interpolate(table, (rows, cols), mode="bicubic", antialias=True)
+        factors = tuple((n + _OFFSET) / _TRAINED_GRID for n in (rows, cols))
+        return functional.interpolate(table, scale_factor=factors, mode="bicubic")
+
+
+def _transformer_block(weights: Weights, x: Tensor) -> Tensor:
+    """Apply one block to tokens (B, N, C)."""
+    attended = _attention(weights, weights.layer_norm("norm1", x, _EPSILON))
+    x = x + weights["ls1.gamma"] * attended
+    hidden = weights.linear("mlp.fc1", weights.layer_norm("norm2", x, _EPSILON))
+    return x + weights["ls2.gamma"] * weights.linear("mlp.fc2", functional.gelu(hidden))
+
+
+def _attention(weights: Weights, x: Tensor) -> Tensor:
+    """Let every token read from all: softmax(q k^T / sqrt(64)) v, per head of 64 channels."""
+    qkv = weights.linear("attn.qkv", x).unflatten(-1, (3, -1, _HEAD_WIDTH))  # (B, N, 3, heads, 64)
+    q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, heads, N, 64)
+    read = functional.scaled_dot_product_attention(q, k, v, scale=1 / math.sqrt(_HEAD_WIDTH))
+    return weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
+
+
+def normalise(
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    device: torch.device,
+) -> Tensor:  # (1, 3, H, W)
+    """Return an image as these networks expect it: batch and channels first, ImageNet's scale."""
+    mean = torch.tensor(IMAGENET_MEAN, device=device)
+    std = torch.tensor(IMAGENET_STD, device=device)
+    return ((image.to(device) - mean) / std).permute(2, 0, 1)[None]
