@@ -68,28 +68,36 @@ class Weights:
         """Return where the tensors are, and where networks built on them run."""
         return next(iter(self._tensors.values())).device
 
-    def linear(self, name: str, x: Tensor) -> Tensor:
-        """Apply a linear layer, with its bias if it has one."""
-        return functional.linear(x, self[f"{name}.weight"], self._bias(name))
+    def linear(self, name: str, x: Tensor, bias: bool = True) -> Tensor:
+        """Apply a linear layer."""
+        return functional.linear(x, self[f"{name}.weight"], self._bias(name, bias))
 
-    def conv(self, name: str, x: Tensor, stride: int = 1, padding: int | None = None) -> Tensor:
-        """Apply a convolution; without `padding` it keeps the size (odd kernels, stride 1)."""
+    def conv(
+        self,
+        name: str,
+        x: Tensor,  # (B, C, H, W)
+        stride: int = 1,
+        padding: int | None = None,  # None: what keeps the size of an odd kernel at stride 1
+        bias: bool = True,
+    ) -> Tensor:
+        """Apply a convolution."""
         weight = self[f"{name}.weight"]
         padding = weight.shape[-1] // 2 if padding is None else padding
-        return functional.conv2d(x, weight, self._bias(name), stride, padding)
+        return functional.conv2d(x, weight, self._bias(name, bias), stride, padding)
 
     def upconv(self, name: str, x: Tensor) -> Tensor:
         """Apply a transposed convolution whose stride is its kernel's size."""
         weight = self[f"{name}.weight"]
-        return functional.conv_transpose2d(x, weight, self._bias(name), stride=weight.shape[-1])
+        return functional.conv_transpose2d(x, weight, self[f"{name}.bias"], weight.shape[-1])
 
     def layer_norm(self, name: str, x: Tensor, epsilon: float) -> Tensor:
         """Normalise over the last dimension."""
         weight, bias = self[f"{name}.weight"], self[f"{name}.bias"]
         return functional.layer_norm(x, weight.shape, weight, bias, epsilon)
 
-    def _bias(self, name: str) -> Tensor | None:
-        return self[f"{name}.bias"] if f"{name}.bias" in self else None
+    def _bias(self, name: str, wanted: bool) -> Tensor | None:
+        # Not "the bias if there is one": an incomplete file would go unnoticed.
+        return self[f"{name}.bias"] if wanted else None
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Weights:

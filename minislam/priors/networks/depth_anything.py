@@ -1,0 +1,138 @@
+"""Depth Anything V2 with its metric heads (paper, ablation of the depth prior).
+
+A ViT is read at four depths. Each reading becomes a map of its own resolution, and from coarse to
+fine each map is added to what the coarser ones have made of the image (a "dense prediction
+transformer"). It knows no focal length: the camera is assumed to be like that of its training.
+"""
+
+import math
+from pathlib import Path
+
+import cv2
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probe, require
+from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
+from minislam.records import Frame
+
+SHORTER_SIDE = 518  # px the network sees, as in its training
+INDOOR_LIMIT, OUTDOOR_LIMIT = 20.0, 80.0  # metre; the Hypersim and the Virtual KITTI checkpoints
+_TAPS = {12: (2, 5, 8, 11), 24: (4, 11, 17, 23)}  # by the number of blocks: S and B, L
+
+
+class DepthAnythingHead:
+    """The convolutions behind the transformer: tokens in, one number per pixel out."""
+
+    def __init__(self, weights: Weights) -> None:
+        transformer = VisionTransformer(weights.below("pretrained."), PositionResize.OFFSET)
+        self.transformer, self.weights = transformer, weights.below("depth_head.")
+        self.taps = _TAPS[transformer.depth]
+
+    def __call__(
+        self,
+        image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 14
+    ) -> Tensor:  # (B, H, W), before the last activation
+        """Return the raw output: its sigmoid is metric depth, its ReLU relative disparity."""
+        weights = self.weights
+        readings = self.transformer(image, self.taps)
+        maps = [weights.conv(f"projects.{k}", tokens.patches) for k, tokens in enumerate(readings)]
+        # Resolutions of 4, 2, 1 and 1/2 cells per patch side.
+        maps[0] = weights.upconv("resize_layers.0", maps[0])
+        maps[1] = weights.upconv("resize_layers.1", maps[1])
+        maps[3] = weights.conv("resize_layers.3", maps[3], stride=2)
+        scratch = weights.below("scratch.")
+        maps = [scratch.conv(f"layer{k + 1}_rn", m, bias=False) for k, m in enumerate(maps)]
+
+        fused = _fuse(scratch.below("refinenet4."), maps[3], None, maps[2].shape[-2:])
+        fused = _fuse(scratch.below("refinenet3."), fused, maps[2], maps[1].shape[-2:])
+        fused = _fuse(scratch.below("refinenet2."), fused, maps[1], maps[0].shape[-2:])
+        rows, cols = maps[0].shape[-2:]
+        fused = _fuse(scratch.below("refinenet1."), fused, maps[0], (2 * rows, 2 * cols))
+
+        out = _resize(scratch.conv("output_conv1", fused), image.shape[-2:])
+        out = functional.relu(scratch.conv("output_conv2.0", out))
+        return scratch.conv("output_conv2.2", out)[:, 0]
+
+
+def _fuse(weights: Weights, coarse: Tensor, fine: Tensor | None, size: tuple[int, int]) -> Tensor:
+    """Add a finer map to a coarser one and bring the sum to a size."""
+    if fine is not None:
+        coarse = coarse + _residual_unit(weights.below("resConfUnit1."), fine)
+    fused = _resize(_residual_unit(weights.below("resConfUnit2."), coarse), size)
+    return weights.conv("out_conv", fused)
+
+
+def _residual_unit(weights: Weights, x: Tensor) -> Tensor:
+    hidden = weights.conv("conv1", functional.relu(x))
+    return x + weights.conv("conv2", functional.relu(hidden))
+
+
+def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:
+    return functional.interpolate(x, size, mode="bilinear", align_corners=True)
+
+
+class DepthAnything:
+    """Metric depth by Depth Anything V2: a `DepthPrior`."""
+
+    def __init__(
+        self,
+        weights: Weights,
+        depth_limit: float,  # metre, of the training data: INDOOR_LIMIT or OUTDOOR_LIMIT
+        shorter_side: int = SHORTER_SIDE,
+    ) -> None:
+        require(weights, "Depth Anything V2")
+        if not depth_limit > 0:
+            raise InputError(
+                f"expected the largest depth of the training in metres, found {depth_limit}; "
+                f"give {INDOOR_LIMIT} for a Hypersim and {OUTDOOR_LIMIT} for a KITTI checkpoint"
+            )
+        self.depth_limit = depth_limit
+        self.shorter_side = shorter_side
+        self.device = weights.device
+        self.network = DepthAnythingHead(weights)
+
+    def __call__(self, frame: Frame, camera: Camera) -> Tensor:
+        """Return the depth (H, W) in metres that the network sees in an image."""
+        size = tuple(frame.image.shape[:2])
+        with torch.inference_mode():
+            seen = normalise(self._resized(frame.image), self.device)
+            depth = self.depth_limit * torch.sigmoid(self.network(seen))
+            full = _resize(depth[None], size)[0, 0]
+        return full.to(frame.image.device).clone()  # clone: leaves inference mode
+
+    def _resized(self, image: Tensor) -> Tensor:
+        """Return the image with sides of whole patches, the shorter one of `shorter_side`."""
+        height, width = image.shape[:2]
+        scale = max(self.shorter_side / height, self.shorter_side / width)
+        rows, cols = (_whole_patches(side * scale, self.shorter_side) for side in (height, width))
+        # In float64, as the official code: float32 weights of the cubic differ in the last digits.
+        resized = cv2.resize(
+            image.double().cpu().numpy(), (cols, rows), interpolation=cv2.INTER_CUBIC
+        )
+        return torch.from_numpy(resized).float()
+
+
+def _whole_patches(side: float, shortest: int) -> int:
+    rounded = round(side / PATCH) * PATCH
+    return rounded if rounded >= shortest else math.ceil(side / PATCH) * PATCH
+
+
+def load_depth_anything(
+    path: Path | str, depth_limit: float, device: torch.device | str = "cpu"
+) -> DepthAnything:
+    """Read a Depth Anything V2 checkpoint with a metric head and check it on a tiny image."""
+    weights = load_checkpoint(path, device)
+    prior = DepthAnything(weights, depth_limit)
+    tiny = torch.zeros(1, 3, 2 * PATCH, 2 * PATCH, device=weights.device)
+    # The first unit of the coarsest level has nothing to add, yet it is stored.
+    unneeded = tuple(
+        f"refinenet4.resConfUnit1.{conv}.{kind}"
+        for conv in ("conv1", "conv2")
+        for kind in ("weight", "bias")
+    )
+    probe(weights, lambda: prior.network(tiny), ignored=("mask_token", *unneeded))
+    return prior
