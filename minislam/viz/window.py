@@ -17,7 +17,7 @@ def show_figure(figure: Figure) -> None:
             "expected a display to plot on, found none; write the plot to a file with "
             "--save_plot FILE"
         )
-    manager_figure = pyplot.figure(figsize=figure.get_size_inches())
+    window = pyplot.figure(figsize=figure.get_size_inches(), dpi=figure.dpi)
     figure.canvas.draw()
-    manager_figure.figimage(figure.canvas.buffer_rgba())
+    window.figimage(figure.canvas.buffer_rgba())
     pyplot.show()

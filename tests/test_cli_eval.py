@@ -1,0 +1,102 @@
+"""`minislam eval`: evo's grammar, evo's printout."""
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import random_transforms
+
+from minislam.cli_eval import add_eval_parser, run_eval
+from minislam.data.trajectory import write_trajectory
+from minislam.errors import InputError
+from minislam.geometry.alignment import Similarity
+from minislam.records import Trajectory
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[str, str]:
+    """Return truth and an estimate: half the size, turned, and with one pose off."""
+    poses = random_transforms(20, "normal", 0).numpy()
+    truth = Trajectory(np.arange(20.0), poses)
+    turn = random_transforms(1, "normal", 1)[0].numpy()
+    moved = Similarity(0.5, turn[:3, :3], turn[:3, 3]).transform_poses(poses)
+    moved[4, :3, 3] += 0.1
+    names = str(tmp_path / "gt.txt"), str(tmp_path / "est.txt")
+    write_trajectory(names[0], truth)
+    write_trajectory(names[1], Trajectory(np.arange(20.0), moved))
+    return names
+
+
+def parse(*arguments: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="minislam")
+    add_eval_parser(parser.add_subparsers())
+    return parser.parse_args(["eval", *arguments])
+
+
+# Known answers
+
+
+@pytest.mark.parametrize(
+    "flags, words",
+    [
+        ([], "(with Sim(3) Umeyama alignment, the default for monocular estimates)"),
+        (["-as"], "(with Sim(3) Umeyama alignment)"),
+        (["--align"], "(with SE(3) Umeyama alignment)"),
+        (["--correct_scale"], "(with scale correction only)"),
+        (["--no_align"], "(with no alignment)"),
+    ],
+)
+def test_the_alignment_is_said(files, capsys, flags: list[str], words: str):
+    assert run_eval(parse(*files, *flags)) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:3] == ["APE w.r.t. translation part (m)", words, ""]
+
+
+def test_the_table_is_evo_s(files, capsys):
+    run_eval(parse(*files))
+    rows = capsys.readouterr().out.splitlines()[3:]
+    assert [row.split()[0] for row in rows] == "max mean median min rmse sse std".split()
+    assert all(re.fullmatch(r" {3,7}[a-z]+\t\d+\.\d{6}", row) for row in rows)
+
+
+def test_results_and_plot_are_saved_silently(files, tmp_path: Path, capsys):
+    plot, results = tmp_path / "plot", tmp_path / "ate.json"
+    run_eval(parse(*files, "--silent", "--save_plot", str(plot), "--save_results", str(results)))
+    assert capsys.readouterr().out == ""
+    assert plot.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    saved = json.loads(results.read_text())
+    assert saved["pairs"] == 20 and len(saved["errors"]) == 20
+    assert saved["scale"] == pytest.approx(2, rel=0.05)
+    assert set(saved["ate_translation"]) == {"max", "mean", "median", "min", "rmse", "sse", "std"}
+
+
+def test_verbose_names_pairs_and_scale(files, capsys):
+    run_eval(parse(*files, "-v"))
+    out = capsys.readouterr().out
+    assert "20 pairs (20 estimated, 20 true poses)" in out and "scale" in out
+
+
+# Errors
+
+
+def test_contradicting_flags_and_strange_clocks(files):
+    with pytest.raises(InputError, match="leave one out"):
+        run_eval(parse(*files, "-a", "--no_align"))
+    with pytest.raises(InputError, match="--t_offset"):
+        run_eval(parse(*files, "--t_offset", "1000"))
+
+
+def test_help_does_not_wait_for_torch():
+    program = (
+        "import argparse, sys\n"
+        "from minislam.cli_eval import add_eval_parser\n"
+        "add_eval_parser(argparse.ArgumentParser().add_subparsers())\n"
+        "assert not {'torch', 'numpy', 'matplotlib'} & set(sys.modules)\n"
+    )
+    root = str(Path(__file__).parents[1])
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=root)

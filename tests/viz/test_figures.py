@@ -1,0 +1,91 @@
+"""Every kind of figure is drawn, says its units, and leaves no window behind."""
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib import pyplot
+from matplotlib.figure import Figure
+
+from minislam.errors import InputError
+from minislam.records import Trajectory
+from minislam.viz import (
+    ate_over_time,
+    build_report,
+    figure_png,
+    keyframe_strip,
+    loss_curves,
+    overview,
+    show_figure,
+    trajectory_plot,
+)
+
+IMAGE, DEPTH = np.full((24, 32, 3), 0.5), np.linspace(0, 3, 24 * 32).reshape(24, 32)
+BETA = np.ones((3, 4))
+
+
+def path(count: int) -> Trajectory:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(count, 3))
+    return Trajectory(np.arange(float(count)), poses)
+
+
+FIGURES = {
+    "strip": lambda: keyframe_strip(IMAGE, DEPTH, BETA, IMAGE, "keyframe 3"),
+    "trajectory": lambda: trajectory_plot(path(9), path(20), "m"),
+    "trajectory without truth": lambda: trajectory_plot(path(9)),
+    "one pose": lambda: trajectory_plot(path(1)),
+    "no pose": lambda: trajectory_plot(path(0)),
+    "ate": lambda: ate_over_time(np.arange(5.0), np.arange(5.0)),
+    "losses": lambda: loss_curves({"render": [3, 2, 1], "uncertainty": [0.0, -1]}),
+    "no losses": lambda: loss_curves({}),
+    "overview": lambda: overview(IMAGE, BETA, IMAGE, path(9), path(9)),
+}
+
+
+@pytest.mark.parametrize("kind", FIGURES)
+def test_figures_are_drawn(kind: str):
+    png = figure_png(FIGURES[kind](), dpi=40)
+    decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded.std() > 1
+
+
+def test_axes_carry_units_and_truth_is_black_dashed():
+    figure: Figure = FIGURES["trajectory"]()
+    assert [axes.get_xlabel() for axes in figure.axes] == ["x [m]", "x [m]"]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["z [m]", "y [m]"]
+    truth = figure.axes[0].lines[0]
+    assert (truth.get_color(), truth.get_linestyle()) == ("black", "--")
+    assert FIGURES["ate"]().axes[0].get_xlabel() == "time [s]"
+
+
+def test_figures_do_not_touch_the_state_of_pyplot():
+    FIGURES["overview"]()
+    assert pyplot.get_fignums() == []
+
+
+def test_without_a_display_the_user_is_told_what_to_do(monkeypatch):
+    monkeypatch.setattr(pyplot, "get_backend", lambda: "agg")
+    with pytest.raises(InputError, match="--save_plot"):
+        show_figure(FIGURES["ate"]())
+
+
+def test_with_a_display_the_figure_is_shown(monkeypatch):
+    shown = []
+    monkeypatch.setattr(pyplot, "get_backend", lambda: "QtAgg")
+    monkeypatch.setattr(pyplot, "show", lambda: shown.extend(pyplot.get_fignums()))
+    show_figure(FIGURES["ate"]())
+    assert len(shown) == 1
+    pyplot.close("all")
+
+
+def test_a_report_needs_no_other_file():
+    png = figure_png(FIGURES["ate"](), dpi=20)
+    html = build_report("run <1>", {"ATE": "1 & 2"}, ["focal length guessed"], [("a < b", png)])
+    assert html.startswith("<!DOCTYPE html>")
+    assert "run &lt;1&gt;" in html and "1 &amp; 2" in html and "a &lt; b" in html
+    assert '<p class="warning">focal length guessed</p>' in html
+    assert html.count("data:image/png;base64,") == 1
+    assert "<script" not in html and "http" not in html
+    assert html == build_report(
+        "run <1>", {"ATE": "1 & 2"}, ["focal length guessed"], [("a < b", png)]
+    )
