@@ -1,0 +1,71 @@
+"""The tile lists: nothing that shows is missing, nothing is listed in vain, order is kept."""
+
+import pytest
+import torch
+from splatting.scenes import KINDS, random_camera, random_map, random_pose
+
+from minislam.splatting.rasterizer import _project
+from minislam.splatting.reference import gaussian_alphas
+from minislam.splatting.tiles import TILE, TileLists, build_tile_lists, tile_grid
+
+
+def lists_and_truth(kind: str, seed: int) -> tuple[TileLists, torch.Tensor, int]:
+    """Return the lists of a random view, and which (Gaussian, tile) pairs truly overlap."""
+    gaussians, camera, pose = random_map(kind, 40, seed), random_camera(seed), random_pose(seed)
+    projected = _project(
+        gaussians.means, gaussians.quats_wxyz, gaussians.scales, gaussians.opacities,
+        None, pose, camera,
+    )  # fmt: skip
+    lists = build_tile_lists(
+        projected.means2d, projected.conics, projected.covariances2d, projected.opacities, camera
+    )
+    xx, xy, yy = projected.covariances2d
+    covariances = torch.stack([xx, xy, xy, yy], -1).view(-1, 2, 2)
+    alphas = gaussian_alphas(projected.means2d.T, covariances, projected.opacities, camera)
+    rows, columns = tile_grid(camera)
+    padding = (0, columns * TILE - camera.width, 0, rows * TILE - camera.height)
+    padded = torch.nn.functional.pad(alphas, padding)
+    tiled = padded.view(-1, rows, TILE, columns, TILE).amax((2, 4)).flatten(1)
+    return lists, tiled > 0, len(projected.index)
+
+
+def listed_pairs(lists: TileLists, shape: torch.Size, count: int) -> torch.Tensor:
+    pairs = torch.zeros(shape, dtype=torch.bool)
+    real = lists.slot_gaussian < count
+    pairs[lists.slot_gaussian[real], lists.slot_tile[real]] = True
+    return pairs
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(6))
+def test_every_pair_that_shows_is_listed_once(kind: str, seed: int):
+    lists, overlaps, count = lists_and_truth(kind, seed)
+    pairs = listed_pairs(lists, overlaps.shape, count)
+    assert not (overlaps & ~pairs).any()
+    real = lists.slot_gaussian < count
+    assert int(real.sum()) == int(pairs.sum())
+
+
+def test_few_pairs_are_listed_in_vain():
+    # An ellipse can meet a row of tiles between two pixel centres and show on neither.
+    listed = overlapping = 0
+    for seed in range(30):
+        lists, overlaps, count = lists_and_truth("ordinary", seed)
+        listed += int((lists.slot_gaussian < count).sum())
+        overlapping += int(overlaps.sum())
+    assert listed <= 1.03 * overlapping
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lists_run_from_front_to_back(seed: int):
+    lists, _, count = lists_and_truth("crowded", seed)
+    for group in lists.groups:
+        slots = lists.slot_gaussian[group.span].view(group.length, -1)
+        assert (slots.diff(dim=0)[slots[1:] < count] > 0).all()  # padding comes last
+        assert (slots.diff(dim=0) >= 0).all()
+
+
+def test_no_gaussian_gives_no_group():
+    empty = torch.zeros(3, 0)
+    lists = build_tile_lists(empty[:2], empty, empty, empty[0], random_camera(0))
+    assert lists.groups == [] and lists.largest_group == 0
