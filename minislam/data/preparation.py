@@ -48,15 +48,25 @@ class ImagePreparation:
             raw_camera.cropped(*self._window).resized(*self._resized).cropped(*self._crop, *size)
         )
 
-    def color(self, raw: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8 -> (H', W', 3) float32
+    def color(
+        self,
+        raw: np.ndarray,  # (H, W, 3) uint8
+        label: str = "an image",  # how to call it in an error
+    ) -> np.ndarray:  # (H', W', 3) float32
         """Prepare a colour image: values in [0, 1]."""
+        self._require_size(raw, label)
         image = self._undistorted(raw, cv2.INTER_LINEAR)
         if (image.shape[1], image.shape[0]) != self._resized:
             image = cv2.resize(image, self._resized, interpolation=cv2.INTER_AREA)
         return self._cropped(image).astype(np.float32) / np.float32(255)
 
-    def nearest(self, raw: np.ndarray) -> np.ndarray:  # (H, W) -> (H', W'), same type
+    def nearest(
+        self,
+        raw: np.ndarray,  # (H, W)
+        label: str = "an image",  # how to call it in an error
+    ) -> np.ndarray:  # (H', W'), same type
         """Prepare a depth image or a mask: every value is one of the raw values."""
+        self._require_size(raw, label)
         as_numbers = raw.astype(np.uint8) if raw.dtype == bool else raw
         image = self._undistorted(as_numbers, cv2.INTER_NEAREST)
         # cv2's nearest neighbour is off by up to half a pixel; these are the true centres.
@@ -65,6 +75,14 @@ class ImagePreparation:
             for new, old in zip(self._resized, self._window[2:], strict=True)
         )
         return np.ascontiguousarray(self._cropped(image[rows][:, columns])).astype(raw.dtype)
+
+    def _require_size(self, raw: np.ndarray, label: str) -> None:
+        width, height = self.raw_size
+        if raw.shape[:2] != (height, width):
+            raise InputError(
+                f"expected images of one size, {width}x{height} as the first, found "
+                f"{raw.shape[1]}x{raw.shape[0]} in {label}; remove or resize the odd ones"
+            )
 
     def _undistorted(self, raw: np.ndarray, interpolation: int) -> np.ndarray:
         if self._maps is not None:

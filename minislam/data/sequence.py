@@ -9,13 +9,14 @@ import torch
 
 from minislam.data.calibration import Calibration, guessed_calibration, read_calibration
 from minislam.data.folder import read_image_folder, read_video
-from minislam.data.images import read_color, read_depth, read_mask
+from minislam.data.images import read_depth
 from minislam.data.options import InputOptions
 from minislam.data.preparation import ImagePreparation
 from minislam.data.recording import Recording
+from minislam.data.truth import RecordedTruth
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
-from minislam.records import Frame, Trajectory
+from minislam.records import Frame
 
 _SYNTHETIC_FRAMES = 100
 _SYNTHETIC_SIZE = (320, 240)  # px
@@ -74,9 +75,11 @@ class RecordedSequence:
         counts = f"{len(self)} of {len(recording.images)} images"
         parts = [counts, *recording.notes, size, calibration.origin]
         self.description = f"{recording.kind}: {', '.join(parts)}"
-        has_truth = any([*recording.mask_paths, *recording.static_paths, recording.novel_views])
-        known = recording.trajectory is not None or has_truth
-        self.ground_truth = RecordedTruth(self) if known else None
+        self.ground_truth: RecordedTruth | None = None
+        if recording.has_truth():
+            self.ground_truth = RecordedTruth(
+                recording, self._prepare, self.source_index, self.sensor_depth
+            )
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -88,7 +91,7 @@ class RecordedSequence:
         """Return one frame; timestamps are those of the source, whatever the stride."""
         index = self.source_index(frame_index)
         raw = self._recording.images.read(index)
-        image = self._color(raw, self._recording.images.label(index))
+        image = self._prepare.color(raw, self._recording.images.label(index))
         timestamp = float(self._recording.timestamps[index])
         return Frame(frame_index, timestamp, torch.from_numpy(image))
 
@@ -100,59 +103,10 @@ class RecordedSequence:
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        path = self._path(self._recording.depth_paths, frame_index)
+        path = self._recording.depth_path(self.source_index(frame_index))
         if path is None:
             return None
-        raw = read_depth(path, self._depth_scale)
-        self._require_size(raw, str(path))
-        return self._prepare.nearest(raw)
-
-    def _color(self, raw: np.ndarray, label: str) -> np.ndarray:
-        self._require_size(raw, label)
-        return self._prepare.color(raw)
-
-    def _path(self, paths: list[Path | None], frame_index: int) -> Path | None:
-        index = self.source_index(frame_index)
-        return paths[index] if index < len(paths) else None
-
-    def _require_size(self, raw: np.ndarray, label: str) -> None:
-        width, height = self._prepare.raw_size
-        if raw.shape[:2] != (height, width):
-            raise InputError(
-                f"expected images of one size, {width}x{height} as the first, found "
-                f"{raw.shape[1]}x{raw.shape[0]} in {label}; remove or resize the odd ones"
-            )
-
-
-class RecordedTruth:
-    """The truth that lies beside a recording: a `minislam.records.GroundTruth`."""
-
-    def __init__(self, sequence: RecordedSequence) -> None:
-        self._sequence, self._recording = sequence, sequence._recording
-        self.trajectory: Trajectory | None = self._recording.trajectory
-
-    def moving_mask(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) bool, True where a mover is seen."""
-        path = self._sequence._path(self._recording.mask_paths, frame_index)
-        if path is None:
-            return None
-        raw = read_mask(path)
-        self._sequence._require_size(raw, str(path))
-        return self._sequence._prepare.nearest(raw)
-
-    def static_image(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W, 3) float32: the same view without the movers and their shadows."""
-        path = self._sequence._path(self._recording.static_paths, frame_index)
-        return None if path is None else self._sequence._color(read_color(path), str(path))
-
-    def depth(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
-        return self._sequence.sensor_depth(frame_index)
-
-    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
-        views = self._recording.novel_views
-        return [(pose, self._sequence._color(read_color(path), str(path))) for pose, path in views]
+        return self._prepare.nearest(read_depth(path, self._depth_scale), str(path))
 
 
 def _calibration(
