@@ -1,0 +1,166 @@
+"""The second half of Metric3D v2: a first estimate, refined by recurrent units, then upsampled.
+
+As in RAFT, three gated recurrent units (GRU) at three resolutions look at the present estimate
+and propose a change, a few times in a row. The state has six channels: scaled depth, depth
+confidence, normal (3), normal confidence.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.priors.networks.checkpoints import Weights
+
+NEAREST, FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
+_BINS = 256  # of depth, between the two on a logarithmic scale
+_STATE_UNIT = 100.0  # metre per unit of the state's depth channel
+_EPSILON = 1e-5  # of the layer norms in the convolutional part
+_UPSAMPLING = 4
+_MASK_SCALE = 0.25  # of the upsampling logits, as in RAFT
+# From fine to coarse; the GRUs are called by twice their level's stride.
+_CONTEXT_NAMES = ("outputs04", "outputs08", "outputs16")
+_GRU_NAMES = ("gru08", "gru16", "gru32")
+
+
+@dataclass(frozen=True)
+class Metric3DOutput:
+    """What Metric3D says about an image."""
+
+    depth: Tensor  # (B, H, W) metre, for the canonical camera
+    confidence: Tensor  # (B, H, W) of the depth
+    normals: Tensor  # (B, 3, H, W) unit vectors
+    normal_confidence: Tensor  # (B, H, W) > 0
+
+
+def refine(
+    weights: Weights,  # of the decoder
+    features: Tensor,  # (B, c0 + 2, h, w), the last two channels are confidences
+    context: list[Tensor],  # three maps (B, c, h_l, w_l), from fine to coarse
+    rounds: int,
+) -> Metric3DOutput:
+    """Return the refined and upsampled estimate."""
+    state = first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
+    hidden, gates = _start(weights, context)
+    update = weights.below("update_block.")
+    for _ in range(rounds):
+        hidden = _recurrent_round(update, hidden, gates, state)
+        state = state + _proposed_change(update.below("flow_head."), hidden[0])
+    mask = update.conv("mask.2", update.conv("mask.0", hidden[0]).relu())
+    fine = convex_upsample(state, _MASK_SCALE * mask, _UPSAMPLING)
+    normals = normalised(fine[:, 2:])
+    return Metric3DOutput(
+        depth=(_STATE_UNIT * fine[:, 0] + FARTHEST).clamp(NEAREST, FARTHEST),
+        confidence=fine[:, 1],
+        normals=normals[:, :3],
+        normal_confidence=normals[:, 3],
+    )
+
+
+def first_estimate(
+    weights: Weights, features: Tensor, depth_confidence: Tensor, normal_confidence: Tensor
+) -> Tensor:  # (B, 6, h, w)
+    """Return the state before refinement: depth is an expectation over logarithmic bins."""
+    logits = _head(weights.below("depth_regressor."), features, layers=2)
+    bins = torch.linspace(math.log(NEAREST), math.log(FARTHEST), _BINS, device=features.device)
+    depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
+    depth = depth.clamp(NEAREST, FARTHEST)
+    normal = _head(weights.below("normal_predictor."), features, layers=4)
+    oriented = normalised(torch.cat([normal, normal_confidence], 1))
+    return torch.cat([(depth - FARTHEST) / _STATE_UNIT, depth_confidence, oriented], 1)
+
+
+def _head(weights: Weights, x: Tensor, layers: int) -> Tensor:
+    """Apply convolutions with ReLUs between them; they are numbered 0, 2, 4, ..."""
+    for k in range(layers):
+        x = weights.conv(f"{2 * k}", x.relu() if k else x)
+    return x
+
+
+def normalised(oriented: Tensor) -> Tensor:
+    """Return (B, 4, ...) with the first three channels of unit length and the last positive."""
+    normal, confidence = oriented[:, :3], oriented[:, 3:]
+    unit = normal / (normal.norm(dim=1, keepdim=True) + 1e-10)
+    return torch.cat([unit, functional.elu(confidence) + 1.01], 1)
+
+
+def _start(weights: Weights, context: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    """Return per level the hidden state and what the context adds to the three gates."""
+    hidden, gates = [], []
+    for level, (name, features) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
+        encoder = weights.below(f"context_feature_encoder.{name}.")
+        hidden.append(_context_head(encoder.below("0."), features).tanh())
+        seen = _context_head(encoder.below("1."), features).relu()
+        gates.append(weights.conv(f"context_zqr_convs.{level}", seen))
+    return hidden, gates
+
+
+def _context_head(weights: Weights, x: Tensor) -> Tensor:
+    unit = weights.below("0.")
+    y = _channel_norm(unit, "norm1", unit.conv("conv1", x)).relu()
+    y = _channel_norm(unit, "norm2", unit.conv("conv2", y)).relu()
+    skip = _channel_norm(unit, "downsample.1", unit.conv("downsample.0", x))
+    return weights.conv("1", (skip + y).relu())
+
+
+def _channel_norm(weights: Weights, name: str, x: Tensor) -> Tensor:
+    """Normalise over the channels of each pixel of (B, C, h, w)."""
+    return weights.layer_norm(name, x.movedim(1, -1), _EPSILON).movedim(-1, 1)
+
+
+def _recurrent_round(
+    weights: Weights, hidden: list[Tensor], gates: list[Tensor], state: Tensor
+) -> list[Tensor]:
+    """Update the coarsest unit three times, the middle one twice, the finest once."""
+    fine, middle, coarse = hidden
+
+    def gru(level: int, h: Tensor, *inputs: Tensor) -> Tensor:
+        return _gru(weights.below(f"{_GRU_NAMES[level]}."), h, gates[level], torch.cat(inputs, 1))
+
+    coarse = gru(2, coarse, _halved(middle))
+    for _ in range(2):
+        coarse = gru(2, coarse, _halved(middle))
+        middle = gru(1, middle, _resized(_halved(fine), middle), _resized(coarse, middle))
+    fine = gru(0, fine, state, _resized(middle, fine))
+    return [fine, middle, coarse]
+
+
+def _gru(weights: Weights, hidden: Tensor, gate_offsets: Tensor, inputs: Tensor) -> Tensor:
+    """Let a gated unit forget a part of its state and take in as much of a proposal."""
+    offset_z, offset_r, offset_q = gate_offsets.chunk(3, 1)
+    both = torch.cat([hidden, inputs], 1)
+    z = torch.sigmoid(weights.conv("convz", both) + offset_z)
+    r = torch.sigmoid(weights.conv("convr", both) + offset_r)
+    proposal = torch.cat([r * hidden, inputs], 1)
+    q = torch.tanh(weights.conv("convq", proposal) + offset_q)
+    return (1 - z) * hidden + z * q
+
+
+def _halved(x: Tensor) -> Tensor:
+    return functional.avg_pool2d(x, 3, stride=2, padding=1)  # counts the padding as zeros
+
+
+def _resized(x: Tensor, like: Tensor) -> Tensor:
+    return functional.interpolate(x, like.shape[-2:], mode="bilinear", align_corners=True)
+
+
+def _proposed_change(weights: Weights, hidden: Tensor) -> Tensor:
+    """Return the change of the state (B, 6, h, w)."""
+    depth = weights.conv("conv2d", weights.conv("conv1d", hidden).relu())
+    normal = weights.conv("conv2n", weights.conv("conv1n", hidden).relu())
+    return torch.cat([depth, normal], 1)
+
+
+def convex_upsample(
+    coarse: Tensor,  # (B, C, h, w)
+    logits: Tensor,  # (B, 9 * factor^2, h, w)
+    factor: int,
+) -> Tensor:  # (B, C, factor * h, factor * w)
+    """Upsample: each fine pixel is a convex combination of the 3x3 coarse ones around it."""
+    batch, channels, height, width = coarse.shape
+    share = logits.view(batch, 1, 9, factor, factor, height, width).softmax(2)
+    around = functional.unfold(coarse, 3, padding=1).view(batch, channels, 9, 1, 1, height, width)
+    fine = (share * around).sum(2)  # (B, C, factor, factor, h, w)
+    return fine.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, factor * height, factor * width)

@@ -1,0 +1,148 @@
+"""Metric3D v2 against the official code, and its handling of the camera."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn import functional
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.priors.networks.checkpoints import Weights
+from minislam.priors.networks.metric3d import Metric3D, Metric3DDepth, fit, load_metric3d
+from minislam.priors.networks.metric3d_refinement import (
+    Metric3DOutput,
+    convex_upsample,
+    normalised,
+)
+from minislam.priors.networks.vit import normalise
+from minislam.records import Frame
+from tests.helpers import generator
+from tests.priors.networks import rebuilt
+
+# With one or two threads the official code differs from itself by 1e-4 m and 4e-6.
+DEPTH, REST = 1e-3, 5e-5
+CPU = torch.device("cpu")
+SMALL_SIZE = (56, 84)
+
+
+@cache
+def weights() -> Weights:
+    return rebuilt.weights_of("metric3d_vit_small")
+
+
+@cache
+def output(height: int, width: int) -> Metric3DOutput:
+    with torch.inference_mode():
+        return Metric3D(weights())(normalise(rebuilt.image(height, width), CPU))
+
+
+def stored(name: str) -> torch.Tensor:
+    return rebuilt.golden("metric3d_vit_small")[name]
+
+
+# Known answers
+
+
+@pytest.mark.parametrize("size", [(56, 84), (112, 56)])
+def test_depth_confidence_and_normals_are_those_of_the_official_code(size: tuple[int, int]):
+    prefix, found = f"{size[0]}x{size[1]}", output(*size)
+    rebuilt.assert_close(found.depth[0], stored(f"{prefix}/depth"), DEPTH)
+    oriented = torch.cat([found.normals[0], found.normal_confidence], 0)
+    rebuilt.assert_close(oriented, stored(f"{prefix}/normal_kappa"), REST)
+
+
+def test_the_confidence_is_that_of_the_official_code():
+    rebuilt.assert_close(output(56, 84).confidence[0], stored("56x84/confidence"), REST)
+
+
+def test_the_finest_map_is_that_of_the_official_code():
+    with torch.inference_mode():
+        pyramid = Metric3D(weights()).pyramid(normalise(rebuilt.image(56, 84), CPU))
+    rebuilt.assert_close(pyramid.fine[0, ::16], stored("56x84/read_0_every16ch"), REST)
+
+
+@pytest.mark.slow
+def test_the_whole_box_is_that_of_the_official_slam():
+    # The official system resizes the depth bicubically and scales by the focal length of the
+    # image before any resizing, here 87.5 px.
+    canonical, _ = Metric3DDepth(weights()).canonical_depth(rebuilt.image(60, 96))
+    full = functional.interpolate(canonical[None, None], (60, 96), mode="bicubic")[0, 0]
+    rebuilt.assert_close(full * 87.5 / 1000, stored("wildgs_60x96_fx87.5/depth"), DEPTH)
+
+
+# Identities
+
+
+def frame(image: torch.Tensor) -> Frame:
+    return Frame(0, 0.0, image)
+
+
+def test_depth_is_scaled_by_the_focal_length_of_the_image_the_network_saw():
+    image = rebuilt.image(28, 42)
+    prior = Metric3DDepth(weights(), SMALL_SIZE)
+    near = prior(frame(image), Camera(30, 30, 20.5, 13.5, 42, 28))
+    far = prior(frame(image), Camera(60, 60, 20.5, 13.5, 42, 28))
+    torch.testing.assert_close(far, 2 * near)
+    canonical, scale = prior.canonical_depth(image)
+    assert scale == 2 and canonical.shape == SMALL_SIZE
+    full = functional.interpolate(canonical[None, None], (28, 42), mode="bilinear")[0, 0]
+    torch.testing.assert_close(near, full * 30 * 2 / 1000)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (320, 240), (289, 300), (17, 400), (720, 1280)])
+def test_an_image_is_fitted_without_changing_its_aspect(size: tuple[int, int]):
+    fitted = fit(torch.ones(*size, 3), (616, 1064), CPU)
+    assert fitted.image.shape == (1, 3, 616, 1064)
+    inner = fitted.image[0, :, fitted.rows, fitted.cols]
+    assert inner.shape[1] == 616 or inner.shape[2] == 1064
+    assert (inner > 1).all()  # white, normalised
+    assert abs(inner.shape[1] - size[0] * fitted.scale) < 1
+    assert abs(inner.shape[2] - size[1] * fitted.scale) < 1
+    outside = fitted.image.sum() - inner.sum()
+    assert abs(float(outside)) < 1e-2 * float(inner.sum())  # only the mean colour around it
+
+
+def test_upsampling_with_even_shares_averages_the_neighbourhood():
+    coarse = torch.rand(1, 2, 4, 5, generator=generator(0))
+    fine = convex_upsample(coarse, torch.zeros(1, 9 * 16, 4, 5), 4)
+    mean = functional.avg_pool2d(coarse, 3, stride=1, padding=1)
+    torch.testing.assert_close(fine, mean.repeat_interleave(4, 2).repeat_interleave(4, 3))
+
+
+def test_upsampling_takes_the_neighbour_that_the_logits_name():
+    coarse = torch.arange(20.0).view(1, 1, 4, 5)
+    logits = torch.zeros(1, 9, 2, 2, 4, 5)
+    logits[:, 5] = 50.0  # row-major in 3x3: the right neighbour
+    fine = convex_upsample(coarse, logits.view(1, 36, 4, 5), 2)
+    torch.testing.assert_close(fine[0, 0, 2, 2], coarse[0, 0, 1, 2])
+    assert fine[0, 0, 0, 9] < 1e-9  # outside of the map is zero
+
+
+def test_normals_have_unit_length_and_positive_confidence():
+    found = normalised(torch.randn(2, 4, 6, 7, generator=generator(1)))
+    torch.testing.assert_close(found[:, :3].norm(dim=1), torch.ones(2, 6, 7))
+    assert (found[:, 3] > 0).all()
+
+
+def test_a_checkpoint_file_is_checked_and_runs(tmp_path: Path):
+    tensors = {name: weights()[name] for name in weights()}
+    torch.save({"model_state_dict": tensors}, tmp_path / "w.pth")
+    prior = load_metric3d(tmp_path / "w.pth", network_size=SMALL_SIZE)
+    camera = Camera(30, 30, 20, 15, 40, 30)
+    assert prior(frame(torch.zeros(30, 40, 3)), camera).shape == (30, 40)
+    del tensors["depth_model.decoder.update_block.mask.2.bias"]
+    torch.save(tensors, tmp_path / "w.pth")
+    with pytest.raises(InputError, match=r"expected the tensor .*update_block\.mask\.2\.bias"):
+        load_metric3d(tmp_path / "w.pth")
+
+
+# Errors
+
+
+def test_another_network_and_an_odd_size_are_refused():
+    with pytest.raises(InputError, match=r"multiples of 28 px, found \(616, 1066\)"):
+        Metric3DDepth(weights(), (616, 1066))
+    with pytest.raises(InputError, match="looks like FiT3D"):
+        Metric3DDepth(rebuilt.weights_of("fit3d_reg_small"))
