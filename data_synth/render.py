@@ -188,19 +188,29 @@ def _paint(
 def lamp_visibility(points: Array, lamp: Array, movers: Sequence[Sequence[Part]]) -> Array:
     """Return how much of the lamp's light (N,) the movers let through to points (3, N)."""
     lit = np.ones(points.shape[1], np.float32)
-    from_lamp = points - lamp.astype(points.dtype)[:, None]
-    squared = np.einsum("kn,kn->n", from_lamp, from_lamp)
+    lamp = lamp.astype(points.dtype)
+    from_lamp = points - lamp[:, None]
+    distance = np.sqrt(np.einsum("kn,kn->n", from_lamp, from_lamp))
+    from_lamp /= distance
     for parts in movers:
-        candidates = np.arange(points.shape[1])
         centre, radius = enclosing_sphere(parts)
-        candidates = _near_segment(candidates, from_lamp, squared, centre - lamp, radius)
+        near = np.flatnonzero(_meets_sphere(from_lamp, distance, centre - lamp, radius))
+        rays, reach = from_lamp[:, near], distance[near] * (1 - SHADOW_MARGIN)
         for part in parts:
             centre, radius = part.bounding_sphere()
-            rays = _near_segment(candidates, from_lamp, squared, centre - lamp, radius)
-            if len(rays):
-                hit = intersect_part(part, lamp, from_lamp[:, rays])
-                lit[rays[hit < 1 - SHADOW_MARGIN]] = 1 - SHADOW_DEPTH
+            chosen = np.flatnonzero(_meets_sphere(rays, reach, centre - lamp, radius))
+            if len(chosen):
+                hit = intersect_part(part, lamp, rays[:, chosen])
+                lit[near[chosen[hit < reach[chosen]]]] = 1 - SHADOW_DEPTH
     return lit
+
+
+def _meets_sphere(directions: Array, reach: Array, centre: Array, radius: float) -> Array:
+    """Return which rays from the origin, unit and of length `reach`, come near a sphere."""
+    along = centre.astype(directions.dtype) @ directions
+    # A ray meets the sphere if it stays inside the cone that touches it.
+    touching = np.sqrt(max(float(centre @ centre) - radius * radius, 0.0))
+    return (along >= touching) & (along - radius < reach)
 
 
 def enclosing_sphere(parts: Sequence[Part]) -> tuple[Array, float]:
@@ -208,17 +218,6 @@ def enclosing_sphere(parts: Sequence[Part]) -> tuple[Array, float]:
     spheres = [part.bounding_sphere() for part in parts]
     centre = np.mean([c for c, _ in spheres], axis=0)
     return centre, max(float(np.linalg.norm(c - centre)) + r for c, r in spheres)
-
-
-def _near_segment(
-    candidates: Array, from_lamp: Array, squared: Array, centre: Array, radius: float
-) -> Array:
-    """Keep the candidates whose way from the lamp comes within `radius` of a centre."""
-    chosen = from_lamp[:, candidates]
-    along = centre.astype(chosen.dtype) @ chosen
-    distance_squared = centre @ centre - along * along / squared[candidates]
-    reached = along - radius * np.sqrt(squared[candidates]) < squared[candidates]
-    return candidates[(distance_squared < radius * radius) & (along > 0) & reached]
 
 
 def develop(colours: Array, intrinsics: Intrinsics) -> Array:

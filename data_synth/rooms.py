@@ -103,7 +103,7 @@ def _shell(
         # The south wall is behind the camera: it shares the paper of the north wall.
         walls = [east_west, east_west, north, north]
         ground = surfaces.planks(rng, (LENGTH, WIDTH), floor)
-    ceiling = surfaces.plaster(rng, (1.5, 1.5), colour(0.1, 0.05, 0.9))
+    ceiling = surfaces.planks(rng, (1.5, 1.5), colour(0.1, 0.05, 0.85), width=0.3)
     shape = Interior((LENGTH, WIDTH, HEIGHT))
     return Part(shape, upright([0.0, 0.0, HEIGHT / 2]), (*walls, ceiling, ground))
 

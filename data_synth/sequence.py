@@ -18,7 +18,7 @@ from .scenes import Scene, scene
 
 NOISE_SIGMA = 0.008  # of the sensor, in units of the full range [0, 1]
 NOVEL_VIEWS = 12
-NOVEL_OFFSET = (0.1, 0.3)  # m, distance of a novel view from the path
+NOVEL_OFFSET = (0.1, 0.3)  # m, distance of a novel view from the path, at least and at most
 NOVEL_ANGLE = 0.07  # rad, largest turn of a novel view about each axis
 NOVEL_CLEARANCE = 0.5  # m, a novel view keeps this distance from everything
 MAXIMUM_WORKERS = 4  # more threads than that wait for each other
@@ -121,7 +121,8 @@ def in_order(function: Callable[[int], object], count: int) -> Iterator:
 def novel_poses(view: Scene, frames: int) -> Array:  # (N, 4, 4)
     """Draw held-out poses beside the path, looking at what the path has seen."""
     rng = np.random.default_rng([zlib.crc32(b"novel " + view.name.encode()), view.seed])
-    near = default_intrinsics((16, 12))
+    camera = default_intrinsics((16, 12))  # coarse: only asked for its distance to things
+    walked = np.array([view.path(index / FRAME_RATE)[:3, 3] for index in range(frames)])
     poses = []
     for index in range(NOVEL_VIEWS):
         on_path = view.path((index + 0.5) / NOVEL_VIEWS * max(frames - 1, 0) / FRAME_RATE)
@@ -130,8 +131,9 @@ def novel_poses(view: Scene, frames: int) -> Array:  # (N, 4, 4)
             offset = rng.uniform(*NOVEL_OFFSET) * direction / np.linalg.norm(direction)
             turn = Rotation.from_rotvec(rng.uniform(-NOVEL_ANGLE, NOVEL_ANGLE, 3)).as_matrix()
             pose = on_path @ rigid(turn, offset)
-            depth, _ = trace(view.room.parts, camera_rays(near, pose))
-            if depth.min() > NOVEL_CLEARANCE:
+            aside = np.linalg.norm(walked - pose[:3, 3], axis=1).min()
+            depth, _ = trace(view.room.parts, camera_rays(camera, pose))
+            if aside >= NOVEL_OFFSET[0] and depth.min() > NOVEL_CLEARANCE:
                 break
         poses.append(pose)
     return np.array(poses)

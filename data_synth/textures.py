@@ -31,15 +31,12 @@ class Texture:
 
     def sample(self, across: Array, up: Array, footprint: Array) -> Array:
         """Return the colours (N, 3) at surface coordinates [m] averaged over a footprint [m]."""
-        level = np.log2(np.maximum(footprint, self.texel) / self.texel)
-        level = np.minimum(level, len(self.levels) - 1).astype(np.float32)
-        lower = np.minimum(level.astype(np.int32), len(self.levels) - 2)
-        weight_upper = level - lower
+        level = np.log2(np.maximum(footprint, self.texel) / self.texel).astype(np.float32)
+        level = np.minimum(level, len(self.levels) - 1)
         colours = np.zeros((len(across), 3), np.float32)
-        for index in range(len(self.levels)):
-            weight = np.where(lower == index, 1 - weight_upper, 0)
-            weight = np.where(lower == index - 1, weight_upper, weight)
-            used = np.flatnonzero(weight)
+        for index in range(int(level.min()), int(np.ceil(level.max())) + 1):
+            weight = 1 - np.abs(level - index)
+            used = np.flatnonzero(weight > 0)
             if len(used):
                 looked_up = self._lookup(index, across[used], up[used])
                 colours[used] += weight[used, None] * looked_up
