@@ -1,6 +1,5 @@
 """Intrinsics: from a file, from a known benchmark, or guessed and said so."""
 
-import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -42,25 +41,6 @@ class Calibration:
                 f"({self.origin}), found {width}x{height}; calibration and images do not match"
             )
         return camera.resized(width, height)
-
-
-# Measured by the makers of the TUM RGB-D benchmark for 640x480 images.
-_TUM_CAMERAS = {
-    "1": (517.3, 516.5, 318.6, 255.3, BrownDistortion(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "2": (520.9, 521.0, 325.1, 249.7, BrownDistortion(0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "3": (535.4, 539.2, 320.1, 247.6, BrownDistortion()),
-}
-_TUM_SIZE = (640, 480)
-_TUM_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)[_ -]?([123])(?!\d)", re.IGNORECASE)
-
-
-def known_tum_camera(text: str) -> Calibration | None:
-    """Return the intrinsics of the TUM camera that a name or note speaks of (freiburg1, fr3...)."""
-    found = _TUM_NAME.search(text)
-    if found is None:
-        return None
-    fx, fy, cx, cy, distortion = _TUM_CAMERAS[found[1]]
-    return Calibration(fx, fy, cx, cy, _TUM_SIZE, distortion, f"TUM fr{found[1]} intrinsics")
 
 
 def guessed_calibration(width: int, height: int) -> Calibration:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from minislam.data.calibration import Calibration, known_tum_camera
+from minislam.data.benchmarks import bonn_camera_trajectory, is_bonn, known_camera
+from minislam.data.calibration import Calibration
 from minislam.data.files import data_rows, finite_numbers, read_text
 from minislam.data.folder import calibration_beside, folder_name, stamps_of_names
 from minislam.data.images import list_images
@@ -34,6 +35,8 @@ def read_tum_folder(folder: Path) -> Recording:
     depth_stamps, depths = _images(folder, "depth")
     truth_path = next((folder / name for name in _TRUTH_NAMES if (folder / name).is_file()), None)
     trajectory = read_trajectory(truth_path) if truth_path else None
+    if trajectory is not None and is_bonn(folder.resolve().name):
+        trajectory = bonn_camera_trajectory(trajectory)
     notes = [f"{len(depths)} depth"] if depths else []
     if trajectory is not None:
         seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
@@ -96,14 +99,14 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
 
 
 def _calibration_by_name(folder: Path) -> Calibration | None:
-    """Look for freiburg1, fr2 ... in the folder's name, its notes and the heads of its lists."""
+    """Look for freiburg1, rgbd_bonn ... in the folder's name, its notes and its lists' heads."""
     notes = [folder.resolve().name]
     lists = [folder / "rgb.txt", folder / "groundtruth.txt"]
     for path in [*sorted(folder.glob("README*")), *lists]:
         if path.is_file():
             head = read_text(path).splitlines()[:20]
             notes += head if path.name.startswith("README") else [x for x in head if x[:1] == "#"]
-    return next(filter(None, map(known_tum_camera, notes)), None)
+    return next(filter(None, map(known_camera, notes)), None)
 
 
 def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[Path | None]:

@@ -7,7 +7,6 @@ import pytest
 
 from minislam.data.calibration import (
     guessed_calibration,
-    known_tum_camera,
     parse_calibration,
     read_calibration,
 )
@@ -30,28 +29,6 @@ def test_four_six_and_eleven_numbers(tmp_path: Path):
 def test_a_calibration_is_carried_to_images_resized_by_half():
     calibration = parse_calibration("500 500 319.5 239.5 640 480", "c")
     assert calibration.camera_for(320, 240) == Camera(250, 250, 159.5, 119.5, 320, 240)
-
-
-@pytest.mark.parametrize(
-    "text, camera",
-    [
-        ("rgbd_dataset_freiburg1_desk", "fr1"),
-        ("fr2_desk", "fr2"),
-        ("Freiburg3 walking_xyz", "fr3"),
-        ("tum_fr3", "fr3"),
-        ("africa_fr10", None),
-        ("suffr1ce", None),
-        ("freiburg", None),
-    ],
-)
-def test_tum_cameras_are_known_by_name(text: str, camera: str | None):
-    found = known_tum_camera(text)
-    assert (found and found.origin) == (camera and f"TUM {camera} intrinsics")
-
-
-def test_fr3_has_no_distortion_and_fr1_has():
-    assert not np.any(known_tum_camera("fr3").distortion.coefficients)
-    assert known_tum_camera("fr1").distortion.k1 == 0.2624
 
 
 def test_the_guess_is_a_field_of_view_of_about_sixty_degrees():
