@@ -1,6 +1,6 @@
 """Open whatever the user names: a folder, a video, or a synthetic sequence."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,14 +22,18 @@ _SYNTHETIC_FRAMES = 100
 _SYNTHETIC_SIZE = (320, 240)  # px
 
 
-def open_sequence(source: str, options: InputOptions | None = None) -> "RecordedSequence":
+def open_sequence(
+    source: str,
+    options: InputOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,  # (done, of all) while rendering synth:
+) -> "RecordedSequence":
     """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED]`.
 
     What a folder is, is decided by what lies in it, not by its name.
     """
     options = options or InputOptions()
     if source.startswith("synth:"):
-        return _open_synthetic(source, options)
+        return _open_synthetic(source, options, progress)
     path = Path(source).expanduser()
     if path.is_file():
         last = None
@@ -132,7 +136,9 @@ def _calibration(
     return calibration, found is None and options.fx is None
 
 
-def _open_synthetic(source: str, options: InputOptions) -> RecordedSequence:
+def _open_synthetic(
+    source: str, options: InputOptions, progress: Callable[[int, int], None] | None
+) -> RecordedSequence:
     """Render a synthetic sequence, or take it from the cache, and open it."""
     import data_synth  # only here: real footage needs no scene generator
 
@@ -146,7 +152,13 @@ def _open_synthetic(source: str, options: InputOptions) -> RecordedSequence:
     if options.max_frames is not None:
         frames = options.start + options.stride * options.max_frames
     size = options.size or _SYNTHETIC_SIZE
-    folder = Path(data_synth.cached_sequence(name, int(seed or 0), frames, size))
+    try:
+        folder = data_synth.cached_sequence(name, int(seed or 0), frames, size, progress)
+    except (data_synth.SynthError, OSError) as error:
+        raise InputError(
+            f"expected to render {source} into the cache, but: {error}; set MINISLAM_CACHE to a "
+            "folder that is writable and has space left"
+        ) from error
     recording = replace(
         read_tum_folder(folder), name=f"{name}-{seed or 0}", kind=f"synthetic sequence {name}"
     )

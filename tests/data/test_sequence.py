@@ -94,6 +94,16 @@ def test_a_synthetic_sequence_is_read_with_its_truth(tmp_path: Path, monkeypatch
     np.testing.assert_allclose(sequence.frame(1).timestamp, 1 / 30, atol=1e-6)
 
 
+def test_rendering_reports_its_progress(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path))
+    calls = []
+    options = InputOptions(max_frames=2, size=(32, 24))
+    open_sequence("synth:static", options, lambda done, total: calls.append((done, total)))
+    assert calls[-1] == (2, 2)
+    open_sequence("synth:static", options, lambda done, total: calls.append((done, total)))
+    assert calls[-1] == (2, 2)  # from the cache: nothing to wait for
+
+
 # Identities
 
 
@@ -117,6 +127,13 @@ def test_wrong_sources_give_one_sentence(tmp_path: Path, monkeypatch, source: st
     with pytest.raises(InputError, match="expected") as caught:
         open_sequence(source)
     assert source in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path / "file"))
+    with pytest.raises(InputError, match="MINISLAM_CACHE"):
+        open_sequence("synth:static", InputOptions(max_frames=2, size=(32, 24)))
 
 
 def test_images_of_another_size_are_named(tmp_path: Path):
