@@ -18,7 +18,7 @@ from .shapes import Part
 SUPERSAMPLE = 2  # rays per pixel side
 FOOTPRINT = 0.6  # px, texture filter width: the spacing of the rays plus a little
 NEAR = 0.05  # m, parts that reach behind this plane are not culled by their outline
-AMBIENT, DIRECT = 0.5, 0.62  # shares of light from everywhere and from the lamp
+AMBIENT, DIRECT = 0.45, 0.57  # shares of light from everywhere and from the lamp
 SHADOW_DEPTH = 0.8  # share of the lamp's light that a mover takes away
 SHADOW_MARGIN = 1e-3  # part of the way to the lamp, against a surface shading itself
 BLUR_SIGMA = 0.5  # px, the lens

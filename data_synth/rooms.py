@@ -1,18 +1,25 @@
 """Two furnished rooms of 6 x 5.2 x 2.8 m: everything that stays where it is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from . import surfaces
 from .poses import Array, upright
+from .render import lamp_visibility
 from .shapes import Box, Cylinder, Ellipsoid, Interior, Part, Shape
-from .textures import Colour, Texture, colour
+from .surfaces import Size
+from .textures import Colour, Texture, build_texture, colour
 
 LENGTH, WIDTH, HEIGHT = 6.0, 5.2, 2.8  # m, along x, y, z; the floor is z = 0
 NORTH = WIDTH / 2  # y of the wall that the camera faces
 EAST = LENGTH / 2
+RUG_HEIGHT = 0.012  # m
+SHADOW_CELL = 0.03  # m, resolution of the painted shadows of furniture
+SHADOW_BLUR = 1.2  # cells, the width of their soft edges
+STILL_SHADOW = 0.55  # how much the furniture's shadow takes away, of what a mover's shadow does
 PLACE_JITTER, YAW_JITTER = 0.05, 0.12  # m, rad: no two seeds have the same furniture
 
 
@@ -32,9 +39,26 @@ class _Builder:
     def __init__(self, rng: np.random.Generator, palette: Sequence[Colour], covers: list[Texture]):
         self.rng, self.palette, self.covers = rng, palette, covers
         self.parts: list[Part] = []
+        self.rugs: list[Part] = []
 
     def add(self, shape: Shape, T_world_part: Array, texture: Texture) -> None:
         self.parts.append(Part(shape, T_world_part, (texture,)))
+
+    def rug(self, size: Size, place: tuple[float, float], yaw: float) -> None:
+        """Spread a rug on the floor."""
+        texture = surfaces.rug(self.rng, size, self.palette[1:])
+        centre = upright([*place, RUG_HEIGHT / 2], yaw)
+        self.rugs.append(Part(Box((*size, RUG_HEIGHT)), centre, (texture,)))
+
+    def finished(self, shell: Part, lamp: Array) -> tuple[Part, ...]:
+        """Return all parts, with the shadows of the furniture painted on floor and rugs."""
+        *walls, floor = shell.textures
+        floor = _shadowed(floor, upright([0.0, 0.0, 0.0]), lamp, self.parts)
+        rugs = [
+            replace(rug, textures=(_shadowed(*rug.textures, rug.T_world_part, lamp, self.parts),))
+            for rug in self.rugs
+        ]
+        return (replace(shell, textures=(*walls, floor)), *rugs, *self.parts)
 
     def cover(self) -> Texture:
         return self.covers[self.rng.integers(len(self.covers))]
@@ -87,6 +111,29 @@ class _Builder:
             self.add(Ellipsoid(radii), place, leaves)
 
 
+def _shadowed(
+    texture: Texture, T_world_surface: Array, lamp: Array, casters: Sequence[Part]
+) -> Texture:
+    """Darken a level surface where furniture keeps the lamp's light away.
+
+    Lamp and furniture never move, so this is done once, coarsely, and blurred: soft shadows for
+    next to nothing, where `lamp_visibility` has only to follow the movers.
+    """
+    rows, columns = texture.levels[0].shape[:2]
+    count_up = round(rows * texture.texel / SHADOW_CELL)
+    count_across = round(columns * texture.texel / SHADOW_CELL)
+    row, column = np.mgrid[0:count_up, 0:count_across]
+    local = np.zeros((4, row.size), np.float32)
+    local[0] = (column.ravel() - (count_across - 1) / 2) * SHADOW_CELL
+    local[1] = ((count_up - 1) / 2 - row.ravel()) * SHADOW_CELL
+    local[3] = 1
+    points = (T_world_surface.astype(np.float32) @ local)[:3]
+    lit = lamp_visibility(points, lamp, [[part] for part in casters]).reshape(row.shape)
+    lit = cv2.resize(cv2.GaussianBlur(lit, (0, 0), SHADOW_BLUR), (columns, rows))
+    shade = 1 - STILL_SHADOW * (1 - lit)
+    return build_texture(texture.levels[0] * shade[..., None], texture.texel)
+
+
 def _shell(
     rng: np.random.Generator, palette: Sequence[Colour], floor: Colour, low_texture: bool
 ) -> Part:
@@ -125,8 +172,7 @@ def living_room(rng: np.random.Generator, low_texture: bool = False) -> Room:
     else:
         covers = [surfaces.furniture(rng, tone) for tone in palette[:5]]
     build = _Builder(rng, palette, covers)
-    build.parts.append(_shell(rng, palette, floor, low_texture))
-
+    shell = _shell(rng, palette, floor, low_texture)
     shelf = surfaces.books(rng, (1.4, 1.95), palette)
     build.add(Box((1.4, 0.34, 1.95)), upright([-1.75, NORTH - 0.17, 0.975]), shelf)
     sideboard = (1.5, 0.45, 0.78)
@@ -137,8 +183,7 @@ def living_room(rng: np.random.Generator, low_texture: bool = False) -> Room:
         build.add(Box(size), upright(np.array(place)), fabric)
     low_table = (0.9, 0.5, 0.36)
     build.clutter(build.block(low_table, (0.25, 1.0)), low_table, 4)
-    rug = surfaces.rug(rng, (2.2, 1.5), palette[1:])
-    build.add(Box((2.2, 1.5, 0.012)), upright([0.2, 0.9, 0.006], 0.1), rug)
+    build.rug((2.2, 1.5), (0.2, 0.9), 0.1)
     for size, at in (((0.42, 0.42, 0.46), (-1.15, 0.35)), ((0.5, 0.4, 0.62), (1.85, 0.75))):
         build.clutter(build.block(size, at), size, 2)
     tower = build.block((0.45, 0.4, 0.5), (2.45, 1.55))
@@ -147,9 +192,10 @@ def living_room(rng: np.random.Generator, low_texture: bool = False) -> Room:
     build.plant((2.6, 2.2), 1.5)
     for wall, along, up, size in _LIVING_ROOM_PICTURES[: 2 if low_texture else None]:
         build.picture(wall, along, up, size)
+    lamp = np.array([0.7, -0.9, 2.65])
     return Room(
-        parts=tuple(build.parts),
-        lamp=np.array([0.7, -0.9, 2.65]),
+        parts=build.finished(shell, lamp),
+        lamp=lamp,
         camera_centre=np.array([0.0, -1.75, 1.42]),
         camera_target=np.array([0.05, 1.05, 0.95]),
     )
@@ -189,8 +235,7 @@ def workshop(rng: np.random.Generator) -> Room:
         colour(hue, 0.05, 0.95),
     ]
     build = _Builder(rng, palette, [surfaces.furniture(rng, tone) for tone in palette[:5]])
-    build.parts.append(_shell(rng, palette, colour(hue + 0.05, 0.15, 0.45), False))
-
+    shell = _shell(rng, palette, colour(hue + 0.05, 0.15, 0.45), low_texture=False)
     bench_top, y = (2.2, 0.62, 0.06), NORTH - 0.36
     bench = upright([-0.6, y, 0.82])
     build.add(Box(bench_top), bench, build.cover())
@@ -212,13 +257,13 @@ def workshop(rng: np.random.Generator) -> Room:
     build.clutter(build.block(cart, (-0.6, 0.9)), cart, 4)
     stool = (0.36, 0.36, 0.45)
     build.clutter(build.block(stool, (1.5, 0.45)), stool, 1)
-    mat = surfaces.rug(rng, (1.8, 1.2), palette[1:])
-    build.add(Box((1.8, 1.2, 0.012)), upright([0.3, 0.6, 0.006], -0.15), mat)
+    build.rug((1.8, 1.2), (0.3, 0.6), -0.15)
     for wall, along, up, size in _WORKSHOP_PICTURES:
         build.picture(wall, along, up, size)
+    lamp = np.array([-0.6, -0.8, 2.6])
     return Room(
-        parts=tuple(build.parts),
-        lamp=np.array([-0.6, -0.8, 2.6]),
+        parts=build.finished(shell, lamp),
+        lamp=lamp,
         camera_centre=np.array([0.0, -1.7, 1.45]),
         camera_target=np.array([-0.05, 1.1, 0.95]),
     )

@@ -33,7 +33,7 @@ from .sequence import (
     render_frame,
 )
 
-GENERATOR_VERSION = 6  # raise it whenever the same arguments give other files
+GENERATOR_VERSION = 7  # raise it whenever the same arguments give other files
 DEPTH_UNITS_PER_METRE = 5000  # of TUM RGB-D
 PNG_COMPRESSION = 1  # of 9: noise does not compress, and level 1 is several times faster
 RECORD = "synth.json"
