@@ -62,9 +62,9 @@ def render_reference(
     contribution = torch.zeros_like(gaussians.opacities.detach())
     contribution[front_to_back] = weights.detach().sum((1, 2))
     radii = torch.zeros_like(contribution)
-    visible = alphas.detach().amax((1, 2)) > 0 if alphas.numel() else alphas.new_zeros(0)
     largest_variance = torch.linalg.eigvalsh(covariances2d.detach())[:, 1]
-    radii[front_to_back] = 3 * largest_variance.sqrt() * visible
+    radii[front_to_back] = 3 * largest_variance.sqrt()
+    radii = radii * (contribution > 0)
     return Rendering(color, depth, opacity, radii, contribution)
 
 

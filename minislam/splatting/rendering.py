@@ -25,7 +25,7 @@ class Rendering(NamedTuple):
     color: Tensor  # (H, W, 3)
     depth: Tensor  # (H, W) sum of weight * z in world units, NOT divided by the opacity
     opacity: Tensor  # (H, W) in [0, 1], 1 - transmittance
-    radii: Tensor  # (N,) px, three standard deviations in the image; 0 where not visible
+    radii: Tensor  # (N,) px, three standard deviations in the image; 0 where contribution is 0
     contribution: Tensor  # (N,) px, sum of a Gaussian's blending weight over all pixels
 
 

@@ -41,6 +41,29 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
     return -(-camera.height // TILE), -(-camera.width // TILE)
 
 
+def tile_centres(camera: Camera, like: Tensor) -> Tensor:  # (2, tiles) px
+    """Return the centre of every tile."""
+    rows, columns = tile_grid(camera)
+    u = torch.arange(columns).to(like) * TILE + (TILE - 1) / 2
+    v = torch.arange(rows).to(like) * TILE + (TILE - 1) / 2
+    return torch.stack([u.repeat(rows), v.repeat_interleave(columns)])
+
+
+def to_tiles(image: Tensor, camera: Camera) -> Tensor:  # (C, H, W) -> (tiles, C, P)
+    """Cut an image into tiles; pixels beyond its border are zero."""
+    rows, columns = tile_grid(camera)
+    pad = (0, columns * TILE - camera.width, 0, rows * TILE - camera.height)
+    tiled = torch.nn.functional.pad(image, pad).view(-1, rows, TILE, columns, TILE)
+    return tiled.permute(1, 3, 0, 2, 4).reshape(rows * columns, -1, PIXELS)
+
+
+def from_tiles(tiled: Tensor, camera: Camera) -> Tensor:  # (tiles, C, P) -> (C, H, W)
+    """Put an image together from its tiles."""
+    rows, columns = tile_grid(camera)
+    image = tiled.view(rows, columns, -1, TILE, TILE).permute(2, 0, 3, 1, 4)
+    return image.reshape(-1, rows * TILE, columns * TILE)[:, : camera.height, : camera.width]
+
+
 def build_tile_lists(
     means2d: Tensor,  # (2, N) px, front to back
     conics: Tensor,  # (3, N) px^-2

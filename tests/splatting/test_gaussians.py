@@ -70,8 +70,8 @@ def test_concatenate_and_prune_undo_each_other():
     first, second = random_map("ordinary", 4, 3), random_map("ordinary", 6, 4)
     both = first.concatenate(second)
     keep = torch.arange(10) < 4
-    for one, other in zip(both.prune(keep).to_arrays().values(), first.to_arrays().values()):
-        assert np.array_equal(one, other)
+    kept, expected = both.prune(keep).to_arrays(), first.to_arrays()
+    assert all(np.array_equal(kept[name], expected[name]) for name in expected)
     assert len(both.prune(~keep)) == 6
 
 

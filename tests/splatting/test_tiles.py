@@ -4,7 +4,7 @@ import pytest
 import torch
 from splatting.scenes import KINDS, random_camera, random_map, random_pose
 
-from minislam.splatting.rasterizer import _project
+from minislam.splatting.ellipses import project_gaussians
 from minislam.splatting.reference import gaussian_alphas
 from minislam.splatting.tiles import TILE, TileLists, build_tile_lists, tile_grid
 
@@ -12,7 +12,7 @@ from minislam.splatting.tiles import TILE, TileLists, build_tile_lists, tile_gri
 def lists_and_truth(kind: str, seed: int) -> tuple[TileLists, torch.Tensor, int]:
     """Return the lists of a random view, and which (Gaussian, tile) pairs truly overlap."""
     gaussians, camera, pose = random_map(kind, 40, seed), random_camera(seed), random_pose(seed)
-    projected = _project(
+    projected = project_gaussians(
         gaussians.means, gaussians.quats_wxyz, gaussians.scales, gaussians.opacities,
         None, pose, camera,
     )  # fmt: skip

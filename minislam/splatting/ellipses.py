@@ -1,0 +1,142 @@
+"""All steps of projection.py in a row: from the map to ellipses in the image, and back."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.splatting.compositing import ellipse_vjp
+from minislam.splatting.covariance import covariance_factors, covariance_factors_vjp
+from minislam.splatting.projection import (
+    conics_from_footprints,
+    conics_from_footprints_vjp,
+    project_factors,
+    project_factors_vjp,
+    project_means,
+    project_means_vjp,
+    to_camera,
+    to_camera_twist_vjp,
+    to_camera_vjp,
+)
+from minislam.splatting.rendering import (
+    LOW_PASS_VARIANCE,
+    MAX_OPACITY,
+    MIN_ALPHA,
+    NEAR_DEPTH,
+    tangent_limits,
+)
+
+
+class Ellipses(NamedTuple):
+    """The visible Gaussians, nearest first, in every form that the backward needs."""
+
+    index: Tensor  # (V,) int64, row in the map
+    quats: Tensor  # (4, V)
+    scales: Tensor  # (3, V)
+    opacities: Tensor  # (V,) at most MAX_OPACITY
+    points_camera: Tensor  # (3, V)
+    camera_factors: Tensor  # (3, 3, V)
+    footprints: Tensor  # (2, 3, V)
+    means2d: Tensor  # (2, V)
+    conics: Tensor  # (3, V)
+    covariances2d: Tensor  # (3, V)
+
+    @property
+    def radii(self) -> Tensor:
+        """Return three standard deviations along the longer axis, (V,) px."""
+        xx, xy, yy = self.covariances2d
+        largest = (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+        return 3 * largest.sqrt()
+
+
+class EllipseGradients(NamedTuple):
+    """dL/d of the visible Gaussians' parameters, in the order of `Ellipses.index`."""
+
+    means: Tensor  # (3, V)
+    quats: Tensor | None  # (4, V)
+    scales: Tensor | None  # (3, V)
+    opacities: Tensor  # (V,)
+    twist: Tensor  # (6,) at the rendered pose
+    means2d: Tensor  # (2, V)
+
+
+def project_gaussians(
+    means: Tensor,  # (N, 3)
+    quats: Tensor,  # (N, 4)
+    scales: Tensor,  # (N, 3)
+    opacities: Tensor,  # (N,)
+    screen_offsets: Tensor | None,  # (N, 2)
+    T_camera_world: Tensor,  # (4, 4)
+    camera: Camera,
+) -> Ellipses:
+    """Sort out what cannot be seen, and project the rest in order of depth."""
+    index = _visible_front_to_back(means, scales, opacities, T_camera_world, camera)
+    means, quats, scales = (rows[index].T.contiguous() for rows in (means, quats, scales))
+    # Capped per Gaussian, not per pixel: the profile stays smooth, and alpha <= o is safe as well.
+    opacities = opacities[index].clamp(max=MAX_OPACITY)
+    points_camera, camera_factors = to_camera(
+        means, covariance_factors(quats, scales), T_camera_world
+    )
+    means2d = project_means(points_camera, camera)
+    if screen_offsets is not None:
+        means2d = means2d + screen_offsets[index].T
+    footprints = project_factors(points_camera, camera_factors, camera)
+    conics, covariances2d = conics_from_footprints(footprints)
+    return Ellipses(
+        index, quats, scales, opacities, points_camera, camera_factors,
+        footprints, means2d, conics, covariances2d,
+    )  # fmt: skip
+
+
+def project_gaussians_vjp(
+    ellipses: Ellipses,
+    moments: Tensor,  # (6, V) of dL/d ln alpha about the mean, see compositing.exponents_vjp
+    v_depths: Tensor,  # (V,)  dL/dz through the depth image
+    T_camera_world: Tensor,  # (4, 4)
+    camera: Camera,
+    needs_shape: bool,  # False where only the pose is asked for
+) -> EllipseGradients:
+    """Pull the gradients of the ellipses back to the Gaussians and to the camera pose."""
+    e = ellipses
+    v_log_opacities, v_means2d, v_conics = ellipse_vjp(e.conics, moments)
+    v_opacities = v_log_opacities / e.opacities * (e.opacities < MAX_OPACITY)
+
+    v_footprints = conics_from_footprints_vjp(e.footprints, e.conics, v_conics)
+    v_points, v_camera_factors = project_factors_vjp(
+        e.points_camera, e.camera_factors, e.footprints, camera, v_footprints
+    )
+    v_points += project_means_vjp(e.points_camera, camera, v_means2d)
+    v_points[2] += v_depths
+
+    v_twist = to_camera_twist_vjp(e.points_camera, e.camera_factors, v_points, v_camera_factors)
+    v_means, v_factors = to_camera_vjp(T_camera_world, v_points, v_camera_factors)
+    v_quats = v_scales = None
+    if needs_shape:
+        v_quats, v_scales = covariance_factors_vjp(e.quats, e.scales, v_factors)
+    return EllipseGradients(v_means, v_quats, v_scales, v_opacities, v_twist, v_means2d)
+
+
+def _visible_front_to_back(
+    means: Tensor, scales: Tensor, opacities: Tensor, T_camera_world: Tensor, camera: Camera
+) -> Tensor:  # (V,) int64
+    """Return the rows that may be seen, nearest first; equal depths stay in map order.
+
+    The radius is bounded before anything is projected: |J| <= f/z sqrt(1 + |h|^2), and the
+    largest support of a Gaussian is sqrt(2 ln(MAX_OPACITY / MIN_ALPHA)) = 3.33 deviations.
+    """
+    x, y, z = torch.addmm(T_camera_world[:3, 3:], T_camera_world[:3, :3], means.T)
+    in_front = z > NEAR_DEPTH
+    z_safe = torch.where(in_front, z, 1)  # what is dropped must not divide by zero
+    tangents = x / z_safe, y / z_safe
+    limits = torch.tensor(tangent_limits(camera)).abs().amax(0)
+    largest_scale = torch.maximum(torch.maximum(scales[:, 0], scales[:, 1]), scales[:, 2])
+    stretch = max(camera.fx, camera.fy) * (1 + float(limits.square().sum())) ** 0.5
+    radius = largest_scale * stretch / z_safe
+    level = 2 * torch.tensor(MAX_OPACITY / MIN_ALPHA).log().item() + 1e-3
+    radius = ((radius * radius + LOW_PASS_VARIANCE) * level).sqrt()
+    u, v = camera.fx * tangents[0] + camera.cx, camera.fy * tangents[1] + camera.cy
+    near_u = (u + radius >= 0) & (u - radius <= camera.width - 1)
+    near_v = (v + radius >= 0) & (v - radius <= camera.height - 1)
+    index = (in_front & near_u & near_v & (opacities > MIN_ALPHA)).nonzero()[:, 0]
+    return index[z[index].argsort(stable=True)]
