@@ -35,12 +35,18 @@ class Calibration:
             camera = Camera(self.fx, self.fy, self.cx, self.cy, *made_for)
         except InputError as error:
             raise InputError(f"{self.origin}: {error}") from error
-        if abs(made_for[0] * height / (made_for[1] * width) - 1) > _ASPECT_TOLERANCE:
+        if not self.fits(width, height):
             raise InputError(
                 f"expected images of {made_for[0]}x{made_for[1]} px or a resized version of that "
                 f"({self.origin}), found {width}x{height}; calibration and images do not match"
             )
         return camera.resized(width, height)
+
+    def fits(self, width: int, height: int) -> bool:
+        """Tell whether images of this size have the aspect that the calibration was made for."""
+        if self.size is None:
+            return True
+        return abs(self.size[0] * height / (self.size[1] * width) - 1) <= _ASPECT_TOLERANCE
 
 
 def guessed_calibration(width: int, height: int) -> Calibration:

@@ -124,7 +124,8 @@ def _calibration(
     found = read_calibration(Path(options.calibration)) if options.calibration else None
     found = found or recording.calibration
     calibration = found or guessed_calibration(width, height)
-    given = {"fx": options.fx, "fy": options.fy or options.fx, "cx": options.cx, "cy": options.cy}
+    fy = options.fx if options.fy is None else options.fy
+    given = {"fx": options.fx, "fy": fy, "cx": options.cx, "cy": options.cy}
     given = {name: value for name, value in given.items() if value is not None}
     if given:
         scaled = calibration.camera_for(width, height)

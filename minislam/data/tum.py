@@ -9,7 +9,7 @@ from minislam.data.benchmarks import bonn_camera_trajectory, is_bonn, known_came
 from minislam.data.calibration import Calibration
 from minislam.data.files import data_rows, finite_numbers, read_text
 from minislam.data.folder import calibration_beside, folder_name, stamps_of_names
-from minislam.data.images import list_images
+from minislam.data.images import list_images, read_color
 from minislam.data.recording import Recording
 from minislam.data.sources import FileImages
 from minislam.data.trajectory import read_trajectory
@@ -46,7 +46,7 @@ def read_tum_folder(folder: Path) -> Recording:
         kind="TUM RGB-D folder",
         images=FileImages(paths),
         timestamps=stamps,
-        calibration=calibration_beside(folder) or _calibration_by_name(folder),
+        calibration=calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
         trajectory=trajectory,
         depth_paths=_nearest(stamps, depth_stamps, depths),
         mask_paths=_beside(folder / "masks", paths),
@@ -98,15 +98,20 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
     return stamps, paths
 
 
-def _calibration_by_name(folder: Path) -> Calibration | None:
-    """Look for freiburg1, rgbd_bonn ... in the folder's name, its notes and its lists' heads."""
+def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
+    """Look for freiburg1, rgbd_bonn ... in the folder's name, its notes and its lists' heads.
+
+    Images of another shape than the benchmark's were filmed by another camera.
+    """
     notes = [folder.resolve().name]
     lists = [folder / "rgb.txt", folder / "groundtruth.txt"]
     for path in [*sorted(folder.glob("README*")), *lists]:
         if path.is_file():
             head = read_text(path).splitlines()[:20]
             notes += head if path.name.startswith("README") else [x for x in head if x[:1] == "#"]
-    return next(filter(None, map(known_camera, notes)), None)
+    found = next(filter(None, map(known_camera, notes)), None)
+    height, width = read_color(image).shape[:2]
+    return found if found is not None and found.fits(width, height) else None
 
 
 def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[Path | None]:

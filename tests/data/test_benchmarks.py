@@ -36,7 +36,7 @@ def test_fr3_has_no_distortion_and_fr1_has():
 
 
 def test_a_bonn_folder_has_camera_and_corrected_truth(tmp_path):
-    folder = tum_folder(tmp_path / "rgbd_bonn_crowd")
+    folder = tum_folder(tmp_path / "rgbd_bonn_crowd", size=(64, 48))
     (folder / "calibration.txt").unlink()
     recording = read_tum_folder(folder)
     assert recording.calibration.origin == "Bonn intrinsics"

@@ -44,7 +44,8 @@ def test_depth_is_associated_by_nearest_stamp(tmp_path: Path):
 
 @pytest.mark.parametrize("where", ["README.md", "rgb.txt", "folder"])
 def test_the_camera_is_known_by_name(tmp_path: Path, where: str):
-    folder = tum_folder(tmp_path / ("rgbd_freiburg2_xyz" if where == "folder" else "desk"))
+    name = "rgbd_freiburg2_xyz" if where == "folder" else "desk"
+    folder = tum_folder(tmp_path / name, size=(64, 48))
     (folder / "calibration.txt").unlink()
     if where == "README.md":
         (folder / "README.md").write_text("# TUM fr2_desk\n")
@@ -52,6 +53,12 @@ def test_the_camera_is_known_by_name(tmp_path: Path, where: str):
         text = (folder / "rgb.txt").read_text()
         (folder / "rgb.txt").write_text("# file: 'rgbd_dataset_freiburg2_desk.bag'\n" + text)
     assert read_tum_folder(folder).calibration.fx == 520.9
+
+
+def test_a_name_alone_does_not_make_another_camera_s_images_wrong(tmp_path: Path):
+    folder = tum_folder(tmp_path / "copy_of_fr1", size=(64, 36))
+    (folder / "calibration.txt").unlink()
+    assert read_tum_folder(folder).calibration is None
 
 
 def test_names_with_spaces_percent_and_unicode(tmp_path: Path):
