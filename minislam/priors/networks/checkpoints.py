@@ -169,7 +169,7 @@ def require(weights: Weights, kind: str) -> None:
 def probe(weights: Weights, run_once: Callable[[], object], ignored: tuple[str, ...] = ()) -> None:
     """Check a file by running its network once: every tensor fits, is there, and is needed."""
     try:
-        with torch.inference_mode():
+        with torch.no_grad():
             run_once()
     except RuntimeError as error:
         raise InputError(

@@ -98,11 +98,11 @@ class DepthAnything:
     def __call__(self, frame: Frame, camera: Camera) -> Tensor:
         """Return the depth (H, W) in metres that the network sees in an image."""
         size = tuple(frame.image.shape[:2])
-        with torch.inference_mode():
+        with torch.no_grad():
             seen = normalise(self._resized(frame.image), self.device)
             depth = self.depth_limit * torch.sigmoid(self.network(seen))
             full = _resize(depth[None], size)[0, 0]
-        return full.to(frame.image.device).clone()  # clone: leaves inference mode
+        return full.to(frame.image.device)
 
     def _resized(self, image: Tensor) -> Tensor:
         """Return the image with sides of whole patches, the shorter one of `shorter_side`."""

@@ -42,11 +42,11 @@ class DinoFeatures:
                 f"expected an image of at least {PATCH}x{PATCH} px for the features, "
                 f"found {image.shape[1]}x{image.shape[0]}; give a larger working size"
             )
-        with torch.inference_mode():
+        with torch.no_grad():
             size = (PATCH * rows, PATCH * cols)
             whole = functional.interpolate(normalise(image, self.device), size, mode="bilinear")
             patches = self._transformer(whole)[0].patches[0]
-        return patches.permute(1, 2, 0).to(image.device).clone()  # clone: leaves inference mode
+        return patches.permute(1, 2, 0).to(image.device)
 
 
 def position_resize_of(weights: Weights) -> PositionResize:

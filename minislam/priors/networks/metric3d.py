@@ -155,10 +155,10 @@ class Metric3DDepth:
 
     def canonical_depth(self, image: Tensor) -> tuple[Tensor, float]:
         """Return the depth of a 1000 px camera at the network's scale, and that scale."""
-        with torch.inference_mode():
+        with torch.no_grad():
             fitted = fit(image, self.network_size, self.device)
             depth = self.network(fitted.image).depth[0, fitted.rows, fitted.cols]
-        return depth.clone(), fitted.scale  # clone: leaves inference mode
+        return depth, fitted.scale
 
 
 def load_metric3d(

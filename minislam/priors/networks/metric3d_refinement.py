@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from minislam.priors.networks.checkpoints import Weights
+from minislam.priors.networks.upsampling import convex_upsample
 
 NEAREST, FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
 _BINS = 256  # of depth, between the two on a logarithmic scale
@@ -151,16 +152,3 @@ def _proposed_change(weights: Weights, hidden: Tensor) -> Tensor:
     depth = weights.conv("conv2d", weights.conv("conv1d", hidden).relu())
     normal = weights.conv("conv2n", weights.conv("conv1n", hidden).relu())
     return torch.cat([depth, normal], 1)
-
-
-def convex_upsample(
-    coarse: Tensor,  # (B, C, h, w)
-    logits: Tensor,  # (B, 9 * factor^2, h, w)
-    factor: int,
-) -> Tensor:  # (B, C, factor * h, factor * w)
-    """Upsample: each fine pixel is a convex combination of the 3x3 coarse ones around it."""
-    batch, channels, height, width = coarse.shape
-    share = logits.view(batch, 1, 9, factor, factor, height, width).softmax(2)
-    around = functional.unfold(coarse, 3, padding=1).view(batch, channels, 9, 1, 1, height, width)
-    fine = (share * around).sum(2)  # (B, C, factor, factor, h, w)
-    return fine.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, factor * height, factor * width)

@@ -11,11 +11,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.metric3d import Metric3D, Metric3DDepth, fit, load_metric3d
-from minislam.priors.networks.metric3d_refinement import (
-    Metric3DOutput,
-    convex_upsample,
-    normalised,
-)
+from minislam.priors.networks.metric3d_refinement import Metric3DOutput, normalised
 from minislam.priors.networks.vit import normalise
 from minislam.records import Frame
 from tests.helpers import generator
@@ -102,22 +98,6 @@ def test_an_image_is_fitted_without_changing_its_aspect(size: tuple[int, int]):
     assert abs(inner.shape[2] - size[1] * fitted.scale) < 1
     outside = fitted.image.sum() - inner.sum()
     assert abs(float(outside)) < 1e-2 * float(inner.sum())  # only the mean colour around it
-
-
-def test_upsampling_with_even_shares_averages_the_neighbourhood():
-    coarse = torch.rand(1, 2, 4, 5, generator=generator(0))
-    fine = convex_upsample(coarse, torch.zeros(1, 9 * 16, 4, 5), 4)
-    mean = functional.avg_pool2d(coarse, 3, stride=1, padding=1)
-    torch.testing.assert_close(fine, mean.repeat_interleave(4, 2).repeat_interleave(4, 3))
-
-
-def test_upsampling_takes_the_neighbour_that_the_logits_name():
-    coarse = torch.arange(20.0).view(1, 1, 4, 5)
-    logits = torch.zeros(1, 9, 2, 2, 4, 5)
-    logits[:, 5] = 50.0  # row-major in 3x3: the right neighbour
-    fine = convex_upsample(coarse, logits.view(1, 36, 4, 5), 2)
-    torch.testing.assert_close(fine[0, 0, 2, 2], coarse[0, 0, 1, 2])
-    assert fine[0, 0, 0, 9] < 1e-9  # outside of the map is zero
 
 
 def test_normals_have_unit_length_and_positive_confidence():

@@ -1,0 +1,229 @@
+"""DROID-SLAM's network behind the `FlowEstimator` interface: the front-end of the paper.
+
+Each edge keeps the hidden state of its recurrent unit as long as it is asked for call after call,
+so a later answer builds on the earlier ones while the geometry between them improves.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+from minislam.parameters import parameter
+from minislam.priors.interfaces import FlowMatches
+from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probe, require
+from minislam.priors.networks.droid_network import (
+    LEVELS,
+    STRIDE,
+    Context,
+    aggregate,
+    cell_grid,
+    correlation_pyramid,
+    encode_context,
+    encode_features,
+    look_up,
+    update,
+)
+from minislam.priors.networks.vit import normalise
+
+_SMALLEST_GRID = 2 ** (LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
+
+
+@dataclass(frozen=True)
+class DroidFlowConfig:
+    """How much work the network is given."""
+
+    updates: int = parameter(
+        2, "updates per match; with two rounds of flow and BA it makes the 4 of a CPU profile"
+    )
+    chain_updates: int = parameter(3, "updates per frame while following the camera")
+    edges_per_batch: int = parameter(8, "edges in one pass, bounds the memory of correlations")
+    matched_confidence: float = parameter(
+        0.1, "least confidence of a cell that counts as matched [-], a guess without real weights"
+    )
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """What the network knows about one frame."""
+
+    features: Tensor  # (1, 128, h, w)
+    context: Context
+
+
+@dataclass(frozen=True)
+class _EdgeState:
+    hidden: Tensor  # (128, h, w)
+    target: Tensor  # (h, w, 2) cells
+
+
+class DroidFlow:
+    """Learned flow between registered keyframes, refined around a predicted reprojection."""
+
+    stride = STRIDE
+
+    def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
+        require(weights, "DROID-SLAM")
+        self.weights = weights
+        self.config = config or DroidFlowConfig()
+        self._frames: dict[int, EncodedFrame] = {}
+        self._edges: dict[tuple[int, int], _EdgeState] = {}
+
+    def add_frame(self, keyframe_index: int, image: Tensor) -> None:
+        """Register the image (H, W, 3) of a keyframe under its index."""
+        self._frames[keyframe_index] = self.encode(image)
+
+    def remove_frame(self, keyframe_index: int) -> None:
+        """Forget a keyframe and the edges that touch it."""
+        del self._frames[keyframe_index]
+        self._edges = {e: state for e, state in self._edges.items() if keyframe_index not in e}
+
+    @torch.no_grad()
+    def match(
+        self,
+        edges_source: list[int],  # (E,) keyframe index
+        edges_target: list[int],  # (E,) keyframe index
+        predicted_targets: Tensor,  # (E, h, w, 2) px
+    ) -> FlowMatches:
+        """Match every grid cell of each source in its target; see FlowEstimator.match."""
+        edges = list(zip(edges_source, edges_target, strict=True))
+        expected = predicted_targets.to(self.weights.device, torch.float32) / STRIDE
+        states: dict[tuple[int, int], _EdgeState] = {}
+        confidences = []
+        for start in range(0, len(edges), self.config.edges_per_batch):
+            batch = edges[start : start + self.config.edges_per_batch]
+            found, confidence = self._refine(batch, expected[start : start + len(batch)])
+            states |= dict(zip(batch, found, strict=True))
+            confidences.append(confidence)
+        # Edges that were not asked for start afresh next time, as in a new graph: memory stays
+        # bounded by one call.
+        self._edges = states
+        targets = torch.stack([states[edge].target for edge in edges])
+        return self.as_matches(targets, torch.cat(confidences), predicted_targets)
+
+    def _refine(
+        self,
+        edges: list[tuple[int, int]],
+        expected: Tensor,  # (E, h, w, 2) cells
+    ) -> tuple[list[_EdgeState], Tensor]:
+        """Return the new states of a batch of edges and their confidences (E, h, w, 2)."""
+        sources = [self._frames[source] for source, _ in edges]
+        targets = torch.cat([self._frames[target].features for _, target in edges])
+        known = [self._edges.get(edge) for edge in edges]
+        hidden = [
+            state.hidden[None] if state else source.context.hidden
+            for state, source in zip(known, sources, strict=True)
+        ]
+        last = [
+            state.target if state else where for state, where in zip(known, expected, strict=True)
+        ]
+        refined = self.refined(
+            torch.cat([source.features for source in sources]),
+            Context(torch.cat(hidden), torch.cat([s.context.features for s in sources])),
+            targets,
+            expected,
+            torch.stack(last),
+            self.config.updates,
+        )
+        return [_EdgeState(h, t) for h, t in zip(*refined[:2], strict=True)], refined[2]
+
+    def refined(
+        self,
+        source_features: Tensor,  # (E, 128, h, w)
+        source_context: Context,  # of E frames
+        target_features: Tensor,  # (E, 128, h, w)
+        expected: Tensor,  # (E, h, w, 2) cells
+        last_target: Tensor,  # (E, h, w, 2) cells
+        updates: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Run updates; return hidden states, targets [cells] and confidences."""
+        pyramid = correlation_pyramid(source_features, target_features)
+        hidden, context = source_context.hidden, source_context.features
+        for _ in range(updates):
+            correlation = look_up(pyramid, expected)
+            answer = update(self.weights, hidden, context, correlation, expected, last_target)
+            hidden, last_target = answer.hidden, expected + answer.revision
+            expected = last_target  # until the geometry is updated, this is the best guess
+        return hidden, last_target, answer.confidence
+
+    @torch.no_grad()
+    def encode(self, image: Tensor) -> EncodedFrame:
+        """Return features and context of an image (H, W, 3)."""
+        if min(image.shape[:2]) <= STRIDE * (_SMALLEST_GRID - 1):
+            raise InputError(
+                f"expected images of more than {STRIDE * (_SMALLEST_GRID - 1)} px per side for "
+                f"DROID, found {image.shape[1]}x{image.shape[0]}; give a larger working size"
+            )
+        seen = normalise(image, self.weights.device)
+        return EncodedFrame(encode_features(self.weights, seen), encode_context(self.weights, seen))
+
+    def as_matches(self, targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatches:
+        """Return targets [cells] and confidences (E, h, w, 2) as matches in px, like a tensor."""
+        size = targets.new_tensor([targets.shape[2] - 1, targets.shape[1] - 1])
+        inside = ((targets >= 0) & (targets <= size)).all(-1)
+        matched = inside & (confidences.mean(-1) >= self.config.matched_confidence)
+        shares = matched.float().mean((1, 2))
+        return FlowMatches(*(x.to(like) for x in (STRIDE * targets, confidences, shares)))
+
+    def start_chain(self, image: Tensor) -> "DroidChain":
+        """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
+        return DroidChain(self, self.encode(image), None, None)
+
+
+class DroidChain:
+    """The flow from one reference frame to the newest; a `FlowChain` that never changes."""
+
+    def __init__(
+        self,
+        flow: DroidFlow,
+        reference: EncodedFrame,
+        newest: EncodedFrame | None,
+        target: Tensor | None,
+    ) -> None:
+        self._flow, self._reference = flow, reference
+        self._newest = newest or reference
+        self._target = target  # (1, h, w, 2) cells, None: nothing has moved yet
+
+    @torch.no_grad()
+    def advanced(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
+        """Return the chain and the matches (E = 1) from the reference to this next image."""
+        newest, reference = self._flow.encode(image), self._reference
+        expected = self._target
+        if expected is None:
+            height, width = reference.features.shape[2:]
+            expected = cell_grid(reference.features.new_zeros(1, height, width, 2))[None]
+        _, target, confidence = self._flow.refined(
+            reference.features,
+            reference.context,
+            newest.features,
+            expected,
+            expected,
+            self._flow.config.chain_updates,
+        )
+        matches = self._flow.as_matches(target, confidence, image)
+        return DroidChain(self._flow, reference, newest, target), matches
+
+    def restarted(self) -> "DroidChain":
+        """Return a chain that starts at the newest frame."""
+        return DroidChain(self._flow, self._newest, None, None)
+
+
+def load_droid(
+    path: Path | str,
+    device: torch.device | str = "cpu",
+    config: DroidFlowConfig | None = None,
+) -> DroidFlow:
+    """Read DROID-SLAM's checkpoint and check it on a tiny image."""
+    weights = load_checkpoint(path, device)
+    flow = DroidFlow(weights, config)
+    side = STRIDE * _SMALLEST_GRID
+
+    def run_once() -> None:
+        chain, _ = flow.start_chain(torch.zeros(side, side, 3)).advanced(torch.zeros(side, side, 3))
+        hidden = chain._reference.context.hidden
+        aggregate(weights, hidden, torch.zeros(1, dtype=torch.long, device=weights.device))
+
+    probe(weights, run_once)
+    return flow

@@ -1,0 +1,168 @@
+"""The network of DROID-SLAM: it looks where a cell is expected and says where it really is.
+
+    image -> features (compared between frames) and context (of the source frame)
+    expected position -> correlation of the features around it
+    correlation, motion, context -> recurrent unit -> revision of the position, confidence
+
+All positions and lengths in this file are in cells (1 cell = 8 px); px are droid.py's affair.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.priors.networks.checkpoints import Weights
+
+STRIDE = 8  # px per cell, fixed by the three halvings of the encoders
+CHANNELS = 128  # of features, hidden state and context
+LEVELS = 4  # of the correlation pyramid
+RADIUS = 3  # cells looked at around the expected position, at every level
+_MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
+_DAMPING_SCALE = 0.01  # of the damping head's softplus
+
+
+@dataclass(frozen=True)
+class Context:
+    """What the recurrent unit knows about the source frame."""
+
+    hidden: Tensor  # (B, 128, h, w) where it starts
+    features: Tensor  # (B, 128, h, w) what it sees in every update
+
+
+@dataclass(frozen=True)
+class Update:
+    """The answer of one update."""
+
+    hidden: Tensor  # (E, 128, h, w)
+    revision: Tensor  # (E, h, w, 2) cells, to be added to the expected position
+    confidence: Tensor  # (E, h, w, 2) in (0, 1), for u and v
+
+
+def encode_features(weights: Weights, image: Tensor) -> Tensor:  # (B, 128, h, w)
+    """Return what is compared between frames, of normalised images (B, 3, H, W)."""
+    return _encode(weights.below("fnet."), image, normalised=True)
+
+
+def encode_context(weights: Weights, image: Tensor) -> Context:
+    """Return the start of the hidden state and the context of normalised images (B, 3, H, W)."""
+    both = _encode(weights.below("cnet."), image, normalised=False)
+    return Context(both[:, :CHANNELS].tanh(), both[:, CHANNELS:].relu())
+
+
+def _encode(weights: Weights, x: Tensor, normalised: bool) -> Tensor:
+    """Halve the image three times with residual blocks: (B, 3, H, W) -> (B, C, H/8, W/8)."""
+
+    def norm(y: Tensor) -> Tensor:
+        return functional.instance_norm(y) if normalised else y
+
+    x = norm(weights.conv("conv1", x, stride=2)).relu()
+    for stage in (1, 2, 3):
+        for block in (0, 1):
+            part = weights.below(f"layer{stage}.{block}.")
+            stride = 2 if stage > 1 and block == 0 else 1
+            y = norm(part.conv("conv1", x, stride)).relu()
+            y = norm(part.conv("conv2", y)).relu()
+            skip = norm(part.conv("downsample.0", x, stride)) if stride == 2 else x
+            x = (skip + y).relu()
+    return weights.conv("conv2", x)
+
+
+def correlation_pyramid(
+    source: Tensor,  # (E, 128, h, w) features
+    target: Tensor,  # (E, 128, h, w) features
+) -> list[Tensor]:  # per level (E * h * w, 1, h / 2^l, w / 2^l)
+    """Compare every source cell with every target cell; average the targets level by level."""
+    edges, _, height, width = source.shape
+    # Each side is divided by 4, so the product by 16: the scale the network was trained with.
+    volume = torch.einsum("ecn,ecm->enm", source.flatten(2) / 4, target.flatten(2) / 4)
+    volume = volume.reshape(edges * height * width, 1, height, width)
+    pyramid = [volume]
+    for _ in range(LEVELS - 1):
+        pyramid.append(functional.avg_pool2d(pyramid[-1], 2))
+    return pyramid
+
+
+def look_up(
+    pyramid: list[Tensor],
+    positions: Tensor,  # (E, h, w, 2) cells in the target
+) -> Tensor:  # (E, 4 * 49, h, w)
+    """Return the correlations in a 7x7 window around positions, at every level, 0 outside."""
+    edges, height, width, _ = positions.shape
+    steps = torch.arange(-RADIUS, RADIUS + 1, dtype=positions.dtype, device=positions.device)
+    # The offset in u changes slowest: that is the order of the trained channels.
+    window = torch.stack(torch.meshgrid(steps, steps, indexing="ij"), -1)  # (7, 7, 2)
+    centres = positions.reshape(-1, 1, 1, 2)
+    levels = []
+    for level, volume in enumerate(pyramid):
+        size = positions.new_tensor([volume.shape[3], volume.shape[2]])
+        # grid_sample counts from -1 to 1 between the outer edges of the outermost cells.
+        sampled_at = (2 * (centres / 2**level + window) + 1) / size - 1
+        levels.append(functional.grid_sample(volume, sampled_at, align_corners=False))
+    found = torch.cat(levels, 1)  # (E * h * w, 4, 7, 7)
+    return found.reshape(edges, height, width, -1).permute(0, 3, 1, 2)
+
+
+def update(
+    weights: Weights,
+    hidden: Tensor,  # (E, 128, h, w)
+    context: Tensor,  # (E, 128, h, w) of the source
+    correlation: Tensor,  # (E, 196, h, w) around the expected positions
+    expected: Tensor,  # (E, h, w, 2) cells in the target, by the present geometry
+    last_target: Tensor,  # (E, h, w, 2) cells, the answer of the last update
+) -> Update:
+    """Return where cells are seen, relative to where they were expected, and how surely."""
+    weights = weights.below("update.")
+    motion = torch.cat([expected - cell_grid(expected), last_target - expected], -1)
+    motion = motion.clamp(-_MOTION_LIMIT, _MOTION_LIMIT).permute(0, 3, 1, 2)
+    inputs = [
+        context,
+        _two_convs(weights.below("corr_encoder."), correlation).relu(),
+        _two_convs(weights.below("flow_encoder."), motion).relu(),
+    ]
+    hidden = _gru(weights.below("gru."), hidden, torch.cat(inputs, 1))
+    # Checkpoints may hold a third output channel, which was of use in the training only.
+    revision = _two_convs(weights.below("delta."), hidden)[:, :2]
+    confidence = _two_convs(weights.below("weight."), hidden)[:, :2].sigmoid()
+    return Update(hidden, revision.permute(0, 2, 3, 1), confidence.permute(0, 2, 3, 1))
+
+
+def cell_grid(like: Tensor) -> Tensor:  # (h, w, 2) cells
+    """Return the position (u, v) of every cell of a map (E, h, w, 2)."""
+    height, width = like.shape[1:3]
+    u = torch.arange(width, dtype=like.dtype, device=like.device)
+    v = torch.arange(height, dtype=like.dtype, device=like.device)
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
+
+def _two_convs(weights: Weights, x: Tensor) -> Tensor:
+    return weights.conv("2", weights.conv("0", x).relu())
+
+
+def _gru(weights: Weights, hidden: Tensor, inputs: Tensor) -> Tensor:
+    """Update the hidden state; a gated mean over the image tells every cell about the whole."""
+    gated = weights.conv("w", hidden).sigmoid() * hidden
+    whole = gated.mean((2, 3), keepdim=True)  # (E, 128, 1, 1)
+    both = torch.cat([hidden, inputs], 1)
+    z = torch.sigmoid(weights.conv("convz", both) + weights.conv("convz_glo", whole))
+    r = torch.sigmoid(weights.conv("convr", both) + weights.conv("convr_glo", whole))
+    proposal = torch.cat([r * hidden, inputs], 1)
+    q = torch.tanh(weights.conv("convq", proposal) + weights.conv("convq_glo", whole))
+    return (1 - z) * hidden + z * q
+
+
+def aggregate(
+    weights: Weights,
+    hidden: Tensor,  # (E, 128, h, w)
+    edges_source: Tensor,  # (E,) frame index
+) -> tuple[Tensor, Tensor]:  # (K, h, w), (K, 576, h, w), by increasing frame index
+    """Return per source frame the damping of its disparities and its upsampling logits."""
+    weights = weights.below("update.agg.")
+    frames, position = edges_source.unique(return_inverse=True)
+    seen = weights.conv("conv1", hidden).relu()
+    mean = seen.new_zeros(len(frames), *seen.shape[1:]).index_add_(0, position, seen)
+    mean = mean / torch.bincount(position).view(-1, 1, 1, 1)
+    features = weights.conv("conv2", mean).relu()
+    damping = _DAMPING_SCALE * functional.softplus(weights.conv("eta.0", features))
+    return damping[:, 0], weights.conv("upmask.0", features)

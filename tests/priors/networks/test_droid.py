@@ -1,0 +1,181 @@
+"""DROID-SLAM as a FlowEstimator: units, hidden states, batches, files.
+
+The weights are made up, so nothing is asked of the quality of the flow; that the network is the
+official one is test_droid_network.py's matter.
+"""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.priors.networks.checkpoints import Weights
+from minislam.priors.networks.droid import DroidFlow, DroidFlowConfig, load_droid
+from minislam.priors.networks.droid_network import (
+    cell_grid,
+    correlation_pyramid,
+    look_up,
+    update,
+)
+from tests.priors.networks import rebuilt
+from tests.priors.networks.test_droid_network import moving_image
+
+HEIGHT, WIDTH = 66, 90  # no multiples of 8: 9 x 12 cells
+
+
+@cache
+def weights() -> Weights:
+    return rebuilt.weights_of("droid")
+
+
+def image(frame: int) -> torch.Tensor:
+    return moving_image(frame, HEIGHT, WIDTH)
+
+
+def flow_with_frames(**settings: int) -> DroidFlow:
+    flow = DroidFlow(weights(), DroidFlowConfig(**settings))
+    for frame in range(3):
+        flow.add_frame(frame, image(frame))
+    return flow
+
+
+def still(edges: int = 1) -> torch.Tensor:
+    """Return predicted targets (E, h, w, 2) [px] of a camera that does not move."""
+    grid = Camera(50, 50, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT).pixel_grid(DroidFlow.stride)
+    return grid.expand(edges, *grid.shape).clone()
+
+
+# Known answers
+
+
+@torch.inference_mode()
+def test_matches_are_the_networks_answer_in_pixels():
+    flow = flow_with_frames(updates=1)
+    matches = flow.match([0], [1], still())
+    source, target = flow.encode(image(0)), flow.encode(image(1))
+    expected = cell_grid(torch.zeros(1, 9, 12, 2))[None]
+    pyramid = correlation_pyramid(source.features, target.features)
+    answer = update(
+        weights(),
+        source.context.hidden,
+        source.context.features,
+        look_up(pyramid, expected),
+        expected,
+        expected,
+    )
+    torch.testing.assert_close(matches.targets, 8 * (expected + answer.revision))
+    torch.testing.assert_close(matches.confidences, answer.confidence)
+
+
+def test_the_grid_is_that_of_the_camera():
+    matches = flow_with_frames(updates=1).match([0, 2], [1, 0], still(2))
+    assert matches.targets.shape == still(2).shape == (2, 9, 12, 2)
+    assert matches.matched_shares.shape == (2,)
+    assert ((matches.confidences > 0) & (matches.confidences < 1)).all()
+
+
+def test_cells_that_leave_the_image_or_are_unsure_are_not_matched():
+    flow = DroidFlow(weights(), DroidFlowConfig(matched_confidence=0.5))
+    targets = torch.tensor([[[[0.0, 0], [1, 1]], [[-0.1, 0], [1, 0]]]])
+    confidences = torch.tensor([[[[0.9, 0.9], [0.9, 0.9]], [[0.9, 0.9], [0.4, 0.5]]]])
+    matches = flow.as_matches(targets, confidences, targets)
+    assert matches.matched_shares.tolist() == [0.5]
+
+
+# Identities
+
+
+def test_batches_do_not_change_the_answer():
+    sources, targets = [0, 1, 0, 2, 1], [1, 0, 2, 1, 2]
+    whole = flow_with_frames(edges_per_batch=8).match(sources, targets, still(5))
+    parts = flow_with_frames(edges_per_batch=2).match(sources, targets, still(5))
+    torch.testing.assert_close(whole.targets, parts.targets, atol=1e-4, rtol=0)
+    torch.testing.assert_close(whole.confidences, parts.confidences, atol=1e-5, rtol=0)
+
+
+def test_the_hidden_state_lives_on_from_call_to_call_and_no_longer():
+    flow = flow_with_frames(updates=1)
+    first = flow.match([0], [1], still())
+    second = flow.match([0], [1], still())
+    assert not torch.equal(first.targets, second.targets)
+    flow.match([1], [2], still())  # the edge 0 -> 1 is not asked for, and forgotten
+    assert torch.equal(first.targets, flow.match([0], [1], still()).targets)
+
+
+def test_a_removed_frame_is_gone_and_its_index_can_be_used_again():
+    flow = flow_with_frames(updates=1)
+    first = flow.match([0, 1], [1, 2], still(2))
+    flow.remove_frame(1)
+    with pytest.raises(KeyError):
+        flow.match([0], [1], still())
+    flow.add_frame(1, image(1))
+    assert torch.equal(first.targets, flow.match([0, 1], [1, 2], still(2)).targets)
+
+
+def test_a_chain_never_changes_and_restarts_at_its_newest_image():
+    flow = flow_with_frames()
+    start = flow.start_chain(image(0))
+    once, matches = start.advanced(image(1))
+    again, repeated = start.advanced(image(1))
+    assert torch.equal(matches.targets, repeated.targets)
+    assert matches.targets.shape == (1, 9, 12, 2)
+    _, carried = once.advanced(image(2))
+    _, direct = start.advanced(image(2))
+    assert not torch.equal(carried.targets, direct.targets)  # it starts where the last one ended
+    _, from_newest = again.restarted().advanced(image(2))
+    _, fresh = flow.start_chain(image(1)).advanced(image(2))
+    assert torch.equal(from_newest.targets, fresh.targets)
+
+
+def test_matches_are_ordinary_tensors_of_the_callers_kind():
+    matches = flow_with_frames(updates=1).match([0], [1], still().double())
+    assert not matches.targets.requires_grad
+    assert matches.targets.dtype == torch.float64
+    (matches.targets * torch.ones(2, dtype=torch.float64, requires_grad=True)).sum().backward()
+
+
+def test_a_checkpoint_of_a_parallel_training_is_checked_and_runs(tmp_path: Path):
+    tensors = {f"module.{name}": weights()[name] for name in weights()}
+    for head in ("delta", "weight"):  # as published: a third channel
+        for kind in ("weight", "bias"):
+            name = f"module.update.{head}.2.{kind}"
+            tensors[name] = torch.cat([tensors[name], tensors[name][:1]])
+    torch.save(tensors, tmp_path / "droid.pth")
+    flow = load_droid(tmp_path / "droid.pth")
+    flow.add_frame(0, image(0))
+    flow.add_frame(1, image(1))
+    assert torch.isfinite(flow.match([0], [1], still()).targets).all()
+    torch.save({**tensors, "module.update.agg_motion.0.weight": torch.zeros(1)}, tmp_path / "d.pth")
+    with pytest.raises(InputError, match=r"found 1 more, such as update\.agg_motion"):
+        load_droid(tmp_path / "d.pth")
+    del tensors["module.cnet.conv2.bias"]
+    torch.save(tensors, tmp_path / "d.pth")
+    with pytest.raises(InputError, match=r"expected the tensor cnet\.conv2\.bias"):
+        load_droid(tmp_path / "d.pth")
+
+
+# Degenerate input
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_textureless_images_give_finite_matches(value: float):
+    flow = DroidFlow(weights())
+    flow.add_frame(0, torch.full((64, 64, 3), value))
+    flow.add_frame(1, torch.full((64, 64, 3), value))
+    predicted = 1e6 * torch.ones(1, 8, 8, 2)  # far outside
+    matches = flow.match([0], [1], predicted)
+    assert torch.isfinite(matches.targets).all() and torch.isfinite(matches.confidences).all()
+    assert matches.matched_shares.tolist() == [0.0]
+
+
+# Errors
+
+
+def test_too_small_an_image_and_another_network_are_refused():
+    with pytest.raises(InputError, match=r"more than 56 px per side for DROID, found 80x56"):
+        DroidFlow(weights()).add_frame(0, torch.zeros(56, 80, 3))
+    with pytest.raises(InputError, match="looks like FiT3D"):
+        DroidFlow(rebuilt.weights_of("fit3d_reg_small"))

@@ -1,0 +1,169 @@
+"""DROID-SLAM's network against the official code (run in float64, stored as float32)."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from minislam.priors.networks.checkpoints import Weights
+from minislam.priors.networks.droid_network import (
+    Context,
+    Update,
+    aggregate,
+    cell_grid,
+    correlation_pyramid,
+    encode_context,
+    encode_features,
+    look_up,
+    update,
+)
+from minislam.priors.networks.upsampling import convex_upsample
+from minislam.priors.networks.vit import normalise
+from tests.helpers import generator
+from tests.priors.networks import rebuilt
+
+TOLERANCE = 1e-3  # standard deviations; typical mistakes cost 0.2 to 0.6
+SOURCES, TARGETS = [0, 1, 0, 2], [1, 0, 2, 1]
+ARRAYS = json.loads((rebuilt.DATA / "droid_arrays.json").read_text())
+
+
+@cache
+def weights() -> Weights:
+    return rebuilt.weights_of("droid")
+
+
+@cache
+def stored() -> dict[str, torch.Tensor]:
+    return rebuilt.golden("droid")
+
+
+def moving_image(frame: int, height: int = 128, width: int = 160) -> torch.Tensor:
+    """Return an RGB image (H, W, 3) of a smooth pattern that moves by (-3, 1.5) px per frame."""
+    y, x = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    x, y = x + 3.0 * frame, y - 1.5 * frame
+    channels = [
+        127.5
+        + 50 * np.sin(0.31 * x + 0.17 * y + 1.1 * c)
+        + 40 * np.cos(0.13 * x - 0.29 * y + 0.7 * c)
+        + 30 * np.sin(0.9 * x) * np.cos(0.8 * y + 0.5 * c)
+        for c in range(3)
+    ]
+    rounded = np.floor(np.clip(np.stack(channels, -1), 0, 255) + 0.5)
+    return torch.from_numpy((rounded / 255).astype(np.float32))
+
+
+def assert_golden(actual: torch.Tensor, name: str) -> None:
+    """Compare with a stored array, of which only every so manieth value may be kept."""
+    array = ARRAYS[name]
+    assert list(actual.shape) == array["shape"], (name, actual.shape)
+    difference = (actual.reshape(-1)[:: array["stride"]] - stored()[name].reshape(-1)).abs().max()
+    assert difference <= TOLERANCE * array["std"], f"{name}: {float(difference / array['std']):.1e}"
+
+
+@cache
+@torch.inference_mode()
+def encoded() -> tuple[torch.Tensor, Context]:
+    images = torch.cat([normalise(moving_image(f), torch.device("cpu")) for f in range(3)])
+    return encode_features(weights(), images), encode_context(weights(), images)
+
+
+@cache
+@torch.inference_mode()
+def updated(iteration: int) -> Update:
+    """Return the update of the stored protocol, each iteration from the official state."""
+    features, context = encoded()
+    pyramid = correlation_pyramid(features[SOURCES], features[TARGETS])
+    expected = stored()[f"coords_it{iteration}"]
+    if iteration == 1:
+        hidden = context.hidden[SOURCES]
+        last_target = expected + torch.tensor([0.25, -0.5])
+    else:
+        hidden = updated(1).hidden
+        last_target = stored()["coords_it1"] + stored()["delta_it1"]
+    correlation = look_up(pyramid, expected)
+    if iteration == 1:
+        assert_golden(correlation, "corr_it1")
+    return update(weights(), hidden, context.features[SOURCES], correlation, expected, last_target)
+
+
+# Known answers
+
+
+def test_encoders_are_those_of_the_official_code():
+    features, context = encoded()
+    assert_golden(features, "fmap")
+    assert_golden(context.hidden, "net0")
+    assert_golden(context.features, "inp")
+
+
+@pytest.mark.parametrize("iteration", [1, 2])
+def test_updates_are_those_of_the_official_code(iteration: int):
+    found = updated(iteration)
+    assert_golden(found.hidden, f"net_it{iteration}")
+    assert_golden(found.revision, f"delta_it{iteration}")
+    assert_golden(found.confidence, f"weight_it{iteration}")
+
+
+@pytest.mark.parametrize("iteration", [1, 2])
+@torch.inference_mode()
+def test_damping_is_that_of_the_official_code(iteration: int):
+    damping, logits = aggregate(weights(), updated(iteration).hidden, torch.tensor(SOURCES))
+    assert_golden(damping, f"eta_it{iteration}")
+    if iteration == 1:
+        assert_golden(logits, "upmask_it1")
+    else:
+        fine = convex_upsample(stored()["ups_in"][:, None], logits, 8)[:, 0]
+        assert_golden(fine, "ups_out")
+
+
+@torch.inference_mode()
+def test_the_first_look_between_frames_is_that_of_the_official_code():
+    features, context = encoded()
+    pyramid = correlation_pyramid(features[:1], features[1:2])
+    still = cell_grid(torch.zeros(1, 16, 20, 2))[None]
+    correlation = look_up(pyramid, still)
+    hidden, seen = context.hidden[:1], context.features[:1]
+    found = update(weights(), hidden, seen, correlation, still, still)
+    assert_golden(found.revision, "mf_delta")
+    assert_golden(found.confidence, "mf_weight")
+
+
+# Identities
+
+
+def test_looking_up_whole_cells_reads_the_volume():
+    features = torch.randn(2, 128, 8, 9, generator=generator(0))
+    pyramid = correlation_pyramid(features[:1], features[1:])
+    found = look_up(pyramid, cell_grid(torch.zeros(1, 8, 9, 2))[None])[0].reshape(4, 7, 7, 8, 9)
+    expected = (features[0, :, 4, 5] * features[1, :, 3, 7]).sum() / 16
+    # From cell (u, v) = (5, 4) two cells to the right and one up: offsets (2, -1), u first.
+    torch.testing.assert_close(found[0, 3 + 2, 3 - 1, 4, 5], expected)
+    assert found[0, 3 - 3, 3, 0, 0] == 0  # left of the image
+
+
+def test_a_wider_head_of_a_checkpoint_is_cut():
+    tensors = {name: weights()[name] for name in weights()}
+    for head in ("update.delta.2", "update.weight.2"):
+        for kind in ("weight", "bias"):
+            name = f"{head}.{kind}"
+            tensors[name] = torch.cat([tensors[name], tensors[name][:1]])
+    size = (1, 8, 9)
+    arguments = (torch.zeros(1, 128, *size[1:]), torch.zeros(1, 128, *size[1:]))
+    correlation, where = torch.zeros(1, 196, *size[1:]), torch.zeros(*size, 2)
+    narrow = update(weights(), *arguments, correlation, where, where)
+    wide = update(Weights(tensors, "droid.pth"), *arguments, correlation, where, where)
+    assert torch.equal(narrow.revision, wide.revision)
+    assert torch.equal(narrow.confidence, wide.confidence)
+
+
+def test_edges_do_not_influence_each_other():
+    found = updated(1)
+    features, context = encoded()
+    pyramid = correlation_pyramid(features[[2]], features[[1]])
+    expected = stored()["coords_it1"][3:]
+    last_target = expected + torch.tensor([0.25, -0.5])
+    hidden, seen = context.hidden[[2]], context.features[[2]]
+    alone = update(weights(), hidden, seen, look_up(pyramid, expected), expected, last_target)
+    torch.testing.assert_close(alone.revision[0], found.revision[3], atol=1e-4, rtol=0)
