@@ -59,8 +59,9 @@ def render(
             "give T_camera_world of one view"
         )
     like = gaussians.means
-    if background is None:
-        background = torch.zeros(3)
+    features_behind = like.new_zeros(4)  # of the background: at depth 0, which adds nothing
+    if background is not None:
+        features_behind[:3] = background.detach()
     return Rendering(
         *_Render.apply(
             like,
@@ -71,7 +72,7 @@ def render(
             twist,
             screen_offsets,
             T_camera_world.detach().to(like),
-            torch.cat([background.detach(), torch.zeros(1)]).to(like),  # at depth 0: adds nothing
+            features_behind,
             camera,
         )
     )
