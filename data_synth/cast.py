@@ -23,7 +23,9 @@ class Mover:
     """Something that can move."""
 
     parts_at: Motion
-    moves_from: float = 0.0  # phase before which it rests and does not count as moving
+    # The phase before which it rests and stays out of the mask: nobody can yet know that it moves.
+    # Static views leave it out at all times.
+    moves_from: float = 0.0
 
 
 class Cast:

@@ -87,7 +87,6 @@ def stand(route: Route, phase: float, height: float) -> Body:
 
 def person(body: Body, outfit: Outfit, swing: float, pace: float, arms: Arms) -> list[Part]:
     """Return a person in mid-step: `swing` is the phase of the walk [rad]."""
-    side = body.limb
     parts = [
         part(Ellipsoid(_scaled(body, 0.15, 0.2, 0.33)), body.placed(0, 0, 1.17), outfit.shirt),
         part(Ellipsoid(_scaled(body, 0.14, 0.185, 0.17)), body.placed(0, 0, 0.92), outfit.trousers),
@@ -97,8 +96,8 @@ def person(body: Body, outfit: Outfit, swing: float, pace: float, arms: Arms) ->
             body.placed(0.005, 0, 1.655),
             outfit.hair,
         ),
-        side(body.point(0, 0, 1.4), body.point(0.01, 0, 1.54), 0.055, outfit.skin),
-        side(body.point(0, 0.15, 1.4), body.point(0, -0.15, 1.4), 0.075, outfit.shirt),
+        body.limb(body.point(0, 0, 1.4), body.point(0.01, 0, 1.54), 0.055, outfit.skin),
+        body.limb(body.point(0, 0.15, 1.4), body.point(0, -0.15, 1.4), 0.075, outfit.shirt),
     ]
     for left, sign, hand in ((0.1, 1.0, arms.left), (-0.1, -1.0, arms.right)):
         parts += _leg(body, outfit, left, sign * np.sin(swing) * pace, swing, sign, pace)

@@ -12,6 +12,7 @@ from .poses import Array, look_at, rigid
 FRAME_RATE = 30.0  # Hz
 CLIP_FRAMES = 100  # frames of the choreography; longer sequences play it forth and back
 CLIP_SECONDS = (CLIP_FRAMES - 1) / FRAME_RATE
+EVENNESS = 0.95  # of the camera's speed: 0 swings like a pendulum, 1 turns back abruptly
 PATH_SAMPLES = 200  # per clip, for lengths of paths
 
 
@@ -78,7 +79,7 @@ class HandheldPath:
     def __call__(self, time: float) -> Array:
         """Return T_world_camera (4, 4) at a time [s]."""
         angle = 2 * np.pi * self.cycles * time / CLIP_SECONDS + self.phases
-        swing = self.reach * np.sin(angle)
+        swing = self.reach * np.arcsin(EVENNESS * np.sin(angle)) / np.arcsin(EVENNESS)
         position = self.centre + swing
         target = self.target + self.target_reach * np.sin(0.7 * angle + 1.0)
         target = target + self.follow * swing
@@ -102,7 +103,7 @@ def handheld_path(rng: np.random.Generator, centre: Array, target: Array) -> Han
     cycles = np.array([0.95, 0.75, 1.2]) * rng.uniform(0.9, 1.1, 3)
     phases = np.array([rng.uniform(-0.5, 0.5), rng.uniform(0, 6.28), rng.uniform(0, 6.28)])
     tremble = np.empty((6, 4))
-    tremble[:, 0] = np.repeat([0.003, 0.006], 3) * rng.uniform(0.7, 1.3, 6)
+    tremble[:, 0] = np.repeat([0.003, 0.005], 3) * rng.uniform(0.7, 1.3, 6)
     tremble[:, 1] = rng.uniform(1.2, 2.6, 6)
     tremble[:, 2:] = rng.uniform(0, 2 * np.pi, (6, 2))
     wanted = rng.uniform(4.2, 4.8)
@@ -112,7 +113,7 @@ def handheld_path(rng: np.random.Generator, centre: Array, target: Array) -> Han
         "phases": phases,
         "target": np.asarray(target) + rng.uniform(-0.12, 0.12, 3),
         "target_reach": np.array([0.22, 0.0, 0.1]) * rng.uniform(0.6, 1.2, 3),
-        "follow": -rng.uniform(0.25, 0.4),
+        "follow": -rng.uniform(0.12, 0.22),
         "tremble": tremble,
     }
     # The length is nearly proportional to the reach: a few corrections meet it.

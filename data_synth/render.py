@@ -240,6 +240,7 @@ class Exposure:
 def expose(
     statics: Sequence[Part],
     movers: Sequence[Sequence[Part]],
+    counted: Sequence[bool],  # for each mover, whether it belongs in the mask
     lamp: Array,  # (3,)
     T_world_camera: Array,  # (4, 4)
     intrinsics: Intrinsics,
@@ -265,4 +266,6 @@ def expose(
     image.reshape(-1, 3)[background.rays] = background.colours(lit)
     image.reshape(-1, 3)[foreground.rays] = foreground.colours()
     rgb = develop(image, intrinsics)
-    return Exposure(rgb, depth.astype(np.float32), centre_index != NOTHING, static_rgb)
+    in_mask = np.repeat(counted, [len(parts) for parts in movers])
+    mask = (centre_index != NOTHING) & in_mask[centre_index]
+    return Exposure(rgb, depth.astype(np.float32), mask, static_rgb)

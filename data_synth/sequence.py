@@ -4,7 +4,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from .errors import SynthError
 from .motion import FRAME_RATE
 from .poses import Array, Intrinsics, default_intrinsics, rigid
-from .render import camera_rays, expose, trace
+from .render import Exposure, camera_rays, expose, trace
 from .scenes import Scene, scene
 
 NOISE_SIGMA = 0.008  # of the sensor, in units of the full range [0, 1]
@@ -67,14 +67,13 @@ def render_view(
     return exposure.rgb, exposure.depth, exposure.mover_mask
 
 
-def _expose(view: Scene, T_world_camera: Array, intrinsics: Intrinsics, time: float, movers: bool):
+def _expose(
+    view: Scene, T_world_camera: Array, intrinsics: Intrinsics, time: float, movers: bool
+) -> Exposure:
     parts = view.mover_parts(time) if movers else []
-    exposure = expose(view.room.parts, parts, view.room.lamp, T_world_camera, intrinsics)
-    moving = view.counts_as_moving(time) if movers else []
-    if any(moving) == bool(moving):
-        return exposure
-    # Nobody moves yet: whoever stands there is part of the scene as far as the mask goes.
-    return replace(exposure, mover_mask=np.zeros_like(exposure.mover_mask))
+    counted = view.counts_as_moving(time) if movers else []
+    room = view.room
+    return expose(room.parts, parts, counted, room.lamp, T_world_camera, intrinsics)
 
 
 def to_bytes(image: Array) -> Array:

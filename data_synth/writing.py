@@ -33,7 +33,7 @@ from .sequence import (
     render_frame,
 )
 
-GENERATOR_VERSION = 7  # raise it whenever the same arguments give other files
+GENERATOR_VERSION = 8  # raise it whenever the same arguments give other files
 DEPTH_UNITS_PER_METRE = 5000  # of TUM RGB-D
 PNG_COMPRESSION = 1  # of 9: noise does not compress, and level 1 is several times faster
 RECORD = "synth.json"
@@ -123,7 +123,12 @@ def _put_in_place(scratch: Path, folder: Path, record: dict) -> None:
         return  # another process was faster, with the same bytes
     if replaces:
         shutil.rmtree(folder)
-    os.rename(scratch, folder)
+    try:
+        os.rename(scratch, folder)
+    except OSError:
+        # Another process may have put the same sequence there since we looked.
+        if not folder.exists() or _may_replace(folder, record) is not None:
+            raise
 
 
 def _write_content(

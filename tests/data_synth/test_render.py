@@ -57,11 +57,22 @@ def test_depth_times_ray_lies_on_the_walls():
 
 def test_the_mask_is_where_the_ray_through_the_pixel_centre_meets_a_mover():
     # The distance of the ball's centre to each ray, by the cross product: no shared code.
-    exposure = expose([ROOM], [[BALL]], LAMP, POSE, CAMERA)
+    exposure = expose([ROOM], [[BALL]], [True], LAMP, POSE, CAMERA)
     rays = world_points(np.ones((60, 80)), POSE) - POSE[:3, 3]
     offset = np.array([0.2, 0.5, 1.1]) - POSE[:3, 3]
     distance = np.linalg.norm(np.cross(rays, offset), axis=-1) / np.linalg.norm(rays, axis=-1)
     np.testing.assert_array_equal(exposure.mover_mask, distance < 0.4)
+
+
+def test_a_mover_that_does_not_count_is_seen_but_not_in_the_mask():
+    both = [[BALL], [CRATE]]
+    counted = expose([ROOM], both, [True, True], LAMP, POSE, CAMERA)
+    only_ball = expose([ROOM], both, [True, False], LAMP, POSE, CAMERA)
+    np.testing.assert_array_equal(counted.rgb, only_ball.rgb)
+    np.testing.assert_array_equal(counted.depth, only_ball.depth)
+    _, index = trace([ROOM, BALL, CRATE], camera_rays(CAMERA, POSE))
+    np.testing.assert_array_equal(counted.mover_mask, index > 0)
+    np.testing.assert_array_equal(only_ball.mover_mask, index == 1)
 
 
 def test_what_is_nearer_hides_what_is_farther():
@@ -90,7 +101,7 @@ def test_a_wall_that_faces_the_lamp_has_the_colour_of_its_paint():
     # The floor straight below the lamp receives all of its light, at a right angle.
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 2.0
-    exposure = expose([ROOM], [], LAMP, pose, CAMERA)
+    exposure = expose([ROOM], [], [], LAMP, pose, CAMERA)
     brightest = exposure.rgb[29, 40]
     np.testing.assert_allclose(brightest, 0.5 * (AMBIENT + DIRECT), atol=2e-3)
     assert not exposure.mover_mask.any()
@@ -114,8 +125,8 @@ def test_a_mover_behind_a_surface_throws_no_shadow_on_it():
 
 
 def test_without_mask_and_shadow_the_static_view_is_the_moving_view():
-    exposure = expose([ROOM, CRATE], [[BALL]], LAMP, POSE, CAMERA)
-    static = expose([ROOM, CRATE], [], LAMP, POSE, CAMERA)
+    exposure = expose([ROOM, CRATE], [[BALL]], [True], LAMP, POSE, CAMERA)
+    static = expose([ROOM, CRATE], [], [], LAMP, POSE, CAMERA)
     np.testing.assert_array_equal(exposure.static_rgb, static.rgb)
     points = world_points(static.depth, POSE).reshape(-1, 3).T.astype(np.float32)
     shadow = lamp_visibility(points, LAMP, [[BALL]]).reshape(60, 80) < 1
