@@ -9,7 +9,7 @@ from . import surfaces
 from .figures import STRIDE, Arms, Body, draw_outfit, person, stand
 from .motion import CLIP_SECONDS, HandheldPath, Route
 from .shapes import Part
-from .textures import Colour, colour
+from .textures import Colour, Texture, colour
 
 Motion = Callable[[float], list[Part]]  # phase -> parts in place
 # (phase, across the view in units of its half width, so that 1 is the edge, metres away)
@@ -61,7 +61,9 @@ class Cast:
         offset = away * (forward + self.side * across * HALF_VIEW * right)
         return (phase, *(T_world_camera[:2, 3] + offset))
 
-    def walker(self, route: Route, arms: Callable[[float], Arms] | None = None):
+    def walker(
+        self, route: Route, arms: Callable[[float], Arms] | None = None
+    ) -> tuple[Motion, Callable[[float], Body]]:
         """Return the motion of a person, and a function that tells where the body is."""
         outfit = draw_outfit(self.rng, *self.colours())
         height = self.rng.uniform(1.64, 1.86)
@@ -77,7 +79,7 @@ class Cast:
 
         return parts_at, body_at
 
-    def vivid(self):
+    def vivid(self) -> Texture:
         """Return a patched cover in the colours of the next mover."""
         main, accent = self.colours()
         return surfaces.patched(self.rng, [main, accent, (0.95, 0.95, 0.9)])

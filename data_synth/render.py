@@ -169,20 +169,23 @@ def _paint(
     to_lamp = lamp.astype(points.dtype)[:, None] - points
     facing = np.einsum("kn,kn->n", normals, to_lamp) / np.linalg.norm(to_lamp, axis=0)
 
-    albedo = np.empty((points.shape[1], 3), np.float32)
+    return _albedo(part, local, local_normals, footprint), np.maximum(facing, 0)
+
+
+def _albedo(part: Part, local: Array, local_normals: Array, footprint: Array) -> Array:
+    """Return the paint (N, 3): each point looks at the face that its normal points to most."""
+    albedo = np.empty((local.shape[1], 3), np.float32)
     axis = np.abs(local_normals).argmax(axis=0)
     outward = local_normals[axis, np.arange(len(axis))] > 0
-    if per_face := len(part.textures) == 6:
-        face = 2 * axis + outward
-    else:
-        face = axis
+    per_face = len(part.textures) == 6
+    face = 2 * axis + outward if per_face else axis
     for number in np.unique(face):
         here = face == number
         plane = number // 2 if per_face else number
         across, up = [k for k in range(3) if k != plane]
         texture = part.textures[number if per_face else 0]
         albedo[here] = texture.sample(local[across, here], local[up, here], footprint[here])
-    return albedo, np.maximum(facing, 0)
+    return albedo
 
 
 def lamp_visibility(points: Array, lamp: Array, movers: Sequence[Sequence[Part]]) -> Array:

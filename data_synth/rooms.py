@@ -42,6 +42,7 @@ class _Builder:
         self.rugs: list[Part] = []
 
     def add(self, shape: Shape, T_world_part: Array, texture: Texture) -> None:
+        """Place a shape."""
         self.parts.append(Part(shape, T_world_part, (texture,)))
 
     def rug(self, size: Size, place: tuple[float, float], yaw: float) -> None:
@@ -61,9 +62,12 @@ class _Builder:
         return (replace(shell, textures=(*walls, floor)), *rugs, *self.parts)
 
     def cover(self) -> Texture:
+        """Draw what the next piece of furniture is covered with."""
         return self.covers[self.rng.integers(len(self.covers))]
 
-    def block(self, size: tuple[float, float, float], at: tuple[float, float], base: float = 0.0):
+    def block(
+        self, size: tuple[float, float, float], at: tuple[float, float], base: float = 0.0
+    ) -> Array:  # (4, 4)
         """Put a block on the floor, or on something `base` metres high; return its frame."""
         jitter = self.rng.uniform(-PLACE_JITTER, PLACE_JITTER, 2)
         yaw = self.rng.uniform(-YAW_JITTER, YAW_JITTER)

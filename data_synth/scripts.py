@@ -1,4 +1,9 @@
-"""Who does what in each sequence. Phases run from 0 to 1 over the clip of 100 frames."""
+"""Who does what in each sequence.
+
+A way is a list of marks (phase, across, away): when in the clip (0 to 1), where across the view of
+the camera at that time (-1 and 1 are its edges), and how many metres away. Numbers such as hand
+positions are choreography, found by looking at the result; tests hold the shares of the image.
+"""
 
 import numpy as np
 
@@ -23,11 +28,13 @@ from .textures import colour
 
 
 def person_movers(cast: Cast) -> list[Mover]:
+    """Return one person who comes close and passes."""
     way = ((0, 1.25, 2.5), (0.3, 0.65, 2.0), (0.55, 0.2, 1.55), (0.75, -0.15, 1.3), (1, -0.6, 1.5))
     return [Mover(cast.walker(cast.route(*way))[0])]
 
 
 def crowd_movers(cast: Cast) -> list[Mover]:
+    """Return four people, one with a bag, and a bouncing ball."""
     ways = (
         ((0, -1.2, 2.9), (0.35, -0.6, 2.4), (0.65, -0.1, 2.1), (1, 0.7, 2.1)),
         ((0, 1.8, 2.2), (0.4, 1.15, 1.8), (0.7, 0.45, 1.7), (1, -0.3, 1.65)),
@@ -56,6 +63,7 @@ def crowd_movers(cast: Cast) -> list[Mover]:
 
 
 def ball_movers(cast: Cast) -> list[Mover]:
+    """Return a person who dribbles a large ball."""
     bounces, radius = 5.0, 0.22
     ball_place = (0.42, -0.14, 0.0)
 
@@ -75,6 +83,8 @@ def ball_movers(cast: Cast) -> list[Mover]:
 
 
 def racket_movers(cast: Cast) -> list[Mover]:
+    """Return a person who swings a racket, and the ball in the air."""
+
     def grip(phase: float) -> tuple[float, float, float]:
         swing = np.sin(2 * np.pi * 3 * phase)
         return (0.42 + 0.1 * swing, -0.3 + 0.35 * swing, 1.2 + 0.25 * np.cos(6 * np.pi * phase))
@@ -102,6 +112,7 @@ def racket_movers(cast: Cast) -> list[Mover]:
 
 
 def stones_movers(cast: Cast) -> list[Mover]:
+    """Return a person who carries a stone, and a table with more of them that is pushed."""
     rng = cast.rng
     carry = Arms(left=(0.42, 0.16, 0.98), right=(0.42, -0.16, 0.98))
     way = ((0, 1.25, 2.3), (0.3, 0.9, 2.0), (0.65, 0.25, 1.7), (1, -0.2, 1.6))
@@ -154,16 +165,19 @@ def _carried_table(
 
 
 def table1_movers(cast: Cast) -> list[Mover]:
+    """Return a table that is carried near and put down."""
     way = ((0.3, 0.9, 2.3), (0.5, 0.45, 1.85), (0.75, -0.1, 1.55))
     return _carried_table(cast, way, (1.1, 0.65, 0.78))
 
 
 def table2_movers(cast: Cast) -> list[Mover]:
+    """Return a large curtained table that is carried close to the camera."""
     way = ((0.2, 0.85, 2.1), (0.5, 0.3, 1.85), (0.75, -0.1, 1.72))
     return _carried_table(cast, way, (1.7, 0.8, 1.0))
 
 
 def umbrella_movers(cast: Cast) -> list[Mover]:
+    """Return a person who opens an umbrella towards the camera."""
     open_by = curve((0, 0.0), (0.35, 0.05), (0.6, 1.0), (1, 1.0))
     forward = curve((0, 0.1), (0.4, 0.1), (0.7, 0.75), (1, 0.5))
     side = curve((0, 0.1), (0.5, 0.2), (0.75, 0.0), (1, -0.35))
@@ -185,17 +199,20 @@ def umbrella_movers(cast: Cast) -> list[Mover]:
 
 
 def _robot(cast: Cast, way: tuple[Mark, ...], size: float) -> list[Mover]:
+    """Return a robot `size` times 0.9 m long."""
     route = cast.route(*way)
     skin = draw_robot(cast.rng, *cast.colours())
     return [Mover(lambda phase: quadruped(route, phase, skin, size))]
 
 
 def anymal1_movers(cast: Cast) -> list[Mover]:
+    """Return a four-legged robot that passes."""
     way = ((0, 1.2, 2.4), (0.3, 0.75, 2.0), (0.6, 0.15, 1.7), (0.8, -0.25, 1.6), (1, -0.7, 1.6))
     return _robot(cast, way, 1.3)
 
 
 def anymal2_movers(cast: Cast) -> list[Mover]:
+    """Return a smaller robot and the person who follows it."""
     robot_way = ((0, -1.1, 2.5), (0.35, -0.6, 2.0), (0.65, 0.1, 1.7), (1, 0.6, 1.7))
     owner_way = ((0, -1.4, 3.0), (0.4, -1.0, 2.6), (0.7, -0.5, 2.3), (1, 0.1, 2.3))
     robot = _robot(cast, robot_way, 1.2)
@@ -203,6 +220,7 @@ def anymal2_movers(cast: Cast) -> list[Mover]:
 
 
 def wandering_movers(cast: Cast) -> list[Mover]:
+    """Return a person who stands in view, then walks towards the camera."""
     phase, *place = cast.on_floor(0.6, 0.35, 1.9)
     leaving = [cast.on_floor(*mark) for mark in ((0.78, 0.0, 1.35), (1, -0.3, 1.15))]
     route = Route([(0, *place), (phase, *place), *leaving], TOWARDS_CAMERA)
@@ -210,4 +228,5 @@ def wandering_movers(cast: Cast) -> list[Mover]:
 
 
 def no_movers(cast: Cast) -> list[Mover]:
+    """Return nobody."""
     return []

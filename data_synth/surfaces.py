@@ -22,7 +22,9 @@ from .textures import (
 Size = tuple[float, float]  # m, across and up
 
 
-def _fill(image: Array, column: float, row: float, width: float, height: float, paint: Colour):
+def _fill(
+    image: Array, column: float, row: float, width: float, height: float, paint: Colour
+) -> None:
     """Paint an axis-aligned rectangle given in texels."""
     corner = (round(column), round(row))
     opposite = (round(column + width) - 1, round(row + height) - 1)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from .errors import SynthError
 from .poses import Array, Intrinsics, default_intrinsics
-from .scenes import scene
+from .scenes import Scene, scene
 from .sequence import (
     Progress,
     SyntheticFrame,
@@ -33,7 +33,7 @@ from .sequence import (
     render_frame,
 )
 
-GENERATOR_VERSION = 8  # raise it whenever the same arguments give other files
+GENERATOR_VERSION = 10  # raise it whenever the same arguments give other files
 DEPTH_UNITS_PER_METRE = 5000  # of TUM RGB-D
 PNG_COMPRESSION = 1  # of 9: noise does not compress, and level 1 is several times faster
 RECORD = "synth.json"
@@ -132,7 +132,7 @@ def _put_in_place(scratch: Path, folder: Path, record: dict) -> None:
 
 
 def _write_content(
-    folder: Path, view, intrinsics: Intrinsics, frames: int, progress: Progress | None
+    folder: Path, view: Scene, intrinsics: Intrinsics, frames: int, progress: Progress | None
 ) -> None:
     for image_folder in IMAGE_FOLDERS:
         (folder / image_folder).mkdir()
