@@ -72,7 +72,10 @@ def project_gaussians(
 ) -> Ellipses:
     """Sort out what cannot be seen, and project the rest in order of depth."""
     index = _visible_front_to_back(means, scales, opacities, T_camera_world, camera)
-    means, quats, scales = (rows[index].T.contiguous() for rows in (means, quats, scales))
+    # index_select throughout: it is several times faster than indexing with a tensor.
+    means, quats, scales = (
+        rows.index_select(0, index).T.contiguous() for rows in (means, quats, scales)
+    )
     # Capped per Gaussian, not per pixel: the profile stays smooth, and alpha <= o is safe as well.
     opacities = opacities[index].clamp(max=MAX_OPACITY)
     points_camera, camera_factors = to_camera(

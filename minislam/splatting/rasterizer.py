@@ -174,7 +174,7 @@ def _composite(
     padding[5] = _LOG_OPACITY_OF_PADDING
     table = torch.cat([e.means2d, e.conics, e.opacities.log()[None], features])
     slots = torch.cat([table, padding], 1).index_select(1, lists.slot_gaussian)
-    offsets = slots[:2] - tile_centres(camera, features)[:, lists.slot_tile]
+    offsets = slots[:2] - tile_centres(camera, features).index_select(1, lists.slot_tile)
     coefficients = exponents(offsets, slots[2:5], slots[5])
 
     inside = to_tiles(features.new_ones(1, camera.height, camera.width), camera)[:, 0]

@@ -75,7 +75,7 @@ def build_tile_lists(
     gaussian, tile = _entries(means2d, conics, covariances2d, opacities, camera)
     rows, columns = tile_grid(camera)
     order = _stable_argsort(tile, rows * columns)
-    gaussian = gaussian[order]
+    gaussian = gaussian.index_select(0, order)
     counts = torch.bincount(tile, minlength=rows * columns)
     starts = counts.cumsum(0) - counts
 
@@ -93,7 +93,7 @@ def build_tile_lists(
         entry = torch.where(position < counts[tiles], starts[tiles] + position, len(gaussian))
         end = first_slot + length * len(tiles)
         groups.append(TileGroup(tiles, length, slice(first_slot, end)))
-        slot_gaussians.append(gaussian_or_padding[entry.view(-1)])
+        slot_gaussians.append(gaussian_or_padding.index_select(0, entry.view(-1)))
         slot_tiles.append(tiles.repeat(length))
         first_slot = end
     return TileLists(groups, torch.cat(slot_gaussians), torch.cat(slot_tiles))
@@ -128,7 +128,7 @@ def _entries(
     column_count = torch.where(left <= right, column_count, 0)
     span, column = _expand(first_column, column_count)
     _, columns = tile_grid(camera)
-    return gaussian[span], row[span] * columns + column
+    return gaussian.index_select(0, span), row.index_select(0, span) * columns + column
 
 
 def _column_spans(
@@ -168,7 +168,7 @@ def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     """Return (index, value) of first[i], first[i] + 1, ... with count[i] values for each i."""
     index = torch.repeat_interleave(count)
     starts = count.cumsum(0) - count
-    within = torch.arange(len(index), device=index.device) - (starts - first)[index]
+    within = torch.arange(len(index), device=index.device) - (starts - first).index_select(0, index)
     return index, within
 
 

@@ -7,18 +7,19 @@ ratios mean more than the milliseconds. The dense reference runs only on a small
 """
 
 import argparse
-import resource
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from room import room_camera, room_scene
 from tile_autograd import render_tiles_with_autograd
 from torch import Tensor
 
+from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.splatting import GaussianMap, render, render_reference
 
@@ -28,7 +29,6 @@ DENSE = (40, 30, 400)  # every Gaussian at every pixel: larger scenes do not fit
 AUTOGRAD_REPEATS = 3  # seconds each
 # Between float32 renderers: Gaussians on a wall nearly tie in depth, and a swap changes both.
 TOLERANCE = 5e-2
-KILOBYTE = 1024
 
 
 class Case:
@@ -99,10 +99,18 @@ def measure_memory() -> float:
     """Return the same, in the process of its own that peak figures need."""
     small, large = Case(*SIZES[0]), Case(*SIZES[-1])
     small.time(render)  # what torch allocates once
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = _peak_kilobytes()
     for _ in range(3):
         large.time(render)
-    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / KILOBYTE
+    return (_peak_kilobytes() - before) / 1024
+
+
+def _peak_kilobytes() -> int:
+    # Not resource.getrusage: its maximum is inherited from the process that started this one.
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM"):
+            return int(line.split()[1])
+    raise InputError("expected VmHWM in /proc/self/status; peak memory needs Linux")
 
 
 def save_plot(rows: list[tuple[str, float, float]], path: str) -> None:
