@@ -12,13 +12,13 @@ class InsertionConfig:
     """Where a keyframe adds Gaussians, and how large they start."""
 
     cell: int = parameter(4, "one Gaussian per cell of this side [px of the full image]")
-    footprint: float = parameter(0.5, "first scale, in sides of a cell seen at its depth [1]")
-    opacity: float = parameter(0.5, "first opacity (0, 1), official")
+    footprint: float = parameter(0.6, "first scale, in sides of a cell seen at its depth [1]")
+    opacity: float = parameter(0.9, "first opacity (0, 1); official 0.5")
     explained_opacity: float = parameter(
-        0.9, "a pixel less opaque than this is not covered by the map yet [1]"
+        0.8, "a pixel less opaque than this is not covered by the map yet [1]"
     )
     explained_depth: float = parameter(
-        0.2, "a pixel whose depth is further off is not explained by the map [relative]"
+        0.4, "a pixel whose depth is further off is not explained by the map [relative]"
     )
     far_factor: float = parameter(
         10.0, "nothing is inserted beyond this many median depths [1], as L_depth"
@@ -43,7 +43,7 @@ class DensityConfig:
     prune_scale: float = parameter(
         0.2, "larger Gaussians are removed [median depths], official 0.6 m"
     )
-    max_gaussians: int = parameter(20000, "no cloning or splitting beyond [Gaussians]; paper none")
+    max_gaussians: int = parameter(1, "no cloning or splitting beyond [Gaussians]; paper none")
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class MappingConfig:
     """
 
     image_scale: float = parameter(0.5, "size of the images used online, of the full size (0, 1]")
-    init_iterations: int = parameter(200, "iterations on the first keyframes; official 1050")
-    keyframe_iterations: int = parameter(30, "iterations per keyframe; official 450")
+    init_iterations: int = parameter(150, "iterations on the first keyframes; official 1050")
+    keyframe_iterations: int = parameter(25, "iterations per keyframe; official 450")
     refine_iterations: int = parameter(600, "iterations at the end; official 20000, fast 3000")
     refine_full_share: float = parameter(
         0.5, "share of them, the last ones, at full image size [0, 1]; official 1"
@@ -85,16 +85,19 @@ class MappingConfig:
     )
 
     means_rate: float = parameter(
-        1e-3, "first Adam step of the means [median depths]; official 9.6e-4 m, decayed"
+        2e-3, "first Adam step of the means [median depths]; official 9.6e-4 m, decayed"
     )
     means_rate_end: float = parameter(
         0.1,
         "last step of the means over the first, log-linear over `rate_iterations`; official 0.01",
     )
     rate_iterations: int = parameter(1500, "iterations of that decay; official 30000")
+    refine_rate_end: float = parameter(
+        0.1, "last step over the first one in the refinement, all parameters; official 1"
+    )
     rates: LearningRates = field(
         default_factory=lambda: LearningRates(
-            quats_wxyz=5e-3, log_scales=1e-2, opacity_logits=5e-2, colors=5e-3
+            quats_wxyz=2e-2, log_scales=2e-2, opacity_logits=5e-2, colors=5e-3
         ),
         metadata={"meaning": "Adam steps of the rest; longer than official: fewer iterations"},
     )

@@ -1,9 +1,10 @@
-"""Insert Gaussians for what a keyframe sees and the map does not explain yet."""
+"""Insert Gaussians for what a keyframe sees and the map does not explain, and withdraw movers."""
 
 import math
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.mapping.config import InsertionConfig
@@ -36,22 +37,21 @@ def insertable_pixels(
 
 
 def draw_pixels(
-    allowed: Tensor,  # (H, W) bool
+    known: Tensor,  # (H, W) bool
     cell: int,  # px, side of a cell
     generator: torch.Generator,
 ) -> Tensor:  # (M, 2) int64, column and row
-    """Draw one random pixel in each cell x cell square of the image and keep the allowed ones.
+    """Draw one random known pixel in each cell x cell square of the image that has any.
 
-    A stratified subset: as random as the paper's, without its clumps and holes.
+    A stratified subset: as random as the paper's, without its clumps and holes, and no fewer
+    where the depth is sparse.
     """
-    height, width = allowed.shape
-    rows, columns = math.ceil(height / cell), math.ceil(width / cell)
-    offset = torch.randint(cell, (2, rows, columns), generator=generator)
-    u = torch.arange(columns) * cell + offset[0]
-    v = (torch.arange(rows) * cell)[:, None] + offset[1]
-    inside = (u < width) & (v < height)
-    pixels = torch.stack([u[inside], v[inside]], -1).to(allowed.device)
-    return pixels[allowed[pixels[:, 1], pixels[:, 0]]]
+    height, width = known.shape
+    lottery = torch.rand(height, width, generator=generator).to(known.device)
+    lottery = torch.where(known, lottery, -1)
+    best, winner = functional.max_pool2d(lottery[None], cell, ceil_mode=True, return_indices=True)
+    winner = winner[best >= 0]
+    return torch.stack([winner % width, winner // width], -1)
 
 
 def gaussians_at_pixels(
@@ -85,3 +85,23 @@ def gaussians_at_pixels(
         image[row, column].to(z),
         torch.full((count,), keyframe_index, dtype=torch.int64, device=z.device),
     )
+
+
+def lies_on_mover(
+    means: Tensor,  # (N, 3) world units
+    camera: Camera,
+    T_camera_world: Tensor,  # (4, 4) float64, of the keyframe they were inserted for
+    weight: Tensor,  # (H, W) static weight of that keyframe, 0 on movers
+) -> Tensor:  # (N,) bool
+    """Tell which Gaussians their own keyframe sees where it now knows a mover.
+
+    They were inserted when the MLP had not learnt it yet. Had it known, `insertable_pixels` would
+    not have let them in, so they leave: they are the mover's surface, seen from where it was.
+    """
+    points = transform_points(T_camera_world, means.double())
+    in_front = points[:, 2] > 0
+    # Points behind the camera have no pixel; any depth that is not zero will do for them.
+    pixels = camera.project(torch.where(in_front[:, None], points, torch.ones_like(points)))
+    inside = in_front & camera.contains(pixels)
+    column, row = (pixels.round().long() * inside[:, None]).unbind(-1)
+    return inside & (weight[row, column] == 0)

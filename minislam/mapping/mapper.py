@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -12,13 +12,19 @@ from minislam.geometry import Camera
 from minislam.mapping.config import MappingConfig
 from minislam.mapping.deformation import deform_rigidly, rescale_to_depths
 from minislam.mapping.density import ScreenGradients, densify, useful_rows
-from minislam.mapping.insertion import draw_pixels, gaussians_at_pixels, insertable_pixels
+from minislam.mapping.insertion import (
+    draw_pixels,
+    gaussians_at_pixels,
+    insertable_pixels,
+    lies_on_mover,
+)
 from minislam.mapping.losses import RenderLoss, render_loss
-from minislam.mapping.views import MappedKeyframe, View
+from minislam.mapping.views import MappedKeyframe, shrink_image
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
-from minislam.splatting import GaussianMap, MapOptimizer, Rendering, render
+from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.uncertainty import (
+    Misfit,
     UncertaintyConfig,
     UncertaintyMLP,
     UncertaintyTrainer,
@@ -115,7 +121,7 @@ class Mapper:
         count = len(self.keyframes)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
         uniform = torch.full((count,), 1 / count, dtype=torch.float64)
-        self._optimise(self.config.init_iterations, uniform, self._online_camera, progress)
+        self._optimise([self._online_camera] * self.config.init_iterations, uniform, progress)
 
     def integrate(self, keyframe: Keyframe, progress: Progress | None = None) -> None:
         """Add one keyframe: window, insertion, then optimisation of map and MLP."""
@@ -131,12 +137,13 @@ class Mapper:
             self.config.window_size,
             self.config.window_overlap,
         )
+        self._withdraw_movers()
         self._insert(new)
         probabilities = sampling_probabilities(
             len(self.keyframes), self.window, self.config.window_share
         )
-        iterations = self.config.keyframe_iterations
-        self._optimise(iterations, probabilities, self._online_camera, progress)
+        cameras = [self._online_camera] * self.config.keyframe_iterations
+        self._optimise(cameras, probabilities, progress)
 
     def update_keyframes(
         self,
@@ -169,11 +176,14 @@ class Mapper:
 
     def refine(self, iterations: int, progress: Progress | None = None) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size."""
+        self._withdraw_movers()
+        for position in range(len(self.keyframes)):
+            self._insert(position)
         count = len(self.keyframes)
         uniform = torch.full((count,), 1 / count, dtype=torch.float64)
         full = round(iterations * self.config.refine_full_share)
-        self._optimise(iterations - full, uniform, self._online_camera, progress)
-        self._optimise(full, uniform, self.camera, progress)
+        cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
+        self._optimise(cameras, uniform, progress, self.config.refine_rate_end)
 
     def _anchor_rows(self) -> Tensor:
         """Return (N,) the position in `keyframes` of each Gaussian's anchor."""
@@ -202,7 +212,8 @@ class Mapper:
         weight = self._weight(keyframe, self.camera)
         far = config.far_factor * self.median_depth
         allowed = insertable_pixels(keyframe.depth, far, weight, rendering, config)
-        pixels = draw_pixels(allowed, config.cell, self._generator)
+        pixels = draw_pixels(keyframe.depth > 0, config.cell, self._generator)
+        pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
         new = gaussians_at_pixels(
             pixels,
             keyframe.image,
@@ -215,22 +226,36 @@ class Mapper:
         self._optimizer.append(new)
         self._gradients = ScreenGradients(len(self.gaussians))
 
+    def _withdraw_movers(self) -> None:
+        """Remove Gaussians that were inserted on a mover before the MLP knew it for one."""
+        gaussians, rows = self.gaussians, self._anchor_rows()
+        keep = torch.ones(len(gaussians), dtype=torch.bool)
+        for position, keyframe in enumerate(self.keyframes):
+            anchored = (rows == position).nonzero().squeeze(-1)
+            weight = self._weight(keyframe, self._online_camera)
+            pose = keyframe.T_camera_world
+            means = gaussians.means[anchored]
+            keep[anchored] = ~lies_on_mover(means, self._online_camera, pose, weight)
+        self._optimizer.prune(keep)
+        self._gradients = ScreenGradients(len(self.gaussians))
+
     def _optimise(
         self,
-        iterations: int,
+        cameras: list[Camera],  # size at which each iteration renders
         probabilities: Tensor,  # (K,) of the keyframes
-        camera: Camera,  # size at which the keyframes are rendered
         progress: Progress | None,
+        last_rate: float = 1.0,  # all steps shrink to this share of themselves, log-linear
     ) -> None:
-        for done in range(iterations):
-            drawn = torch.multinomial(probabilities, 1, generator=self._generator)
-            self._step(int(drawn), camera)
-            if (self._iteration % self.config.density.interval) == 0:
+        """Run the iterations, each on a keyframe drawn at random."""
+        for done, camera in enumerate(cameras):
+            position = torch.multinomial(probabilities, 1, generator=self._generator)
+            self._step(int(position), camera, last_rate ** (done / len(cameras)))
+            if self._iteration % self.config.density.interval == 0:
                 self._change_density()
             if progress is not None:
-                progress(done + 1, iterations)
+                progress(done + 1, len(cameras))
 
-    def _step(self, position: int, camera: Camera) -> None:
+    def _step(self, position: int, camera: Camera, rate_factor: float) -> None:
         """Take one step of the map on L_render and one of the MLP on L_uncer."""
         keyframe = self.keyframes[position]
         view = keyframe.view(camera)
@@ -244,39 +269,59 @@ class Mapper:
         )
         loss.total.backward()
         self._gradients.add(offsets.grad, rendering.radii, camera)
-        self._optimizer.rates = self._rates()
+        self._optimizer.rates = self._rates(rate_factor)
         self._optimizer.step()
 
         uncertainty = math.nan
         if self.uncertainty.enabled and self._iteration >= self._frozen_until:
-            uncertainty = self._train_mlp(position, view, rendering)
+            uncertainty = self._train_mlp(position, rendering)
         self.history.add(loss, uncertainty, len(gaussians))
         self._iteration += 1
 
-    def _rates(self):
-        """Return the step lengths of this iteration: that of the means decays, log-linear."""
-        config = self.config
-        progress = min(1.0, self._iteration / config.rate_iterations)
-        decay = math.exp(progress * math.log(config.means_rate_end))
-        return replace(config.rates, means=config.means_rate * self.median_depth * decay)
+    def _rates(self, factor: float) -> LearningRates:
+        """Return the step lengths of this iteration: those of the means decay, log-linear."""
+        config, rates = self.config, self.config.rates
+        decay = config.means_rate_end ** min(1.0, self._iteration / config.rate_iterations)
+        return LearningRates(
+            means=factor * decay * config.means_rate * self.median_depth,
+            quats_wxyz=factor * rates.quats_wxyz,
+            log_scales=factor * rates.log_scales,
+            opacity_logits=factor * rates.opacity_logits,
+            colors=factor * rates.colors,
+        )
 
-    def _train_mlp(self, position: int, view: View, rendering: Rendering) -> float:
-        """Take one step of the MLP on a rendering, as a constant, and return L_uncer."""
-        features = self.keyframes[position].features
-        misfit = measure_misfit(
+    @torch.no_grad()
+    def _misfit(self, keyframe: MappedKeyframe, rendering: Rendering) -> Misfit:
+        """Compare a rendering of any size with its keyframe, at the online image size.
+
+        Always the same size, because the windows of the SSIM are in pixels: beta would mean
+        something else at each size. And it saves time.
+        """
+        camera = self._online_camera
+        size = (camera.height, camera.width)
+        view = keyframe.view(camera)
+        depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
+        depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
+        return measure_misfit(
             view.image,
             view.depth,
-            rendering.color.detach(),
-            rendering.depth.detach(),
-            rendering.opacity.detach(),
-            tuple(features.shape[:2]),
+            shrink_image(rendering.color, *size),
+            depth,
+            opacity,
+            keyframe.features.shape[:2],
             self.median_depth / self.config.metric_median,
             self.uncertainty,
         )
+
+    def _train_mlp(self, position: int, rendering: Rendering) -> float:
+        """Take one step of the MLP on a rendering, as a constant, and return L_uncer."""
+        features = self.keyframes[position].features
         reach = self.uncertainty.neighbour_keyframes
         nearby = self.keyframes[max(0, position - reach) : position + reach + 1]
         cells = torch.cat([k.features.reshape(-1, features.shape[-1]) for k in nearby])
-        return self._trainer.step(features, misfit, cells)
+        return self._trainer.step(
+            features, self._misfit(self.keyframes[position], rendering), cells
+        )
 
     def _change_density(self) -> None:
         """Clone, split and prune, then let the map settle before the MLP learns again."""

@@ -3,6 +3,8 @@
 Everything that comes from the renderer is a constant here: L_uncer never moves a Gaussian.
 """
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -27,15 +29,18 @@ def gaussian_blur(
     As two products with banded matrices it is some twenty times faster on a CPU, gradient
     included, than as a convolution of a few channels.
     """
-    rows = _blur_matrix(images.shape[-2], size, sigma, images)
-    columns = _blur_matrix(images.shape[-1], size, sigma, images)
+    rows = _blur_matrix(images.shape[-2], size, sigma, images.dtype, images.device)
+    columns = _blur_matrix(images.shape[-1], size, sigma, images.dtype, images.device)
     return rows @ (images @ columns)
 
 
-def _blur_matrix(length: int, size: int, sigma: float, like: Tensor) -> Tensor:
-    """Return the symmetric matrix (length, length) that blurs a row of pixels."""
-    position = torch.arange(length, dtype=like.dtype, device=like.device)
-    window = torch.arange(size, dtype=like.dtype, device=like.device) - size // 2
+@lru_cache(maxsize=16)
+def _blur_matrix(
+    length: int, size: int, sigma: float, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Return the symmetric matrix (length, length) that blurs a row of pixels, made once."""
+    position = torch.arange(length, dtype=dtype, device=device)
+    window = torch.arange(size, dtype=dtype, device=device) - size // 2
     total = torch.exp(-0.5 * (window / sigma) ** 2).sum()
     distance = (position[:, None] - position[None, :]).abs()
     return torch.exp(-0.5 * (distance / sigma) ** 2) * (distance <= size // 2) / total

@@ -9,7 +9,7 @@ from minislam.mapping.density import ScreenGradients, densify, split, useful_row
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer
 from tests.helpers import generator
 
-CONFIG = DensityConfig()
+CONFIG = DensityConfig(max_gaussians=10000)
 
 
 def map_of(scales: list[float], opacity_logit: float = 2.0) -> GaussianMap:

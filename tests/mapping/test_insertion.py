@@ -3,9 +3,14 @@ import math
 import pytest
 import torch
 
-from minislam.geometry import Camera, se3_exp, transform_points
+from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 from minislam.mapping import InsertionConfig
-from minislam.mapping.insertion import draw_pixels, gaussians_at_pixels, insertable_pixels
+from minislam.mapping.insertion import (
+    draw_pixels,
+    gaussians_at_pixels,
+    insertable_pixels,
+    lies_on_mover,
+)
 from minislam.splatting import Rendering
 from tests.helpers import generator
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
@@ -62,12 +67,31 @@ def test_each_cell_gives_at_most_one_pixel_inside_the_image(height, width, cell)
         assert len(pixels) == math.prod([height // cell, width // cell])
 
 
-def test_only_allowed_pixels_are_drawn_and_the_seed_decides():
+def test_only_known_pixels_are_drawn_and_the_seed_decides():
     allowed = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     allowed[:, 10:20] = True
     first, second = draw_pixels(allowed, 2, generator(1)), draw_pixels(allowed, 2, generator(1))
     assert torch.equal(first, second)
     assert ((first[:, 0] >= 10) & (first[:, 0] < 20)).all() and len(first) > 40
+
+
+def test_sparse_depth_is_used_up_to_one_pixel_per_cell():
+    known = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    known[1::4, 2::4] = True
+    pixels = draw_pixels(known, 4, generator(2))
+    assert len(pixels) == 6 * 8 and (pixels % 4 == torch.tensor([2, 1])).all()
+
+
+def test_a_gaussian_on_a_mover_of_its_own_keyframe_is_found():
+    weight = torch.ones(CAMERA.height, CAMERA.width)
+    weight[4:8, 10:20] = 0
+    pixels = torch.tensor([[12.0, 5.0], [12.0, 9.0], [12.0, 5.0], [12.0, 5.0]])
+    depth = torch.tensor([2.0, 2.0, 3.0, -2.0])
+    pose = se3_exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
+    points = CAMERA.backproject(pixels, depth).double()
+    means = transform_points(se3_inverse(pose), points).float()
+    found = lies_on_mover(means, CAMERA, pose, weight)
+    assert found.tolist() == [True, False, True, False]
 
 
 # Degenerate input
