@@ -21,6 +21,7 @@ from minislam.records import Frame
 
 SHORTER_SIDE = 518  # px the network sees, as in its training
 INDOOR_LIMIT, OUTDOOR_LIMIT = 20.0, 80.0  # metre; the Hypersim and the Virtual KITTI checkpoints
+_LIMIT_OF_NAME = {"metric_hypersim": INDOOR_LIMIT, "metric_vkitti": OUTDOOR_LIMIT}
 _TAPS = {12: (2, 5, 8, 11), 24: (4, 11, 17, 23)}  # by the number of blocks: S and B, L
 
 
@@ -122,11 +123,16 @@ def _whole_patches(side: float, shortest: int) -> int:
 
 
 def load_depth_anything(
-    path: Path | str, depth_limit: float, device: torch.device | str = "cpu"
+    path: Path | str,
+    depth_limit: float | None = None,  # metre; None: as the official file name says
+    device: torch.device | str = "cpu",
 ) -> DepthAnything:
     """Read a Depth Anything V2 checkpoint with a metric head and check it on a tiny image."""
     weights = load_checkpoint(path, device)
-    prior = DepthAnything(weights, depth_limit)
+    require(weights, "Depth Anything V2")
+    prior = DepthAnything(
+        weights, limit_of_name(Path(path)) if depth_limit is None else depth_limit
+    )
     tiny = torch.zeros(1, 3, 2 * PATCH, 2 * PATCH, device=weights.device)
     # The first unit of the coarsest level has nothing to add, yet it is stored.
     unneeded = tuple(
@@ -136,3 +142,17 @@ def load_depth_anything(
     )
     probe(weights, lambda: prior.network(tiny), ignored=("mask_token", *unneeded))
     return prior
+
+
+def limit_of_name(path: Path) -> float:
+    """Return the largest depth [m] that a checkpoint was trained with, from its official name.
+
+    The file itself does not say it, nor whether its output is a metric depth at all.
+    """
+    for part, limit in _LIMIT_OF_NAME.items():
+        if part in path.name:
+            return limit
+    raise InputError(
+        f"expected {' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint, found "
+        f"{path.name}, whose output may be no metric depth; keep the official name of the file"
+    )

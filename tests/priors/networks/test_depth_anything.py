@@ -13,6 +13,7 @@ from minislam.priors.networks.depth_anything import (
     INDOOR_LIMIT,
     DepthAnything,
     DepthAnythingHead,
+    limit_of_name,
     load_depth_anything,
 )
 from minislam.priors.networks.vit import normalise
@@ -91,7 +92,19 @@ def test_a_missing_bias_and_an_extra_tensor_are_named(tmp_path: Path):
         load_depth_anything(tmp_path / "w.pth", INDOOR_LIMIT)
 
 
+def test_the_limit_follows_from_the_official_name():
+    assert limit_of_name(Path("a/depth_anything_v2_metric_hypersim_vits.pth")) == 20
+    assert limit_of_name(Path("depth_anything_v2_metric_vkitti_vitl.pth")) == 80
+
+
 # Errors
+
+
+def test_a_relative_checkpoint_is_refused_by_its_name(tmp_path: Path):
+    tensors = {name: weights()[name] for name in weights()}
+    torch.save(tensors, tmp_path / "depth_anything_v2_vits.pth")
+    with pytest.raises(InputError, match=r"found depth_anything_v2_vits\.pth, whose output may"):
+        load_depth_anything(tmp_path / "depth_anything_v2_vits.pth")
 
 
 def test_a_limit_that_is_not_positive_and_another_network_are_refused():

@@ -7,11 +7,14 @@ official one is test_droid_network.py's matter.
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.priors.depth import SensorDepth
+from minislam.priors.features import ClassicalFeatures
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid import DroidFlow, DroidFlowConfig, load_droid
 from minislam.priors.networks.droid_network import (
@@ -20,6 +23,9 @@ from minislam.priors.networks.droid_network import (
     look_up,
     update,
 )
+from minislam.records import Frame
+from minislam.tracking.config import TrackingConfig
+from minislam.tracking.tracker import Tracker
 from tests.priors.networks import rebuilt
 from tests.priors.networks.test_droid_network import moving_image
 
@@ -155,6 +161,30 @@ def test_a_checkpoint_of_a_parallel_training_is_checked_and_runs(tmp_path: Path)
     torch.save(tensors, tmp_path / "d.pth")
     with pytest.raises(InputError, match=r"expected the tensor cnet\.conv2\.bias"):
         load_droid(tmp_path / "d.pth")
+
+
+def test_the_tracker_runs_on_it_from_warm_up_to_the_last_adjustment():
+    # Made-up weights see no motion worth the name: scaled down, they at least keep it small.
+    tensors = {name: weights()[name] for name in weights()}
+    for kind in ("weight", "bias"):
+        tensors[f"update.delta.2.{kind}"] = 0.01 * tensors[f"update.delta.2.{kind}"]
+    camera = Camera(80, 80, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    config = TrackingConfig(
+        warmup_keyframes=3, keyframe_interval=1, warmup_rounds=1, warmup_rounds_with_beta=1
+    )
+    depth = SensorDepth(lambda frame_index: np.full((HEIGHT, WIDTH), 2.0))
+    flow = DroidFlow(Weights(tensors, "droid.pth"), DroidFlowConfig(updates=1, chain_updates=1))
+    tracker = Tracker(
+        camera, config, flow, ClassicalFeatures(), depth, lambda features: torch.ones(9 * 12)
+    )
+    for index in range(5):
+        tracker.track(Frame(index, index / 10, image(index)))
+        if index == 2:
+            tracker.initialise()
+            tracker.refine_initialisation()
+    tracker.finish()
+    assert len(tracker.keyframes) == 5
+    assert torch.isfinite(tracker.keyframes.T_camera_world).all()
 
 
 # Degenerate input
