@@ -1,4 +1,4 @@
-"""Settings for every test: one thread (repeatable and not slower on a busy machine), quiet plots."""
+"""Settings for every test: one thread (repeatable, not slower on a busy machine), quiet plots."""
 
 import os
 import sys
