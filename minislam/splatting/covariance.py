@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def rotations(
-    quats: Tensor,  # (4, N) w, x, y, z, any length but zero
+    quats: Tensor,  # (4, N) w, x, y, z, any length; zero is the identity
 ) -> Tensor:  # (3, 3, N)
     """Return the rotation of each quaternion q / |q|."""
     w, x, y, z = quats * _inverse_norms(quats)
@@ -76,4 +76,5 @@ def covariance_factors_vjp(
 
 def _inverse_norms(quats: Tensor) -> Tensor:
     # Not norm(dim=0): that reduction is forty times slower on a leading dimension.
-    return (quats * quats).sum(0).rsqrt_()
+    # The floor turns a zero quaternion into the identity instead of NaN.
+    return (quats * quats).sum(0).clamp_min_(torch.finfo(quats.dtype).tiny).rsqrt_()

@@ -1,5 +1,6 @@
 """All steps of projection.py in a row: from the map to ellipses in the image, and back."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -26,6 +27,9 @@ from minislam.splatting.rendering import (
     NEAR_DEPTH,
     tangent_limits,
 )
+
+# px. The determinant of Sigma' grows with the fourth power, and float32 ends at 1e38.
+_MAX_RADIUS = 1e8
 
 
 class Ellipses(NamedTuple):
@@ -66,7 +70,7 @@ def project_gaussians(
     quats: Tensor,  # (N, 4)
     scales: Tensor,  # (N, 3)
     opacities: Tensor,  # (N,)
-    screen_offsets: Tensor | None,  # (N, 2)
+    screen_offsets: Tensor | None,  # (N, 2) px, small: what is visible is decided without them
     T_camera_world: Tensor,  # (4, 4)
     camera: Camera,
 ) -> Ellipses:
@@ -123,23 +127,29 @@ def project_gaussians_vjp(
 def _visible_front_to_back(
     means: Tensor, scales: Tensor, opacities: Tensor, T_camera_world: Tensor, camera: Camera
 ) -> Tensor:  # (V,) int64
-    """Return the rows that may be seen, nearest first; equal depths stay in map order.
-
-    The radius is bounded before anything is projected: |J| <= f/z sqrt(1 + |h|^2), and the
-    largest support of a Gaussian is sqrt(2 ln(MAX_OPACITY / MIN_ALPHA)) = 3.33 deviations.
-    """
+    """Return the rows that may be seen, nearest first; equal depths stay in map order."""
     x, y, z = torch.addmm(T_camera_world[:3, 3:], T_camera_world[:3, :3], means.T)
     in_front = z > NEAR_DEPTH
-    z_safe = torch.where(in_front, z, 1)  # what is dropped must not divide by zero
-    tangents = x / z_safe, y / z_safe
-    limits = torch.tensor(tangent_limits(camera)).abs().amax(0)
-    largest_scale = torch.maximum(torch.maximum(scales[:, 0], scales[:, 1]), scales[:, 2])
-    stretch = max(camera.fx, camera.fy) * (1 + float(limits.square().sum())) ** 0.5
-    radius = largest_scale * stretch / z_safe
-    level = 2 * torch.tensor(MAX_OPACITY / MIN_ALPHA).log().item() + 1e-3
-    radius = ((radius * radius + LOW_PASS_VARIANCE) * level).sqrt()
-    u, v = camera.fx * tangents[0] + camera.cx, camera.fy * tangents[1] + camera.cy
+    inverse_z = 1 / torch.where(in_front, z, 1)  # what is dropped must not divide by zero
+    u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
+    radius = _largest_radius(scales, inverse_z, camera)
     near_u = (u + radius >= 0) & (u - radius <= camera.width - 1)
     near_v = (v + radius >= 0) & (v - radius <= camera.height - 1)
-    index = (in_front & near_u & near_v & (opacities > MIN_ALPHA)).nonzero()[:, 0]
+    # A scale that has run away would overflow to NaN, and one NaN spoils the pose gradient.
+    visible = in_front & near_u & near_v & (radius < _MAX_RADIUS) & (opacities > MIN_ALPHA)
+    index = visible.nonzero()[:, 0]
     return index[z[index].argsort(stable=True)]
+
+
+def _largest_radius(scales: Tensor, inverse_z: Tensor, camera: Camera) -> Tensor:  # (N,) px
+    """Bound the radius of the support before anything is projected.
+
+    |J| <= f/z sqrt(1 + h_x^2 + h_y^2) for tangents h within their limits, and the support ends
+    at sqrt(2 ln(MAX_OPACITY / MIN_ALPHA)) = 3.33 standard deviations.
+    """
+    lower, upper = tangent_limits(camera)
+    h_x, h_y = (max(-low, high) for low, high in zip(lower, upper, strict=True))
+    stretch = max(camera.fx, camera.fy) * math.sqrt(1 + h_x**2 + h_y**2)
+    largest_scale = torch.maximum(torch.maximum(scales[:, 0], scales[:, 1]), scales[:, 2])
+    variance = (largest_scale * inverse_z * stretch) ** 2 + LOW_PASS_VARIANCE
+    return (2 * math.log(MAX_OPACITY / MIN_ALPHA) * variance).sqrt() + 1  # 1 px for rounding

@@ -176,6 +176,27 @@ def test_capped_and_invisible_gaussians_have_no_gradient():
             assert value.grad.abs().max() == 0
 
 
+@pytest.mark.parametrize("fault", ["zero quaternion", "infinite scale", "huge scale", "nan mean"])
+def test_one_broken_gaussian_does_not_spoil_the_others(fault: str):
+    camera, pose = Camera(60.0, 60.0, 12.0, 9.0, 27, 21), torch.eye(4)
+    arrays = random_map("ordinary", 20, 8).to_arrays()
+    if fault == "zero quaternion":
+        arrays["quats_wxyz"][3] = 0
+    elif fault == "nan mean":
+        arrays["means"][3] = float("nan")
+    else:
+        arrays["log_scales"][3] = 100.0 if fault == "infinite scale" else 40.0
+    gaussians = with_leaves(GaussianMap.from_arrays(arrays))
+    twist = torch.zeros(6, requires_grad=True)
+    rendering = render(gaussians, camera, pose, twist=twist)
+    rendering.color.sum().backward()
+    assert rendering.color.isfinite().all() and rendering.color.sum() > 0
+    assert twist.grad.isfinite().all() and twist.grad.abs().sum() > 0
+    others = torch.arange(20) != 3
+    for value in gaussians.parameters.values():
+        assert value.grad[others].isfinite().all()
+
+
 def test_flushing_denormals_does_not_outlast_the_rendering():
     gaussians = with_leaves(one_gaussian())
     render(gaussians, Camera(60.0, 60.0, 12.0, 9.0, 27, 21), torch.eye(4)).color.sum().backward()
