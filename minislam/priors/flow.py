@@ -76,9 +76,8 @@ class ClassicalFlow:
         with ThreadPoolExecutor(self.config.workers) as pool:
             measured = list(pool.map(measure, edges))
         dtype = predicted_targets.dtype
-        targets = torch.from_numpy(np.stack([m[0] for m in measured])).to(dtype)
-        confidence = torch.from_numpy(np.stack([m[1] for m in measured])).to(dtype)
-        return FlowMatches(targets, confidence[..., None].expand(targets.shape))
+        textures = [self._textures[source] for source in edges_source]
+        return as_matches([m[0] for m in measured], [m[1] for m in measured], textures, dtype)
 
     def _edge_flow(self, edge: tuple[int, int], predicted: np.ndarray) -> np.ndarray:
         source, target = self._images[edge[0]], self._images[edge[1]]
@@ -122,9 +121,7 @@ class FlowChain:
         texture = texture_confidence(self._reference, self._config)
         targets, confidence = grid_matches(flow, backward, texture, self._config)
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
-        matched = torch.from_numpy(targets)[None]
-        confidences = torch.from_numpy(confidence)[None, ..., None].expand(matched.shape)
-        return chain, FlowMatches(matched, confidences)
+        return chain, as_matches([targets], [confidence], [texture], torch.float32)
 
     def restarted(self) -> "FlowChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
@@ -228,3 +225,17 @@ def grid_matches(
     agreement = np.exp(-0.5 * squared_error / config.consistency_scale**2)
     inside = (target_u >= 0) & (target_u <= width - 1) & (target_v >= 0) & (target_v <= height - 1)
     return np.stack([target_u, target_v], -1), agreement * texture * inside
+
+
+def as_matches(
+    targets: list[np.ndarray],  # per edge (h, w, 2) px
+    confidences: list[np.ndarray],  # per edge (h, w)
+    textures: list[np.ndarray],  # per edge (h, w), the most its confidence could be
+    dtype: torch.dtype,
+) -> FlowMatches:
+    """Bundle the measurements of single edges."""
+    matched = torch.from_numpy(np.stack(targets)).to(dtype)
+    confidence = torch.from_numpy(np.stack(confidences)).to(dtype)
+    possible = torch.from_numpy(np.stack(textures)).to(dtype).sum((1, 2))
+    shares = confidence.sum((1, 2)) / possible.clamp_min(1e-6)
+    return FlowMatches(matched, confidence[..., None].expand(matched.shape), shares)

@@ -19,6 +19,7 @@ class FlowMatches:
 
     targets: Tensor  # (E, h, w, 2) px, the matched position of each cell
     confidences: Tensor  # (E, h, w, 2) in [0, 1], for u and for v; 0 where there is no match
+    matched_shares: Tensor  # (E,) in [0, 1], how much of what could be matched was matched
 
 
 class FlowChain(Protocol):

@@ -19,7 +19,7 @@ class TrackingConfig:
     window: int = parameter(10, "newest keyframes that the local BA moves")
     neighbourhood: int = parameter(3, "every keyframe is linked with so many predecessors")
     proximity_edges: int = parameter(2, "further links of a new keyframe, nearest by flow distance")
-    proximity_distance: float = parameter(60.0, "largest flow distance of a proximity link [px]")
+    proximity_distance: float = parameter(120.0, "largest flow distance of a proximity link [px]")
     rounds: int = parameter(2, "rounds of flow and BA per keyframe")
     iterations: int = parameter(3, "Gauss-Newton steps per round")
     robust_scale: float = parameter(
@@ -38,8 +38,11 @@ class TrackingConfig:
     rotation_share: float = parameter(
         0.75, "beta of the flow distance: share of the full motion, the rest without rotation [-]"
     )
+    keyframe_share: float = parameter(
+        0.2, "less of the last keyframe matched than this makes a new one [-]"
+    )
     min_matched_share: float = parameter(
-        0.1, "a frame with less of its flow confirmed backwards is lost [-]"
+        0.1, "a frame in which less of the last keyframe is matched is lost [-]"
     )
     max_disparity_error: float = parameter(
         0.05, "relative disagreement of two views of a point that still counts as agreement [-]"

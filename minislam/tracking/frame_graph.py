@@ -7,8 +7,8 @@ from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.reprojection import relative_transforms, reproject, scaled_points
 
-# A pair whose cells mostly leave the view has no meaningful distance. [-], as in DROID-SLAM.
-MIN_VISIBLE_SHARE = 0.75
+# A pair whose cells mostly leave the view has no meaningful distance. [-]; DROID-SLAM: 0.75.
+MIN_VISIBLE_SHARE = 0.5
 FAR = 1000.0  # px, the distance of such a pair
 
 

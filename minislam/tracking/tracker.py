@@ -61,7 +61,6 @@ class TrackedFrame:
     frame_index: int
     timestamp: float
     status: TrackingStatus
-    keyframe_index: int | None  # if it became a keyframe
 
 
 class Tracker:
@@ -86,6 +85,7 @@ class Tracker:
         self._flow, self._features, self._depth_prior = flow, features, depth_prior
         self._predict_static_weight = predict_static_weight
         self._chain: FlowChain | None = None
+        self._passed_over: tuple[Frame, FlowMatches] | None = None  # newest frame, no keyframe
         self._warmup_matches: list[FlowMatches] = []  # keyframe k to k + 1
         self._pixel_scale = (camera.width**2 + camera.height**2) ** 0.5 / REFERENCE_DIAGONAL
         self._robust_scale = config.robust_scale * self._pixel_scale or None
@@ -99,27 +99,38 @@ class Tracker:
             self._chain = self._flow.start_chain(frame.image)
             identity = torch.eye(4, dtype=torch.float64)
             self._add_keyframe(frame, identity, torch.ones(len(self.grid.rays)))
+            self._log(frame, TrackingStatus.OK)
             return True
         chain, matches = self._chain.advanced(frame.image)
+        added = False
+        if not self._is_followed(matches) and self._passed_over is not None:
+            # Too far from the last keyframe, but perhaps not from the last frame: make that one
+            # a keyframe after all and go on from there.
+            self._insert(*self._passed_over)
+            chain, matches = self._chain.advanced(frame.image)
+            added = True
         if not self._is_followed(matches):
             # The chain stays where the view was last seen, so that it can be taken up again.
-            self._log(frame, TrackingStatus.LOST, None)
-            return False
+            self._log(frame, TrackingStatus.LOST)
+            return added
         self._chain = chain
+        self._log(frame, TrackingStatus.OK)
+        self._passed_over = (frame, matches)
         if not self._is_keyframe(frame, matches):
-            self._log(frame, TrackingStatus.OK, None)
-            return False
+            return added
         self._insert(frame, matches)
         return True
 
     def _is_followed(self, matches: FlowMatches) -> bool:
-        return float((matches.confidences > 0.1).float().mean()) >= self.config.min_matched_share
+        return float(matches.matched_shares) >= self.config.min_matched_share
 
     def _is_keyframe(self, frame: Frame, matches: FlowMatches) -> bool:
         lengths = (matches.targets.reshape(-1, 2) - self.grid.pixels).norm(dim=1)
         confidence = matches.confidences.reshape(-1, 2)[:, 0]
         mean_flow = float((confidence * lengths).sum() / confidence.sum())
         if mean_flow > self.config.keyframe_flow * self._pixel_scale:
+            return True
+        if float(matches.matched_shares) < self.config.keyframe_share:
             return True
         # Without a depth prior the first keyframes need parallax more than they need each other.
         may_force = self.initialised or self._has_prior
@@ -128,7 +139,7 @@ class Tracker:
 
     def _insert(self, frame: Frame, matches: FlowMatches) -> None:
         last, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
-        self._chain = self._chain.restarted()
+        self._chain, self._passed_over = self._chain.restarted(), None
         if not self.initialised:
             # Poses of the warm-up are all estimated together, in initialise().
             self._warmup_matches.append(matches)
@@ -158,11 +169,9 @@ class Tracker:
         self._flow.add_frame(index, frame.image)
         if self.initialised:
             self.update_static_weights(first=index)
-        self._log(frame, TrackingStatus.OK, index)
 
-    def _log(self, frame: Frame, status: TrackingStatus, keyframe_index: int | None) -> None:
-        record = TrackedFrame(frame.frame_index, frame.timestamp, status, keyframe_index)
-        self.tracked.append(record)
+    def _log(self, frame: Frame, status: TrackingStatus) -> None:
+        self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status))
 
     # ---- the stages ------------------------------------------------------------------------
 
@@ -250,7 +259,11 @@ class Tracker:
         if bool((prior > 0).any()):
             return [torch.where(prior > 0, prior, prior[prior > 0].median())]
         from_first = [
-            FlowMatches(matches.targets[p : p + 1], matches.confidences[p : p + 1])
+            FlowMatches(
+                matches.targets[p : p + 1],
+                matches.confidences[p : p + 1],
+                matches.matched_shares[p : p + 1],
+            )
             for p, edge in enumerate(edges)
             if edge[0] == 0
         ]
