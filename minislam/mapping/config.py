@@ -11,7 +11,7 @@ from minislam.splatting import LearningRates
 class InsertionConfig:
     """Where a keyframe adds Gaussians, and how large they start."""
 
-    cell: int = parameter(4, "one Gaussian per cell of this side [px of the full image]")
+    cell: int = parameter(3, "one Gaussian per cell of this side [px of the full image]")
     footprint: float = parameter(0.6, "first scale, in sides of a cell seen at its depth [1]")
     opacity: float = parameter(0.9, "first opacity (0, 1); official 0.5")
     explained_opacity: float = parameter(
@@ -57,9 +57,9 @@ class MappingConfig:
     image_scale: float = parameter(0.5, "size of the images used online, of the full size (0, 1]")
     init_iterations: int = parameter(150, "iterations on the first keyframes; official 1050")
     keyframe_iterations: int = parameter(25, "iterations per keyframe; official 450")
-    refine_iterations: int = parameter(600, "iterations at the end; official 20000, fast 3000")
+    refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
     refine_full_share: float = parameter(
-        0.5, "share of them, the last ones, at full image size [0, 1]; official 1"
+        0.4, "share of them, the last ones, at full image size [0, 1]; official 1"
     )
 
     window_size: int = parameter(10, "most keyframes in the local window, official")
@@ -93,7 +93,7 @@ class MappingConfig:
     )
     rate_iterations: int = parameter(1500, "iterations of that decay; official 30000")
     refine_rate_end: float = parameter(
-        0.1, "last step over the first one in the refinement, all parameters; official 1"
+        0.5, "last step over the first one in the refinement, all parameters; official 1"
     )
     rates: LearningRates = field(
         default_factory=lambda: LearningRates(

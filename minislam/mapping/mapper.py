@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -12,13 +11,14 @@ from minislam.geometry import Camera
 from minislam.mapping.config import MappingConfig
 from minislam.mapping.deformation import deform_rigidly, rescale_to_depths
 from minislam.mapping.density import ScreenGradients, densify, useful_rows
+from minislam.mapping.history import MappingHistory
 from minislam.mapping.insertion import (
     draw_pixels,
     gaussians_at_pixels,
     insertable_pixels,
     lies_on_mover,
 )
-from minislam.mapping.losses import RenderLoss, render_loss
+from minislam.mapping.losses import render_loss
 from minislam.mapping.views import MappedKeyframe, shrink_image
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
@@ -35,27 +35,6 @@ from minislam.uncertainty import (
 Progress = Callable[[int, int], None]  # called with the iterations done and their number
 
 
-@dataclass
-class MappingHistory:
-    """One entry per iteration, for plots."""
-
-    render: list[float] = field(default_factory=list)  # L_render
-    color: list[float] = field(default_factory=list)  # weighted L_color
-    depth: list[float] = field(default_factory=list)  # weighted L_depth
-    isotropic: list[float] = field(default_factory=list)  # L_iso
-    uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
-    gaussians: list[int] = field(default_factory=list)  # size of the map
-
-    def add(self, loss: RenderLoss, uncertainty: float, gaussians: int) -> None:
-        """Append one iteration."""
-        self.render.append(float(loss.total.detach()))
-        self.color.append(float(loss.color.detach()))
-        self.depth.append(float(loss.depth.detach()))
-        self.isotropic.append(float(loss.isotropic.detach()))
-        self.uncertainty.append(uncertainty)
-        self.gaussians.append(gaussians)
-
-
 class Mapper:
     """Grow and optimise the map of the static scene, and train the MLP on what does not fit."""
 
@@ -66,6 +45,7 @@ class Mapper:
         uncertainty: UncertaintyConfig,
         feature_dimension: int,  # C
         seed: int,
+        device: torch.device | str = "cpu",  # where the keyframes' tensors live
     ) -> None:
         self.camera = camera
         self.config = config
@@ -74,9 +54,9 @@ class Mapper:
         self.window: list[int] = []  # positions in `keyframes`, newest first
         self.median_depth = 1.0  # world units; set by the first keyframes, then fixed
         self.history = MappingHistory()
-        self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed)
+        self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed, device)
         self._generator = torch.Generator().manual_seed(seed + 1)
-        self._optimizer = MapOptimizer(GaussianMap.empty(), config.rates)
+        self._optimizer = MapOptimizer(GaussianMap.empty(device=device), config.rates)
         self._gradients = ScreenGradients(0)
         self._iteration = 0
         self._frozen_until = 0
@@ -187,13 +167,15 @@ class Mapper:
 
     def _anchor_rows(self) -> Tensor:
         """Return (N,) the position in `keyframes` of each Gaussian's anchor."""
-        indices = torch.tensor([keyframe.keyframe_index for keyframe in self.keyframes])
-        return torch.searchsorted(indices, self._optimizer.gaussians.anchor_keyframe)
+        anchors = self._optimizer.gaussians.anchor_keyframe
+        return torch.searchsorted(
+            anchors.new_tensor([keyframe.keyframe_index for keyframe in self.keyframes]), anchors
+        )
 
     def _weight(self, keyframe: MappedKeyframe, camera: Camera) -> Tensor:
         """Return the static weight (H, W) of a keyframe; 1 with uncertainty switched off."""
         if not self.uncertainty.enabled:
-            return torch.ones(camera.height, camera.width)
+            return torch.ones(camera.height, camera.width, device=keyframe.image.device)
         return mapping_weight(self.predict_beta(keyframe.features), camera)
 
     @torch.no_grad()
@@ -229,7 +211,7 @@ class Mapper:
     def _withdraw_movers(self) -> None:
         """Remove Gaussians that were inserted on a mover before the MLP knew it for one."""
         gaussians, rows = self.gaussians, self._anchor_rows()
-        keep = torch.ones(len(gaussians), dtype=torch.bool)
+        keep = torch.ones_like(rows, dtype=torch.bool)
         for position, keyframe in enumerate(self.keyframes):
             anchored = (rows == position).nonzero().squeeze(-1)
             weight = self._weight(keyframe, self._online_camera)
@@ -247,6 +229,8 @@ class Mapper:
         last_rate: float = 1.0,  # all steps shrink to this share of themselves, log-linear
     ) -> None:
         """Run the iterations, each on a keyframe drawn at random."""
+        if len(self._optimizer.gaussians) == 0:
+            return  # There is nothing to optimise: all was pruned, or nothing was inserted.
         for done, camera in enumerate(cameras):
             position = torch.multinomial(probabilities, 1, generator=self._generator)
             self._step(int(position), camera, last_rate ** (done / len(cameras)))
@@ -260,7 +244,7 @@ class Mapper:
         keyframe = self.keyframes[position]
         view = keyframe.view(camera)
         gaussians = self._optimizer.gaussians
-        offsets = torch.zeros(len(gaussians), 2, requires_grad=True)
+        offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         pose = keyframe.T_camera_world.float()
         rendering = render(gaussians, camera, pose, screen_offsets=offsets)
         weight = self._weight(keyframe, camera)

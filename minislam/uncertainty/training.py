@@ -66,12 +66,18 @@ def uncertainty_loss(
 class UncertaintyTrainer:
     """Own the MLP, its Adam and its random source for a whole run."""
 
-    def __init__(self, feature_dimension: int, config: UncertaintyConfig, seed: int) -> None:
+    def __init__(
+        self,
+        feature_dimension: int,  # C
+        config: UncertaintyConfig,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.config = config
         self.generator = torch.Generator().manual_seed(seed)
         self.mlp = UncertaintyMLP(
             feature_dimension, self.generator, config.hidden_units, config.dropout
-        )
+        ).to(device)
         self.optimizer = torch.optim.Adam(
             self.mlp.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )

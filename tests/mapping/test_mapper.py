@@ -180,6 +180,15 @@ def test_a_black_keyframe_without_depth_changes_nothing_for_the_worse():
     assert psnr(mapper.render(first.T_camera_world).color, first.image) > 20
 
 
+def test_a_map_that_lost_all_its_gaussians_recovers_with_the_next_keyframe():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    mapper.initialise([wall_keyframe(0)])
+    mapper._optimizer.prune(torch.zeros(len(mapper.gaussians), dtype=torch.bool))
+    assert mapper.render(wall_keyframe(0).T_camera_world).opacity.max() == 0
+    mapper.integrate(wall_keyframe(1))
+    assert len(mapper.gaussians) > 100
+
+
 def test_one_keyframe_per_frame_index_gap_keeps_its_anchor():
     mapper = make_mapper(replace(CONFIG, init_iterations=1))
     mapper.initialise([replace(wall_keyframe(0), keyframe_index=3)])
