@@ -21,6 +21,11 @@ class FlowMatches:
     confidences: Tensor  # (E, h, w, 2) in [0, 1], for u and for v; 0 where there is no match
     matched_shares: Tensor  # (E,) in [0, 1], how much of what could be matched was matched
 
+    def edge(self, position: int) -> "FlowMatches":
+        """Return the matches of one edge (E = 1)."""
+        only = slice(position, position + 1)
+        return FlowMatches(self.targets[only], self.confidences[only], self.matched_shares[only])
+
 
 class FlowChain(Protocol):
     """Flow from a reference frame, followed from frame to frame without any geometry."""

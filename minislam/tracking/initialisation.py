@@ -32,6 +32,7 @@ POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
 # outliers: the weight is narrowed step by step.
 POSE_ROBUST_WIDENING = (16.0, 4.0, 1.0)  # [-], times the final width
 MIN_CELLS_FOR_ESSENTIAL = 40  # confident cells; five define the matrix, noise wants many more
+HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps before hypotheses are compared
 DISPARITY_SPREAD = 20.0  # largest ratio of a triangulated disparity to the median, both ways
 
 
@@ -173,11 +174,12 @@ def chain_state(
     return BundleState(torch.stack(poses), torch.stack(disparities))
 
 
-def best_hypothesis(
-    problem: BundleProblem, states: list[BundleState], iterations: int
-) -> tuple[BundleState, int, list[float]]:
-    """Adjust every hypothesis on the same measurements; return the best, its place, all costs."""
-    adjusted = [bundle_adjust(problem, state, iterations) for state in states]
-    costs = [report.cost_after for _, report in adjusted]
-    best = int(np.argmin(costs))
-    return adjusted[best][0], best, costs
+def best_hypothesis(problem: BundleProblem, states: list[BundleState]) -> BundleState:
+    """Adjust every hypothesis on the same measurements and return the cheapest.
+
+    Comparing is safe where a threshold is not: a wrong basin can have small residuals too, but
+    on the same measurements the right one has smaller ones.
+    """
+    adjusted = [bundle_adjust(problem, state, HYPOTHESIS_ITERATIONS) for state in states]
+    best = min(range(len(states)), key=lambda index: adjusted[index][1].cost_after)
+    return adjusted[best][0]

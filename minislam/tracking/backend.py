@@ -1,0 +1,172 @@
+"""The back-end: keyframes, the graph between them, and their adjustment (Eq. 5)."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.priors.interfaces import FlowEstimator
+from minislam.tracking.bundle_adjustment import (
+    BundleProblem,
+    BundleReport,
+    BundleState,
+    bundle_adjust,
+)
+from minislam.tracking.config import TrackingConfig
+from minislam.tracking.frame_graph import (
+    FrameGraph,
+    both_directions,
+    flow_distances,
+    neighbourhood_edges,
+    proximity_pairs,
+)
+from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.reprojection import relative_transforms, reproject
+
+REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that the thresholds in px belong to
+HORIZON = 3  # windows of keyframes among which a new one looks for proximity links
+
+
+class BackEnd:
+    """Holds what tracking has estimated, and makes it consistent."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
+        self.config = config
+        self.grid = Grid.of(camera, flow.stride)
+        self.keyframes = KeyframeStore(len(self.grid.rays))
+        self.graph = FrameGraph()
+        self.reports: list[BundleReport] = []
+        self.pixel_scale = (camera.width**2 + camera.height**2) ** 0.5 / REFERENCE_DIAGONAL
+        self.robust_scale = config.robust_scale * self.pixel_scale or None
+        self.flow = flow
+
+    def adjust_newest(self) -> None:
+        """Link the newest keyframe with its like and adjust the window around it."""
+        count = len(self.keyframes)
+        edges = neighbourhood_edges(count - 1, count, self.config.neighbourhood)
+        limit = self.config.proximity_distance * self.pixel_scale
+        start = max(0, count - HORIZON * self.config.window)
+        pairs = self._proximity_pairs(
+            start, range(count - 1, count), edges, limit, self.config.proximity_edges
+        )
+        edges += both_directions(pairs)
+        first_free = max(0, count - self.config.window)
+        for _ in range(self.config.rounds):
+            self.match(edges)
+            self.adjust(first_free, self.config.iterations)
+
+    def adjust_all(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """Adjust all keyframes together on fresh flow (final global BA).
+
+        The disparity prior is off: it has served to start from, and a single image's depth is
+        worse than that of many views.
+        """
+        everyone = range(len(self.keyframes))
+        limit = self.config.final_distance * self.pixel_scale
+        pairs = self._proximity_pairs(0, everyone, [], limit, self.config.final_edges)
+        edges = self.graph.edges() + both_directions(pairs)
+        lambda_prior = self.config.lambda_disparity_prior if self.config.final_prior else 0.0
+        for done in range(self.config.final_rounds):
+            self.match(edges)
+            self.adjust(0, self.config.final_iterations, lambda_prior)
+            if progress:
+                progress(done + 1, self.config.final_rounds)
+
+    def match(self, edges: list[tuple[int, int]]) -> None:
+        """Measure the flow of these edges, started from what the present geometry predicts."""
+        sources, targets = (list(ends) for ends in zip(*edges, strict=True))
+        transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
+        predicted, _ = reproject(
+            transforms, self.keyframes.disparities[sources], self.grid.rays, self.grid.camera
+        )
+        # Points near the camera plane project to anywhere; a flow started there finds nothing.
+        size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
+        predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
+        predicted = predicted.mT.reshape(len(edges), *self.grid.shape, 2)
+        self.graph.record(edges, self.flow.match(sources, targets, predicted))
+
+    def adjust(
+        self,
+        first_free: int,  # keyframes from here on move
+        iterations: int,
+        lambda_prior: float | None = None,  # None: as configured
+    ) -> None:
+        """Run a bundle adjustment over the edges that touch the free keyframes."""
+        problem = self.problem(self.graph.select(first_free), first_free, lambda_prior)
+        state, report = bundle_adjust(problem, self.state, iterations)
+        self.state = state
+        self.reports.append(report)
+
+    @property
+    def state(self) -> BundleState:
+        """Return poses and disparities of all keyframes."""
+        return BundleState(self.keyframes.T_camera_world, self.keyframes.disparities)
+
+    @state.setter
+    def state(self, state: BundleState) -> None:
+        self.keyframes.T_camera_world = state.T_camera_world
+        self.keyframes.disparities = state.disparities
+
+    def problem(
+        self, positions: Sequence[int], first_free: int, lambda_prior: float | None = None
+    ) -> BundleProblem:
+        """Collect edges, by their position in the graph, into a bundle problem."""
+        sources = torch.tensor([self.graph.edges_source[p] for p in positions])
+        edges_target = torch.tensor([self.graph.edges_target[p] for p in positions])
+        targets = torch.stack([self.graph.targets[p] for p in positions])
+        confidences = torch.stack([self.graph.confidences[p] for p in positions])
+        static = self.keyframes.static_weights
+        # Eq. (5) weighs by beta of the source. A learned confidence also notices a target that
+        # is covered by a mover; a classical one does not, so beta of the target counts as well.
+        seen = self.grid.sample(static[edges_target][..., None], targets.mT)[..., 0]
+        weights = confidences * (static[sources] * seen)[:, None]
+        prior = self.keyframes.prior_disparities
+        if lambda_prior is None:
+            lambda_prior = self.config.lambda_disparity_prior
+        strength = lambda_prior * self.grid.camera.fx**2
+        free = torch.arange(len(self.keyframes)) >= first_free
+        movable = free.clone()
+        movable[0] = False  # the first camera is the world
+        return BundleProblem(
+            camera=self.grid.camera,
+            rays=self.grid.rays,
+            edges_source=sources,
+            edges_target=edges_target,
+            targets=targets,
+            weights=weights,
+            prior_disparities=prior,
+            prior_weights=strength * (prior > 0),
+            free_poses=movable,
+            free_disparities=free,
+            robust_scale=self.robust_scale,
+        )
+
+    def normalise_scale(self) -> None:
+        """Choose the unit of length so that the median disparity is one: nothing else fixes it."""
+        scale = self.keyframes.disparities.median()
+        self.keyframes.disparities /= scale
+        self.keyframes.T_camera_world[:, :3, 3] *= float(scale)
+
+    def _proximity_pairs(
+        self,
+        start: int,  # first keyframe to look at
+        newer: range,  # keyframes that want links
+        edges: list[tuple[int, int]],  # that will be there besides those of the graph
+        limit: float,  # px
+        links: int,  # per keyframe
+    ) -> list[tuple[int, int]]:
+        """Return pairs of keyframes that see the same from different places."""
+        distances = flow_distances(
+            self.keyframes.T_camera_world[start:],
+            self.keyframes.disparities[start:],
+            self.grid.rays,
+            self.grid.pixels,
+            self.grid.camera,
+            self.config.rotation_share,
+        )
+        taken = [(i - start, j - start) for i, j in self.graph.edges() + edges if min(i, j) >= start]
+        shifted = range(newer.start - start, newer.stop - start)
+        pairs = proximity_pairs(distances, taken, shifted, limit, links)
+        return [(i + start, j + start) for i, j in pairs]

@@ -1,0 +1,87 @@
+"""Poses of the frames between the keyframes."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import se3_exp, se3_inverse, se3_log
+from minislam.records import Sequence
+from minislam.tracking.backend import BackEnd
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, motion_only_adjust
+from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.tracker import Tracker, TrackingStatus
+
+ITERATIONS = 8  # Gauss-Newton steps of six unknowns
+ROBUST_NARROWING = 0.5  # the structure is known by now: a narrower Cauchy weight [-]
+
+
+def interpolate_pose(first: Tensor, second: Tensor, share: float) -> Tensor:
+    """Return the pose (4, 4) at `share` of the way from first to second, on a constant twist."""
+    return se3_exp(share * se3_log(second @ se3_inverse(first))) @ first
+
+
+def pose_all_frames(
+    tracker: Tracker, sequence: Sequence, progress: Callable[[int, int], None] | None = None
+) -> dict[int, Tensor]:
+    """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
+
+    A keyframe keeps its pose. Another frame starts from the interpolated one and is adjusted on
+    the flow from the keyframe before and the keyframe after it, their structure held.
+    """
+    frames = tracker.keyframes.frames
+    poses = {f.frame_index: T for f, T in zip(frames, tracker.keyframes.T_camera_world, strict=True)}
+    others = [
+        t for t in tracker.tracked if t.status is TrackingStatus.OK and t.frame_index not in poses
+    ]
+    for done, tracked in enumerate(others):
+        following = sum(f.frame_index < tracked.frame_index for f in frames)
+        around = [k for k in (following - 1, following) if k < len(frames)]
+        image = sequence.frame(tracked.frame_index).image
+        poses[tracked.frame_index] = _pose_between(
+            tracker.backend, around, tracked.timestamp, image
+        )
+        if progress:
+            progress(done + 1, len(others))
+    return dict(sorted(poses.items()))
+
+
+def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: Tensor) -> Tensor:
+    """Return T_camera_world of a frame beside one keyframe or between two."""
+    keyframes, grid = backend.keyframes, backend.grid
+    known = keyframes.T_camera_world[around]
+    start = known[0]
+    if len(around) == 2:
+        first, second = (keyframes.frames[k].timestamp for k in around)
+        start = interpolate_pose(known[0], known[1], (timestamp - first) / (second - first))
+    newest, count = len(keyframes), len(around)
+    poses = torch.cat([known, start[None]])
+    disparities = keyframes.disparities[around]
+    sources, targets = torch.arange(count), torch.full((count,), count)
+
+    transforms = relative_transforms(poses, sources, targets).float()
+    predicted, _ = reproject(transforms, disparities, grid.rays, grid.camera)
+    backend.flow.add_frame(newest, image)
+    matches = backend.flow.match(
+        around, [newest] * count, predicted.mT.reshape(count, *grid.shape, 2)
+    )
+    backend.flow.remove_frame(newest)
+
+    empty = torch.zeros(count + 1, len(grid.rays))
+    robust_scale = backend.robust_scale and ROBUST_NARROWING * backend.robust_scale
+    problem = BundleProblem(
+        camera=grid.camera,
+        rays=grid.rays,
+        edges_source=sources,
+        edges_target=targets,
+        targets=matches.targets.flatten(1, 2).mT,
+        weights=matches.confidences.flatten(1, 2).mT * keyframes.static_weights[around, None],
+        prior_disparities=empty,
+        prior_weights=empty,
+        free_poses=torch.arange(count + 1) == count,
+        free_disparities=torch.zeros(count + 1, dtype=torch.bool),
+        robust_scale=robust_scale,
+    )
+    state = BundleState(poses, torch.cat([disparities, empty[:1]]))
+    state, _ = motion_only_adjust(problem, state, ITERATIONS)
+    return state.T_camera_world[-1]
