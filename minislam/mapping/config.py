@@ -15,10 +15,7 @@ class InsertionConfig:
     footprint: float = parameter(0.6, "first scale, in sides of a cell seen at its depth [1]")
     opacity: float = parameter(0.9, "first opacity (0, 1); official 0.5")
     explained_opacity: float = parameter(
-        0.8, "a pixel less opaque than this is not covered by the map yet [1]"
-    )
-    explained_depth: float = parameter(
-        0.4, "a pixel whose depth is further off is not explained by the map [relative]"
+        0.8, "a pixel rendered less opaque than this is not explained by the map yet [1]"
     )
     far_factor: float = parameter(
         10.0, "nothing is inserted beyond this many median depths [1], as L_depth"
@@ -123,3 +120,19 @@ class MappingConfig:
                 f"expected a window of at least 3 keyframes, found {self.window_size}; "
                 "two of them are always kept, set mapping.window_size to 10"
             )
+
+    def rates_at(
+        self,
+        iteration: int,
+        median_depth: float,  # world units, of the scene
+        factor: float,  # on all steps
+    ) -> LearningRates:
+        """Return the step lengths of an iteration: those of the means decay, log-linear."""
+        decay = self.means_rate_end ** min(1.0, iteration / self.rate_iterations)
+        return LearningRates(
+            means=factor * decay * self.means_rate * median_depth,
+            quats_wxyz=factor * self.rates.quats_wxyz,
+            log_scales=factor * self.rates.log_scales,
+            opacity_logits=factor * self.rates.opacity_logits,
+            colors=factor * self.rates.colors,
+        )

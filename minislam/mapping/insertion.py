@@ -24,16 +24,14 @@ def insertable_pixels(
     """Tell which pixels may add a Gaussian.
 
     The reference depth must be known and not too far, the pixel static as far as the MLP knows,
-    and the map must be transparent there or show another surface.
+    and the map transparent there. Where the map shows another surface nothing is added: if the
+    new one is nearer it may be a mover that the MLP does not know yet, and if it is farther the
+    old one is a mover's remainder, which `lies_on_mover` finds, or the blurred edge of an object.
     """
     wanted = (depth > 0) & (depth < far_limit) & (weight > 0)
-    if rendering is None:
-        return wanted
-    covered = rendering.opacity > config.explained_opacity
-    # The rendered depth is a sum of weights: it is a depth only after division by the opacity.
-    surface = rendering.depth / rendering.opacity.clamp_min(config.explained_opacity)
-    agrees = (surface - depth).abs() < config.explained_depth * depth
-    return wanted & ~(covered & agrees)
+    if rendering is not None:
+        wanted &= rendering.opacity < config.explained_opacity
+    return wanted
 
 
 def draw_pixels(
@@ -102,6 +100,7 @@ def lies_on_mover(
     in_front = points[:, 2] > 0
     # Points behind the camera have no pixel; any depth that is not zero will do for them.
     pixels = camera.project(torch.where(in_front[:, None], points, torch.ones_like(points)))
-    inside = in_front & camera.contains(pixels)
-    column, row = (pixels.round().long() * inside[:, None]).unbind(-1)
-    return inside & (weight[row, column] == 0)
+    # Optimisation may have pushed a Gaussian over the border: the nearest pixel speaks for it.
+    column = pixels[:, 0].round().clamp(0, camera.width - 1).long()
+    row = pixels[:, 1].round().clamp(0, camera.height - 1).long()
+    return in_front & (weight[row, column] == 0)

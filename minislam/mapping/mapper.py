@@ -22,7 +22,7 @@ from minislam.mapping.losses import render_loss
 from minislam.mapping.views import MappedKeyframe, shrink_image
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
-from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
+from minislam.splatting import GaussianMap, MapOptimizer, Rendering, render
 from minislam.uncertainty import (
     Misfit,
     UncertaintyConfig,
@@ -102,6 +102,7 @@ class Mapper:
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
         uniform = torch.full((count,), 1 / count, dtype=torch.float64)
         self._optimise([self._online_camera] * self.config.init_iterations, uniform, progress)
+        self._exchange_movers()
 
     def integrate(self, keyframe: Keyframe, progress: Progress | None = None) -> None:
         """Add one keyframe: window, insertion, then optimisation of map and MLP."""
@@ -156,9 +157,7 @@ class Mapper:
 
     def refine(self, iterations: int, progress: Progress | None = None) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size."""
-        self._withdraw_movers()
-        for position in range(len(self.keyframes)):
-            self._insert(position)
+        self._exchange_movers()
         count = len(self.keyframes)
         uniform = torch.full((count,), 1 / count, dtype=torch.float64)
         full = round(iterations * self.config.refine_full_share)
@@ -221,6 +220,12 @@ class Mapper:
         self._optimizer.prune(keep)
         self._gradients = ScreenGradients(len(self.gaussians))
 
+    def _exchange_movers(self) -> None:
+        """Withdraw movers and fill the holes that they leave, from every keyframe."""
+        self._withdraw_movers()
+        for position in range(len(self.keyframes)):
+            self._insert(position)
+
     def _optimise(
         self,
         cameras: list[Camera],  # size at which each iteration renders
@@ -253,7 +258,9 @@ class Mapper:
         )
         loss.total.backward()
         self._gradients.add(offsets.grad, rendering.radii, camera)
-        self._optimizer.rates = self._rates(rate_factor)
+        self._optimizer.rates = self.config.rates_at(
+            self._iteration, self.median_depth, rate_factor
+        )
         self._optimizer.step()
 
         uncertainty = math.nan
@@ -261,18 +268,6 @@ class Mapper:
             uncertainty = self._train_mlp(position, rendering)
         self.history.add(loss, uncertainty, len(gaussians))
         self._iteration += 1
-
-    def _rates(self, factor: float) -> LearningRates:
-        """Return the step lengths of this iteration: those of the means decay, log-linear."""
-        config, rates = self.config, self.config.rates
-        decay = config.means_rate_end ** min(1.0, self._iteration / config.rate_iterations)
-        return LearningRates(
-            means=factor * decay * config.means_rate * self.median_depth,
-            quats_wxyz=factor * rates.quats_wxyz,
-            log_scales=factor * rates.log_scales,
-            opacity_logits=factor * rates.opacity_logits,
-            colors=factor * rates.colors,
-        )
 
     @torch.no_grad()
     def _misfit(self, keyframe: MappedKeyframe, rendering: Rendering) -> Misfit:

@@ -52,6 +52,19 @@ def test_a_mover_becomes_uncertain_and_fades_from_the_map():
     assert psnr(mapper.render(empty.T_camera_world).color, empty.image) > 18
 
 
+def test_movers_are_withdrawn_and_not_inserted_again_once_the_mlp_knows_them():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    mapper.initialise([wall_keyframe(0, mover_column=12)])
+    mover = mapper.gaussians.means[:, 2] < 1.5
+    assert mover.sum() >= 12
+
+    # An MLP that answers the mover's features (0, 1, 0) with a large beta.
+    mapper.predict_beta = lambda features: 0.1 + 5 * features[..., 1]
+    mapper._exchange_movers()
+    assert (mapper.gaussians.means[:, 2] < 1.5).sum() < 0.4 * mover.sum()
+    assert (mapper.gaussians.means[:, 2] > 1.5).sum() > 100
+
+
 def test_a_half_size_image_has_half_the_pixels_and_the_same_means():
     mapper = make_mapper(replace(CONFIG, image_scale=0.5, init_iterations=1))
     mapper.initialise([wall_keyframe(0)])
@@ -219,7 +232,3 @@ def test_impossible_calls_are_refused_in_one_sentence():
     mapper.initialise([wall_keyframe(0)])
     with pytest.raises(InputError, match="1 keyframes in the map, found 2"):
         mapper.update_keyframes(torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
-    with pytest.raises(InputError, match="image scale"):
-        MappingConfig(image_scale=0.0)
-    with pytest.raises(InputError, match="window of at least 3"):
-        MappingConfig(window_size=2)

@@ -1,0 +1,36 @@
+from dataclasses import fields
+
+import pytest
+
+from minislam.errors import InputError
+from minislam.mapping import DensityConfig, InsertionConfig, MappingConfig
+from minislam.uncertainty import UncertaintyConfig
+
+
+def test_steps_of_the_means_scale_with_the_scene_and_decay_to_their_end():
+    config = MappingConfig(means_rate=1e-3, means_rate_end=0.01, rate_iterations=100)
+    assert config.rates_at(0, 2.0, 1.0).means == pytest.approx(2e-3)
+    assert config.rates_at(50, 2.0, 1.0).means == pytest.approx(2e-4)
+    assert config.rates_at(100, 2.0, 1.0).means == pytest.approx(2e-5)
+    assert config.rates_at(10**6, 2.0, 1.0).means == pytest.approx(2e-5)
+
+
+def test_the_common_factor_reaches_every_parameter():
+    config = MappingConfig()
+    whole, half = config.rates_at(7, 1.0, 1.0), config.rates_at(7, 1.0, 0.5)
+    for rate in fields(whole):
+        assert getattr(half, rate.name) == pytest.approx(0.5 * getattr(whole, rate.name))
+
+
+@pytest.mark.parametrize(
+    "config", [MappingConfig, InsertionConfig, DensityConfig, UncertaintyConfig]
+)
+def test_every_constant_says_what_it_means(config):
+    assert all(len(constant.metadata["meaning"]) > 10 for constant in fields(config))
+
+
+def test_impossible_values_are_refused_in_one_sentence():
+    with pytest.raises(InputError, match="image scale"):
+        MappingConfig(image_scale=0.0)
+    with pytest.raises(InputError, match="window of at least 3"):
+        MappingConfig(window_size=2)
