@@ -21,6 +21,7 @@ from minislam.tracking.reprojection import relative_transforms, reproject_with_j
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # share of the mean diagonal C that is added to all of it [-]
+MIN_RAISED_DAMPING = 1e-6  # relative; an undamped solve that fails is tried again with this
 MAX_DAMPING = 1e6  # relative; beyond it a step is no longer worth taking
 
 
@@ -98,7 +99,7 @@ def bundle_adjust(
                 reason = "cost settled"
                 break
             continue
-        level *= 10
+        level = max(10 * level, MIN_RAISED_DAMPING)
         if level > MAX_DAMPING:
             # Already at the minimum no step lowers the cost: that is convergence, not failure.
             converged = candidate is not None

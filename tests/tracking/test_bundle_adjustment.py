@@ -1,0 +1,419 @@
+"""Bundle adjustment: against the dense twin, against the truth, and where it cannot succeed."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from tracking.scene import (
+    CELLS,
+    KnownProblem,
+    assert_same_bits,
+    distance,
+    known_problem,
+    normal,
+    perturbed,
+    uniform,
+    with_prior,
+)
+
+from minislam.geometry import se3_exp
+from minislam.tracking import bundle_adjustment
+from minislam.tracking.bundle_adjustment import (
+    MAX_DAMPING,
+    MIN_DISPARITY,
+    BundleProblem,
+    BundleState,
+    bundle_adjust,
+    motion_only_adjust,
+    residuals,
+)
+from minislam.tracking.reference import dense_normal_equations, dense_step
+
+
+def one_step(problem: BundleProblem, state: BundleState, damping: float, absolute: float):
+    equations = bundle_adjustment._normal_equations(problem, state)
+    after = bundle_adjustment._damped_step(problem, state, equations, damping, absolute)
+    assert after is not None
+    return after
+
+
+def two_fixed_poses(known: KnownProblem) -> KnownProblem:
+    """Fix the second pose as well: then nothing is free to scale, and the truth is unique."""
+    free_poses = known.problem.free_poses.clone()
+    free_poses[1] = False
+    return replace(known, problem=replace(known.problem, free_poses=free_poses))
+
+
+def noisy(known: KnownProblem, sigma: float, seed: int = 9) -> BundleProblem:
+    targets = known.problem.targets
+    return replace(known.problem, targets=targets + sigma * normal(seed, *targets.shape))
+
+
+def scaled(state: BundleState, factor: float) -> BundleState:
+    """Return the same views of a world that is `factor` times as large."""
+    poses = state.T_camera_world.clone()
+    poses[:, :3, 3] *= factor
+    return BundleState(poses, state.disparities / factor)
+
+
+# Known answers
+
+
+@pytest.mark.parametrize("seed", [0, 100])
+def test_a_disturbed_state_returns_to_the_truth(seed: int):
+    known = two_fixed_poses(known_problem(seed=seed))
+    start = perturbed(known, 0.02)
+    assert distance(start, known.truth) > 0.02
+    end, report = bundle_adjust(known.problem, start, iterations=10)
+    assert distance(end, known.truth) < 1e-8
+    assert report.converged and report.cost_after < 1e-12 * report.cost_before
+
+
+def test_without_a_prior_the_truth_is_found_up_to_scale():
+    known = known_problem()
+    end, _ = bundle_adjust(known.problem, perturbed(known, 0.02), iterations=10)
+    factor = float((end.disparities / known.truth.disparities).median())
+    assert distance(scaled(end, factor), known.truth) < 1e-8
+
+
+def test_the_prior_pulls_the_scale():
+    known = with_prior(known_problem(), weight=50.0)
+    start = scaled(known.truth, 1.3)
+    without, _ = bundle_adjust(known_problem().problem, start, iterations=20)
+    assert distance(without, start) < 1e-8  # every scale explains the flow
+    pulled, _ = bundle_adjust(known.problem, start, iterations=20)
+    assert distance(pulled, known.truth) < 1e-5
+
+
+def test_robust_weights_recover_from_thirty_percent_outliers():
+    known = two_fixed_poses(known_problem())
+    targets = known.problem.targets
+    is_outlier = (uniform(70, len(targets), 1, CELLS) < 0.3).expand_as(targets)
+    spoilt = torch.where(is_outlier, targets + 25 * normal(71, *targets.shape), targets)
+    plain = replace(known.problem, targets=spoilt)
+    robust = replace(plain, robust_scale=0.5)
+    start = perturbed(known, 0.01)
+    misled, _ = bundle_adjust(plain, start, iterations=20)
+    recovered, _ = bundle_adjust(robust, start, iterations=20)
+    error = (recovered.T_camera_world - known.truth.T_camera_world).abs().max()
+    plain_error = (misled.T_camera_world - known.truth.T_camera_world).abs().max()
+    assert error < 2e-3
+    assert error < 0.02 * plain_error
+
+
+def test_cauchy_weights_by_hand():
+    known = known_problem(2)
+    shift = torch.tensor([3.0, 4.0])[:, None]
+    problem = replace(known.problem, targets=known.problem.targets + shift, robust_scale=2.5)
+    residual, weight = residuals(problem, known.truth)
+    torch.testing.assert_close(residual, shift.double().expand_as(residual))
+    torch.testing.assert_close(weight, problem.weights / (1 + 25 / 6.25))  # |r| = 5 px
+
+
+# Identities
+
+
+@pytest.mark.parametrize("robust_scale", [None, 1.5])
+@pytest.mark.parametrize(("damping", "absolute"), [(0.0, 0.0), (1e-2, 1e-3)])
+def test_elimination_of_disparities_changes_nothing(robust_scale, damping: float, absolute: float):
+    known = with_prior(known_problem(3), weight=3.0)
+    problem = replace(noisy(known, 1.0), robust_scale=robust_scale)
+    start = perturbed(known, 0.02)
+    eliminated = one_step(problem, start, damping, absolute)
+    assert distance(eliminated, start) > 0.01
+    assert distance(eliminated, dense_step(problem, start, damping, absolute)) < 1e-9
+
+
+def test_elimination_with_some_disparities_and_poses_held():
+    known = with_prior(known_problem(3), weight=3.0)
+    problem = replace(
+        noisy(known, 1.0),
+        free_poses=torch.tensor([False, False, True]),
+        free_disparities=torch.tensor([True, False, True]),
+    )
+    start = perturbed(known, 0.02)
+    eliminated = one_step(problem, start, 0.0, 0.0)
+    assert distance(eliminated, dense_step(problem, start, 0.0, 0.0)) < 1e-9
+
+
+def test_normal_equations_are_those_of_the_dense_twin():
+    known = with_prior(known_problem(3), weight=3.0)
+    problem, start = noisy(known, 1.0), perturbed(known, 0.02)
+    ours = bundle_adjustment._normal_equations(problem, start)
+    dense = dense_normal_equations(problem, start)
+    split = dense.pose_unknowns
+    assert split == 12
+    close = {"rtol": 1e-10, "atol": 1e-9}
+    torch.testing.assert_close(ours.pose_pose, dense.matrix[:split, :split], **close)
+    torch.testing.assert_close(ours.pose_gradient, dense.vector[:split], **close)
+    C = dense.matrix[split:, split:]
+    torch.testing.assert_close(ours.disparity_diagonal.reshape(-1), C.diagonal(), **close)
+    assert (C - torch.diag(C.diagonal())).abs().max() < 1e-9  # a disparity has one source only
+    torch.testing.assert_close(ours.disparity_gradient.reshape(-1), dense.vector[split:], **close)
+
+
+@pytest.mark.parametrize("robust_scale", [None, 1.5])
+def test_the_gradient_is_that_of_the_cost(robust_scale):
+    # d cost = -2 (g . xi + s . dd): the weights of the solve belong to the cost that is reported.
+    known = with_prior(known_problem(3), weight=3.0)
+    weights = known.problem.weights.mean(1, keepdim=True).expand_as(known.problem.weights)
+    problem = replace(noisy(known, 1.0), robust_scale=robust_scale, weights=weights)
+    start, step = perturbed(known, 0.02), 1e-6
+    equations = bundle_adjustment._normal_equations(problem, start)
+    xi, added = normal(5, 2, 6), normal(6, 3, CELLS)
+    costs = []
+    for sign in (1, -1):
+        poses = start.T_camera_world.clone()
+        poses[1:] = se3_exp(sign * step * xi) @ poses[1:]
+        moved = BundleState(poses, start.disparities + sign * step * added)
+        costs.append(bundle_adjustment._normal_equations(problem, moved).cost)
+    slope = (costs[0] - costs[1]) / (2 * step)
+    predicted = equations.pose_gradient @ xi.reshape(-1)
+    predicted = -2 * (predicted + (equations.disparity_gradient * added).sum())
+    assert slope == pytest.approx(float(predicted), rel=1e-6)
+
+
+def test_a_weight_of_zero_removes_a_cell_exactly():
+    known = with_prior(known_problem(), weight=3.0)
+    weights = known.problem.weights.clone()
+    weights[2, :, 17] = 0
+    removed = replace(known.problem, weights=weights)
+    targets = removed.targets.clone()
+    targets[2, :, 17] += 1e3
+    start = perturbed(known, 0.02)
+    end, report = bundle_adjust(removed, start, iterations=3)
+    other, other_report = bundle_adjust(replace(removed, targets=targets), start, iterations=3)
+    assert_same_bits(end, other)
+    assert report == other_report
+
+
+def test_an_edge_of_zero_weight_might_as_well_not_be_there():
+    known = with_prior(known_problem(), weight=3.0)
+    problem = noisy(known, 1.0)
+    weights = problem.weights.clone()
+    weights[-1] = 0
+    shorter = replace(
+        problem,
+        edges_source=problem.edges_source[:-1],
+        edges_target=problem.edges_target[:-1],
+        targets=problem.targets[:-1],
+        weights=problem.weights[:-1],
+    )
+    start = perturbed(known, 0.02)
+    end, _ = bundle_adjust(replace(problem, weights=weights), start, iterations=3)
+    expected, _ = bundle_adjust(shorter, start, iterations=3)
+    assert distance(end, expected) < 1e-12
+
+
+@pytest.mark.parametrize("robust_scale", [None, 1.5])
+def test_doubled_weights_change_nothing(robust_scale):
+    known = two_fixed_poses(known_problem())
+    problem = replace(noisy(known, 1.0), robust_scale=robust_scale)
+    doubled = replace(problem, weights=2 * problem.weights)
+    start = perturbed(known, 0.02)
+    end, report = bundle_adjust(problem, start, 3, damping=0.0, absolute_damping=0.0)
+    other, doubled_report = bundle_adjust(doubled, start, 3, damping=0.0, absolute_damping=0.0)
+    assert distance(end, other) < 1e-12
+    assert doubled_report.cost_after == pytest.approx(2 * report.cost_after, rel=1e-12)
+
+
+def test_the_order_of_edges_does_not_matter():
+    known = with_prior(known_problem(), weight=3.0)
+    problem, order = noisy(known, 1.0), torch.arange(12).flip(0)
+    shuffled = replace(
+        problem,
+        edges_source=problem.edges_source[order],
+        edges_target=problem.edges_target[order],
+        targets=problem.targets[order],
+        weights=problem.weights[order],
+    )
+    start = perturbed(known, 0.02)
+    end, _ = bundle_adjust(problem, start, iterations=3)
+    assert distance(end, bundle_adjust(shuffled, start, iterations=3)[0]) < 1e-12
+
+
+def test_what_is_fixed_keeps_its_bits():
+    known = known_problem()
+    free_poses = torch.tensor([False, True, False, True])
+    free_disparities = torch.tensor([True, False, False, True])
+    problem = replace(noisy(known, 1.0), free_poses=free_poses, free_disparities=free_disparities)
+    start = perturbed(known_problem(), 0.02)
+    end, report = bundle_adjust(problem, start, iterations=4)
+    assert report.iterations > 0
+    for index in range(4):
+        same_pose = torch.equal(end.T_camera_world[index], start.T_camera_world[index])
+        same_disparity = torch.equal(end.disparities[index], start.disparities[index])
+        assert same_pose == (not free_poses[index])
+        assert same_disparity == (not free_disparities[index])
+
+
+def test_motion_only_moves_poses_to_the_truth_and_no_disparity():
+    known = known_problem()
+    held = torch.zeros(4, dtype=torch.bool)
+    start = perturbed(
+        replace(known, problem=replace(known.problem, free_disparities=held)), size=0.05
+    )
+    end, _ = motion_only_adjust(known.problem, start, iterations=8)
+    assert torch.equal(end.disparities, start.disparities)
+    assert distance(end, known.truth) < 1e-8
+
+
+def test_the_given_state_is_left_alone():
+    known = known_problem()
+    start = perturbed(known, 0.02)
+    copy = BundleState(start.T_camera_world.clone(), start.disparities.clone())
+    bundle_adjust(known.problem, start, iterations=3)
+    assert_same_bits(start, copy)
+
+
+def test_float32_cells_with_float64_poses():
+    known = two_fixed_poses(known_problem())
+    problem = replace(
+        known.problem,
+        **{
+            name: getattr(known.problem, name).float()
+            for name in ("rays", "targets", "weights", "prior_disparities", "prior_weights")
+        },
+    )
+    start = perturbed(known, 0.02)
+    start = BundleState(start.T_camera_world, start.disparities.float())
+    end, _ = bundle_adjust(problem, start, iterations=10)
+    assert end.T_camera_world.dtype == torch.float64 and end.disparities.dtype == torch.float32
+    assert distance(end, known.truth) < 1e-4
+
+
+# Steps that are not taken
+
+
+@pytest.mark.parametrize("robust_scale", [None, 1.0])
+def test_cost_never_rises_over_accepted_steps(robust_scale):
+    known = known_problem()
+    problem = replace(noisy(known, 1.0), robust_scale=robust_scale)
+    start = perturbed(known, 0.15)  # far off: undamped steps overshoot
+    costs = [bundle_adjust(problem, start, n)[1].cost_after for n in range(9)]
+    assert costs[0] == bundle_adjust(problem, start, 3)[1].cost_before
+    assert all(later <= earlier for earlier, later in zip(costs, costs[1:], strict=False))
+    assert costs[-1] < 0.3 * costs[0]
+
+
+def test_a_step_that_raises_the_cost_is_tried_again_with_more_damping(monkeypatch):
+    known = known_problem()
+    start, solve, dampings = perturbed(known, 0.02), bundle_adjustment._damped_step, []
+
+    def bad_below_a_tenth(problem, state, equations, damping, absolute_damping):
+        dampings.append(damping)
+        step = solve(problem, state, equations, damping, absolute_damping)
+        return step if damping > 0.05 else BundleState(state.T_camera_world, 3 * state.disparities)
+
+    monkeypatch.setattr(bundle_adjustment, "_damped_step", bad_below_a_tenth)
+    end, report = bundle_adjust(known.problem, start, iterations=1)
+    assert dampings == pytest.approx([1e-4, 1e-3, 1e-2, 1e-1])
+    assert report.iterations == 1 and report.cost_after < report.cost_before
+    assert distance(end, start) > 0
+
+
+def test_steps_that_only_raise_the_cost_leave_the_state_as_it_was(monkeypatch):
+    known = known_problem()
+    start = perturbed(known, 0.02)
+
+    def worse(problem, state, equations, damping, absolute_damping):
+        return BundleState(state.T_camera_world, 3 * state.disparities)
+
+    monkeypatch.setattr(bundle_adjustment, "_damped_step", worse)
+    end, report = bundle_adjust(known.problem, start, iterations=5)
+    assert_same_bits(end, start)
+    assert report.cost_after == report.cost_before and report.iterations == 0
+    assert report.reason == "no step lowers the cost" and report.damping > MAX_DAMPING
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-4])
+def test_singular_equations_leave_the_state_as_it_was(damping: float):
+    known = known_problem()
+    blind = replace(known.problem, weights=torch.zeros_like(known.problem.weights))
+    start = perturbed(known, 0.02)
+    end, report = bundle_adjust(blind, start, 5, damping=damping, absolute_damping=0.0)
+    assert_same_bits(end, start)
+    assert not report.converged and report.iterations == 0
+    assert report.reason == "normal equations are singular"
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_targets_that_are_no_numbers_leave_the_state_as_it_was(value: float):
+    known = known_problem()
+    targets = known.problem.targets.clone()
+    targets[3, 0, 5] = value
+    start = perturbed(known, 0.02)
+    end, report = bundle_adjust(replace(known.problem, targets=targets), start, iterations=5)
+    assert_same_bits(end, start)
+    assert not report.converged and report.iterations == 0
+
+
+# Degenerate input
+
+
+def test_at_the_truth_nothing_moves_and_that_is_convergence():
+    known = two_fixed_poses(known_problem())
+    end, report = bundle_adjust(known.problem, known.truth, iterations=5)
+    assert distance(end, known.truth) < 1e-12
+    assert report.converged and report.cost_after < 1e-18
+
+
+def test_a_cell_that_nothing_observes_keeps_its_disparity():
+    known = two_fixed_poses(known_problem())
+    weights = known.problem.weights.clone()
+    weights[known.problem.edges_source == 2, :, 11] = 0
+    start = perturbed(known, 0.02)
+    end, _ = bundle_adjust(replace(known.problem, weights=weights), start, iterations=5)
+    assert end.disparities[2, 11] == start.disparities[2, 11]
+    assert (end.disparities != start.disparities).sum() == end.disparities.numel() - 1
+
+
+def test_a_keyframe_without_edges_follows_its_prior_alone():
+    known = with_prior(known_problem(), weight=3.0)
+    chosen = (known.problem.edges_source != 3) & (known.problem.edges_target != 3)
+    problem = replace(
+        known.problem,
+        edges_source=known.problem.edges_source[chosen],
+        edges_target=known.problem.edges_target[chosen],
+        targets=known.problem.targets[chosen],
+        weights=known.problem.weights[chosen],
+    )
+    start = perturbed(known, 0.02)
+    end, report = bundle_adjust(problem, start, iterations=4)
+    assert report.converged
+    torch.testing.assert_close(end.T_camera_world[3], start.T_camera_world[3], rtol=0, atol=1e-14)
+    before = (start.disparities[3] - known.truth.disparities[3]).abs().max()
+    assert (end.disparities[3] - known.truth.disparities[3]).abs().max() < 0.2 * before
+
+
+def test_all_poses_fixed_refines_disparities():
+    known = known_problem()
+    problem = replace(known.problem, free_poses=torch.zeros(4, dtype=torch.bool))
+    start = perturbed(replace(known, problem=problem), 0.05)
+    end, _ = bundle_adjust(problem, start, iterations=10)
+    assert_same_bits(replace(end, disparities=start.disparities), start)
+    assert distance(end, known.truth) < 1e-8
+
+
+def test_disparities_stay_positive():
+    known = two_fixed_poses(known_problem())
+    wrong_way = known.problem.targets.clone()
+    outgoing = known.problem.edges_source == 2
+    moved: Tensor = residuals(known.problem, BundleState(
+        known.truth.T_camera_world, torch.full_like(known.truth.disparities, 1e-9)
+    ))[0]  # fmt: skip
+    wrong_way[outgoing] -= 2 * moved[outgoing]  # mirrored at the point at infinity
+    end, _ = bundle_adjust(replace(known.problem, targets=wrong_way), known.truth, iterations=8)
+    assert end.disparities.min() >= MIN_DISPARITY
+    assert (end.disparities[2] == MIN_DISPARITY).any()
+
+
+def test_points_behind_the_target_have_no_weight():
+    known = known_problem(2)
+    poses = known.truth.T_camera_world.clone()
+    poses[1, 2, 3] -= 3.0  # depth ratio 1 - 3 d is below 0.25 for d > 0.25
+    residual, weight = residuals(known.problem, BundleState(poses, known.truth.disparities))
+    assert torch.isfinite(residual).all()
+    forward = weight[0] == 0
+    assert forward.any() and not forward.all()
