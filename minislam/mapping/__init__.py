@@ -1,7 +1,14 @@
 """Mapping (Sec. 3.4): a Gaussian map of the static scene, grown keyframe by keyframe."""
 
-from minislam.mapping.config import DensityConfig, InsertionConfig, MappingConfig
+from minislam.mapping.config import DensityConfig, InsertionConfig, MappingConfig, paper_mapping
 from minislam.mapping.history import MappingHistory
 from minislam.mapping.mapper import Mapper
 
-__all__ = ["DensityConfig", "InsertionConfig", "Mapper", "MappingConfig", "MappingHistory"]
+__all__ = [
+    "DensityConfig",
+    "InsertionConfig",
+    "Mapper",
+    "MappingConfig",
+    "MappingHistory",
+    "paper_mapping",
+]

@@ -1,6 +1,6 @@
 """Uncertainty (Sec. 3.2): an MLP learns, while the map grows, which image patches move."""
 
-from minislam.uncertainty.config import UncertaintyConfig
+from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.training import Misfit, UncertaintyTrainer, measure_misfit
 from minislam.uncertainty.weights import mapping_weight, tracking_weight
@@ -12,5 +12,6 @@ __all__ = [
     "UncertaintyTrainer",
     "mapping_weight",
     "measure_misfit",
+    "paper_uncertainty",
     "tracking_weight",
 ]

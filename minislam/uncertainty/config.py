@@ -63,3 +63,8 @@ class UncertaintyConfig:
                 f"expected a dropout share in [0, 1), found {self.dropout}; "
                 "set uncertainty.dropout, 0.2 by default"
             )
+
+
+def paper_uncertainty() -> UncertaintyConfig:
+    """Return the official constants, for the many iterations of `paper_mapping`."""
+    return UncertaintyConfig(learning_rate=4e-4, median_size=5)

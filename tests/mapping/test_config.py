@@ -3,8 +3,8 @@ from dataclasses import fields
 import pytest
 
 from minislam.errors import InputError
-from minislam.mapping import DensityConfig, InsertionConfig, MappingConfig
-from minislam.uncertainty import UncertaintyConfig
+from minislam.mapping import DensityConfig, InsertionConfig, MappingConfig, paper_mapping
+from minislam.uncertainty import UncertaintyConfig, paper_uncertainty
 
 
 def test_steps_of_the_means_scale_with_the_scene_and_decay_to_their_end():
@@ -34,3 +34,12 @@ def test_impossible_values_are_refused_in_one_sentence():
         MappingConfig(image_scale=0.0)
     with pytest.raises(InputError, match="window of at least 3"):
         MappingConfig(window_size=2)
+
+
+def test_the_paper_values_are_the_official_ones():
+    mapping, uncertainty = paper_mapping(), paper_uncertainty()
+    # The step of the means of a scene of median depth 2 m, before and after its decay.
+    assert mapping.rates_at(0, 2.0, 1.0).means == pytest.approx(9.6e-4)
+    assert mapping.rates_at(30000, 2.0, 1.0).means == pytest.approx(9.6e-6)
+    assert (mapping.init_iterations, mapping.keyframe_iterations) == (1050, 450)
+    assert (uncertainty.lambda_depth, uncertainty.learning_rate) == (0.2, 4e-4)
