@@ -1,6 +1,7 @@
 """Bundle adjustment: against the dense twin, against the truth, and where it cannot succeed."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -293,7 +294,7 @@ def test_cost_never_rises_over_accepted_steps(robust_scale):
     start = perturbed(known, 0.15)  # far off: undamped steps overshoot
     costs = [bundle_adjust(problem, start, n)[1].cost_after for n in range(9)]
     assert costs[0] == bundle_adjust(problem, start, 3)[1].cost_before
-    assert all(later <= earlier for earlier, later in zip(costs, costs[1:], strict=False))
+    assert all(later <= earlier for earlier, later in pairwise(costs))
     assert costs[-1] < 0.3 * costs[0]
 
 

@@ -1,0 +1,53 @@
+"""The keyframe store: rows that belong together."""
+
+import torch
+from tracking.scene import normal, poses_on_an_arc, uniform
+
+from minislam.records import Frame
+from minislam.tracking.keyframes import KeyframeStore
+
+CELLS = 12
+
+
+def filled(count: int) -> KeyframeStore:
+    store = KeyframeStore(CELLS)
+    poses = poses_on_an_arc(count, 0)
+    for index in range(count):
+        frame = Frame(3 * index, 0.1 * index, torch.zeros(6, 8, 3))
+        depth = None if index % 2 else torch.full((6, 8), float(index))
+        features = normal(index, 2, 2, 5)
+        disparities, prior = uniform(index, CELLS).float(), uniform(index + 50, CELLS).float()
+        store.append(frame, features, depth, poses[index], disparities, prior)
+    return store
+
+
+def test_an_empty_store_has_no_rows():
+    store = KeyframeStore(CELLS)
+    assert len(store) == 0 and store.T_camera_world.shape == (0, 4, 4)
+    assert store.disparities.shape == (0, CELLS)
+
+
+def test_rows_come_back_as_they_were_given():
+    store = filled(5)
+    assert len(store) == 5
+    assert [frame.frame_index for frame in store.frames] == [0, 3, 6, 9, 12]
+    torch.testing.assert_close(store.T_camera_world, poses_on_an_arc(5, 0), rtol=0, atol=0)
+    for index in range(5):
+        assert torch.equal(store.disparities[index], uniform(index, CELLS).float())
+        assert torch.equal(store.prior_disparities[index], uniform(index + 50, CELLS).float())
+        assert (store.metric_depths[index] is None) == bool(index % 2)
+
+
+def test_poses_are_float64_and_cells_float32():
+    store = filled(2)
+    assert store.T_camera_world.dtype == torch.float64
+    assert store.disparities.dtype == store.static_weights.dtype == torch.float32
+
+
+def test_a_new_keyframe_is_trusted_and_leaves_the_others_alone():
+    store = filled(2)
+    store.static_weights[0] = 0.25
+    frame = Frame(9, 1.0, torch.zeros(6, 8, 3))
+    row = torch.ones(CELLS)
+    store.append(frame, normal(0, 2, 2, 5), None, torch.eye(4), row, row)
+    assert (store.static_weights[0] == 0.25).all() and (store.static_weights[1:] == 1).all()
