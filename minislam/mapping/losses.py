@@ -13,6 +13,8 @@ SSIM_WINDOW = 11  # px, the usual window of SSIM, as in 3DGS
 SSIM_SIGMA = 1.5  # px
 # Summed RGB. Darker pixels are the empty border that undistortion leaves, official.
 BLACK = 0.01
+# A rendering less opaque than this is a hole with ragged edges and no surface; as in L_uncer.
+SOLID = 0.9
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ def color_loss(
 
 def weighted_depth_loss(
     rendered_depth: Tensor,  # (H, W) world units
+    opacity: Tensor,  # (H, W) in [0, 1]
     reference_depth: Tensor,  # (H, W) world units, 0 where unknown
     weight: Tensor,  # (H, W) static weight
     far_limit: float,  # world units
@@ -67,10 +70,13 @@ def weighted_depth_loss(
     """Return the weighted |D^ - D~| (Eq. 3); floaters count even where beta is large.
 
     A mover hides the static scene, so it is always NEARER than the scene. Where the map has a
-    surface far in front of the reference, it is the map that is wrong, whatever beta says.
+    surface far in front of the reference, it is the map that is wrong, whatever beta says. A hole
+    behind a mover is no such surface, though its rendered depth is small too: without the test of
+    opacity the mover's own depth would be painted into it.
     """
     loss = depth_loss(rendered_depth, reference_depth, far_limit)
-    floater = reference_depth > rendered_depth.detach() + floater_margin
+    in_front = reference_depth > rendered_depth.detach() + floater_margin
+    floater = in_front & (opacity.detach() > SOLID)
     return torch.where(floater, loss, weight * loss)
 
 
@@ -96,6 +102,7 @@ def render_loss(
     color = (weight * color_loss(rendering.color, image, config.lambda_ssim)).mean()
     depth = weighted_depth_loss(
         rendering.depth,
+        rendering.opacity,
         reference_depth,
         weight,
         config.far_factor * median_depth,

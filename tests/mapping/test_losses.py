@@ -37,11 +37,13 @@ def test_color_loss_mixes_l1_and_ssim_and_skips_black_pixels():
 
 
 def test_depth_loss_ignores_beta_only_for_floaters():
-    reference = torch.tensor([[4.0, 4.0, 0.0, 40.0]])
-    rendered = torch.tensor([[3.5, 1.0, 3.0, 3.0]])
-    weight = torch.tensor([[0.1, 0.1, 1.0, 1.0]])
-    loss = weighted_depth_loss(rendered, reference, weight, 20.0, 1.0)
-    torch.testing.assert_close(loss, torch.tensor([[0.05, 3.0, 0.0, 0.0]]))
+    #                          near  floater unknown far  hole
+    reference = torch.tensor([[4.0, 4.0, 0.0, 40.0, 4.0]])
+    rendered = torch.tensor([[3.5, 1.0, 3.0, 3.0, 0.5]])
+    opacity = torch.tensor([[1.0, 0.95, 1.0, 1.0, 0.2]])
+    weight = torch.tensor([[0.1, 0.1, 1.0, 1.0, 0.0]])
+    loss = weighted_depth_loss(rendered, opacity, reference, weight, 20.0, 1.0)
+    torch.testing.assert_close(loss, torch.tensor([[0.05, 3.0, 0.0, 0.0, 0.0]]))
 
 
 def test_isotropic_loss_by_hand():
