@@ -141,7 +141,10 @@ def _weighted_residuals(problem: BundleProblem, state: BundleState):
 
 def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
     """Return Eq. (5) in px^2, with the Cauchy loss c^2 log(1 + r^2 / c^2) if it is robust."""
-    weight = problem.weights * valid[:, None]
+    # Points behind the target would leave the sum, and the cheapest camera would look away from
+    # all of them: each counts as a miss by the width of the image.
+    residual = torch.where(valid[:, None], residual, float(problem.camera.width))
+    weight = problem.weights
     if problem.robust_scale is None:
         flow_cost = (weight * residual.square()).sum(dtype=torch.float64)
     else:

@@ -418,3 +418,16 @@ def test_points_behind_the_target_have_no_weight():
     assert torch.isfinite(residual).all()
     forward = weight[0] == 0
     assert forward.any() and not forward.all()
+
+
+@pytest.mark.parametrize("robust_scale", [None, 2.0])
+def test_looking_away_does_not_pay(robust_scale):
+    # Without a price for points behind the camera, the state with no valid point costs nothing.
+    known = known_problem(2)
+    problem = replace(known.problem, robust_scale=robust_scale)
+    poses = known.truth.T_camera_world.clone()
+    poses[1] = se3_exp(torch.tensor([0, 0, 0, 0, torch.pi, 0], dtype=torch.float64)) @ poses[1]
+    away = BundleState(poses, known.truth.disparities)
+    assert not residuals(problem, away)[1].any()
+    cost_away = bundle_adjust(problem, away, iterations=0)[1].cost_after
+    assert cost_away > bundle_adjust(problem, perturbed(known, 0.1), 0)[1].cost_after > 0

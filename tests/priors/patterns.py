@@ -1,0 +1,37 @@
+"""A texture that is a formula: it can be seen at any position, so the flow between views is known."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+WAVES = 60
+SHORTEST, LONGEST = 9.0, 70.0  # px, wavelengths: shorter than DIS can follow, and longer
+
+
+def brightness(u: np.ndarray, v: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Return the brightness in [0, 1] of a sum of waves at positions (u, v) [px]."""
+    source = np.random.default_rng(seed)
+    angles, phases = source.uniform(0, 2 * np.pi, (2, WAVES))
+    wavelengths = np.exp(source.uniform(np.log(SHORTEST), np.log(LONGEST), WAVES))
+    total = np.zeros_like(u)
+    for angle, phase, wavelength in zip(angles, phases, wavelengths, strict=True):
+        along = u * np.cos(angle) + v * np.sin(angle)
+        total += np.sin(2 * np.pi * along / wavelength + phase)
+    return np.clip(0.5 + 0.5 * total / np.sqrt(2 * WAVES), 0, 1)
+
+
+def view(
+    matrix: np.ndarray,  # (2, 2) and
+    offset: np.ndarray,  # (2,) px: the view shows at p what the texture holds at matrix p + offset
+    size: tuple[int, int],  # (height, width)
+) -> Tensor:  # (height, width, 3)
+    """Return an image of the texture."""
+    v, u = np.mgrid[: size[0], : size[1]].astype(np.float64)
+    seen = np.stack([u, v], -1) @ np.asarray(matrix).T + offset
+    gray = torch.from_numpy(brightness(seen[..., 0], seen[..., 1])).float()
+    return gray[..., None].expand(*size, 3)
+
+
+def shifted(du: float, dv: float, size: tuple[int, int]) -> Tensor:
+    """Return the texture moved by (du, dv) px: the flow from shifted(0, 0) to it is (du, dv)."""
+    return view(np.eye(2), np.array([-du, -dv]), size)
