@@ -85,6 +85,12 @@ class MappingConfig:
         10.0, "no depth loss beyond this many median depths [1], official"
     )
 
+    mean_background: bool = parameter(
+        True,
+        "what no keyframe sees is rendered in the mean colour of the first ones; off: black,"
+        " official",
+    )
+
     means_rate: float = parameter(
         2e-3, "first Adam step of the means [median depths]; official 9.6e-4 m, decayed"
     )
@@ -156,6 +162,7 @@ def paper_mapping() -> MappingConfig:
         refine_full_share=1.0,
         refine_rate_end=1.0,
         color_share=0.5,
+        mean_background=False,
         means_rate=4.8e-4,
         means_rate_end=0.01,
         rate_iterations=30000,

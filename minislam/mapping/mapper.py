@@ -53,6 +53,7 @@ class Mapper:
         self.keyframes: list[MappedKeyframe] = []
         self.window: list[int] = []  # positions in `keyframes`, newest first
         self.median_depth = 1.0  # world units; set by the first keyframes, then fixed
+        self.background = torch.zeros(3, device=device)  # RGB of what no keyframe sees
         self.history = MappingHistory()
         self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed, device)
         self._generator = torch.Generator().manual_seed(seed + 1)
@@ -82,7 +83,8 @@ class Mapper:
     @torch.no_grad()
     def render(self, T_camera_world: Tensor, camera: Camera | None = None) -> Rendering:
         """Render the map from a pose (4, 4), without gradients."""
-        return render(self.gaussians, camera or self.camera, T_camera_world.float())
+        camera = camera or self.camera
+        return render(self.gaussians, camera, T_camera_world.float(), self.background)
 
     def initialise(self, keyframes: list[Keyframe], progress: Progress | None = None) -> None:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
@@ -95,6 +97,8 @@ class Mapper:
                 "prior, or let the tracker's disparities reach the mapper"
             )
         self.median_depth = float(depths.median())
+        if self.config.mean_background:
+            self.background = torch.stack([k.image.mean((0, 1)) for k in keyframes]).mean(0)
         for keyframe in keyframes:
             self.keyframes.append(MappedKeyframe.from_record(keyframe))
             self._insert(len(self.keyframes) - 1)
@@ -251,7 +255,7 @@ class Mapper:
         gaussians = self._optimizer.gaussians
         offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         pose = keyframe.T_camera_world.float()
-        rendering = render(gaussians, camera, pose, screen_offsets=offsets)
+        rendering = render(gaussians, camera, pose, self.background, screen_offsets=offsets)
         weight = self._weight(keyframe, camera)
         loss = render_loss(
             gaussians, rendering, view.image, view.depth, weight, self.median_depth, self.config

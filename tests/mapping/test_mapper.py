@@ -74,6 +74,17 @@ def test_a_half_size_image_has_half_the_pixels_and_the_same_means():
     torch.testing.assert_close(view.image[0, 0], wall_keyframe(0).image[:2, :2].mean((0, 1)))
 
 
+@pytest.mark.parametrize("mean_background", [True, False])
+def test_what_no_keyframe_sees_has_the_mean_colour_or_is_black(mean_background):
+    mapper = make_mapper(replace(CONFIG, init_iterations=1, mean_background=mean_background))
+    first = wall_keyframe(0)
+    mapper.initialise([first])
+    beside = first.T_camera_world.clone()
+    beside[0, 3] = -100
+    expected = first.image.mean((0, 1)) if mean_background else torch.zeros(3)
+    torch.testing.assert_close(mapper.render(beside).color[10, 10], expected)
+
+
 def test_shrinking_depth_averages_known_pixels_only():
     keyframe = wall_keyframe(0)
     keyframe.depth[0, 0] = 0
