@@ -1,4 +1,4 @@
-"""A texture that is a formula: it can be seen at any position, so the flow between views is known."""
+"""A texture that is a formula, seen at any position: the flow between two views is known."""
 
 import numpy as np
 import torch

@@ -23,9 +23,9 @@ from minislam.tracking.grid import Grid
 GRID = Grid.of(CAMERA, STRIDE)
 
 
-def matches_of(value: float, edges: int) -> FlowMatches:
+def matches_of(value: float, edges: int, share: float = 1.0) -> FlowMatches:
     targets = torch.full((edges, *GRID.shape, 2), value)
-    return FlowMatches(targets, torch.ones_like(targets), torch.ones(edges))
+    return FlowMatches(targets, torch.ones_like(targets), torch.full((edges,), share))
 
 
 def distances_on_a_line(count: int) -> Tensor:
@@ -45,6 +45,27 @@ def test_recording_an_edge_again_replaces_its_matches():
     assert (0, 2) in graph and (2, 0) not in graph
     assert [float(t[0, 0]) for t in graph.targets] == [1.0, 2.0, 2.0]
     assert graph.targets[0].shape == graph.confidences[0].shape == (2, len(RAYS))
+
+
+def test_an_edge_keeps_what_it_has_against_clearly_less():
+    graph = FrameGraph()
+    graph.record([(0, 1)], matches_of(1.0, 1, share=0.5))
+    graph.record([(0, 1)], matches_of(2.0, 1, share=0.39))
+    assert float(graph.targets[0][0, 0]) == 1.0  # 0.39 < 0.8 * 0.5
+    graph.record([(0, 1)], matches_of(3.0, 1, share=0.41))
+    assert float(graph.targets[0][0, 0]) == 3.0
+    graph.record([(0, 1)], matches_of(4.0, 1, share=0.35))
+    assert float(graph.targets[0][0, 0]) == 4.0 and len(graph) == 1  # 0.35 > 0.8 * 0.41
+
+
+def test_what_a_keyframe_measured_is_that_of_its_own_edges():
+    graph = FrameGraph()
+    graph.record([(0, 1)], matches_of(1.0, 1))
+    graph.record([(1, 0), (0, 2)], matches_of(2.0, 2))
+    measured = graph.measured_from(0)
+    assert [float(targets[0, 0]) for targets, _ in measured] == [1.0, 2.0]
+    assert all(t.shape == c.shape == (len(RAYS), 2) for t, c in measured)
+    assert graph.measured_from(2) == []
 
 
 def test_recorded_targets_keep_the_order_of_cells():

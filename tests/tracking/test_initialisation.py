@@ -42,6 +42,16 @@ def seen_matches(T_target_source: Tensor, disparities: Tensor) -> FlowMatches:
     return matches_to(positions[0].T)
 
 
+def flat(matches: FlowMatches) -> tuple[Tensor, Tensor]:
+    """Return targets [px] and confidences, each (N, 2)."""
+    return matches.targets.reshape(CELLS, 2), matches.confidences.reshape(CELLS, 2)
+
+
+def triangulated(T_target_source: Tensor, matches: FlowMatches) -> Tensor:
+    targets, confidences = flat(matches)
+    return triangulate(GRID, T_target_source, targets, confidences[:, 0] > 0.5)
+
+
 def room_disparities(seed: int = 0) -> Tensor:
     """Return disparities (N,) float32 of a slanted wall with bumps, median about 0.5."""
     slant = 0.3 + 0.004 * GRID.pixels[:, 0] + 0.002 * GRID.pixels[:, 1]
@@ -61,7 +71,7 @@ def test_triangulation_by_hand():
     targets = GRID.pixels - torch.stack([flow, torch.zeros(CELLS)], 1)
     transform = torch.eye(4, dtype=torch.float64)
     transform[0, 3] = -0.5
-    disparities = triangulate(GRID, transform, matches_to(targets))
+    disparities = triangulated(transform, matches_to(targets))
     expected = torch.where(flow == 24.0, 2.0, 1.0)  # in units of the median
     torch.testing.assert_close(disparities, expected, rtol=1e-5, atol=0)
 
@@ -72,7 +82,7 @@ def test_triangulation_recovers_a_room_up_to_scale():
         transform = sideways()
         matches = seen_matches(transform, truth)
         transform[:3, 3] *= scale  # the length of the step cannot be seen, nor does it matter
-        recovered = triangulate(GRID, transform, matches)
+        recovered = triangulated(transform, matches)
         torch.testing.assert_close(recovered, truth / truth.median(), rtol=2e-3, atol=0)
 
 
@@ -83,7 +93,7 @@ def test_triangulation_gives_doubtful_cells_the_median():
     confidence[3] = 0.2
     targets[5] = 2 * GRID.pixels[5] - targets[5]  # the wrong way: a point behind both cameras
     targets[7] += 40 * (targets[7] - GRID.pixels[7])  # forty times too near
-    recovered = triangulate(GRID, transform, matches_to(targets, confidence))
+    recovered = triangulated(transform, matches_to(targets, confidence))
     assert (recovered[[3, 5, 7]] == 1).all()
     others = torch.ones(CELLS, dtype=torch.bool)
     others[[3, 5, 7]] = False
@@ -94,7 +104,7 @@ def test_triangulation_gives_doubtful_cells_the_median():
 def test_the_essential_matrix_gives_the_room_without_a_pose():
     truth = room_disparities()
     # RANSAC accepts 0.7 px: with little parallax a wrong matrix would explain the matches as well.
-    disparities = essential_disparities(GRID, seen_matches(sideways(0.6), truth))
+    disparities = essential_disparities(GRID, *flat(seen_matches(sideways(0.6), truth)))
     assert disparities is not None
     ratio = disparities / (truth / truth.median())
     assert ratio.median() == pytest.approx(1, abs=0.02)
@@ -106,8 +116,8 @@ def test_the_essential_matrix_survives_outliers_and_repeats_itself():
     targets = seen_matches(sideways(0.5), truth).targets.reshape(CELLS, 2)
     is_outlier = (uniform(3, CELLS, 1) < 0.2).expand(CELLS, 2)
     spoilt = torch.where(is_outlier, targets + 15 * normal(4, CELLS, 2).float(), targets)
-    first = essential_disparities(GRID, matches_to(spoilt))
-    assert torch.equal(first, essential_disparities(GRID, matches_to(spoilt)))
+    first = essential_disparities(GRID, *flat(matches_to(spoilt)))
+    assert torch.equal(first, essential_disparities(GRID, *flat(matches_to(spoilt))))
     good = ~is_outlier[:, 0]
     ratio = first[good] / (truth / truth.median())[good]
     assert (ratio / ratio.median() - 1).abs().median() < 0.05
@@ -182,9 +192,7 @@ def test_a_chain_with_known_disparities_finds_every_pose():
     for seed in range(3):
         truth.append(se3_exp(0.02 * normal(seed, 6)) @ sideways(0.2) @ truth[-1])
     known = torch.stack([room_disparities(seed) for seed in range(4)])
-    chain = [
-        seen_matches(truth[k + 1] @ se3_inverse(truth[k]), known[k]) for k in range(3)
-    ]
+    chain = [seen_matches(truth[k + 1] @ se3_inverse(truth[k]), known[k]) for k in range(3)]
     state = chain_state(GRID, chain, known[0], known, 2.0)
     torch.testing.assert_close(state.T_camera_world, torch.stack(truth), rtol=0, atol=1e-4)
     assert torch.equal(state.disparities, known)
@@ -227,7 +235,7 @@ def test_when_nothing_is_carried_the_median_stands_in():
 
 def test_the_first_hypothesis_is_a_wall():
     truth = room_disparities()
-    hypotheses = list(first_disparity_hypotheses(GRID, [seen_matches(sideways(), truth)]))
+    hypotheses = list(first_disparity_hypotheses(GRID, [flat(seen_matches(sideways(), truth))]))
     assert len(hypotheses) == 2
     assert torch.equal(hypotheses[0], torch.ones(CELLS))
     assert hypotheses[1].median() == pytest.approx(1, abs=0.05)
@@ -235,16 +243,16 @@ def test_the_first_hypothesis_is_a_wall():
 
 def test_hypotheses_without_confident_matches_are_the_wall_alone():
     blind = matches_to(GRID.pixels, 0.1)
-    assert essential_disparities(GRID, blind) is None
-    assert len(list(first_disparity_hypotheses(GRID, [blind, blind]))) == 1
-    assert torch.equal(triangulate(GRID, sideways(), blind), torch.ones(CELLS))
+    assert essential_disparities(GRID, *flat(blind)) is None
+    assert len(list(first_disparity_hypotheses(GRID, 2 * [flat(blind)]))) == 1
+    assert torch.equal(triangulated(sideways(), blind), torch.ones(CELLS))
 
 
 def test_matches_that_stand_still_give_finite_disparities():
     standing = matches_to(GRID.pixels)
-    disparities = essential_disparities(GRID, standing)
+    disparities = essential_disparities(GRID, *flat(standing))
     assert disparities is None or bool(torch.isfinite(disparities).all())
-    assert torch.isfinite(triangulate(GRID, torch.eye(4), standing)).all()
+    assert torch.isfinite(triangulated(torch.eye(4), standing)).all()
 
 
 def test_the_best_hypothesis_is_the_one_that_explains_the_matches():
