@@ -1,9 +1,19 @@
 """A texture that is a formula, seen at any position: the flow between two views is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from minislam.geometry import Camera
+from minislam.priors.flow import ClassicalFlow, ClassicalFlowConfig
+
+HEIGHT, WIDTH = 96, 128
+SIZE = (HEIGHT, WIDTH)
+CONFIG = ClassicalFlowConfig()
+GRID = Camera(100, 100, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT).pixel_grid(CONFIG.stride)
+INNER = (slice(20, -20), slice(20, -20))  # px that short displacements do not lose
 WAVES = 60
 SHORTEST, LONGEST = 9.0, 70.0  # px, wavelengths: shorter than DIS can follow, and longer
 
@@ -21,11 +31,11 @@ def brightness(u: np.ndarray, v: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def view(
-    matrix: np.ndarray,  # (2, 2) and
-    offset: np.ndarray,  # (2,) px: the view shows at p what the texture holds at matrix p + offset
+    matrix: np.ndarray,  # (2, 2)
+    offset: np.ndarray,  # (2,) px
     size: tuple[int, int],  # (height, width)
 ) -> Tensor:  # (height, width, 3)
-    """Return an image of the texture."""
+    """Return an image that shows at p what the texture holds at matrix p + offset."""
     v, u = np.mgrid[: size[0], : size[1]].astype(np.float64)
     seen = np.stack([u, v], -1) @ np.asarray(matrix).T + offset
     gray = torch.from_numpy(brightness(seen[..., 0], seen[..., 1])).float()
@@ -35,3 +45,18 @@ def view(
 def shifted(du: float, dv: float, size: tuple[int, int]) -> Tensor:
     """Return the texture moved by (du, dv) px: the flow from shifted(0, 0) to it is (du, dv)."""
     return view(np.eye(2), np.array([-du, -dv]), size)
+
+
+def flow_of(images: list[Tensor], **settings: int) -> ClassicalFlow:
+    flow = ClassicalFlow(replace(CONFIG, **settings))
+    for index, image in enumerate(images):
+        flow.add_frame(index, image)
+    return flow
+
+
+def still(edges: int = 1) -> Tensor:
+    return GRID.expand(edges, *GRID.shape).clone()
+
+
+def constant(du: float, dv: float) -> np.ndarray:
+    return np.broadcast_to(np.float32([du, dv]), (*SIZE, 2)).copy()

@@ -97,3 +97,15 @@ def distance(a: BundleState, b: BundleState) -> float:
 def assert_same_bits(a: BundleState, b: BundleState) -> None:
     assert torch.equal(a.T_camera_world, b.T_camera_world)
     assert torch.equal(a.disparities, b.disparities)
+
+
+def two_fixed_poses(known: KnownProblem) -> KnownProblem:
+    """Fix the second pose as well: then nothing is free to scale, and the truth is unique."""
+    free_poses = known.problem.free_poses.clone()
+    free_poses[1] = False
+    return replace(known, problem=replace(known.problem, free_poses=free_poses))
+
+
+def noisy(known: KnownProblem, sigma: float, seed: int = 9) -> BundleProblem:
+    targets = known.problem.targets
+    return replace(known.problem, targets=targets + sigma * normal(seed, *targets.shape))

@@ -1,0 +1,98 @@
+"""What the classical flow must not trust: borders, bare walls, disagreement, black images."""
+
+import numpy as np
+import torch
+
+from minislam.priors.flow import (
+    as_matches,
+    grayscale,
+    grid_matches,
+    texture_confidence,
+)
+from tests.priors.patterns import (
+    CONFIG,
+    HEIGHT,
+    SIZE,
+    WIDTH,
+    constant,
+    flow_of,
+    shifted,
+    still,
+    view,
+)
+
+# Confidence
+
+
+def test_what_leaves_the_image_has_no_confidence():
+    flow = flow_of([shifted(0, 0, SIZE), shifted(30, 0, SIZE)])
+    matches = flow.match([0], [1], still() + torch.tensor([30.0, 0.0]))
+    outside = matches.targets[0, ..., 0] > WIDTH - 1
+    assert outside[:, -3:].all()
+    assert (matches.confidences[0][outside] == 0).all()
+    assert matches.confidences[0, :, :9].mean() > 0.5
+
+
+def test_the_border_of_the_image_counts_as_inside():
+    texture = np.full((HEIGHT // 8, WIDTH // 8), 0.9)
+    targets, confidence = grid_matches(constant(0, 0), constant(0, 0), texture, CONFIG)
+    assert targets[0, 0].tolist() == [0, 0] and (confidence == 0.9).all()
+    _, left = grid_matches(constant(-0.5, 0), constant(0.5, 0), texture, CONFIG)
+    assert (left[:, 0] == 0).all() and (left[:, 1:] == 0.9).all()
+
+
+def test_disagreement_costs_confidence_by_its_formula():
+    texture = np.ones((HEIGHT // 8, WIDTH // 8))
+    backward = constant(-2.0, 0.6)  # off by 0.6 px, the consistency scale
+    _, confidence = grid_matches(constant(2.0, 0.0), backward, texture, CONFIG)
+    np.testing.assert_allclose(confidence[1:-1, 1:-1], np.exp(-0.5), rtol=1e-5)
+
+
+def test_a_bare_wall_and_an_edge_have_no_confidence():
+    wall = np.full(SIZE, 120, np.uint8)
+    edge = wall.copy()
+    edge[:, 64:] = 200  # vertical: a motion along it would go unnoticed
+    corner = edge.copy()
+    corner[48:] = 40
+    assert (texture_confidence(wall, CONFIG) == 0).all()
+    assert texture_confidence(edge, CONFIG).max() < 1e-3
+    assert texture_confidence(corner, CONFIG)[6, 8] > 0.9
+    assert texture_confidence(grayscale(shifted(0, 0, SIZE)), CONFIG).mean() > 0.7
+
+
+def test_half_a_bare_wall_leaves_the_other_half():
+    images = [shifted(d, 0, SIZE).clone() for d in (0, 3)]
+    for image in images:
+        image[:, :64] = 0.5
+    matches = flow_of(images).match([0], [1], still())
+    confidence = matches.confidences[0, ..., 0]
+    assert confidence[:, :7].max() < 1e-3 and confidence[:, 10:14].mean() > 0.5
+
+
+def test_matched_share_is_relative_to_what_texture_allows():
+    texture = np.array([[0.5, 0.9], [0.0, 0.6]])
+    confidence = 0.5 * texture
+    targets = np.zeros((2, 2, 2))
+    matches = as_matches(
+        [targets, targets], [confidence, texture], [texture, texture], torch.float64
+    )
+    torch.testing.assert_close(matches.matched_shares, torch.tensor([0.5, 1.0]).double())
+    assert torch.equal(matches.confidences[..., 0], matches.confidences[..., 1])
+
+
+# Degenerate input
+
+
+def test_black_images_match_nothing():
+    black, seen = torch.zeros(*SIZE, 3), shifted(0, 0, SIZE)
+    matches = flow_of([black, seen, black]).match([0, 0], [1, 2], still(2))
+    assert torch.isfinite(matches.targets).all()
+    assert (matches.confidences == 0).all() and (matches.matched_shares == 0).all()
+    _, of_chain = flow_of([]).start_chain(black).advanced(black)
+    assert float(of_chain.matched_shares) == 0
+
+
+def test_unrelated_images_share_little():
+    other = view(np.eye(2), np.array([5000.0, 3000.0]), SIZE)
+    matches = flow_of([shifted(0, 0, SIZE), other]).match([0, 0], [0, 1], still(2))
+    assert matches.matched_shares[1] < 0.4 < 0.95 < matches.matched_shares[0]
