@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.priors.interfaces import FlowEstimator
+from minislam.priors.interfaces import FlowEstimator, FlowMatches
 from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleReport,
@@ -22,6 +22,7 @@ from minislam.tracking.frame_graph import (
     proximity_pairs,
 )
 from minislam.tracking.grid import Grid
+from minislam.tracking.initialisation import compose_matches
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import relative_transforms, reproject
 
@@ -42,20 +43,54 @@ class BackEnd:
         self.robust_scale = config.robust_scale * self.pixel_scale or None
         self.flow = flow
 
-    def adjust_newest(self) -> None:
-        """Link the newest keyframe with its like and adjust the window around it."""
+    def adjust_newest(self, steps: list[FlowMatches]) -> None:
+        """Link the newest keyframe with its like and adjust the window around it.
+
+        `steps` are the chained matches from each keyframe to the next, up to the newest: the
+        first flow to the newest keyframe starts from them, not from a pose that may be wrong.
+        """
         count = len(self.keyframes)
-        edges = neighbourhood_edges(count - 1, count, self.config.neighbourhood)
-        limit = self.config.proximity_distance * self.pixel_scale
-        start = max(0, count - HORIZON * self.config.window)
-        pairs = self._proximity_pairs(
-            start, range(count - 1, count), edges, limit, self.config.proximity_edges
-        )
-        edges += both_directions(pairs)
         first_free = max(0, count - self.config.window)
+        self.match_from_chain(steps, count - 1)
+        self.adjust(first_free, self.config.iterations)
+        edges = neighbourhood_edges(count - 1, count, self.config.neighbourhood)
+        edges += self._proximity_links(count - 1)
         for _ in range(self.config.rounds):
             self.match(edges)
             self.adjust(first_free, self.config.iterations)
+
+    def match_from_chain(self, steps: list[FlowMatches], target: int) -> None:
+        """Measure the flow from the predecessors of a keyframe, started from flow alone."""
+        edges, predictions, composed = [], [], None
+        for source in range(target - 1, max(-1, target - 1 - self.config.neighbourhood), -1):
+            step = steps[source]
+            composed = step if composed is None else compose_matches(step, composed, self.grid)
+            edges.append((source, target))
+            predictions.append(composed.targets)
+        sources, targets = (list(ends) for ends in zip(*edges, strict=True))
+        self.graph.record(edges, self.flow.match(sources, targets, torch.cat(predictions)))
+
+    def _proximity_links(self, keyframe: int) -> list[tuple[int, int]]:
+        """Return edges to older keyframes that see the same, if their flow can be confirmed.
+
+        A far link starts from geometry that may have drifted; a false one pulls harder than all
+        true ones together, so it must be confirmed before it enters.
+        """
+        start = max(0, keyframe + 1 - HORIZON * self.config.window)
+        limit = self.config.proximity_distance * self.pixel_scale
+        near = neighbourhood_edges(keyframe, keyframe + 1, self.config.neighbourhood)
+        newest = range(keyframe, keyframe + 1)
+        pairs = self._proximity_pairs(start, newest, near, limit, self.config.proximity_edges)
+        return self.confirmed(both_directions(pairs))
+
+    def confirmed(self, edges: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Return those of these new edges whose flow is matched in both directions."""
+        if not edges:
+            return []
+        matches = self._flow_from_geometry(edges)
+        share = dict(zip(edges, matches.matched_shares.tolist(), strict=True))
+        least = self.config.min_link_share
+        return [(i, j) for i, j in edges if min(share[i, j], share[j, i]) >= least]
 
     def adjust_all(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Adjust all keyframes together on fresh flow (final global BA).
@@ -66,7 +101,7 @@ class BackEnd:
         everyone = range(len(self.keyframes))
         limit = self.config.final_distance * self.pixel_scale
         pairs = self._proximity_pairs(0, everyone, [], limit, self.config.final_edges)
-        edges = self.graph.edges() + both_directions(pairs)
+        edges = self.graph.edges() + self.confirmed(both_directions(pairs))
         lambda_prior = self.config.lambda_disparity_prior if self.config.final_prior else 0.0
         for done in range(self.config.final_rounds):
             self.match(edges)
@@ -75,7 +110,11 @@ class BackEnd:
                 progress(done + 1, self.config.final_rounds)
 
     def match(self, edges: list[tuple[int, int]]) -> None:
-        """Measure the flow of these edges, started from what the present geometry predicts."""
+        """Measure the flow of these edges again and store it in the graph."""
+        self.graph.record(edges, self._flow_from_geometry(edges))
+
+    def _flow_from_geometry(self, edges: list[tuple[int, int]]) -> FlowMatches:
+        """Return the flow of these edges, started from what the present geometry predicts."""
         sources, targets = (list(ends) for ends in zip(*edges, strict=True))
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         predicted, _ = reproject(
@@ -85,7 +124,7 @@ class BackEnd:
         size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
         predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
         predicted = predicted.mT.reshape(len(edges), *self.grid.shape, 2)
-        self.graph.record(edges, self.flow.match(sources, targets, predicted))
+        return self.flow.match(sources, targets, predicted)
 
     def adjust(
         self,

@@ -9,7 +9,7 @@ from minislam.parameters import parameter
 class TrackingConfig:
     """Lengths in px belong to a 320x240 image and are scaled with the image diagonal."""
 
-    keyframe_flow: float = parameter(18.0, "mean flow since the last keyframe that makes one [px]")
+    keyframe_flow: float = parameter(10.0, "mean flow since the last keyframe that makes one [px]")
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement"
     )
@@ -20,6 +20,9 @@ class TrackingConfig:
     neighbourhood: int = parameter(3, "every keyframe is linked with so many predecessors")
     proximity_edges: int = parameter(2, "further links of a new keyframe, nearest by flow distance")
     proximity_distance: float = parameter(120.0, "largest flow distance of a proximity link [px]")
+    min_link_share: float = parameter(
+        0.3, "a link beyond the neighbourhood needs this much of its flow confirmed [-]"
+    )
     rounds: int = parameter(2, "rounds of flow and BA per keyframe")
     iterations: int = parameter(3, "Gauss-Newton steps per round")
     robust_scale: float = parameter(

@@ -9,6 +9,8 @@ from minislam.tracking.reprojection import relative_transforms, reproject, scale
 
 # A pair whose cells mostly leave the view has no meaningful distance. [-]; DROID-SLAM: 0.75.
 MIN_VISIBLE_SHARE = 0.5
+# A new measurement must confirm at least this part of what the old one did. [-]
+KEPT_SHARE = 0.8
 FAR = 1000.0  # px, the distance of such a pair
 
 
@@ -20,6 +22,7 @@ class FrameGraph:
         self.edges_target: list[int] = []
         self.targets: list[Tensor] = []  # per edge (2, N) px
         self.confidences: list[Tensor] = []  # per edge (2, N) in [0, 1]
+        self.matched_shares: list[float] = []  # per edge, in [0, 1]
         self._position: dict[tuple[int, int], int] = {}
 
     def __len__(self) -> int:
@@ -29,22 +32,37 @@ class FrameGraph:
         return edge in self._position
 
     def record(self, edges: list[tuple[int, int]], matches: FlowMatches) -> None:
-        """Store the matches of these edges, adding the edges that are new."""
+        """Store the matches of these edges, adding the edges that are new.
+
+        An edge keeps what it has if the new measurement confirms clearly less: a flow that
+        started from wrong geometry finds nothing, and would take with it what could repair that
+        geometry.
+        """
         targets = matches.targets.flatten(1, 2).mT.contiguous()
         confidences = matches.confidences.flatten(1, 2).mT.contiguous()
-        for edge, target, confidence in zip(edges, targets, confidences, strict=True):
+        shares = matches.matched_shares.tolist()
+        for edge, target, confidence, share in zip(
+            edges, targets, confidences, shares, strict=True
+        ):
             position = self._position.setdefault(edge, len(self))
             if position == len(self):
                 self.edges_source.append(edge[0])
                 self.edges_target.append(edge[1])
                 self.targets.append(target)
                 self.confidences.append(confidence)
-            else:
+                self.matched_shares.append(share)
+            elif share >= KEPT_SHARE * self.matched_shares[position]:
                 self.targets[position], self.confidences[position] = target, confidence
+                self.matched_shares[position] = share
 
     def edges(self) -> list[tuple[int, int]]:
         """Return all edges, in the order they were added."""
         return list(zip(self.edges_source, self.edges_target, strict=True))
+
+    def measured_from(self, source: int) -> list[tuple[Tensor, Tensor]]:
+        """Return targets [px] and confidences, each (N, 2), of the edges that leave a keyframe."""
+        leaving = [p for p, edge in enumerate(self.edges()) if edge[0] == source]
+        return [(self.targets[p].mT, self.confidences[p].mT) for p in leaving]
 
     def select(self, first: int) -> list[int]:
         """Return the positions of the edges with an end at keyframe `first` or later."""

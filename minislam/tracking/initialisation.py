@@ -43,8 +43,8 @@ def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> Flow
     confidence = second.confidences.reshape(1, -1, 2)
     targets = middle + grid.sample(flow, middle)
     confidences = first.confidences.reshape(1, -1, 2) * grid.sample(confidence, middle)
-    shape = first.targets.shape
     shares = first.matched_shares * second.matched_shares
+    shape = first.targets.shape
     return FlowMatches(targets.reshape(shape), confidences.reshape(shape), shares)
 
 
@@ -100,7 +100,12 @@ def carry_disparities(
     return carried[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])].reshape(-1)
 
 
-def triangulate(grid: Grid, T_target_source: Tensor, matches: FlowMatches) -> Tensor:  # (N,)
+def triangulate(
+    grid: Grid,
+    T_target_source: Tensor,  # (4, 4)
+    targets: Tensor,  # (N, 2) px
+    confident: Tensor,  # (N,) bool
+) -> Tensor:  # (N,)
     """Return the disparities that best explain matches under a known motion.
 
     With the matched ray (a, b, 1), (R rho + d t) must be parallel to it: two equations that are
@@ -108,26 +113,30 @@ def triangulate(grid: Grid, T_target_source: Tensor, matches: FlowMatches) -> Te
     """
     rotated = grid.rays @ T_target_source[:3, :3].T.to(grid.rays.dtype)
     t = T_target_source[:3, 3].to(grid.rays.dtype)
-    seen = grid.camera.rays(matches.targets.reshape(-1, 2))[:, :2]
+    seen = grid.camera.rays(targets)[:, :2]
     factor = t[:2] - seen * t[2]
     value = seen * rotated[:, 2:] - rotated[:, :2]
     disparities = (factor * value).sum(1) / factor.square().sum(1).clamp_min(1e-12)
-    confident = (matches.confidences.reshape(-1, 2)[:, 0] > 0.5) & (disparities > 0)
-    if not confident.any():
+    usable = confident & (disparities > 0)
+    if not usable.any():
         return torch.ones_like(disparities)
-    typical = disparities[confident].median()
-    usable = confident & (disparities < DISPARITY_SPREAD * typical)
+    typical = disparities[usable].median()
+    usable &= disparities < DISPARITY_SPREAD * typical
     usable &= disparities > typical / DISPARITY_SPREAD
     return torch.where(usable, disparities, typical) / typical
 
 
-def essential_disparities(grid: Grid, matches: FlowMatches) -> Tensor | None:  # (N,)
+def essential_disparities(
+    grid: Grid,
+    targets: Tensor,  # (N, 2) px
+    confidences: Tensor,  # (N, 2)
+) -> Tensor | None:  # (N,)
     """Return disparities of the source from an essential matrix, median 1, or None."""
-    confident = matches.confidences.reshape(-1, 2)[:, 0] > 0.5
+    confident = confidences[:, 0] > 0.5
     if int(confident.sum()) < MIN_CELLS_FOR_ESSENTIAL:
         return None
     source = grid.pixels[confident].double().numpy()
-    target = matches.targets.reshape(-1, 2)[confident].double().numpy()
+    target = targets[confident].double().numpy()
     matrix = camera_matrix(grid.camera)
     cv2.setRNGSeed(0)
     essential, inliers = cv2.findEssentialMat(
@@ -138,14 +147,17 @@ def essential_disparities(grid: Grid, matches: FlowMatches) -> Tensor | None:  #
     _, rotation, translation, _ = cv2.recoverPose(essential, source, target, matrix, mask=inliers)
     T_target_source = np.eye(4)
     T_target_source[:3, :3], T_target_source[:3, 3] = rotation, translation[:, 0]
-    return triangulate(grid, torch.from_numpy(T_target_source), matches)
+    return triangulate(grid, torch.from_numpy(T_target_source), targets, confident)
 
 
-def first_disparity_hypotheses(grid: Grid, from_first: list[FlowMatches]) -> Iterator[Tensor]:
+def first_disparity_hypotheses(
+    grid: Grid,
+    from_first: list[tuple[Tensor, Tensor]],  # targets [px] and confidences (N, 2) to followers
+) -> Iterator[Tensor]:
     """Yield guesses (N,) of the first keyframe's disparities: a wall, then essential matrices."""
     yield torch.ones(len(grid.rays))
-    for matches in from_first[:3]:
-        disparities = essential_disparities(grid, matches)
+    for targets, confidences in from_first:
+        disparities = essential_disparities(grid, targets, confidences)
         if disparities is not None:
             yield disparities
 

@@ -70,7 +70,7 @@ class Tracker:
         self._predict_static_weight = predict_static_weight
         self._chain: FlowChain | None = None
         self._passed_over: tuple[Frame, FlowMatches] | None = None  # newest frame, no keyframe
-        self._warmup_matches: list[FlowMatches] = []  # keyframe k to k + 1
+        self._steps: list[FlowMatches] = []  # keyframe k to k + 1
 
     # One frame ----------------------------------------------------------------------------------
 
@@ -123,9 +123,9 @@ class Tracker:
         """Make a frame a keyframe: pose from its flow, disparities from its predecessor."""
         last, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
         self._chain, self._passed_over = self._chain.restarted(), None
+        self._steps.append(matches)
         if not self.initialised:
             # Poses of the warm-up are all estimated together, in initialise().
-            self._warmup_matches.append(matches)
             self._add_keyframe(frame, last, disparities)
             return
         before = self.keyframes.T_camera_world[-2]
@@ -136,7 +136,7 @@ class Tracker:
         )
         carried = carry_disparities(self.grid, pose @ se3_inverse(last), disparities)
         self._add_keyframe(frame, pose, carried)
-        self.backend.adjust_newest()
+        self.backend.adjust_newest(self._steps)
 
     def _add_keyframe(self, frame: Frame, pose: Tensor, carried: Tensor) -> None:
         metric_depth = self._depth_prior(frame, self.grid.camera)
@@ -162,19 +162,19 @@ class Tracker:
         """Estimate the warm-up keyframes together, beta unknown (first of the two stages)."""
         self._require_a_pair()
         count = len(self.keyframes)
-        edges, matches = self._match_warmup()
-        self.backend.graph.record(edges, matches)
+        for target in range(1, count):
+            self.backend.match_from_chain(self._steps, target)
         states = [
             chain_state(
                 self.grid,
-                self._warmup_matches,
+                self._steps,
                 first,
                 self.keyframes.prior_disparities,
                 self.backend.robust_scale,
             )
-            for first in self._first_disparities(edges, matches)
+            for first in self._first_disparities()
         ]
-        problem = self.backend.problem(range(len(edges)), first_free=0)
+        problem = self.backend.problem(range(len(self.backend.graph)), first_free=0)
         self.backend.state = best_hypothesis(problem, states)
         self.initialised = True
         both_ways = neighbourhood_edges(0, count, self.config.neighbourhood)
@@ -214,26 +214,10 @@ class Tracker:
             self.backend.match(edges)
             self.backend.adjust(first_free=0, iterations=2 * self.config.iterations)
 
-    def _match_warmup(self) -> tuple[list[tuple[int, int]], FlowMatches]:
-        """Match each warm-up keyframe with its followers, predicted from flow alone."""
-        edges, predictions = [], []
-        for source in range(len(self.keyframes) - 1):
-            composed = None
-            for target in range(source + 1, len(self.keyframes))[: self.config.neighbourhood]:
-                step = self._warmup_matches[target - 1]
-                composed = step if composed is None else compose_matches(composed, step, self.grid)
-                edges.append((source, target))
-                predictions.append(composed.targets)
-        sources, targets = zip(*edges, strict=True)
-        prediction = torch.cat(predictions)
-        return edges, self.backend.flow.match(list(sources), list(targets), prediction)
-
-    def _first_disparities(
-        self, edges: list[tuple[int, int]], matches: FlowMatches
-    ) -> list[Tensor]:
+    def _first_disparities(self) -> list[Tensor]:
         """Return the hypotheses for the first keyframe: its prior if there is one."""
         prior = self.keyframes.prior_disparities[0]
         if bool((prior > 0).any()):
             return [torch.where(prior > 0, prior, prior[prior > 0].median())]
-        from_first = [matches.edge(p) for p, edge in enumerate(edges) if edge[0] == 0]
+        from_first = self.backend.graph.measured_from(0)
         return list(first_disparity_hypotheses(self.grid, from_first))

@@ -1,0 +1,135 @@
+"""Every constant of the system in one tree, the presets, and their way in and out of JSON."""
+
+import dataclasses
+import difflib
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from minislam.errors import InputError
+from minislam.mapping.config import MappingConfig
+from minislam.parameters import parameter
+from minislam.priors.depth import SimulatedDepthConfig
+from minislam.priors.features import ClassicalFeaturesConfig
+from minislam.priors.flow import ClassicalFlowConfig
+from minislam.tracking.config import TrackingConfig
+from minislam.uncertainty.config import UncertaintyConfig
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """The whole configuration. Names with dots reach every part: `tracking.window`."""
+
+    seed: int = parameter(0, "of every random draw: same seed, same bytes")
+    threads: int = parameter(1, "of torch; more are slower on a busy machine")
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
+    flow: ClassicalFlowConfig = field(default_factory=ClassicalFlowConfig)
+    features: ClassicalFeaturesConfig = field(default_factory=ClassicalFeaturesConfig)
+    simulated_depth: SimulatedDepthConfig = field(default_factory=SimulatedDepthConfig)
+
+
+# What each preset changes. `laptop` is the default tree: a 100-frame clip in minutes on two cores.
+PRESETS: dict[str, dict[str, Any]] = {
+    "laptop": {},
+    "test": {
+        "tracking.warmup_keyframes": 6,
+        "tracking.warmup_rounds": 2,
+        "tracking.warmup_rounds_with_beta": 1,
+        "tracking.rounds": 1,
+        "tracking.final_rounds": 1,
+        "mapping.init_iterations": 60,
+        "mapping.keyframe_iterations": 10,
+        "mapping.refine_iterations": 60,
+        "mapping.image_scale": 1.0,
+    },
+}
+
+
+def preset(name: str) -> SlamConfig:
+    """Return a preset by name."""
+    if name not in PRESETS:
+        raise InputError(f"expected a preset among {', '.join(PRESETS)}, found {name!r}")
+    return with_settings(SlamConfig(), PRESETS[name])
+
+
+def settings_of(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Return all values of a configuration under their names with dots."""
+    flat: dict[str, Any] = {}
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        name = prefix + entry.name
+        if is_dataclass(value):
+            flat |= settings_of(value, name + ".")
+        else:
+            flat[name] = value
+    return flat
+
+
+def meanings_of(config: Any, prefix: str = "") -> dict[str, str]:
+    """Return what each value of a configuration means, under its name with dots."""
+    flat: dict[str, str] = {}
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        name = prefix + entry.name
+        if is_dataclass(value):
+            flat |= meanings_of(value, name + ".")
+        else:
+            flat[name] = entry.metadata.get("meaning", "")
+    return flat
+
+
+def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
+    """Return the configuration with values replaced, each given under its name with dots."""
+    known = settings_of(config)
+    for name, value in settings.items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+            raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
+        config = _replaced(config, name.split("."), _converted(name, value, known[name]))
+    return config
+
+
+def _replaced(config: Any, path: list[str], value: Any) -> Any:
+    if len(path) > 1:
+        value = _replaced(getattr(config, path[0]), path[1:], value)
+    return replace(config, **{path[0]: value})
+
+
+def _converted(name: str, value: Any, present: Any) -> Any:
+    """Return a value (a JSON value, or text from the command line) in the type of the present one."""
+    kind = type(present)
+    try:
+        if kind is bool:
+            words = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
+            return value if isinstance(value, bool) else words[str(value).lower()]
+        if kind is tuple:
+            parts = value.split(",") if isinstance(value, str) else value
+            return tuple(type(present[0])(part) for part in parts)
+        if kind is int and not isinstance(value, str) and int(value) != value:
+            raise ValueError
+        return kind(value)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            f"expected {name} to be of type {kind.__name__} like {present!r}, found {value!r}"
+        ) from None
+
+
+def as_json(config: SlamConfig) -> dict[str, Any]:
+    """Return the configuration as nested dictionaries of plain values."""
+    return dataclasses.asdict(config)
+
+
+def from_json(tree: dict[str, Any]) -> SlamConfig:
+    """Return the configuration written by `as_json`; what is left out keeps its default."""
+    return with_settings(SlamConfig(), _flattened(tree))
+
+
+def _flattened(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flattened(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat

@@ -1,0 +1,189 @@
+"""The whole system (paper Fig. 2) on one screen: one process, one loop.
+
+    frame -> tracker -> keyframe (pose, disparity) -> mapper -> Gaussian map
+                ^                                       |
+                |  beta: what the MLP has learnt        |
+                +---------------------------------------+
+
+The two arrows that go back are two calls: the tracker asks `_static_weight` for what the MLP has
+learnt of each cell, and `_move_map` carries the map along when an adjustment moves keyframes.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.config import SlamConfig
+from minislam.errors import TrackingLost
+from minislam.geometry import se3_inverse
+from minislam.mapping import Mapper
+from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
+from minislam.records import Keyframe, Sequence, Trajectory
+from minislam.tracking.structure import depth_from_disparities
+from minislam.tracking.tracker import Tracker, TrackingStatus
+from minislam.tracking.trajectory import pose_all_frames
+from minislam.uncertainty import tracking_weight
+
+Report = Callable[[str, int, int], None]  # stage, done, of all
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known of an image before any geometry."""
+
+    flow: FlowEstimator
+    features: FeatureExtractor
+    depth: DepthPrior
+
+
+class Slam:
+    """Monocular SLAM in a scene with moving things. Its parts can be read at any time."""
+
+    def __init__(
+        self, sequence: Sequence, config: SlamConfig, priors: Priors, report: Report | None = None
+    ) -> None:
+        self.sequence, self.config = sequence, config
+        self.seconds: dict[str, float] = {}  # spent per stage
+        self.mapper = Mapper(
+            sequence.camera,
+            config.mapping,
+            config.uncertainty,
+            priors.features.dimension,
+            config.seed,
+        )
+        self.tracker = Tracker(
+            sequence.camera,
+            config.tracking,
+            priors.flow,
+            priors.features,
+            priors.depth,
+            self._static_weight,
+        )
+        self._stride = priors.flow.stride
+        self._report = report or (lambda stage, done, of_all: None)
+        self._poses: dict[int, Tensor] = {}  # T_camera_world of every frame, once known
+
+    def run(self) -> None:
+        """Process the sequence from the first frame to the final map."""
+        for done, frame in enumerate(self.sequence):
+            with self._timed("tracking"):
+                is_keyframe = self.tracker.track(frame)
+            if is_keyframe and self.tracker.initialised:
+                self._map_new_keyframes()
+            elif is_keyframe and len(self.tracker.keyframes) >= self.config.tracking.warmup_keyframes:
+                self._initialise()
+            self._report("tracking and mapping", done + 1, len(self.sequence))
+        if not self.tracker.initialised:
+            self._initialise()
+
+        with self._timed("final adjustment"):
+            self.tracker.finish(self._progress("final adjustment"))
+        with self._timed("refinement"):
+            self._move_map(first_changed=0)
+            iterations = self.config.mapping.refine_iterations
+            self.mapper.refine(iterations, self._progress("refining the map"))
+        with self._timed("all frames"):
+            progress = self._progress("posing all frames")
+            self._poses = pose_all_frames(self.tracker, self.sequence, progress)
+
+    def _initialise(self) -> None:
+        """Start in two stages (paper Sec. 3.3): without beta, then with what it has learnt."""
+        with self._timed("initialisation"):
+            self.tracker.initialise()
+        with self._timed("mapping"):
+            everyone = range(len(self.tracker.keyframes))
+            progress = self._progress("first map")
+            self.mapper.initialise([self._keyframe(index) for index in everyone], progress)
+        with self._timed("initialisation"):
+            self.tracker.refine_initialisation()
+
+    def _map_new_keyframes(self) -> None:
+        with self._timed("mapping"):
+            mapped = len(self.mapper.keyframes)
+            self._move_map(first_changed=max(0, mapped - self.config.tracking.window))
+            for index in range(mapped, len(self.tracker.keyframes)):
+                self.mapper.integrate(self._keyframe(index))
+
+    def _move_map(self, first_changed: int) -> None:
+        """Carry the map along with keyframes that an adjustment has moved."""
+        mapped = len(self.mapper.keyframes)
+        depths: list[Tensor | None] | None = None
+        if not self.tracker.has_prior:
+            depths = [None] * first_changed
+            depths += [self._depth(index) for index in range(first_changed, mapped)]
+        self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped], depths)
+
+    def _static_weight(self, features: Tensor) -> Tensor:
+        """Return how far beta trusts each cell of the tracker (h, w), in (0, 1]."""
+        if not self.config.uncertainty.enabled or not self.mapper.keyframes:
+            height, width = self.tracker.grid.shape
+            return torch.ones(height, width)
+        beta = self.mapper.predict_beta(features)
+        return tracking_weight(beta, self.sequence.camera, self._stride)
+
+    def _keyframe(self, index: int) -> Keyframe:
+        """Return a keyframe as the mapper wants it."""
+        keyframes = self.tracker.keyframes
+        frame = keyframes.frames[index]
+        return Keyframe(
+            keyframe_index=index,
+            frame_index=frame.frame_index,
+            timestamp=frame.timestamp,
+            image=frame.image,
+            features=keyframes.features[index],
+            depth=self._depth(index),
+            T_camera_world=keyframes.T_camera_world[index],
+        )
+
+    def _depth(self, index: int) -> Tensor:
+        """Return the mapper's reference depth (H, W): the prior, or else our own structure."""
+        metric_depth = self.tracker.keyframes.metric_depths[index]
+        if metric_depth is not None:
+            return metric_depth
+        return depth_from_disparities(self.tracker.backend, index)
+
+    # What came out ------------------------------------------------------------------------------
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of all frames that were not lost; before the end, of the keyframes."""
+        if not self._poses:
+            return self.keyframe_trajectory()
+        stamps = {t.frame_index: t.timestamp for t in self.tracker.tracked}
+        return _trajectory([stamps[index] for index in self._poses], list(self._poses.values()))
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Return the poses of the keyframes."""
+        keyframes = self.tracker.keyframes
+        stamps = [frame.timestamp for frame in keyframes.frames]
+        return _trajectory(stamps, list(keyframes.T_camera_world))
+
+    def lost_frames(self) -> list[tuple[int, float, str]]:
+        """Return frame index, timestamp and reason of every frame without a pose."""
+        return [
+            (t.frame_index, t.timestamp, f"matched_share_{t.matched_share:.3f}")
+            for t in self.tracker.tracked
+            if t.status is TrackingStatus.LOST
+        ]
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def _progress(self, stage: str) -> Callable[[int, int], None]:
+        return lambda done, of_all: self._report(stage, done, of_all)
+
+
+def _trajectory(timestamps: list[float], T_camera_world: list[Tensor]) -> Trajectory:
+    if not T_camera_world:
+        raise TrackingLost("expected at least one frame with a pose, found none")
+    T_world_camera = se3_inverse(torch.stack(T_camera_world)).numpy()
+    return Trajectory(np.array(timestamps), T_world_camera)
