@@ -234,6 +234,16 @@ def test_a_restarted_chain_measures_from_the_newest_frame():
     assert sure.float().mean() > 0.6 and error[sure].median() < 0.1
 
 
+def test_a_chain_expects_the_motion_to_go_on():
+    # Each step is 10 px longer than the last: too long from where the last one ended.
+    chain = flow_of([]).start_chain(shifted(0, 0, SIZE))
+    for place in (10, 30, 60):
+        chain, matches = chain.advanced(shifted(place, 0, SIZE))
+    stays = GRID[..., 0] + 60 < WIDTH - 8
+    error = (matches.targets[0] - GRID - torch.tensor([60.0, 0.0])).norm(dim=-1)[stays]
+    assert error.median() < 0.1
+
+
 def test_a_chain_takes_up_a_motion_that_stops():
     chain = flow_of([]).start_chain(shifted(0, 0, SIZE))
     for place in (12, 24, 24):

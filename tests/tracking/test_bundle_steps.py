@@ -29,6 +29,10 @@ from minislam.tracking.bundle_adjustment import (
 # Steps that are not taken
 
 
+def scaled_disparities(state: BundleState, factor: float) -> BundleState:
+    return replace(state, disparities=factor * state.disparities)
+
+
 @pytest.mark.parametrize("robust_scale", [None, 1.0])
 def test_cost_never_rises_over_accepted_steps(robust_scale):
     known = known_problem()
@@ -47,7 +51,7 @@ def test_a_step_that_raises_the_cost_is_tried_again_with_more_damping(monkeypatc
     def bad_below_a_tenth(problem, state, equations, damping, absolute_damping):
         dampings.append(damping)
         step = solve(problem, state, equations, damping, absolute_damping)
-        return step if damping > 0.05 else BundleState(state.T_camera_world, 3 * state.disparities)
+        return step if damping > 0.05 else scaled_disparities(state, 3.0)
 
     monkeypatch.setattr(bundle_adjustment, "_damped_step", bad_below_a_tenth)
     end, report = bundle_adjust(known.problem, start, iterations=1)
@@ -56,12 +60,13 @@ def test_a_step_that_raises_the_cost_is_tried_again_with_more_damping(monkeypatc
     assert distance(end, start) > 0
 
 
-def test_steps_that_only_raise_the_cost_leave_the_state_as_it_was(monkeypatch):
+@pytest.mark.parametrize("factor", [3.0, 1.001])
+def test_steps_that_only_raise_the_cost_leave_the_state_as_it_was(factor: float, monkeypatch):
     known = known_problem()
-    start = perturbed(known, 0.02)
+    start = scaled_disparities(perturbed(known, 0.01), 1.05)  # larger still is worse still
 
     def worse(problem, state, equations, damping, absolute_damping):
-        return BundleState(state.T_camera_world, 3 * state.disparities)
+        return scaled_disparities(state, factor)
 
     monkeypatch.setattr(bundle_adjustment, "_damped_step", worse)
     end, report = bundle_adjust(known.problem, start, iterations=5)
@@ -128,6 +133,16 @@ def test_a_keyframe_without_edges_follows_its_prior_alone():
     torch.testing.assert_close(end.T_camera_world[3], start.T_camera_world[3], rtol=0, atol=1e-14)
     before = (start.disparities[3] - known.truth.disparities[3]).abs().max()
     assert (end.disparities[3] - known.truth.disparities[3]).abs().max() < 0.2 * before
+
+
+def test_a_held_disparity_of_zero_is_a_point_at_infinity():
+    known = known_problem()
+    disparities = known.truth.disparities.clone()
+    disparities[3] = 0
+    held = torch.tensor([True, True, True, False])
+    problem = replace(known.problem, free_disparities=held)
+    end, report = bundle_adjust(problem, BundleState(known.truth.T_camera_world, disparities), 3)
+    assert report.iterations > 0 and (end.disparities[3] == 0).all()
 
 
 def test_all_poses_fixed_refines_disparities():

@@ -195,6 +195,13 @@ def test_existing_edges_suppress_in_either_direction():
         assert pairs == [(11, 7)]
 
 
+def test_a_pair_two_apart_suppresses_nothing_but_itself():
+    distances = distances_on_a_line(6)
+    distances[5, 3], distances[5, 2], distances[5, 4] = 0.1, 0.2, 0.3
+    pairs = proximity_pairs(distances, [(5, 3)], range(5, 6), 0.5, limit_per_keyframe=9)
+    assert pairs == [(5, 2), (5, 4)]
+
+
 def test_no_keyframe_gets_more_than_its_share_of_pairs():
     distances = 0.01 * distances_on_a_line(12)
     pairs = proximity_pairs(distances, [], range(12), 1.0, limit_per_keyframe=2, suppression=0)
