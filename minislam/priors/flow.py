@@ -16,6 +16,9 @@ from torch import Tensor
 from minislam.parameters import parameter
 from minislam.priors.interfaces import FlowMatches
 
+LIKENESS_WINDOW = (9, 9)  # px
+LEAST_VARIANCE = 1e-5  # of brightness in [0, 1]: below it there is nothing to correlate
+
 
 @dataclass(frozen=True)
 class ClassicalFlowConfig:
@@ -71,7 +74,9 @@ class ClassicalFlow:
             forward, backward = flow_of[edge], flow_of.get((target, source))
             if backward is None:
                 backward = reverse_flow(self._images[source], self._images[target], forward)
-            return grid_matches(forward, backward, self._textures[source], self.config)
+            warped = warp(self._images[target], forward)
+            alike = likeness(self._images[source], warped, self.stride)
+            return grid_matches(forward, backward, alike * self._textures[source], self.config)
 
         with ThreadPoolExecutor(self.config.workers) as pool:
             measured = list(pool.map(measure, edges))
@@ -119,7 +124,8 @@ class FlowChain:
         flow = composed_flow(self._reference, gray, starts[int(np.argmin(errors))])
         backward = reverse_flow(self._reference, gray, flow)
         texture = texture_confidence(self._reference, self._config)
-        targets, confidence = grid_matches(flow, backward, texture, self._config)
+        alike = likeness(self._reference, warp(gray, flow), self._config.stride)
+        targets, confidence = grid_matches(flow, backward, alike * texture, self._config)
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
         return chain, as_matches([targets], [confidence], [texture], torch.float32)
 
@@ -150,6 +156,22 @@ def texture_confidence(gray: np.ndarray, config: ClassicalFlowConfig) -> np.ndar
     smaller = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
     smaller = np.maximum(smaller[:: config.stride, :: config.stride], 0)
     return smaller / (smaller + config.texture_scale)
+
+
+def likeness(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
+    """Return how alike a source and its warped target look around each cell (h, w), in [0, 1].
+
+    It is the squared normalised cross-correlation, blind to exposure. Forward and backward flow
+    agree with each other on a black target and, here and there, on any other: this asks the images.
+    """
+    a, b = source.astype(np.float32) / 255, warped.astype(np.float32) / 255
+    mean_a, mean_b, mean_aa, mean_bb, mean_ab = (
+        cv2.boxFilter(product, -1, LIKENESS_WINDOW) for product in (a, b, a * a, b * b, a * b)
+    )
+    covariance = mean_ab - mean_a * mean_b
+    variances = (mean_aa - mean_a**2) * (mean_bb - mean_b**2)
+    correlation = covariance / np.sqrt(np.maximum(variances, LEAST_VARIANCE**2))
+    return np.clip(correlation, 0, 1)[::stride, ::stride] ** 2
 
 
 def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """What the classical flow must not trust: borders, bare walls, disagreement, black images."""
 
 import numpy as np
+import pytest
 import torch
 
 from minislam.priors.flow import (
@@ -95,4 +96,21 @@ def test_black_images_match_nothing():
 def test_unrelated_images_share_little():
     other = view(np.eye(2), np.array([5000.0, 3000.0]), SIZE)
     matches = flow_of([shifted(0, 0, SIZE), other]).match([0, 0], [0, 1], still(2))
-    assert matches.matched_shares[1] < 0.4 < 0.95 < matches.matched_shares[0]
+    assert matches.matched_shares[1] < 0.15 < 0.9 < matches.matched_shares[0]
+
+
+@pytest.mark.parametrize("brightness", [0.0, 0.5, 1.0])
+def test_a_view_that_goes_blank_is_not_matched(brightness: float):
+    blank, seen = torch.full((*SIZE, 3), brightness), shifted(0, 0, SIZE)
+    assert flow_of([seen, blank]).match([0], [1], still()).matched_shares[0] < 0.01
+    _, of_chain = flow_of([]).start_chain(seen).advanced(blank)
+    assert float(of_chain.matched_shares) < 0.01
+
+
+def test_exposure_does_not_matter():
+    darker = 0.2 + 0.5 * shifted(3, 0, SIZE)
+    plain, dimmed = (
+        flow_of([shifted(0, 0, SIZE), image]).match([0], [1], still()).matched_shares[0]
+        for image in (shifted(3, 0, SIZE), darker)
+    )
+    assert dimmed > 0.9 * plain

@@ -21,6 +21,7 @@ SIZE = (160, 120)
 FRAMES = 30
 # Five keyframes in thirty frames; the flow is that of a 320x240 image.
 CONFIG = TrackingConfig(warmup_keyframes=3, keyframe_flow=8.0)
+WHERE_LOST = 17  # a frame after the warm-up
 
 
 @cache
@@ -114,6 +115,22 @@ def test_two_runs_are_the_same_to_the_bit():
     run(second, frames())
     assert torch.equal(first.keyframes.T_camera_world, second.keyframes.T_camera_world)
     assert torch.equal(first.keyframes.disparities, second.keyframes.disparities)
+
+
+@pytest.mark.parametrize("kind", ["noise", "black"])
+def test_a_spoilt_frame_is_lost_and_the_next_is_found_again(kind: str):
+    images = frames()
+    source = torch.Generator().manual_seed(0)
+    noise = torch.rand(images[0].image.shape, generator=source)
+    spoilt = noise if kind == "noise" else torch.zeros_like(noise)
+    images[WHERE_LOST] = Frame(WHERE_LOST, images[WHERE_LOST].timestamp, spoilt)
+    tracker = new_tracker(with_depth=True)
+    run(tracker, images)
+    lost = [f.frame_index for f in tracker.tracked if f.status is TrackingStatus.LOST]
+    assert lost == [WHERE_LOST]
+    estimate, truth = trajectories(tracker)
+    error = absolute_trajectory_error(estimate, truth, Alignment.SIM3)
+    assert error.statistics["rmse"] < 5e-3 * path_length(truth)
 
 
 def test_blank_images_are_an_error_of_one_sentence():
