@@ -23,6 +23,8 @@ def cleaned(notebook: dict) -> dict:
     """Return the notebook without what differs from run to run: timings, versions, random ids."""
     result = copy.deepcopy(notebook)
     for number, cell in enumerate(result["cells"]):
+        if "outputs" in cell:
+            cell["outputs"] = with_joined_streams(cell["outputs"])
         cell["metadata"] = {}
         cell["id"] = f"cell-{number:02d}"
     result["metadata"] = {
@@ -31,6 +33,18 @@ def cleaned(notebook: dict) -> dict:
     }
     result["nbformat"], result["nbformat_minor"] = 4, 5
     return result
+
+
+def with_joined_streams(outputs: list[dict]) -> list[dict]:
+    """Join neighbouring prints: into how many pieces a kernel cuts them depends on timing."""
+    joined: list[dict] = []
+    for output in outputs:
+        if joined and "name" in output and output["name"] == joined[-1].get("name"):
+            text = "".join([*joined[-1]["text"], *output["text"]])
+            joined[-1]["text"] = text.splitlines(keepends=True)
+        else:
+            joined.append(output)
+    return joined
 
 
 def without_solutions(notebook: dict) -> dict:
