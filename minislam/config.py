@@ -122,14 +122,15 @@ def as_json(config: SlamConfig) -> dict[str, Any]:
 
 def from_json(tree: dict[str, Any]) -> SlamConfig:
     """Return the configuration written by `as_json`; what is left out keeps its default."""
-    return with_settings(SlamConfig(), _flattened(tree))
+    return with_settings(SlamConfig(), flattened(tree))
 
 
-def _flattened(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested dictionaries as one, under names with dots."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, dict):
-            flat |= _flattened(value, f"{prefix}{name}.")
+            flat |= flattened(value, f"{prefix}{name}.")
         else:
             flat[prefix + name] = value
     return flat

@@ -46,7 +46,7 @@ class ClassicalFeatures:
 
     def __init__(
         self,
-        stride: int = 14,  # px, size of a cell; 14 is the patch size of the paper's DINOv2
+        stride: int = 7,  # px, size of a cell; half the patch of DINOv2: the windows look further
         config: ClassicalFeaturesConfig | None = None,
     ) -> None:
         self.stride = stride

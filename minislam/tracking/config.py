@@ -17,19 +17,19 @@ class TrackingConfig:
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     window: int = parameter(10, "newest keyframes that the local BA moves")
-    neighbourhood: int = parameter(3, "every keyframe is linked with so many predecessors")
+    neighbourhood: int = parameter(5, "every keyframe is linked with so many predecessors")
     proximity_edges: int = parameter(2, "further links of a new keyframe, nearest by flow distance")
     proximity_distance: float = parameter(120.0, "largest flow distance of a proximity link [px]")
     min_link_share: float = parameter(
-        0.3, "a link beyond the neighbourhood needs this much of its flow confirmed [-]"
+        0.1, "a link beyond the neighbourhood needs this much of its flow confirmed [-]"
     )
     rounds: int = parameter(2, "rounds of flow and BA per keyframe")
     iterations: int = parameter(3, "Gauss-Newton steps per round")
     robust_scale: float = parameter(
-        2.0, "width of the Cauchy weight inside Sigma [px]; 0: plain least squares"
+        1.0, "width of the Cauchy weight inside Sigma [px]; 0: plain least squares"
     )
     lambda_disparity_prior: float = parameter(
-        0.005,
+        0.0005,
         "lambda_4: disparity prior, times fx^2, so that it weighs a disparity error by the pixels "
         "that a unit baseline would turn it into [-], Eq. 5",
     )

@@ -1,0 +1,113 @@
+"""All figures of one run against the truth, as the paper evaluates (Sec. 4)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from minislam.errors import InputError
+from minislam.evaluation.images import psnr, ssim
+from minislam.evaluation.novel_views import align_novel_views, truth_to_estimate
+from minislam.evaluation.separability import auroc
+from minislam.evaluation.trajectory import absolute_trajectory_error, straight_line_error
+from minislam.records import GroundTruth, Trajectory
+
+MAX_DIFFERENCE = 0.02  # second between a frame and its true pose; TUM stamps differ by 0.005
+MIN_MASK = 20  # px of a mover below which a view says nothing about ghosts
+CENTIMETRES = 100.0  # per world unit of the truth, which is metric
+
+
+@dataclass(frozen=True)
+class MappedView:
+    """A keyframe as the run left it."""
+
+    frame_index: int
+    T_world_camera: np.ndarray  # (4, 4) estimated
+    beta: np.ndarray | None  # (H, W), None if beta was switched off
+
+
+def measure_run(
+    truth: GroundTruth | None,
+    trajectory: Trajectory,
+    keyframe_trajectory: Trajectory,
+    views: list[MappedView],
+    render: Callable[[np.ndarray], np.ndarray],  # T_world_camera (4, 4) -> RGB (H, W, 3)
+) -> dict[str, float | None]:
+    """Return the metrics by name, units in the names; None for what cannot be known."""
+    metrics: dict[str, float | None] = dict.fromkeys(
+        (
+            "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db",
+            "ssim_novel", "psnr_input_db", "psnr_masked_db", "beta_auroc",
+        )
+    )  # fmt: skip
+    if truth is None:
+        return metrics
+    if truth.trajectory is not None:
+        metrics["ate_all_cm"] = _ate_cm(trajectory, truth.trajectory)
+        metrics["ate_keyframes_cm"] = _ate_cm(keyframe_trajectory, truth.trajectory)
+        metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(truth.trajectory)
+        if metrics["ate_all_cm"] is not None:
+            metrics |= _novel_views(truth, trajectory, render)
+    metrics |= _input_views(truth, views, render)
+    metrics["beta_auroc"] = _beta_auroc(truth, views)
+    return metrics
+
+
+def _ate_cm(estimate: Trajectory, truth: Trajectory) -> float | None:
+    try:
+        error = absolute_trajectory_error(estimate, truth, max_difference=MAX_DIFFERENCE)
+    except InputError:
+        return None  # too few poses in common, or a camera that never moved: nothing to align
+    return CENTIMETRES * error.statistics["rmse"]
+
+
+def _novel_views(
+    truth: GroundTruth, trajectory: Trajectory, render: Callable[[np.ndarray], np.ndarray]
+) -> dict[str, float | None]:
+    """Compare held-out static views with renderings from their Sim(3)-aligned poses."""
+    views = truth.novel_views()
+    if not views:
+        return {}
+    similarity = truth_to_estimate(trajectory, truth.trajectory, MAX_DIFFERENCE)
+    pairs = [(render(align_novel_views(pose, similarity)), image) for pose, image in views]
+    return {
+        "psnr_novel_db": _mean([psnr(rendered, image) for rendered, image in pairs]),
+        "ssim_novel": _mean([ssim(rendered, image) for rendered, image in pairs]),
+    }
+
+
+def _input_views(
+    truth: GroundTruth, views: list[MappedView], render: Callable[[np.ndarray], np.ndarray]
+) -> dict[str, float | None]:
+    """Compare renderings from the keyframes with the same views of the empty scene.
+
+    `psnr_masked_db` looks only where a mover stood: a ghost of it would show there.
+    """
+    whole, masked = [], []
+    for view in views:
+        static = truth.static_image(view.frame_index)
+        if static is None:
+            continue
+        rendered = render(view.T_world_camera)
+        whole.append(psnr(rendered, static))
+        mask = truth.moving_mask(view.frame_index)
+        if mask is not None and mask.sum() >= MIN_MASK:
+            masked.append(psnr(rendered, static, mask))
+    return {"psnr_input_db": _mean(whole), "psnr_masked_db": _mean(masked)}
+
+
+def _beta_auroc(truth: GroundTruth, views: list[MappedView]) -> float | None:
+    """Return how well beta separates movers from the rest, all keyframes taken together."""
+    scores, masks = [], []
+    for view in views:
+        mask = truth.moving_mask(view.frame_index)
+        if view.beta is not None and mask is not None:
+            scores.append(view.beta.ravel())
+            masks.append(mask.ravel())
+    if not masks or not np.concatenate(masks).any():
+        return None
+    return auroc(np.concatenate(scores), np.concatenate(masks))
+
+
+def _mean(values: list[float]) -> float | None:
+    return float(np.mean(values)) if values else None

@@ -1,0 +1,229 @@
+"""One run from a name to a folder: read the sequence, do SLAM, measure it, write everything."""
+
+import resource
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import minislam
+from minislam.config import SlamConfig, as_json
+from minislam.data import GaussianArrays, RunFolder
+from minislam.errors import InputError
+from minislam.evaluation import absolute_trajectory_error
+from minislam.evaluation.run import MAX_DIFFERENCE, MappedView, measure_run
+from minislam.geometry import se3_inverse
+from minislam.priors.depth import FileDepth, NoDepth, SensorDepth, SimulatedDepth
+from minislam.priors.features import ClassicalFeatures
+from minislam.priors.flow import ClassicalFlow
+from minislam.priors.interfaces import DepthPrior
+from minislam.records import Sequence
+from minislam.slam import Priors, Report, Slam
+from minislam.uncertainty.grid import resample
+from minislam.viz import (
+    ate_over_time,
+    beta_to_rgb,
+    build_report,
+    depth_to_rgb,
+    figure_png,
+    keyframe_strip,
+    loss_curves,
+    overview,
+    trajectory_plot,
+)
+
+MAX_STRIPS = 6  # keyframes shown in the report
+LOST_EXIT, INTERRUPTED_EXIT = 3, 130  # exit codes of a run that is not whole
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What a finished or interrupted run has to say."""
+
+    metrics: dict[str, float | None]
+    warnings: list[str]
+    exit_code: int
+    state: str  # "finished", "finished, partly lost" or "interrupted"
+
+
+def choose_depth(name: str, sequence: Sequence, config: SlamConfig) -> DepthPrior:
+    """Return the depth prior by name: none, simulated, sensor, or files:FOLDER."""
+    if name == "none":
+        return NoDepth()
+    if name == "simulated":
+        truth = sequence.ground_truth
+        if truth is None or truth.depth(0) is None:
+            raise InputError(
+                "expected a sequence with true depth for --depth simulated, found none in "
+                f"{sequence.name}; use --depth none or --depth files:FOLDER"
+            )
+        return SimulatedDepth(truth.depth, config.seed, config.simulated_depth)
+    if name == "sensor":
+        return SensorDepth(sequence.sensor_depth)
+    if name.startswith("files:"):
+        return FileDepth(Path(name.removeprefix("files:")))
+    raise InputError(
+        f"expected --depth none, simulated, sensor or files:FOLDER, found {name!r}; choose one"
+    )
+
+
+def run_sequence(
+    sequence: Sequence,
+    config: SlamConfig,
+    depth: str,
+    folder: RunFolder,
+    report: Report | None = None,
+) -> RunOutcome:
+    """Run SLAM on a sequence and write the run folder, also when it is interrupted."""
+    torch.set_num_threads(config.threads)
+    start = time.perf_counter()
+    folder.write_config(as_json(config))
+    flow, features = ClassicalFlow(config.flow), ClassicalFeatures(config=config.features)
+    priors = Priors(flow, features, choose_depth(depth, sequence, config))
+    slam = Slam(sequence, config, priors, report)
+    interrupted = False
+    try:
+        slam.run()
+    except KeyboardInterrupt:
+        if not slam.tracker.initialised:
+            raise  # there is nothing to save yet
+        interrupted = True
+    seconds = time.perf_counter() - start
+    lost = slam.lost_frames()
+    state = "finished, partly lost" if lost else "finished"
+    exit_code = LOST_EXIT if lost else 0
+    if interrupted:
+        state, exit_code = "interrupted", INTERRUPTED_EXIT
+    _write_estimates(folder, slam)
+    metrics = _measure(slam, seconds)
+    folder.write_metrics(metrics)
+    outcome = RunOutcome(metrics, _warnings(slam), exit_code, state)
+    _write_pictures(folder, slam, outcome)
+    folder.write_run(
+        {
+            "version": minislam.__version__,
+            "command": sys.argv,
+            "sequence": sequence.description,
+            "depth": depth,
+            "seed": config.seed,
+            "state": state,
+            "exit_code": exit_code,
+            "warnings": outcome.warnings,
+            "seconds": {"total": seconds, **slam.seconds},
+            "frames": len(slam.tracker.tracked),
+            "keyframes": len(slam.tracker.keyframes),
+            "lost_frames": len(lost),
+            "gaussians": len(slam.mapper.gaussians),
+        }
+    )
+    return outcome
+
+
+def _write_estimates(folder: RunFolder, slam: Slam) -> None:
+    folder.write_trajectory(slam.trajectory())
+    folder.write_keyframe_trajectory(slam.keyframe_trajectory())
+    folder.write_lost_frames(slam.lost_frames())
+    arrays = slam.mapper.gaussians.to_arrays()
+    arrays.pop("anchor_keyframe")
+    folder.write_map(GaussianArrays(**arrays))
+    folder.write_mlp(slam.mapper.mlp.state_dict())
+
+
+def _measure(slam: Slam, seconds: float) -> dict[str, Any]:
+    views = [
+        MappedView(
+            keyframe.frame_index,
+            se3_inverse(keyframe.T_camera_world).numpy(),
+            _beta_image(slam, index) if slam.config.uncertainty.enabled else None,
+        )
+        for index, keyframe in enumerate(slam.mapper.keyframes)
+    ]
+    metrics: dict[str, Any] = measure_run(
+        slam.sequence.ground_truth,
+        slam.trajectory(),
+        slam.keyframe_trajectory(),
+        views,
+        lambda pose: _rendered(slam, pose),
+    )
+    metrics["seconds_total"] = seconds
+    metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds
+    # Kilobytes on Linux. The largest the process has been, reading and interpreter included.
+    metrics["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return metrics
+
+
+def _rendered(slam: Slam, T_world_camera: np.ndarray) -> np.ndarray:
+    pose = se3_inverse(torch.from_numpy(T_world_camera))
+    return slam.mapper.render(pose).color.clamp(0, 1).numpy()
+
+
+def _beta_image(slam: Slam, index: int) -> np.ndarray:
+    camera = slam.sequence.camera
+    beta = slam.mapper.predict_beta(slam.mapper.keyframes[index].features)
+    return resample(beta, camera.height, camera.width).numpy()
+
+
+def _warnings(slam: Slam) -> list[str]:
+    warnings = list(slam.sequence.warnings)
+    lost = len(slam.lost_frames())
+    if lost:
+        warnings.append(
+            f"{lost} of {len(slam.tracker.tracked)} frames could not be followed and have no "
+            "pose; lost_frames.txt lists them"
+        )
+    if not slam.tracker.has_prior:
+        warnings.append("without a depth prior the unit of length is arbitrary")
+    return warnings
+
+
+def _write_pictures(folder: RunFolder, slam: Slam, outcome: RunOutcome) -> None:
+    """Write keyframe images, plots and the report."""
+    strips: list[tuple[str, bytes]] = []
+    count = len(slam.mapper.keyframes)
+    shown = set(np.linspace(0, count - 1, min(MAX_STRIPS, count)).round().astype(int).tolist())
+    middle = sorted(shown)[len(shown) // 2]
+    truth = slam.sequence.ground_truth
+    true_path = truth.trajectory if truth else None
+    unit = "world units"
+    estimate = slam.trajectory()
+    if outcome.metrics["ate_all_cm"] is not None:
+        error = absolute_trajectory_error(estimate, true_path, max_difference=MAX_DIFFERENCE)
+        estimate, true_path = error.estimate, error.truth
+        unit = "m"
+        png = figure_png(ate_over_time(estimate.timestamps, error.errors, unit))
+        folder.write_plot("ate_over_time", png)
+    else:
+        true_path = None
+    for index, keyframe in enumerate(slam.mapper.keyframes):
+        rendering = slam.mapper.render(keyframe.T_camera_world)
+        image, beta = keyframe.image.numpy(), _beta_image(slam, index)
+        color, depth = rendering.color.clamp(0, 1).numpy(), rendering.depth.numpy()
+        number = keyframe.frame_index
+        folder.write_keyframe_image(number, "input", image)
+        folder.write_keyframe_image(number, "render", color)
+        folder.write_keyframe_image(number, "depth", depth_to_rgb(depth))
+        folder.write_keyframe_image(number, "beta", beta_to_rgb(beta))
+        if index in shown:
+            strip = figure_png(keyframe_strip(image, depth, beta, color, f"frame {number}"))
+            strips.append((f"Keyframe {index}, frame {number}", strip))
+        if index == middle:
+            picture = overview(image, beta, color, estimate, true_path, unit)
+            folder.write_plot("overview", figure_png(picture))
+    path = figure_png(trajectory_plot(estimate, true_path, unit))
+    folder.write_plot("trajectory", path)
+    history = slam.mapper.history
+    curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
+    losses = figure_png(loss_curves(curves))
+    folder.write_plot("losses", losses)
+    summary = {name: _shown(value) for name, value in outcome.metrics.items()}
+    figures = [("Trajectory", path), *strips, ("Losses", losses)]
+    title = f"minislam: {slam.sequence.name}"
+    folder.write_report(build_report(title, summary, outcome.warnings, figures))
+
+
+def _shown(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f}"
