@@ -4,32 +4,53 @@ Exit codes: 0 all is well, 1 a known error (one sentence), 2 wrong usage, 3 fini
 the sequence was lost, 130 interrupted with everything so far written.
 """
 
+from __future__ import annotations
+
 import argparse
+import difflib
+import importlib
 import os
 import sys
 import time
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import minislam
 from minislam.cli_eval import add_eval_parser
+from minislam.cli_progress import ProgressLine, StopRequest
 from minislam.errors import MinislamError
 
+if TYPE_CHECKING:
+    from minislam.config import SlamConfig
+    from minislam.data import InputOptions
+
 DEMO_SEQUENCE, DEMO_FRAMES = "synth:crowd", 60
-PLAIN_STEP = 0.1  # share of a stage between two progress lines that are not on a terminal
+FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
+MAX_SELF_TEST_ERROR = 0.1  # px
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    args = _parser(arguments).parse_args(arguments)
+    args, unknown = _parser(arguments).parse_known_args(arguments)
+    if unknown:
+        print(f"minislam: {_unknown_option(unknown[0], args)}", file=sys.stderr)
+        return USAGE_EXIT
     try:
         return args.run(args)
     except MinislamError as error:
         print(f"minislam: {error}", file=sys.stderr)
-        return 1
+        return FAILED_EXIT
     except KeyboardInterrupt:
         print("minislam: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED_EXIT
+
+
+def _unknown_option(found: str, args: argparse.Namespace) -> str:
+    settings = [name.replace("set:", "--") for name in vars(args) if name.startswith("set:")]
+    near = difflib.get_close_matches(found.partition("=")[0], settings, n=1)
+    hint = f"the nearest setting is {near[0]}" if near else "see minislam COMMAND --help"
+    return f"expected a known option, found {found}; {hint}"
 
 
 def _parser(arguments: list[str]) -> argparse.ArgumentParser:
@@ -41,12 +62,20 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     demo = commands.add_parser(
-        "demo", help="make a synthetic clip with moving people and run everything on it"
+        "demo",
+        help="make a synthetic clip with moving people and run everything on it",
+        usage="minislam demo [-o OUTPUT] [options]",
+        allow_abbrev=False,
     )
     demo.add_argument("-o", "--output", default="output/demo", help="run folder, output/demo")
     demo.set_defaults(run=_demo, sequence=DEMO_SEQUENCE, overwrite=True, depth="simulated")
 
-    run = commands.add_parser("run", help="run SLAM on a video, an image folder or a benchmark")
+    run = commands.add_parser(
+        "run",
+        help="run SLAM on a video, an image folder or a benchmark",
+        usage="minislam run SEQUENCE [-o OUTPUT] [options]",
+        allow_abbrev=False,  # half a setting's name might be another setting tomorrow
+    )
     run.add_argument("sequence", help="video file, image folder, TUM folder or synth:NAME[:SEED]")
     run.add_argument("-o", "--output", help="run folder, default output/NAME_TIME")
     run.add_argument("--overwrite", action="store_true", help="replace an earlier run")
@@ -72,7 +101,9 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
     for name in ("fx", "fy", "cx", "cy"):
         group.add_argument(f"--{name}", type=float, help="of the raw images [px]")
     group.add_argument("--calibration", help="file: fx fy cx cy [width height [k1 k2 p1 p2 k3]]")
-    group.add_argument("--depth-scale", type=float, default=5000, help="depth units per metre, 5000")
+    group.add_argument(
+        "--depth-scale", type=float, default=5000, help="depth units per metre, 5000"
+    )
     group.add_argument(
         "--depth",
         help="depth prior: none, simulated (synthetic sequences), sensor, files:FOLDER; "
@@ -106,7 +137,7 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _settings(args: argparse.Namespace):
+def _settings(args: argparse.Namespace) -> SlamConfig:
     """Return the configuration: preset, then file, then single settings, each over the last."""
     from minislam.config import flattened, preset, with_settings
     from minislam.data.files import read_json
@@ -142,22 +173,35 @@ def _run(args: argparse.Namespace) -> int:
     return _run_with(args, options, args.output)
 
 
-def _run_with(args: argparse.Namespace, options, output: str | None) -> int:
+def _run_with(args: argparse.Namespace, options: InputOptions, output: str | None) -> int:
+    with StopRequest() as stop:
+        return _run_until(stop, args, options, output)
+
+
+def _run_until(
+    stop: StopRequest, args: argparse.Namespace, options: InputOptions, output: str | None
+) -> int:
     from minislam.data import RunFolder, open_sequence
-    from minislam.run import run_sequence
+    from minislam.run import choose_depth, run_sequence
 
     config = _settings(args)
     progress = ProgressLine()
+
+    def report(stage: str, done: int, of_all: int) -> None:
+        progress.show(stage, done, of_all)
+        stop.check()
+
     sequence = open_sequence(
-        args.sequence, options, lambda done, of_all: progress.show("making frames", done, of_all)
+        args.sequence, options, lambda done, of_all: report("making frames", done, of_all)
     )
     depth = args.depth or ("simulated" if args.sequence.startswith("synth:") else "none")
     output = output or f"output/{sequence.name}_{time.strftime('%Y%m%d-%H%M%S')}"
     print(sequence.description)
     for warning in sequence.warnings:
         print(f"WARNING: {warning}", file=sys.stderr)
+    choose_depth(depth, sequence, config)  # a wrong name must not cost an earlier run its files
     folder = RunFolder.create(output, args.overwrite)
-    outcome = run_sequence(sequence, config, depth, folder, progress.show)
+    outcome = run_sequence(sequence, config, depth, folder, report)
     print(f"{outcome.state}:")
     for name, value in outcome.metrics.items():
         print(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
@@ -168,60 +212,25 @@ def _run_with(args: argparse.Namespace, options, output: str | None) -> int:
     return outcome.exit_code
 
 
-class ProgressLine:
-    """One line per stage with rate and time left; off a terminal, a plain line every 10 %."""
-
-    def __init__(self) -> None:
-        self._stage, self._start, self._shown = "", 0.0, 0.0
-        self._terminal = sys.stderr.isatty()
-
-    def show(self, stage: str, done: int, of_all: int) -> None:
-        """Report that `done` of all steps of a stage are done."""
-        now = time.perf_counter()
-        if stage != self._stage:
-            self._stage, self._start, self._shown = stage, now, 0.0
-        finished = done >= of_all
-        if self._terminal:
-            end = "\n" if finished else ""
-            print(f"\r\033[K{self._text(done, of_all, now)}", end=end, file=sys.stderr, flush=True)
-        elif finished or done / of_all >= self._shown + PLAIN_STEP:
-            self._shown = done / of_all
-            print(self._text(done, of_all, now), file=sys.stderr, flush=True)
-
-    def _text(self, done: int, of_all: int, now: float) -> str:
-        elapsed = max(now - self._start, 1e-6)
-        rate = done / elapsed
-        left = (of_all - done) / rate if rate else 0.0
-        times = f"{rate:.1f}/s, {left:.0f} s left" if done < of_all else f"{elapsed:.0f} s"
-        return f"{self._stage}: {done}/{of_all} ({times})"
-
-
 def _doctor(args: argparse.Namespace) -> int:
-    """Print versions and threads, and render and track something small."""
+    """Print versions and threads, and measure a flow that is known."""
     import platform
 
-    import cv2
-    import matplotlib
-    import numpy as np
-    import scipy
     import torch
 
     print(f"minislam {minislam.__version__}, Python {platform.python_version()}")
-    for name, module in (
-        ("numpy", np), ("scipy", scipy), ("torch", torch), ("opencv", cv2),
-        ("matplotlib", matplotlib),
-    ):  # fmt: skip
-        print(f"  {name:11s} {module.__version__}")
+    for name in ("numpy", "scipy", "torch", "cv2", "matplotlib"):
+        print(f"  {name:11s} {importlib.import_module(name).__version__}")
     print(f"  processors  {os.cpu_count()}, torch uses {torch.get_num_threads()} threads")
     print(f"  CUDA        {torch.cuda.get_device_name() if torch.cuda.is_available() else 'none'}")
     start = time.perf_counter()
     error = _self_test()
     seconds = time.perf_counter() - start
     print(f"  self-test   flow of a shifted image, off by {error:.3f} px, {seconds:.1f} s")
-    if error > 0.1:
+    if not error <= MAX_SELF_TEST_ERROR:
         raise MinislamError(
-            f"expected the self-test to be exact to 0.1 px, found {error:.3f} px; reinstall "
-            "opencv-python-headless"
+            f"expected the self-test to be exact to {MAX_SELF_TEST_ERROR} px, found "
+            f"{error:.3f} px; reinstall opencv-python-headless"
         )
     return 0
 
@@ -238,7 +247,9 @@ def _self_test() -> float:
     image = smooth[0].permute(1, 2, 0).clamp(0, 1)
     _, matches = ClassicalFlow().start_chain(image[:240, :320]).advanced(image[4:244, 8:328])
     rows, columns = matches.targets.shape[1:3]
-    start = torch.stack(torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), -1)
+    start = torch.stack(
+        torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), -1
+    )
     flow = matches.targets[0] - 8 * start
     middle = flow[8:-8, 8:-8].reshape(-1, 2).median(0).values
     return float((middle - torch.tensor([-8.0, -4.0])).norm())

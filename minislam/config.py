@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
@@ -97,7 +98,7 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
 
 
 def _converted(name: str, value: Any, present: Any) -> Any:
-    """Return a value (a JSON value, or text from the command line) in the type of the present one."""
+    """Return a value, from JSON or as text of the command line, in the type of the present one."""
     kind = type(present)
     try:
         if kind is bool:
@@ -106,10 +107,13 @@ def _converted(name: str, value: Any, present: Any) -> Any:
         if kind is tuple:
             parts = value.split(",") if isinstance(value, str) else value
             return tuple(type(present[0])(part) for part in parts)
-        if kind is int and not isinstance(value, str) and int(value) != value:
+        converted = kind(value)
+        # int(2.5) and float("nan") succeed, but nobody means them.
+        is_wrong = isinstance(value, bool) or not math.isfinite(converted)
+        if is_wrong or (not isinstance(value, str) and converted != value):
             raise ValueError
-        return kind(value)
-    except (KeyError, TypeError, ValueError):
+        return converted
+    except (KeyError, OverflowError, TypeError, ValueError):
         raise InputError(
             f"expected {name} to be of type {kind.__name__} like {present!r}, found {value!r}"
         ) from None
@@ -127,6 +131,11 @@ def from_json(tree: dict[str, Any]) -> SlamConfig:
 
 def flattened(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested dictionaries as one, under names with dots."""
+    if not isinstance(tree, dict):
+        raise InputError(
+            f"expected settings as a JSON object, found {type(tree).__name__}; write "
+            '{"tracking": {"window": 8}} or {"tracking.window": 8}'
+        )
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, dict):

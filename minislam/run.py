@@ -13,7 +13,7 @@ import torch
 import minislam
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
-from minislam.errors import InputError
+from minislam.errors import InputError, MinislamError
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.run import MAX_DIFFERENCE, MappedView, measure_run
 from minislam.geometry import se3_inverse
@@ -37,7 +37,7 @@ from minislam.viz import (
 )
 
 MAX_STRIPS = 6  # keyframes shown in the report
-LOST_EXIT, INTERRUPTED_EXIT = 3, 130  # exit codes of a run that is not whole
+FAILED_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 3, 130  # exit codes of a run that is not whole
 
 
 @dataclass(frozen=True)
@@ -81,46 +81,54 @@ def run_sequence(
     """Run SLAM on a sequence and write the run folder, also when it is interrupted."""
     torch.set_num_threads(config.threads)
     start = time.perf_counter()
-    folder.write_config(as_json(config))
     flow, features = ClassicalFlow(config.flow), ClassicalFeatures(config=config.features)
     priors = Priors(flow, features, choose_depth(depth, sequence, config))
+    folder.write_config(as_json(config))
     slam = Slam(sequence, config, priors, report)
     interrupted = False
     try:
         slam.run()
     except KeyboardInterrupt:
-        if not slam.tracker.initialised:
-            raise  # there is nothing to save yet
         interrupted = True
+        if not slam.mapper.keyframes:  # there is nothing to save yet
+            folder.write_run(_facts(slam, depth, start, "interrupted", INTERRUPTED_EXIT))
+            raise
+    except MinislamError as error:
+        folder.write_run(_facts(slam, depth, start, f"failed: {error}", FAILED_EXIT))
+        raise
     seconds = time.perf_counter() - start
     lost = slam.lost_frames()
     state = "finished, partly lost" if lost else "finished"
     exit_code = LOST_EXIT if lost else 0
     if interrupted:
         state, exit_code = "interrupted", INTERRUPTED_EXIT
+    facts = _facts(slam, depth, start, state, exit_code)
     _write_estimates(folder, slam)
     metrics = _measure(slam, seconds)
     folder.write_metrics(metrics)
-    outcome = RunOutcome(metrics, _warnings(slam), exit_code, state)
+    outcome = RunOutcome(metrics, facts["warnings"], exit_code, state)
     _write_pictures(folder, slam, outcome)
-    folder.write_run(
-        {
-            "version": minislam.__version__,
-            "command": sys.argv,
-            "sequence": sequence.description,
-            "depth": depth,
-            "seed": config.seed,
-            "state": state,
-            "exit_code": exit_code,
-            "warnings": outcome.warnings,
-            "seconds": {"total": seconds, **slam.seconds},
-            "frames": len(slam.tracker.tracked),
-            "keyframes": len(slam.tracker.keyframes),
-            "lost_frames": len(lost),
-            "gaussians": len(slam.mapper.gaussians),
-        }
-    )
+    folder.write_run(facts)
     return outcome
+
+
+def _facts(slam: Slam, depth: str, start: float, state: str, exit_code: int) -> dict[str, Any]:
+    """Return what run.json says: how the run was asked for, how long it took, how it ended."""
+    return {
+        "version": minislam.__version__,
+        "command": sys.argv,
+        "sequence": slam.sequence.description,
+        "depth": depth,
+        "seed": slam.config.seed,
+        "state": state,
+        "exit_code": exit_code,
+        "warnings": _warnings(slam),
+        "seconds": {"total": time.perf_counter() - start, **slam.seconds},
+        "frames": len(slam.tracker.tracked),
+        "keyframes": len(slam.tracker.keyframes),
+        "lost_frames": len(slam.lost_frames()),
+        "gaussians": len(slam.mapper.gaussians),
+    }
 
 
 def _write_estimates(folder: RunFolder, slam: Slam) -> None:
@@ -136,7 +144,7 @@ def _write_estimates(folder: RunFolder, slam: Slam) -> None:
 def _measure(slam: Slam, seconds: float) -> dict[str, Any]:
     views = [
         MappedView(
-            keyframe.frame_index,
+            _frame_index(slam, index),
             se3_inverse(keyframe.T_camera_world).numpy(),
             _beta_image(slam, index) if slam.config.uncertainty.enabled else None,
         )
@@ -159,6 +167,12 @@ def _measure(slam: Slam, seconds: float) -> dict[str, Any]:
 def _rendered(slam: Slam, T_world_camera: np.ndarray) -> np.ndarray:
     pose = se3_inverse(torch.from_numpy(T_world_camera))
     return slam.mapper.render(pose).color.clamp(0, 1).numpy()
+
+
+def _frame_index(slam: Slam, index: int) -> int:
+    """Return which frame a keyframe of the map is."""
+    keyframe_index = slam.mapper.keyframes[index].keyframe_index
+    return slam.tracker.keyframes.frames[keyframe_index].frame_index
 
 
 def _beta_image(slam: Slam, index: int) -> np.ndarray:
@@ -202,7 +216,7 @@ def _write_pictures(folder: RunFolder, slam: Slam, outcome: RunOutcome) -> None:
         rendering = slam.mapper.render(keyframe.T_camera_world)
         image, beta = keyframe.image.numpy(), _beta_image(slam, index)
         color, depth = rendering.color.clamp(0, 1).numpy(), rendering.depth.numpy()
-        number = keyframe.frame_index
+        number = _frame_index(slam, index)
         folder.write_keyframe_image(number, "input", image)
         folder.write_keyframe_image(number, "render", color)
         folder.write_keyframe_image(number, "depth", depth_to_rgb(depth))

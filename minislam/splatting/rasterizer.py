@@ -93,8 +93,18 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, means, quats, scales, opacities, colors, twist, offsets2d, T, background, camera
-    ):
+        ctx,
+        means: Tensor,  # (N, 3)
+        quats: Tensor,  # (N, 4) wxyz, raw
+        scales: Tensor,  # (N, 3)
+        opacities: Tensor,  # (N,)
+        colors: Tensor,  # (N, 3)
+        twist: Tensor | None,  # (6,)
+        offsets2d: Tensor | None,  # (N, 2) px
+        T: Tensor,  # (4, 4) camera_world
+        background: Tensor,  # (4,) RGB and depth
+        camera: Camera,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         if twist is not None and twist.any():
             T = se3_exp(twist).to(T) @ T
         with _denormals_flushed():
@@ -112,7 +122,14 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_color, v_depth, v_opacity, _v_radii, _v_contribution):
+    def backward(
+        ctx,
+        v_color: Tensor,  # (H, W, 3)
+        v_depth: Tensor,  # (H, W)
+        v_opacity: Tensor,  # (H, W)
+        _v_radii: Tensor,
+        _v_contribution: Tensor,
+    ) -> tuple[Tensor | None, ...]:
         ellipses, composited, T, background, camera, count, twist = ctx.state
         needs_means, needs_quats, needs_scales, needs_opacities, needs_colors = (
             ctx.needs_input_grad[:5]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from minislam.tracking.backend import BackEnd
-from minislam.tracking.reprojection import relative_transforms, scaled_points, reproject
+from minislam.tracking.reprojection import relative_transforms, reproject, scaled_points
 
 MIN_AGREEING_VIEWS = 2  # other keyframes that must see a point at the same depth
 NEIGHBOURS = 4  # keyframes on either side that are asked
@@ -46,10 +46,11 @@ def depth_from_disparities(backend: BackEnd, keyframe_index: int) -> Tensor:  # 
     needed = min(MIN_AGREEING_VIEWS, len(keyframes) - 1)
     agreed = (agreeing_views(backend, keyframe_index) >= needed).reshape(grid.shape).numpy()
     trusted = keyframes.static_weights[keyframe_index].reshape(grid.shape).numpy() > 0
-    largest = cv2.dilate(disparities, np.ones((2, 2), np.uint8), anchor=(0, 0))
-    smallest = cv2.erode(disparities, np.ones((2, 2), np.uint8), anchor=(0, 0))
+    square = np.ones((2, 2), np.uint8)
+    largest = cv2.dilate(disparities, square, anchor=(0, 0))
+    smallest = cv2.erode(disparities, square, anchor=(0, 0))
     smooth = largest < EDGE_RATIO * smallest
-    usable = cv2.erode((agreed & trusted).astype(np.uint8), np.ones((2, 2), np.uint8), anchor=(0, 0))
+    usable = cv2.erode((agreed & trusted).astype(np.uint8), square, anchor=(0, 0))
     known = (usable > 0) & smooth  # of the square between a cell and its right and lower ones
 
     column, row = np.meshgrid(

@@ -29,8 +29,8 @@ def pose_all_frames(
     A keyframe keeps its pose. Another frame starts from the interpolated one and is adjusted on
     the flow from the keyframe before and the keyframe after it, their structure held.
     """
-    frames = tracker.keyframes.frames
-    poses = {f.frame_index: T for f, T in zip(frames, tracker.keyframes.T_camera_world, strict=True)}
+    frames, known = tracker.keyframes.frames, tracker.keyframes.T_camera_world
+    poses = {frame.frame_index: T for frame, T in zip(frames, known, strict=True)}
     others = [
         t for t in tracker.tracked if t.status is TrackingStatus.OK and t.frame_index not in poses
     ]
