@@ -31,6 +31,9 @@ MAX_SELF_TEST_ERROR = 0.1  # px
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
+    # What OpenCV and FFmpeg would print about a damaged file, our own sentence says better.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     args, unknown = _parser(arguments).parse_known_args(arguments)
     if unknown:

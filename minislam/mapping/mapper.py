@@ -93,8 +93,8 @@ class Mapper:
         depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in keyframes])
         if len(depths) == 0:
             raise InputError(
-                "expected some known depth in the first keyframes, found none; give a depth "
-                "prior, or let the tracker's disparities reach the mapper"
+                "expected some known depth in the first keyframes, found none; the images hold "
+                "too little texture or parallax: move the camera more, or give a depth prior"
             )
         self.median_depth = float(depths.median())
         if self.config.mean_background:

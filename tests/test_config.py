@@ -1,0 +1,146 @@
+"""The one tree of settings: presets, names with dots, JSON, and what a wrong value is told."""
+
+import json
+from dataclasses import fields, is_dataclass
+
+import pytest
+
+from minislam.config import (
+    PRESETS,
+    SlamConfig,
+    as_json,
+    flattened,
+    from_json,
+    meanings_of,
+    preset,
+    settings_of,
+    with_settings,
+)
+from minislam.errors import InputError
+
+CHANGED = {
+    "seed": 7,
+    "tracking.window": 4,
+    "tracking.final_prior": True,
+    "mapping.insertion.cell": 5,
+    "mapping.image_scale": 0.25,
+    "uncertainty.enabled": False,
+    "features.windows": (1, 7),
+}
+
+
+# Known answers
+
+
+def test_laptop_is_the_default_tree():
+    assert preset("laptop") == SlamConfig()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_sets_what_it_says_and_nothing_else(name: str):
+    expected = settings_of(SlamConfig()) | PRESETS[name]
+    assert settings_of(preset(name)) == expected
+
+
+def test_settings_of_deeper_parts_are_named_with_more_dots():
+    names = settings_of(SlamConfig())
+    assert {"seed", "tracking.window", "mapping.insertion.cell"} <= set(names)
+    assert not any(is_dataclass(value) for value in names.values())
+
+
+def test_every_setting_says_what_it_means():
+    meanings = meanings_of(SlamConfig())
+    assert set(meanings) == set(settings_of(SlamConfig()))
+    assert [name for name, meaning in meanings.items() if len(meaning) < 8] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("tracking.window", "12", 12),
+        ("tracking.keyframe_flow", "7.5", 7.5),
+        ("tracking.keyframe_flow", 7, 7.0),
+        ("tracking.window", 12.0, 12),
+        ("uncertainty.enabled", "off", False),
+        ("uncertainty.enabled", "True", True),
+        ("tracking.final_prior", "1", True),
+        ("features.windows", "1,5,9", (1, 5, 9)),
+        ("features.windows", [1, 5], (1, 5)),
+    ],
+)
+def test_text_and_json_values_take_the_type_of_the_setting(name: str, text: object, value: object):
+    found = settings_of(with_settings(SlamConfig(), {name: text}))[name]
+    assert found == value and type(found) is type(value)
+
+
+# Identities
+
+
+def test_the_json_form_comes_back_the_same():
+    config = with_settings(SlamConfig(), CHANGED)
+    text = json.dumps(as_json(config))
+    assert from_json(json.loads(text)) == config
+
+
+def test_names_with_dots_and_nested_names_mean_the_same():
+    nested = {"tracking": {"window": 4}, "mapping": {"insertion": {"cell": 5}}}
+    assert flattened(nested) == {"tracking.window": 4, "mapping.insertion.cell": 5}
+    assert from_json(nested) == with_settings(SlamConfig(), flattened(nested))
+
+
+def test_a_changed_copy_leaves_the_original_alone():
+    config = SlamConfig()
+    with_settings(config, CHANGED)
+    assert config == SlamConfig()
+
+
+def test_what_is_left_out_keeps_its_default():
+    assert from_json({}) == SlamConfig()
+
+
+def test_all_parts_are_frozen():
+    config = SlamConfig()
+    parts = [getattr(config, entry.name) for entry in fields(config)]
+    for part in [config, *(part for part in parts if is_dataclass(part))]:
+        assert type(part).__dataclass_params__.frozen
+
+
+# Errors
+
+
+def test_an_unknown_name_is_answered_with_the_nearest():
+    with pytest.raises(InputError, match=r"'tracking.windw'; the nearest is tracking\.window"):
+        with_settings(SlamConfig(), {"tracking.windw": 3})
+    with pytest.raises(InputError, match=r"'mapping.insertion.cel'; .* mapping\.insertion\.cell"):
+        from_json({"mapping": {"insertion": {"cel": 3}}})
+
+
+def test_an_unknown_preset_is_answered_with_all():
+    with pytest.raises(InputError, match="laptop, test, found 'desktop'"):
+        preset("desktop")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("tracking.window", "many"),
+        ("tracking.window", 2.5),
+        ("tracking.window", None),
+        ("tracking.window", True),
+        ("tracking.window", float("inf")),
+        ("tracking.keyframe_flow", "nan"),
+        ("tracking.keyframe_flow", "1,5"),
+        ("uncertainty.enabled", "maybe"),
+        ("features.windows", "one,two"),
+        ("features.windows", 3),
+    ],
+)
+def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):
+    with pytest.raises(InputError, match=f"expected {name} to be of type .*, found"):
+        with_settings(SlamConfig(), {name: value})
+
+
+@pytest.mark.parametrize("tree", [[1, 2], "tracking", None, 3])
+def test_settings_that_are_no_object_are_an_error(tree: object):
+    with pytest.raises(InputError, match="as a JSON object"):
+        flattened(tree)
