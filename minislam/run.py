@@ -176,7 +176,10 @@ def _frame_index(slam: Slam, index: int) -> int:
 
 
 def _beta_image(slam: Slam, index: int) -> np.ndarray:
+    """Return beta (H, W) of a keyframe; without uncertainty every pixel is trusted alike."""
     camera = slam.sequence.camera
+    if not slam.config.uncertainty.enabled:
+        return np.ones((camera.height, camera.width), np.float32)
     beta = slam.mapper.predict_beta(slam.mapper.keyframes[index].features)
     return resample(beta, camera.height, camera.width).numpy()
 
@@ -189,7 +192,7 @@ def _warnings(slam: Slam) -> list[str]:
             f"{lost} of {len(slam.tracker.tracked)} frames could not be followed and have no "
             "pose; lost_frames.txt lists them"
         )
-    if not slam.tracker.has_prior:
+    if not slam.tracker.keyframes.has_prior:
         warnings.append("without a depth prior the unit of length is arbitrary")
     return warnings
 
