@@ -113,7 +113,7 @@ class Slam:
         """Carry the map along with keyframes that an adjustment has moved."""
         mapped = len(self.mapper.keyframes)
         depths: list[Tensor | None] | None = None
-        if not self.tracker.has_prior:
+        if not self.tracker.keyframes.has_prior:
             depths = [None] * first_changed
             depths += [self._depth(index) for index in range(first_changed, mapped)]
         self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped], depths)

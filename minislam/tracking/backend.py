@@ -1,6 +1,7 @@
 """The back-end: keyframes, the graph between them, and their adjustment (Eq. 5)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -27,6 +28,9 @@ from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import relative_transforms, reproject
 
 REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that the thresholds in px belong to
+# A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
+# correct would look like outliers. So the weight is wide at first. [-]
+FIRST_WIDENING = 8.0
 HORIZON = 3  # windows of keyframes among which a new one looks for proximity links
 
 
@@ -40,8 +44,23 @@ class BackEnd:
         self.graph = FrameGraph()
         self.reports: list[BundleReport] = []
         self.pixel_scale = (camera.width**2 + camera.height**2) ** 0.5 / REFERENCE_DIAGONAL
-        self.robust_scale = config.robust_scale * self.pixel_scale or None
         self.flow = flow
+
+    @property
+    def robust_scale(self) -> float | None:
+        """Return the width of the Cauchy weight [px], None for plain least squares."""
+        config = self.config
+        known = self.keyframes.has_prior
+        scale = config.robust_scale if known else config.robust_scale_without_prior
+        return scale * self.pixel_scale or None
+
+    @property
+    def keyframe_flow(self) -> float:
+        """Return the mean flow that makes a keyframe [px]."""
+        config = self.config
+        known = self.keyframes.has_prior
+        flow = config.keyframe_flow if known else config.keyframe_flow_without_prior
+        return flow * self.pixel_scale
 
     def adjust_newest(self, steps: list[FlowMatches]) -> None:
         """Link the newest keyframe with its like and adjust the window around it.
@@ -52,7 +71,7 @@ class BackEnd:
         count = len(self.keyframes)
         first_free = max(0, count - self.config.window)
         self.match_from_chain(steps, count - 1)
-        self.adjust(first_free, self.config.iterations)
+        self.adjust(first_free, self.config.iterations, widening=FIRST_WIDENING)
         edges = neighbourhood_edges(count - 1, count, self.config.neighbourhood)
         edges += self._proximity_links(count - 1)
         for _ in range(self.config.rounds):
@@ -131,20 +150,24 @@ class BackEnd:
         first_free: int,  # keyframes from here on move
         iterations: int,
         lambda_prior: float | None = None,  # None: as configured
+        widening: float = 1.0,  # of the robust weight
     ) -> None:
         """Run a bundle adjustment over the edges that touch the free keyframes."""
         problem = self.problem(self.graph.select(first_free), first_free, lambda_prior)
+        if self.robust_scale:
+            problem = replace(problem, robust_scale=widening * self.robust_scale)
         state, report = bundle_adjust(problem, self.state, iterations)
         self.state = state
         self.reports.append(report)
 
     @property
     def state(self) -> BundleState:
-        """Return poses and disparities of all keyframes."""
+        """Poses and disparities of all keyframes."""
         return BundleState(self.keyframes.T_camera_world, self.keyframes.disparities)
 
     @state.setter
     def state(self, state: BundleState) -> None:
+        """Take over poses and disparities of all keyframes."""
         self.keyframes.T_camera_world = state.T_camera_world
         self.keyframes.disparities = state.disparities
 

@@ -10,6 +10,9 @@ class TrackingConfig:
     """Lengths in px belong to a 320x240 image and are scaled with the image diagonal."""
 
     keyframe_flow: float = parameter(10.0, "mean flow since the last keyframe that makes one [px]")
+    keyframe_flow_without_prior: float = parameter(
+        18.0, "the same where no depth prior is known and depth needs parallax [px]"
+    )
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement"
     )
@@ -27,6 +30,11 @@ class TrackingConfig:
     iterations: int = parameter(3, "Gauss-Newton steps per round")
     robust_scale: float = parameter(
         1.0, "width of the Cauchy weight inside Sigma [px]; 0: plain least squares"
+    )
+    robust_scale_without_prior: float = parameter(
+        4.0,
+        "the same without a depth prior: a narrow weight would take for an outlier what is still "
+        "to be corrected [px]",
     )
     lambda_disparity_prior: float = parameter(
         0.0005,

@@ -21,6 +21,11 @@ class KeyframeStore:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @property
+    def has_prior(self) -> bool:
+        """Tell whether any keyframe came with a depth prior."""
+        return any(depth is not None for depth in self.metric_depths)
+
     def append(
         self,
         frame: Frame,

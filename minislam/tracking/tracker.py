@@ -65,7 +65,6 @@ class Tracker:
         self.grid = self.backend.grid
         self.tracked: list[TrackedFrame] = []
         self.initialised = False
-        self.has_prior = False
         self._features, self._depth_prior = features, depth_prior
         self._predict_static_weight = predict_static_weight
         self._chain: FlowChain | None = None
@@ -110,12 +109,12 @@ class Tracker:
         lengths = (matches.targets.reshape(-1, 2) - self.grid.pixels).norm(dim=1)
         confidence = matches.confidences.reshape(-1, 2)[:, 0]
         mean_flow = float((confidence * lengths).sum() / confidence.sum())
-        if mean_flow > self.config.keyframe_flow * self.backend.pixel_scale:
+        if mean_flow > self.backend.keyframe_flow:
             return True
         if float(matches.matched_shares) < self.config.keyframe_share:
             return True
         # Without a depth prior the first keyframes need parallax more than they need each other.
-        may_force = self.initialised or self.has_prior
+        may_force = self.initialised or self.keyframes.has_prior
         elapsed = frame.frame_index - self.keyframes.frames[-1].frame_index
         return may_force and elapsed >= self.config.keyframe_interval
 
@@ -142,7 +141,6 @@ class Tracker:
         metric_depth = self._depth_prior(frame, self.grid.camera)
         prior = torch.zeros_like(carried)
         if metric_depth is not None:
-            self.has_prior = True
             depth = metric_depth[:: self.grid.stride, :: self.grid.stride].reshape(-1)
             prior = torch.where(depth > 0, depth.clamp_min(1e-6).reciprocal(), prior)
         disparities = torch.where(prior > 0, prior, carried)
@@ -179,7 +177,7 @@ class Tracker:
         self.initialised = True
         both_ways = neighbourhood_edges(0, count, self.config.neighbourhood)
         self._warm_up(both_ways, self.config.warmup_rounds)
-        if not self.has_prior:
+        if not self.keyframes.has_prior:
             self.backend.normalise_scale()
 
     def refine_initialisation(self) -> None:
