@@ -70,12 +70,13 @@ class Slam:
 
     def run(self) -> None:
         """Process the sequence from the first frame to the final map."""
+        warmup = self.config.tracking.warmup_keyframes
         for done, frame in enumerate(self.sequence):
             with self._timed("tracking"):
                 is_keyframe = self.tracker.track(frame)
             if is_keyframe and self.tracker.initialised:
                 self._map_new_keyframes()
-            elif is_keyframe and len(self.tracker.keyframes) >= self.config.tracking.warmup_keyframes:
+            elif is_keyframe and len(self.tracker.keyframes) >= warmup:
                 self._initialise()
             self._report("tracking and mapping", done + 1, len(self.sequence))
         if not self.tracker.initialised:

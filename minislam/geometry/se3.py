@@ -29,9 +29,7 @@ def _rotation_coefficients(angle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     b = torch.where(
         small, 0.5 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56))), (1 - t.cos()) / t**2
     )
-    c = torch.where(
-        small, (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72))) / 6, (t - t.sin()) / t**3
-    )
+    c = torch.where(small, (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72))) / 6, (t - t.sin()) / t**3)
     return a, b, c
 
 

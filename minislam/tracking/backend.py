@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
@@ -228,7 +227,9 @@ class BackEnd:
             self.grid.camera,
             self.config.rotation_share,
         )
-        taken = [(i - start, j - start) for i, j in self.graph.edges() + edges if min(i, j) >= start]
+        taken = [
+            (i - start, j - start) for i, j in self.graph.edges() + edges if min(i, j) >= start
+        ]
         shifted = range(newer.start - start, newer.stop - start)
         pairs = proximity_pairs(distances, taken, shifted, limit, links)
         return [(i + start, j + start) for i, j in pairs]

@@ -197,7 +197,10 @@ def _assemble_poses(
     slots = _pose_slots(problem)
     count = int(problem.free_poses.sum())
     # One extra slot collects what belongs to fixed poses and is cut off afterwards.
-    source, target = slots[problem.edges_source] % (count + 1), slots[problem.edges_target] % (count + 1)
+    source, target = (
+        slots[problem.edges_source] % (count + 1),
+        slots[problem.edges_target] % (count + 1),
+    )
     A_source = -adjoint.mT @ A  # rows of the source, columns of the target
     H = torch.zeros((count + 1) ** 2, 6, 6, dtype=torch.float64)
     width = count + 1

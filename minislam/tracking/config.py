@@ -16,7 +16,7 @@ class TrackingConfig:
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement"
     )
-    warmup_keyframes: int = parameter(12, "keyframes of the two-stage initialisation, paper Sec. 3.3")
+    warmup_keyframes: int = parameter(12, "keyframes of the two-stage start, paper Sec. 3.3")
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     window: int = parameter(10, "newest keyframes that the local BA moves")

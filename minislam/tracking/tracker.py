@@ -24,7 +24,6 @@ from minislam.tracking.initialisation import (
     best_hypothesis,
     carry_disparities,
     chain_state,
-    compose_matches,
     first_disparity_hypotheses,
     start_pose,
 )
