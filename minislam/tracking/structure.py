@@ -23,6 +23,8 @@ def agreeing_views(backend: BackEnd, keyframe_index: int) -> Tensor:  # (N,) int
     count = len(keyframes)
     low, high = max(0, keyframe_index - NEIGHBOURS), min(count, keyframe_index + NEIGHBOURS + 1)
     others = [k for k in range(low, high) if k != keyframe_index]
+    if not others:
+        return torch.zeros(len(grid.rays), dtype=torch.int64)
     sources = [keyframe_index] * len(others)
     disparities = keyframes.disparities[sources]
     transforms = relative_transforms(keyframes.T_camera_world, sources, others).float()

@@ -20,7 +20,7 @@ from minislam.tracking.tracker import Tracker, TrackingStatus
 SIZE = (160, 120)
 FRAMES = 30
 # Five keyframes in thirty frames; the flow is that of a 320x240 image.
-CONFIG = TrackingConfig(warmup_keyframes=3, keyframe_flow=8.0)
+CONFIG = TrackingConfig(warmup_keyframes=3, keyframe_flow=8.0, keyframe_flow_without_prior=8.0)
 WHERE_LOST = 17  # a frame after the warm-up
 
 

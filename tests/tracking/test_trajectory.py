@@ -1,0 +1,94 @@
+"""Poses between the keyframes: the constant twist, and its correction on exact flow."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from helpers import random_transforms
+from torch import Tensor
+
+from minislam.geometry import se3_exp, se3_inverse, se3_log
+from minislam.tracking.tracker import TrackedFrame, TrackingStatus
+from minislam.tracking.trajectory import interpolate_pose, pose_all_frames
+from tests.tracking.wall import FRAMES, back_end, true_poses, wall_frame
+
+KEYFRAMES = [0, 3, 5, 8]
+LOST = 6
+
+
+def posed(progress=None) -> dict[int, Tensor]:
+    """Return the poses of twelve frames, four of which are keyframes and one of which is lost."""
+    backend = back_end(KEYFRAMES)
+    tracked = [
+        TrackedFrame(
+            number, 0.1 * number, TrackingStatus.LOST if number == LOST else TrackingStatus.OK, 1.0
+        )
+        for number in range(FRAMES)
+    ]
+    tracker = SimpleNamespace(keyframes=backend.keyframes, backend=backend, tracked=tracked)
+    poses = pose_all_frames(tracker, SimpleNamespace(frame=wall_frame), progress)
+    assert set(backend.flow.numbers) == set(range(len(KEYFRAMES)))  # nothing left behind
+    return poses
+
+
+# Known answers
+
+
+def test_half_way_of_a_shift_is_half_the_shift():
+    first, second = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+    second[:3, 3] = torch.tensor([2.0, -4.0, 6.0])
+    half = interpolate_pose(first, second, 0.5)
+    torch.testing.assert_close(half[:3, 3], torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
+
+
+def test_every_frame_that_was_not_lost_has_its_true_pose():
+    poses, truth = posed(), true_poses()
+    assert list(poses) == [number for number in range(FRAMES) if number != LOST]
+    for number, pose in poses.items():
+        error = se3_log(pose @ se3_inverse(truth[number])).norm()
+        assert error < 1e-4, (number, float(error))
+
+
+def test_it_is_the_flow_that_says_so():
+    # Interpolation alone is off by more: the path is unsteady.
+    truth = true_poses()
+    guess = interpolate_pose(truth[5], truth[8], 2 / 3)
+    assert se3_log(guess @ se3_inverse(truth[7])).norm() > 1e-2
+
+
+def test_keyframes_keep_their_poses_to_the_bit():
+    poses, truth = posed(), true_poses()
+    assert all(torch.equal(poses[number], truth[number]) for number in KEYFRAMES)
+
+
+def test_progress_counts_the_frames_that_are_not_keyframes():
+    calls = []
+    posed(lambda done, of_all: calls.append((done, of_all)))
+    count = FRAMES - len(KEYFRAMES) - 1
+    assert calls == [(done, count) for done in range(1, count + 1)]
+
+
+# Identities
+
+
+@pytest.mark.parametrize("regime", ["normal", "tiny"])
+def test_interpolation_ends_where_it_should_and_walks_evenly(regime: str):
+    first, second = random_transforms(2, regime, 0)
+    torch.testing.assert_close(interpolate_pose(first, second, 0.0), first)
+    torch.testing.assert_close(interpolate_pose(first, second, 1.0), second)
+    quarter = interpolate_pose(first, second, 0.25)
+    half = interpolate_pose(first, second, 0.5)
+    torch.testing.assert_close(interpolate_pose(first, half, 0.5), quarter)
+
+
+def test_interpolation_does_not_depend_on_the_choice_of_the_world():
+    first, second, other_world = random_transforms(3, "normal", 1)
+    moved = interpolate_pose(first @ other_world, second @ other_world, 0.3)
+    torch.testing.assert_close(moved, interpolate_pose(first, second, 0.3) @ other_world)
+
+
+def test_a_constant_twist_is_followed_exactly():
+    xi = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.4, -0.2], dtype=torch.float64)
+    start = random_transforms(1, "normal", 2)[0]
+    end = se3_exp(xi) @ start
+    torch.testing.assert_close(interpolate_pose(start, end, 0.4), se3_exp(0.4 * xi) @ start)
