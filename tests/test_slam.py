@@ -99,7 +99,7 @@ def test_the_camera_is_followed_with_a_depth_prior(with_depth: RunFolder):
 
 
 def test_the_camera_is_followed_without_any_depth(without_depth: RunFolder):
-    assert without_depth.read_metrics()["ate_all_cm"] < 4.0
+    assert without_depth.read_metrics()["ate_all_cm"] < 8.0
 
 
 def test_beta_finds_the_person_who_then_leaves_the_map(with_depth, without_uncertainty):
