@@ -20,6 +20,7 @@ from minislam.splatting.projection import (
 )
 from minislam.splatting.reference import project_covariances
 from minislam.splatting.rendering import LOW_PASS_VARIANCE
+from minislam.uncertainty.weights import WEIGHT_SCALE, adjusted_beta, mapping_weight
 
 PASSED, NOT_YET, WRONG = "passed", "not yet", "wrong"
 
@@ -94,6 +95,28 @@ def _recognise(
         if not _difference(answer, torch.as_tensor(mistake(*case.arguments)), tolerance):
             return " " + hint
     return ""
+
+
+# Notebook 00
+
+
+def check_mapping_weight(student: Callable[[Tensor], Tensor]) -> Verdict:
+    """Check beta (h, w) -> the weight of each pixel in the map's loss (h, w)."""
+    camera = Camera(5.0, 5.0, 1.0, 0.5, 3, 2)
+
+    def reference(beta: Tensor) -> Tensor:
+        return mapping_weight(beta, camera)
+
+    def uncut(beta: Tensor) -> Tensor:
+        return WEIGHT_SCALE / adjusted_beta(beta, camera) ** 2
+
+    cases = [
+        Case((torch.tensor([[0.2, 0.471, 0.6], [0.7, 0.9, 1.2]]),), "small beta"),
+        Case((torch.tensor([[0.5, 1.3, 1.5], [2.0, 3.0, 4.0]]),), "large beta"),
+        Case((torch.tensor([[0.0, 0.05, 0.1], [0.5, 0.5, 0.5]]),), "beta below the floor"),
+    ]
+    hint = "Weights below 0.1 must be 0: over many iterations a little is too much."
+    return check_function(student, reference, cases, tolerance=1e-5, hints=[(uncut, hint)])
 
 
 # Notebook 01

@@ -11,6 +11,7 @@ from minislam.checks import (
     Case,
     check_conic_vjp,
     check_function,
+    check_mapping_weight,
     check_pixel_color,
     check_projected_covariance,
     check_reproject,
@@ -58,7 +59,13 @@ def twist_pulled_back(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
     return torch.cat([v_x.sum(1), turn])
 
 
+def weight_of(beta: Tensor) -> Tensor:
+    weight = 0.5 / (1.6315789 * (beta.clamp_min(0.1) - 0.099) + 0.1) ** 2
+    return torch.where(weight < 0.1, 0.0, weight)
+
+
 CHECKS = [
+    (check_mapping_weight, weight_of),
     (check_resized_intrinsics, resized),
     (check_reproject, reprojected),
     (check_projected_covariance, projected),
