@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
@@ -54,30 +55,24 @@ def preset(name: str) -> SlamConfig:
     return with_settings(SlamConfig(), PRESETS[name])
 
 
-def settings_of(config: Any, prefix: str = "") -> dict[str, Any]:
+def settings_of(config: Any) -> dict[str, Any]:
     """Return all values of a configuration under their names with dots."""
-    flat: dict[str, Any] = {}
-    for entry in fields(config):
-        value = getattr(config, entry.name)
-        name = prefix + entry.name
-        if is_dataclass(value):
-            flat |= settings_of(value, name + ".")
-        else:
-            flat[name] = value
-    return flat
+    return {name: value for name, value, _ in _leaves(config)}
 
 
-def meanings_of(config: Any, prefix: str = "") -> dict[str, str]:
+def meanings_of(config: Any) -> dict[str, str]:
     """Return what each value of a configuration means, under its name with dots."""
-    flat: dict[str, str] = {}
+    return {name: meaning for name, _, meaning in _leaves(config)}
+
+
+def _leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    """Yield name, value and meaning of every constant in a tree of dataclasses."""
     for entry in fields(config):
         value = getattr(config, entry.name)
-        name = prefix + entry.name
         if is_dataclass(value):
-            flat |= meanings_of(value, name + ".")
+            yield from _leaves(value, f"{prefix}{entry.name}.")
         else:
-            flat[name] = entry.metadata.get("meaning", "")
-    return flat
+            yield prefix + entry.name, value, entry.metadata.get("meaning", "")
 
 
 def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
