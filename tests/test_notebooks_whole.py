@@ -16,7 +16,7 @@ from tests.notebook_files import NOTEBOOKS, as_text, cleaned, load, source, with
 LARGEST = 500_000  # bytes
 LONGEST_CELL = 15  # lines
 MOST_CELLS = 25
-MACHINE_PATH = re.compile(r"(?<![\w.])(/home/|/Users/|/root/|/tmp/|/work/|/opt/|[A-Z]:\\\\)")
+MACHINE_PATH = re.compile(r"(?<![\w.])(/home/|/Users/|/root/|/tmp/|[A-Z]:\\\\)")
 
 pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy")
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
