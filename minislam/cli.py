@@ -100,7 +100,7 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--stride", type=int, default=1, help="use every n-th frame, 1")
     group.add_argument("--start", type=int, default=0, help="first frame to use, 0")
     group.add_argument("--max-frames", type=int, help="number of frames at most, all")
-    group.add_argument("--size", type=_size, help="working size WIDTHxHEIGHT, about 400x300")
+    group.add_argument("--size", type=_size, help="working size WIDTHxHEIGHT, about 320x240")
     for name in ("fx", "fy", "cx", "cy"):
         group.add_argument(f"--{name}", type=float, help="of the raw images [px]")
     group.add_argument("--calibration", help="file: fx fy cx cy [width height [k1 k2 p1 p2 k3]]")

@@ -18,7 +18,7 @@ class InputOptions:
     size: tuple[int, int] | None = parameter(
         None, "working width and height, none: keep the aspect and choose by `pixels` [px]"
     )
-    pixels: int = parameter(400 * 300, "about width * height of the chosen working size [px]")
+    pixels: int = parameter(320 * 240, "about width * height of the chosen working size [px]")
     fx: float | None = parameter(None, "focal length of the raw images, x [px]")
     fy: float | None = parameter(None, "focal length of the raw images, y; none: as fx [px]")
     cx: float | None = parameter(None, "principal point of the raw images, x; none: centre [px]")
