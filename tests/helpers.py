@@ -6,11 +6,17 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp
+from minislam.records import Frame
 
 
 def generator(seed: int) -> torch.Generator:
     """Return an explicit random source; no test uses the global one."""
     return torch.Generator().manual_seed(seed)
+
+
+def frame_of(image: Tensor, frame_index: int = 0) -> Frame:
+    """Return an image (H, W, 3) as a frame, ten per second."""
+    return Frame(frame_index, frame_index / 10, image)
 
 
 def numerical_jacobian(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-6):

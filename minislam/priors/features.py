@@ -14,6 +14,7 @@ from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.parameters import parameter
+from minislam.records import Frame
 
 # Centre and spread of each raw feature, rounded from statistics of everyday video (indoor and
 # outdoor, about a hundred frames). Without the centring all colours share one large common part
@@ -55,9 +56,10 @@ class ClassicalFeatures:
 
     def __call__(
         self,
-        image: Tensor,  # (H, W, 3) float32 RGB in [0, 1]
+        frame: Frame,
     ) -> Tensor:  # (H // stride, W // stride, C) float32, each of length sqrt(C)
         """Return one vector per cell; the cosine of two says how alike their surroundings look."""
+        image = frame.image
         height, width = image.shape[0] // self.stride, image.shape[1] // self.stride
         if min(height, width) < 1:
             raise InputError(

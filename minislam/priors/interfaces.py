@@ -66,8 +66,8 @@ class FeatureExtractor(Protocol):
     stride: int  # px per feature patch
     dimension: int  # C
 
-    def __call__(self, image: Tensor) -> Tensor:
-        """Return the features (H // stride, W // stride, C) of an image (H, W, 3)."""
+    def __call__(self, frame: Frame) -> Tensor:
+        """Return the features (H // stride, W // stride, C) of a frame's image (H, W, 3)."""
 
 
 class DepthPrior(Protocol):

@@ -144,7 +144,7 @@ class Tracker:
             prior = torch.where(depth > 0, depth.clamp_min(1e-6).reciprocal(), prior)
         disparities = torch.where(prior > 0, prior, carried)
         index = len(self.keyframes)
-        features = self._features(frame.image)
+        features = self._features(frame)
         self.keyframes.append(frame, features, metric_depth, pose, disparities, prior)
         self.backend.flow.add_frame(index, frame.image)
         if self.initialised:

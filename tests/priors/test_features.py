@@ -7,7 +7,7 @@ import torch
 
 from minislam.errors import InputError
 from minislam.priors.features import ClassicalFeatures, oriented_edges
-from tests.helpers import generator
+from tests.helpers import frame_of, generator
 
 BINS = 8
 
@@ -28,7 +28,7 @@ def cosine(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def test_shape_is_one_vector_per_full_cell_and_length_is_sqrt_of_the_dimension():
     extractor = ClassicalFeatures(stride=14)
-    features = extractor(torch.from_numpy(textured(0, (0.6, 0.3, 0.2), 250, 333)))
+    features = extractor(frame_of(torch.from_numpy(textured(0, (0.6, 0.3, 0.2), 250, 333))))
     assert features.shape == (250 // 14, 333 // 14, extractor.dimension)
     assert features.dtype == torch.float32
     expected = torch.full(features.shape[:2], extractor.dimension**0.5)
@@ -64,7 +64,9 @@ def test_the_same_surface_from_two_views_is_alike_and_two_surfaces_are_not():
         wall, np.array([[1.1, 0.1, -23.0], [-0.1, 1.1, 9.0]]), (320, 240), borderMode=4
     )
     extractor = ClassicalFeatures()
-    first, second, other = (extractor(torch.from_numpy(im)) for im in (wall, moved, person))
+    first, second, other = (
+        extractor(frame_of(torch.from_numpy(im))) for im in (wall, moved, person)
+    )
     assert cosine(first, second).median() > 0.9
     assert cosine(first, other).median() < 0.3
 
@@ -72,7 +74,7 @@ def test_the_same_surface_from_two_views_is_alike_and_two_surfaces_are_not():
 def test_an_object_in_the_image_is_separated_from_its_background():
     image = textured(0, (0.7, 0.65, 0.5))
     image[84:168, 112:224] = textured(1, (0.6, 0.15, 0.15))[84:168, 112:224]
-    features = ClassicalFeatures()(torch.from_numpy(image))
+    features = ClassicalFeatures()(frame_of(torch.from_numpy(image)))
     inside = features[7:11, 9:15].reshape(-1, features.shape[-1])
     outside = features[13:, :].reshape(-1, features.shape[-1])
     within = cosine(inside[:, None], inside[None]).mean()
@@ -84,8 +86,8 @@ def test_an_object_in_the_image_is_separated_from_its_background():
 
 
 def test_the_same_image_gives_the_same_bytes():
-    image = torch.from_numpy(textured(3, (0.4, 0.5, 0.3)))
-    assert torch.equal(ClassicalFeatures()(image), ClassicalFeatures()(image))
+    frame = frame_of(torch.from_numpy(textured(3, (0.4, 0.5, 0.3))))
+    assert torch.equal(ClassicalFeatures()(frame), ClassicalFeatures()(frame))
 
 
 # Degenerate input
@@ -94,15 +96,15 @@ def test_the_same_image_gives_the_same_bytes():
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
 def test_constant_images_give_finite_features_of_full_length(value: float):
     extractor = ClassicalFeatures()
-    features = extractor(torch.full((56, 70, 3), value))
+    features = extractor(frame_of(torch.full((56, 70, 3), value)))
     assert torch.isfinite(features).all()
     assert features.norm(dim=-1).min() > 0.99 * extractor.dimension**0.5
 
 
 def test_a_single_cell_and_another_stride_work():
-    one_cell = torch.rand(7, 7, 3, generator=generator(0))
+    one_cell = frame_of(torch.rand(7, 7, 3, generator=generator(0)))
     assert ClassicalFeatures()(one_cell).shape[:2] == (1, 1)
-    assert ClassicalFeatures(stride=8)(torch.zeros(48, 64, 3)).shape[:2] == (6, 8)
+    assert ClassicalFeatures(stride=8)(frame_of(torch.zeros(48, 64, 3))).shape[:2] == (6, 8)
 
 
 # Errors
@@ -110,4 +112,4 @@ def test_a_single_cell_and_another_stride_work():
 
 def test_an_image_smaller_than_a_cell_is_refused_in_one_sentence():
     with pytest.raises(InputError, match=r"at least 7x7 px.*found 20x6"):
-        ClassicalFeatures()(torch.zeros(6, 20, 3))
+        ClassicalFeatures()(frame_of(torch.zeros(6, 20, 3)))

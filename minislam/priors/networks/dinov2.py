@@ -18,6 +18,7 @@ from minislam.priors.networks.checkpoints import (
     require,
 )
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
+from minislam.records import Frame
 
 
 class DinoFeatures:
@@ -33,9 +34,10 @@ class DinoFeatures:
 
     def __call__(
         self,
-        image: Tensor,  # (H, W, 3) RGB in [0, 1]
+        frame: Frame,
     ) -> Tensor:  # (H // 14, W // 14, C) float32
         """Return one feature per patch of 14 px; the image is stretched to whole patches."""
+        image = frame.image
         rows, cols = image.shape[0] // PATCH, image.shape[1] // PATCH
         if min(rows, cols) < 1:
             raise InputError(
@@ -63,5 +65,9 @@ def load_dino_features(path: Path | str, device: torch.device | str = "cpu") -> 
     weights = load_checkpoint(path, device)
     features = DinoFeatures(weights)
     # The mask token is used in training only.
-    probe(weights, lambda: features(torch.zeros(PATCH, PATCH, 3)), ignored=("mask_token",))
+    probe(
+        weights,
+        lambda: features(Frame(0, 0.0, torch.zeros(PATCH, PATCH, 3))),
+        ignored=("mask_token",),
+    )
     return features

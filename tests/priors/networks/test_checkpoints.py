@@ -8,6 +8,7 @@ import torch
 from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights, describe, load_checkpoint
 from minislam.priors.networks.dinov2 import load_dino_features
+from tests.helpers import frame_of
 from tests.priors.networks import rebuilt
 
 
@@ -83,7 +84,7 @@ def test_other_files_are_described():
 
 def test_a_good_file_loads_and_runs(tmp_path: Path, tensors):
     features = load_dino_features(write(tmp_path / "w.pth", tensors))
-    assert features(torch.zeros(28, 42, 3)).shape == (2, 3, 384)
+    assert features(frame_of(torch.zeros(28, 42, 3))).shape == (2, 3, 384)
 
 
 def test_parts_share_what_has_been_used():

@@ -9,6 +9,7 @@ from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.dinov2 import DinoFeatures, position_resize_of
 from minislam.priors.networks.vit import PositionResize, Tokens, VisionTransformer, normalise
+from tests.helpers import frame_of
 from tests.priors.networks import rebuilt
 
 TOLERANCE = 2e-5  # the official code differs from its own float64 run by 3e-6
@@ -65,7 +66,7 @@ def test_the_trained_size_needs_no_resize_of_the_positions():
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_features_of_an_image_are_those_of_the_official_path(name: str):
     extractor = DinoFeatures(weights(name))
-    features = extractor(rebuilt.image(100, 135))
+    features = extractor(frame_of(rebuilt.image(100, 135)))
     assert features.shape == (100 // 14, 135 // 14, extractor.dimension)
     expected = rebuilt.golden(name)["wildgs_100x135/features_every2"]
     rebuilt.assert_close(features[..., ::2], expected, TOLERANCE)
@@ -90,8 +91,8 @@ def test_the_other_position_resize_would_be_noticed():
 
 def test_features_can_be_trained_on_and_are_repeatable():
     extractor = DinoFeatures(weights("fit3d_reg_small"))
-    features = extractor(rebuilt.image(28, 42))
-    assert torch.equal(features, extractor(rebuilt.image(28, 42)))
+    features = extractor(frame_of(rebuilt.image(28, 42)))
+    assert torch.equal(features, extractor(frame_of(rebuilt.image(28, 42))))
     weight = torch.ones(features.shape[-1], requires_grad=True)
     (features @ weight).sum().backward()  # an inference tensor would refuse
     assert torch.isfinite(weight.grad).all()
@@ -102,7 +103,7 @@ def test_features_can_be_trained_on_and_are_repeatable():
 
 def test_an_image_smaller_than_a_patch_is_refused():
     with pytest.raises(InputError, match=r"at least 14x14 px .* found 13x20"):
-        DinoFeatures(weights("fit3d_reg_small"))(torch.zeros(20, 13, 3))
+        DinoFeatures(weights("fit3d_reg_small"))(frame_of(torch.zeros(20, 13, 3)))
 
 
 def test_a_giant_is_refused_in_words():
