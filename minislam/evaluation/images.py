@@ -1,4 +1,4 @@
-"""Similarity of two images: PSNR and SSIM. LPIPS needs a network and is not here."""
+"""Similarity of two images: PSNR and SSIM. LPIPS is in lpips.py."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -13,6 +13,7 @@ from minislam.evaluation.trajectory import absolute_trajectory_error, straight_l
 from minislam.records import GroundTruth, Trajectory
 
 MAX_DIFFERENCE = 0.02  # second between a frame and its true pose; TUM stamps differ by 0.005
+ImageDistance = Callable[[np.ndarray, np.ndarray], float]  # rendered, true (H, W, 3) RGB
 MIN_MASK = 20  # px of a mover below which a view says nothing about ghosts
 CENTIMETRES = 100.0  # per world unit of the truth, which is metric
 
@@ -32,6 +33,7 @@ def measure_run(
     keyframe_trajectory: Trajectory,
     views: list[MappedView],
     render: Callable[[np.ndarray], np.ndarray],  # T_world_camera (4, 4) -> RGB (H, W, 3)
+    lpips: ImageDistance | None = None,  # needs weights; without it its two figures are left out
 ) -> dict[str, float | None]:
     """Return the metrics by name, units in the names; None for what cannot be known."""
     metrics: dict[str, float | None] = dict.fromkeys(
@@ -40,6 +42,8 @@ def measure_run(
             "ssim_novel", "psnr_input_db", "psnr_masked_db", "beta_auroc",
         )
     )  # fmt: skip
+    if lpips is not None:
+        metrics |= {"lpips_novel": None, "lpips_input": None}
     if truth is None:
         return metrics
     if truth.trajectory is not None:
@@ -47,8 +51,8 @@ def measure_run(
         metrics["ate_keyframes_cm"] = _ate_cm(keyframe_trajectory, truth.trajectory)
         metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(truth.trajectory)
         if metrics["ate_all_cm"] is not None:
-            metrics |= _novel_views(truth, trajectory, render)
-    metrics |= _input_views(truth, views, render)
+            metrics |= _novel_views(truth, trajectory, render, lpips)
+    metrics |= _input_views(truth, views, render, lpips)
     metrics["beta_auroc"] = _beta_auroc(truth, views)
     return metrics
 
@@ -62,7 +66,10 @@ def _ate_cm(estimate: Trajectory, truth: Trajectory) -> float | None:
 
 
 def _novel_views(
-    truth: GroundTruth, trajectory: Trajectory, render: Callable[[np.ndarray], np.ndarray]
+    truth: GroundTruth,
+    trajectory: Trajectory,
+    render: Callable[[np.ndarray], np.ndarray],
+    lpips: ImageDistance | None,
 ) -> dict[str, float | None]:
     """Compare held-out static views with renderings from their Sim(3)-aligned poses."""
     views = truth.novel_views()
@@ -70,30 +77,39 @@ def _novel_views(
         return {}
     similarity = truth_to_estimate(trajectory, truth.trajectory, MAX_DIFFERENCE)
     pairs = [(render(align_novel_views(pose, similarity)), image) for pose, image in views]
-    return {
+    metrics = {
         "psnr_novel_db": _mean([psnr(rendered, image) for rendered, image in pairs]),
         "ssim_novel": _mean([ssim(rendered, image) for rendered, image in pairs]),
     }
+    if lpips is not None:
+        metrics["lpips_novel"] = _mean([lpips(rendered, image) for rendered, image in pairs])
+    return metrics
 
 
 def _input_views(
-    truth: GroundTruth, views: list[MappedView], render: Callable[[np.ndarray], np.ndarray]
+    truth: GroundTruth,
+    views: list[MappedView],
+    render: Callable[[np.ndarray], np.ndarray],
+    lpips: ImageDistance | None,
 ) -> dict[str, float | None]:
     """Compare renderings from the keyframes with the same views of the empty scene.
 
     `psnr_masked_db` looks only where a mover stood: a ghost of it would show there.
     """
-    whole, masked = [], []
+    whole, masked, distances = [], [], []
     for view in views:
         static = truth.static_image(view.frame_index)
         if static is None:
             continue
         rendered = render(view.T_world_camera)
         whole.append(psnr(rendered, static))
+        if lpips is not None:
+            distances.append(lpips(rendered, static))
         mask = truth.moving_mask(view.frame_index)
         if mask is not None and mask.sum() >= MIN_MASK:
             masked.append(psnr(rendered, static, mask))
-    return {"psnr_input_db": _mean(whole), "psnr_masked_db": _mean(masked)}
+    metrics = {"psnr_input_db": _mean(whole), "psnr_masked_db": _mean(masked)}
+    return metrics if lpips is None else {**metrics, "lpips_input": _mean(distances)}
 
 
 def _beta_auroc(truth: GroundTruth, views: list[MappedView]) -> float | None:

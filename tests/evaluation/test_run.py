@@ -147,6 +147,20 @@ def test_novel_views_are_rendered_from_the_world_of_the_map():
     assert 0 < metrics["ssim_novel"] < 1
 
 
+def test_lpips_is_measured_where_weights_are_given():
+    truth = Truth(walk(), static={0: grey(0.5)}, novel=[(np.eye(4), grey(0.5))] * 2)
+    path = estimated(truth.trajectory)
+
+    def lpips(rendered: np.ndarray, true: np.ndarray) -> float:
+        return float(np.abs(rendered - true).mean())
+
+    metrics = measure_run(truth, path, path, [view(0)], lambda pose: grey(0.6), lpips)
+    assert metrics["lpips_novel"] == pytest.approx(0.1, abs=1e-6)
+    assert metrics["lpips_input"] == pytest.approx(0.1, abs=1e-6)
+    unknown = measure_run(None, path, path, [], lambda pose: grey(0.6), lpips)
+    assert list(unknown) == [*NAMES, "lpips_novel", "lpips_input"] and known(unknown) == set()
+
+
 def test_a_ghost_is_measured_where_the_mover_stood():
     rendered = grey(0.5)
     rendered[:, :4] += 0.1  # the ghost: 20 dB there
