@@ -8,12 +8,15 @@ file completely: a missing tensor is named, and a tensor that was never asked fo
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from minislam.errors import InputError
+
+Network = TypeVar("Network")
 
 _CONTAINERS = ("model_state_dict", "state_dict", "model")  # where trainers put the weights
 _DATA_PARALLEL = "module."  # what torch's DistributedDataParallel puts before every name
@@ -45,6 +48,10 @@ class Weights:
     def __iter__(self) -> Iterator[str]:
         """Walk through the names below the prefix, without it."""
         return (n[len(self.prefix) :] for n in self._tensors if n.startswith(self.prefix))
+
+    def as_dict(self) -> dict[str, Tensor]:
+        """Return the tensors below the prefix under the rest of their names."""
+        return {name: self._tensors[self.prefix + name] for name in self}
 
     def below(self, prefix: str) -> "Weights":
         """Return the part whose names start with one more prefix."""
@@ -166,12 +173,16 @@ def require(weights: Weights, kind: str) -> None:
         )
 
 
-def probe(weights: Weights, run_once: Callable[[], object], ignored: tuple[str, ...] = ()) -> None:
-    """Check a file by running its network once: every tensor fits, is there, and is needed."""
+def probed(
+    weights: Weights,
+    build_and_run: Callable[[], Network],  # builds a network, runs it once, returns it
+    ignored: tuple[str, ...] = (),  # ends of names that are stored and not needed
+) -> Network:
+    """Return a network whose file is checked: every tensor fits, is there, and is needed."""
     try:
         with torch.no_grad():
-            run_once()
-    except RuntimeError as error:
+            network = build_and_run()
+    except (RuntimeError, IndexError, ValueError) as error:
         raise InputError(
             f"expected the shapes of {describe(weights)} in {weights.file}, found tensors that do "
             f"not fit together ({str(error).splitlines()[0]}); it is another version"
@@ -182,3 +193,4 @@ def probe(weights: Weights, run_once: Callable[[], object], ignored: tuple[str, 
             f"expected only the tensors of {describe(weights)} in {weights.file}, found "
             f"{len(extra)} more, such as {extra[0]}; it is another version of the network"
         )
+    return network

@@ -6,6 +6,7 @@ transformer"). It knows no focal length: the camera is assumed to be like that o
 """
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,8 @@ from torch.nn import functional
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probe, require
+from minislam.parameters import parameter
+from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probed, require
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
 from minislam.records import Frame
 
@@ -25,12 +27,27 @@ _LIMIT_OF_NAME = {"metric_hypersim": INDOOR_LIMIT, "metric_vkitti": OUTDOOR_LIMI
 _TAPS = {12: (2, 5, 8, 11), 24: (4, 11, 17, 23)}  # by the number of blocks: S and B, L
 
 
+@dataclass(frozen=True)
+class DepthAnythingConfig:
+    """What the network is shown, and how its output is read."""
+
+    shorter_side: int = parameter(SHORTER_SIDE, "shorter side of what it sees [px], official")
+    depth_limit: float = parameter(
+        0.0, "largest depth of the training [m]; 0: as the official file name says (20 or 80)"
+    )
+
+
 class DepthAnythingHead:
     """The convolutions behind the transformer: tokens in, one number per pixel out."""
 
     def __init__(self, weights: Weights) -> None:
         transformer = VisionTransformer(weights.below("pretrained."), PositionResize.OFFSET)
         self.transformer, self.weights = transformer, weights.below("depth_head.")
+        if transformer.depth not in _TAPS:
+            raise InputError(
+                f"expected a ViT of {' or '.join(map(str, _TAPS))} blocks in {weights.file}, found "
+                f"{transformer.depth}; the file is not complete"
+            )
         self.taps = _TAPS[transformer.depth]
 
     def __call__(
@@ -124,24 +141,32 @@ def _whole_patches(side: float, shortest: int) -> int:
 
 def load_depth_anything(
     path: Path | str,
-    depth_limit: float | None = None,  # metre; None: as the official file name says
     device: torch.device | str = "cpu",
+    config: DepthAnythingConfig = DepthAnythingConfig(),
 ) -> DepthAnything:
-    """Read a Depth Anything V2 checkpoint with a metric head and check it on a tiny image."""
-    weights = load_checkpoint(path, device)
+    """Read a Depth Anything V2 checkpoint with a metric head and check it."""
+    return checked_depth_anything(load_checkpoint(path, device), config)
+
+
+def checked_depth_anything(
+    weights: Weights, config: DepthAnythingConfig = DepthAnythingConfig()
+) -> DepthAnything:
+    """Return the prior after its weights have been checked on a tiny image."""
     require(weights, "Depth Anything V2")
-    prior = DepthAnything(
-        weights, limit_of_name(Path(path)) if depth_limit is None else depth_limit
-    )
-    tiny = torch.zeros(1, 3, 2 * PATCH, 2 * PATCH, device=weights.device)
+    limit = config.depth_limit or limit_of_name(Path(weights.file))
+
+    def build_and_run() -> DepthAnything:
+        prior = DepthAnything(weights, limit, config.shorter_side)
+        prior.network(torch.zeros(1, 3, 2 * PATCH, 2 * PATCH, device=weights.device))
+        return prior
+
     # The first unit of the coarsest level has nothing to add, yet it is stored.
     unneeded = tuple(
         f"refinenet4.resConfUnit1.{conv}.{kind}"
         for conv in ("conv1", "conv2")
         for kind in ("weight", "bias")
     )
-    probe(weights, lambda: prior.network(tiny), ignored=("mask_token", *unneeded))
-    return prior
+    return probed(weights, build_and_run, ignored=("mask_token", *unneeded))
 
 
 def limit_of_name(path: Path) -> float:

@@ -14,7 +14,7 @@ from minislam.priors.networks.checkpoints import (
     Weights,
     is_timm_layout,
     load_checkpoint,
-    probe,
+    probed,
     require,
 )
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
@@ -26,8 +26,8 @@ class DinoFeatures:
 
     stride = PATCH
 
-    def __init__(self, weights: Weights) -> None:
-        require(weights, "DINOv2 or FiT3D")
+    def __init__(self, weights: Weights, kind: str = "DINOv2 or FiT3D") -> None:
+        require(weights, kind)
         self.device = weights.device
         self._transformer = VisionTransformer(weights, position_resize_of(weights))
         self.dimension = self._transformer.width
@@ -60,14 +60,21 @@ def position_resize_of(weights: Weights) -> PositionResize:
     return PositionResize.ANTIALIAS if antialias else PositionResize.OFFSET
 
 
-def load_dino_features(path: Path | str, device: torch.device | str = "cpu") -> DinoFeatures:
-    """Read a DINOv2 or FiT3D checkpoint and check it on a tiny image."""
-    weights = load_checkpoint(path, device)
-    features = DinoFeatures(weights)
-    # The mask token is used in training only.
-    probe(
-        weights,
-        lambda: features(Frame(0, 0.0, torch.zeros(PATCH, PATCH, 3))),
-        ignored=("mask_token",),
-    )
-    return features
+def load_dino_features(
+    path: Path | str,
+    device: torch.device | str = "cpu",
+    kind: str = "DINOv2 or FiT3D",  # what the file must hold
+) -> DinoFeatures:
+    """Read a DINOv2 or FiT3D checkpoint and check it."""
+    return checked_dino_features(load_checkpoint(path, device), kind)
+
+
+def checked_dino_features(weights: Weights, kind: str = "DINOv2 or FiT3D") -> DinoFeatures:
+    """Return the features after their weights have been checked on a tiny image."""
+
+    def build_and_run() -> DinoFeatures:
+        features = DinoFeatures(weights, kind)
+        features(Frame(0, 0.0, torch.zeros(PATCH, PATCH, 3)))
+        return features
+
+    return probed(weights, build_and_run, ignored=("mask_token",))  # used in training only

@@ -13,7 +13,7 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.parameters import parameter
 from minislam.priors.interfaces import FlowMatches
-from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probe, require
+from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probed, require
 from minislam.priors.networks.droid_network import (
     LEVELS,
     STRIDE,
@@ -213,17 +213,21 @@ class DroidChain:
 def load_droid(
     path: Path | str,
     device: torch.device | str = "cpu",
-    config: DroidFlowConfig | None = None,
+    config: DroidFlowConfig = DroidFlowConfig(),
 ) -> DroidFlow:
-    """Read DROID-SLAM's checkpoint and check it on a tiny image."""
-    weights = load_checkpoint(path, device)
-    flow = DroidFlow(weights, config)
-    side = STRIDE * _SMALLEST_GRID
+    """Read DROID-SLAM's checkpoint and check it."""
+    return checked_droid(load_checkpoint(path, device), config)
 
-    def run_once() -> None:
-        chain, _ = flow.start_chain(torch.zeros(side, side, 3)).advanced(torch.zeros(side, side, 3))
-        hidden = chain._reference.context.hidden
+
+def checked_droid(weights: Weights, config: DroidFlowConfig = DroidFlowConfig()) -> DroidFlow:
+    """Return the flow after its weights have been checked on a tiny image."""
+    tiny = torch.zeros(STRIDE * _SMALLEST_GRID, STRIDE * _SMALLEST_GRID, 3)
+
+    def build_and_run() -> DroidFlow:
+        flow = DroidFlow(weights, config)
+        flow.start_chain(tiny).advanced(tiny)
+        hidden = flow.encode(tiny).context.hidden
         aggregate(weights, hidden, torch.zeros(1, dtype=torch.long, device=weights.device))
+        return flow
 
-    probe(weights, run_once)
-    return flow
+    return probed(weights, build_and_run)

@@ -18,7 +18,8 @@ from torch.nn import functional
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probe, require
+from minislam.parameters import parameter
+from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probed, require
 from minislam.priors.networks.metric3d_refinement import Metric3DOutput, refine
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
 from minislam.records import Frame
@@ -27,7 +28,17 @@ CANONICAL_FOCAL = 1000.0  # px, of the camera that all training images were turn
 FARTHEST = 300.0  # world units (metre); the official cut of the scaled depth
 NETWORK_SIZE = (616, 1064)  # px (height, width), as in the training
 _SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling of the coarsest map needs an even grid
-_ROUNDS = {384: 4, 1024: 8}  # of refinement, by the width of the ViT: small, large
+_SMALL, _LARGE = 384, 1024  # width of the ViT
+_ROUNDS = {_SMALL: 4, _LARGE: 8}  # of refinement
+
+
+@dataclass(frozen=True)
+class Metric3DConfig:
+    """What the network is shown."""
+
+    size: tuple[int, int] = parameter(
+        NETWORK_SIZE, "rows and columns it sees [px], official; multiples of 28, half costs a fifth"
+    )
 
 
 @dataclass(frozen=True)
@@ -48,7 +59,13 @@ class Metric3D:
         # It has registers, yet resizes its positions like the networks without.
         self.transformer = VisionTransformer(encoder, PositionResize.OFFSET)
         self.weights = weights.below("depth_model.decoder.")
-        self.rounds = _ROUNDS[self.transformer.width]
+        width = self.transformer.width
+        if width not in _ROUNDS:
+            raise InputError(
+                f"expected Metric3D v2 with a ViT of width {_SMALL} or {_LARGE}, found "
+                f"{width} in {weights.file}; give the small or the large one"
+            )
+        self.rounds = _ROUNDS[width]
 
     def __call__(
         self,
@@ -164,13 +181,19 @@ class Metric3DDepth:
 def load_metric3d(
     path: Path | str,
     device: torch.device | str = "cpu",
-    network_size: tuple[int, int] = NETWORK_SIZE,
+    config: Metric3DConfig = Metric3DConfig(),
 ) -> Metric3DDepth:
-    """Read a Metric3D v2 checkpoint (ViT-small or -large) and check it on a tiny image."""
-    weights = load_checkpoint(path, device)
-    prior = Metric3DDepth(weights, network_size)
-    tiny = torch.zeros(1, 3, _SIZE_STEP, _SIZE_STEP, device=weights.device)
+    """Read a Metric3D v2 checkpoint (ViT-small or -large) and check it."""
+    return checked_metric3d(load_checkpoint(path, device), config)
+
+
+def checked_metric3d(weights: Weights, config: Metric3DConfig = Metric3DConfig()) -> Metric3DDepth:
+    """Return the prior after its weights have been checked on a tiny image."""
+
+    def build_and_run() -> Metric3DDepth:
+        prior = Metric3DDepth(weights, config.size)
+        prior.network(torch.zeros(1, 3, _SIZE_STEP, _SIZE_STEP, device=weights.device))
+        return prior
+
     # Stored and not needed: a token of the training, and one layer norm under a second name.
-    ignored = ("mask_token", "norm3.weight", "norm3.bias")
-    probe(weights, lambda: prior.network(tiny), ignored)
-    return prior
+    return probed(weights, build_and_run, ("mask_token", "norm3.weight", "norm3.bias"))

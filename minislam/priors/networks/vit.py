@@ -56,6 +56,11 @@ class VisionTransformer:
         # Metric3D stores all blocks in one chunk.
         self._block = "blocks.0.{}." if "blocks.0.0.norm1.weight" in weights else "blocks.{}."
         self.depth = weights.count(self._block)
+        if self.depth == 0:
+            raise InputError(
+                f"expected the blocks of a transformer in {weights.file}, found none; the file is "
+                "not complete"
+            )
         if f"{self._block.format(0)}mlp.w12.weight" in weights:
             raise InputError(
                 f"expected a ViT-S, -B or -L, found a ViT-giant in {weights.file}; "

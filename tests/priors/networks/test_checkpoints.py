@@ -91,6 +91,7 @@ def test_parts_share_what_has_been_used():
     weights = Weights({"a.x.weight": torch.zeros(1), "a.y.weight": torch.zeros(1)}, "f")
     part = weights.below("a.")
     assert sorted(part) == ["x.weight", "y.weight"] and "x.weight" in part
+    assert list(part.as_dict()) == ["x.weight", "y.weight"]
     part.below("x.")["weight"]
     assert weights.unused() == ["a.y.weight"]
 
@@ -147,3 +148,13 @@ def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path: Path, tens
     misshapen = {**tensors, "blocks.0.mlp.fc1.weight": torch.zeros(1536, 383)}
     with pytest.raises(InputError, match="do not fit together"):
         load_dino_features(write(tmp_path / "c.pth", misshapen))
+    misshapen = {**tensors, "cls_token": torch.zeros(1, 1, 12)}
+    with pytest.raises(InputError, match="do not fit together"):
+        load_dino_features(write(tmp_path / "d.pth", misshapen))
+
+
+def test_dinov2_and_fit3d_can_be_told_apart(tmp_path: Path, tensors):
+    path = write(tmp_path / "fit3d.pth", tensors)
+    assert load_dino_features(path, kind="FiT3D").dimension == 384
+    with pytest.raises(InputError, match=r"expected a DINOv2 checkpoint, .*looks like FiT3D"):
+        load_dino_features(path, kind="DINOv2")

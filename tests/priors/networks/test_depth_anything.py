@@ -12,6 +12,7 @@ from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.depth_anything import (
     INDOOR_LIMIT,
     DepthAnything,
+    DepthAnythingConfig,
     DepthAnythingHead,
     limit_of_name,
     load_depth_anything,
@@ -22,6 +23,7 @@ from tests.priors.networks import rebuilt
 
 RELATIVE, METRIC = 2e-5, 1e-4  # the official code differs from its own float64 run by 2e-5 m
 CPU = torch.device("cpu")
+INDOOR = DepthAnythingConfig(shorter_side=28, depth_limit=INDOOR_LIMIT)
 
 
 @cache
@@ -76,8 +78,7 @@ def test_the_depth_scales_with_the_limit_of_the_training():
 def test_a_checkpoint_file_is_checked_and_runs(tmp_path: Path):
     tensors = {name: weights()[name] for name in weights()}
     torch.save(tensors, tmp_path / "w.pth")
-    prior = load_depth_anything(tmp_path / "w.pth", INDOOR_LIMIT)
-    prior.shorter_side = 28
+    prior = load_depth_anything(tmp_path / "w.pth", config=INDOOR)
     assert prior(*frame(torch.zeros(30, 40, 3))).shape == (30, 40)
 
 
@@ -85,11 +86,11 @@ def test_a_missing_bias_and_an_extra_tensor_are_named(tmp_path: Path):
     tensors = {name: weights()[name] for name in weights()}
     torch.save({**tensors, "depth_head.extra": torch.zeros(1)}, tmp_path / "w.pth")
     with pytest.raises(InputError, match=r"1 more, such as depth_head\.extra"):
-        load_depth_anything(tmp_path / "w.pth", INDOOR_LIMIT)
+        load_depth_anything(tmp_path / "w.pth", config=INDOOR)
     del tensors["depth_head.scratch.output_conv2.2.bias"]
     torch.save(tensors, tmp_path / "w.pth")
     with pytest.raises(InputError, match=r"expected the tensor .*output_conv2\.2\.bias"):
-        load_depth_anything(tmp_path / "w.pth", INDOOR_LIMIT)
+        load_depth_anything(tmp_path / "w.pth", config=INDOOR)
 
 
 def test_the_limit_follows_from_the_official_name():
@@ -112,3 +113,9 @@ def test_a_limit_that_is_not_positive_and_another_network_are_refused():
         DepthAnything(weights(), 0)
     with pytest.raises(InputError, match="looks like DROID-SLAM"):
         DepthAnything(Weights({"update.gru.convz.weight": torch.zeros(1)}, "f"), 20.0)
+
+
+def test_a_file_without_its_last_blocks_is_refused():
+    tensors = {n: t for n, t in weights().as_dict().items() if ".blocks.11." not in n}
+    with pytest.raises(InputError, match=r"12 or 24 blocks in f, found 11; the file is not compl"):
+        DepthAnything(Weights(tensors, "f"), 20.0)

@@ -10,7 +10,13 @@ from torch.nn import functional
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.metric3d import Metric3D, Metric3DDepth, fit, load_metric3d
+from minislam.priors.networks.metric3d import (
+    Metric3D,
+    Metric3DConfig,
+    Metric3DDepth,
+    fit,
+    load_metric3d,
+)
 from minislam.priors.networks.metric3d_refinement import Metric3DOutput, normalised
 from minislam.priors.networks.vit import normalise
 from minislam.records import Frame
@@ -109,7 +115,7 @@ def test_normals_have_unit_length_and_positive_confidence():
 def test_a_checkpoint_file_is_checked_and_runs(tmp_path: Path):
     tensors = {name: weights()[name] for name in weights()}
     torch.save({"model_state_dict": tensors}, tmp_path / "w.pth")
-    prior = load_metric3d(tmp_path / "w.pth", network_size=SMALL_SIZE)
+    prior = load_metric3d(tmp_path / "w.pth", config=Metric3DConfig(SMALL_SIZE))
     camera = Camera(30, 30, 20, 15, 40, 30)
     assert prior(frame(torch.zeros(30, 40, 3)), camera).shape == (30, 40)
     del tensors["depth_model.decoder.update_block.mask.2.bias"]
@@ -126,3 +132,18 @@ def test_another_network_and_an_odd_size_are_refused():
         Metric3DDepth(weights(), (616, 1066))
     with pytest.raises(InputError, match="looks like FiT3D"):
         Metric3DDepth(rebuilt.weights_of("fit3d_reg_small"))
+
+
+def test_a_size_of_the_network_that_does_not_exist_is_refused():
+    tensors = {
+        "depth_model.decoder.token2feature.read_0.readoper.project_patch.weight": torch.zeros(1),
+        "depth_model.encoder.patch_embed.proj.weight": torch.zeros(768, 3, 14, 14),
+        "depth_model.encoder.cls_token": torch.zeros(1, 1, 768),
+        "depth_model.encoder.pos_embed": torch.zeros(1, 1370, 768),
+        "depth_model.encoder.blocks.0.0.norm1.weight": torch.zeros(768),
+    }
+    with pytest.raises(InputError, match=r"ViT of width 384 or 1024, found 768 in b\.pth"):
+        Metric3DDepth(Weights(tensors, "b.pth"))
+    del tensors["depth_model.encoder.blocks.0.0.norm1.weight"]
+    with pytest.raises(InputError, match=r"the blocks of a transformer in b\.pth, found none"):
+        Metric3DDepth(Weights(tensors, "b.pth"))
