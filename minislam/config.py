@@ -10,6 +10,7 @@ from typing import Any
 from minislam.errors import InputError
 from minislam.mapping.config import MappingConfig
 from minislam.parameters import parameter
+from minislam.priors.choice import NetworksConfig
 from minislam.priors.depth import SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeaturesConfig
 from minislam.priors.flow import ClassicalFlowConfig
@@ -29,6 +30,7 @@ class SlamConfig:
     flow: ClassicalFlowConfig = field(default_factory=ClassicalFlowConfig)
     features: ClassicalFeaturesConfig = field(default_factory=ClassicalFeaturesConfig)
     simulated_depth: SimulatedDepthConfig = field(default_factory=SimulatedDepthConfig)
+    networks: NetworksConfig = field(default_factory=NetworksConfig)
 
 
 # What each preset changes. `laptop` is the default tree: a 100-frame clip in minutes on two cores.
@@ -44,6 +46,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mapping.keyframe_iterations": 10,
         "mapping.refine_iterations": 60,
         "mapping.image_scale": 1.0,
+        "networks.droid.updates": 1,
+        "networks.droid.chain_updates": 1,
+        "networks.metric3d.size": (112, 168),
+        "networks.depth_anything.shorter_side": 70,
     },
 }
 

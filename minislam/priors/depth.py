@@ -16,6 +16,7 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
+from minislam.priors.files import FrameFiles, read_array
 from minislam.records import Frame
 
 _ASPECT_TOLERANCE = 0.02  # relative; rounding a resized image to whole pixels stays below it
@@ -81,8 +82,7 @@ class SimulatedDepth:
 class FileDepth:
     """Depth made elsewhere: a folder of .npy (world units) or 16-bit .png files.
 
-    A file belongs to the frame whose index is its name (`17.npy`, `00017.png`), or, when the
-    names of the input images are given, to the frame whose image has the same name.
+    Which file belongs to which frame, `FrameFiles` says.
     """
 
     def __init__(
@@ -91,29 +91,17 @@ class FileDepth:
         png_unit: float | None = None,  # world units of one count; TUM and Bonn: 1 / 5000 m
         stems: list[str] | None = None,  # image name without ending, by frame_index
     ) -> None:
-        self.folder = Path(folder)
         self.png_unit = png_unit
         if png_unit is not None and not png_unit > 0:
             raise InputError(
                 f"expected a positive world unit per count for depth .png files, found {png_unit}; "
                 "for TUM and Bonn give 0.0002"
             )
-        if not self.folder.is_dir():
-            raise InputError(
-                f"expected a folder of depth files, found nothing at {self.folder}; check the path"
-            )
-        # Sorted, so that of 17.npy and 17.png the same one wins on every machine.
-        files = sorted(p for p in self.folder.iterdir() if p.suffix.lower() in (".npy", ".png"))
-        self._files = _by_stem(files, stems) if stems is not None else _by_number(files)
-        if not self._files:
-            raise InputError(
-                f"expected .npy or .png files named by frame index or image name in {self.folder}, "
-                f"found {len(files)} such files and none that fits; name them like 00017.npy"
-            )
+        self._files = FrameFiles(folder, "depth", (".npy", ".png"), stems)
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Read the depth of a frame, resized to its image, or return None if there is no file."""
-        path = self._files.get(frame.frame_index)
+        path = self._files.of(frame)
         if path is None:
             return None
         depth = _read_npy(path) if path.suffix.lower() == ".npy" else self._read_png(path)
@@ -165,27 +153,12 @@ def _smooth_noise(
     return (noise - noise.mean()) / (deviation if deviation > 0 else 1.0)
 
 
-def _by_number(files: list[Path]) -> dict[int, Path]:
-    return {int(path.stem): path for path in files if path.stem.isdecimal()}
-
-
-def _by_stem(files: list[Path], stems: list[str]) -> dict[int, Path]:
-    paths = {path.stem: path for path in files}
-    return {index: paths[stem] for index, stem in enumerate(stems) if stem in paths}
-
-
 def _read_npy(path: Path) -> np.ndarray:
-    try:
-        depth = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    depth = np.squeeze(read_array(path, "depth"))
+    if depth.ndim != 2:
         raise InputError(
-            f"expected a numpy array of depth, found an unreadable file {path}; write it again"
-        ) from error
-    depth = np.squeeze(depth)
-    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
-        raise InputError(
-            f"expected floating-point depth of shape (H, W) in {path}, found {depth.dtype} of "
-            f"shape {depth.shape}; store one depth map in world units per file"
+            f"expected depth of shape (H, W) in {path}, found {depth.dtype} of shape "
+            f"{depth.shape}; store one depth map in world units per file"
         )
     return depth
 

@@ -1,0 +1,165 @@
+"""Features and depth made elsewhere: a folder with one file per frame.
+
+`minislam priors` writes such folders, and so may anything else: heavy networks then run once,
+where there is a GPU, and the SLAM runs anywhere.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+from minislam.records import Frame
+
+INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
+FEATURES, DEPTH = "features", "depth"  # folders of one sequence's priors
+_ALSO_DEPTH = "depths"  # the folder's name where WildGS-SLAM writes its own
+
+
+class FrameFiles:
+    """Finds the file of a frame in a folder.
+
+    If the folder has an index, by the frame's timestamp: then any choice of the frames it was
+    made for finds its files. Else by name, which is the frame index (`17.npy`, `00017.png`), or
+    that of the input image where these names are given.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        what: str,  # "depth" or "features", for messages
+        endings: tuple[str, ...],
+        stems: list[str] | None = None,  # image name without ending, by frame_index
+    ) -> None:
+        self.folder, self.what = Path(folder), what
+        if not self.folder.is_dir():
+            raise InputError(
+                f"expected a folder of {what} files, found nothing at {self.folder}; check the path"
+            )
+        # Sorted, so that of 17.npy and 17.png the same one wins on every machine.
+        files = sorted(p for p in self.folder.iterdir() if p.suffix.lower() in endings)
+        self._files = _by_stem(files, stems) if stems is not None else _by_number(files)
+        if not self._files:
+            raise InputError(
+                f"expected {' or '.join(endings)} files named by frame index or image name in "
+                f"{self.folder}, found {len(files)} such files and none that fits; name them like "
+                "00017.npy"
+            )
+        index = self.folder / INDEX
+        self._number_of = _read_index(index) if stems is None and index.is_file() else None
+
+    def of(self, frame: Frame) -> Path | None:
+        """Return the file of a frame, or None if the folder has none for it."""
+        number: int | None = frame.frame_index
+        if self._number_of is not None:
+            number = self._number_of.get(stamp(frame.timestamp))
+            if number is None:
+                raise InputError(
+                    f"expected {self.what} of the frame at {stamp(frame.timestamp)} s, found no "
+                    f"such frame in {self.folder / INDEX}; make them from this sequence with "
+                    "minislam priors"
+                )
+        return self._files.get(number)
+
+    def any(self) -> Path:
+        """Return one of the files."""
+        return self._files[min(self._files)]
+
+
+class FileFeatures:
+    """Features made elsewhere, from .npy files (h', w', C): a `FeatureExtractor`."""
+
+    def __init__(self, folder: Path | str) -> None:
+        self._files = FrameFiles(folder, "features", (".npy",))
+        self.dimension = _read_features(self._files.any()).shape[2]
+
+    def __call__(self, frame: Frame) -> Tensor:  # (h', w', C) float32
+        """Read the features of a frame."""
+        path = self._files.of(frame)
+        if path is None:
+            raise InputError(
+                f"expected features of every keyframe in {self._files.folder}, found none for "
+                f"frame {frame.frame_index}; make them from this sequence with minislam priors"
+            )
+        features = _read_features(path)
+        rows, cols, channels = features.shape
+        if channels != self.dimension:
+            raise InputError(
+                f"expected {self.dimension} channels in {path} as in the other files, found "
+                f"{channels}; write all of them with one network"
+            )
+        height, width = frame.image.shape[:2]
+        # Whole patches are counted, so each side of the grid may lack up to one of them.
+        if abs(rows - cols * height / width) > max(1, height / width):
+            raise InputError(
+                f"expected {path} to cover the image of {width}x{height}, found a grid of "
+                f"{cols}x{rows}, of another aspect ratio; crop it like the image"
+            )
+        return torch.from_numpy(features).to(frame.image.device)
+
+
+def folder_of(name: str, kind: str) -> Path:
+    """Return where the files of a kind are: in a folder's part of that name, or in it itself."""
+    folder = Path(name).expanduser()
+    parts = [kind, _ALSO_DEPTH] if kind == DEPTH else [kind]
+    return next((folder / part for part in parts if (folder / part).is_dir()), folder)
+
+
+def index_text(origin: str, frames: list[tuple[int, float]]) -> str:
+    """Return the content of an index: frame index and timestamp [s] of every frame."""
+    rows = "".join(f"{number} {stamp(timestamp)}\n" for number, timestamp in frames)
+    return f"# {origin}\n# frame_index timestamp\n{rows}"
+
+
+def stamp(timestamp: float) -> str:
+    """Return a timestamp [s] to the microsecond: as text it can be looked up exactly."""
+    return f"{timestamp:.6f}"
+
+
+def read_array(path: Path, what: str) -> np.ndarray:
+    """Return the array of an .npy file of floating-point numbers."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(
+            f"expected a numpy array of {what}, found an unreadable file {path}; write it again"
+        ) from error
+    if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, np.floating):
+        raise InputError(
+            f"expected floating-point {what} in {path}, found {getattr(array, 'dtype', 'several')}"
+            "; store one array of float32 per file"
+        )
+    return array
+
+
+def _read_features(path: Path) -> np.ndarray:
+    features = read_array(path, "features")
+    if features.ndim != 3 or features.size == 0 or not np.isfinite(features).all():
+        raise InputError(
+            f"expected finite features of shape (rows, columns, channels) in {path}, found shape "
+            f"{features.shape}; write it again"
+        )
+    return features.astype(np.float32)
+
+
+def _read_index(path: Path) -> dict[str, int]:
+    try:
+        rows = path.read_text(encoding="utf-8").splitlines()
+        pairs = [row.split() for row in rows if row and not row.startswith("#")]
+        return {stamp(float(timestamp)): int(number) for number, timestamp in pairs}
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"expected rows of frame index and timestamp in {path}, found something else "
+            f"({error}); write it again with minislam priors, or remove it"
+        ) from error
+
+
+def _by_number(files: list[Path]) -> dict[int, Path]:
+    return {int(path.stem): path for path in files if path.stem.isdecimal()}
+
+
+def _by_stem(files: list[Path], stems: list[str]) -> dict[int, Path]:
+    paths = {path.stem: path for path in files}
+    return {index: paths[stem] for index, stem in enumerate(stems) if stem in paths}
