@@ -3,7 +3,7 @@
 import resource
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,13 @@ import torch
 import minislam
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
-from minislam.errors import InputError, MinislamError
+from minislam.errors import MinislamError
 from minislam.evaluation import absolute_trajectory_error
+from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.run import MAX_DIFFERENCE, MappedView, measure_run
 from minislam.geometry import se3_inverse
-from minislam.priors.depth import FileDepth, NoDepth, SensorDepth, SimulatedDepth
-from minislam.priors.features import ClassicalFeatures
-from minislam.priors.flow import ClassicalFlow
-from minislam.priors.interfaces import DepthPrior
+from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
+from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
 from minislam.slam import Priors, Report, Slam
 from minislam.uncertainty.grid import resample
@@ -50,39 +49,34 @@ class RunOutcome:
     state: str  # "finished", "finished, partly lost" or "interrupted"
 
 
-def choose_depth(name: str, sequence: Sequence, config: SlamConfig) -> DepthPrior:
-    """Return the depth prior by name: none, simulated, sensor, or files:FOLDER."""
-    if name == "none":
-        return NoDepth()
-    if name == "simulated":
-        truth = sequence.ground_truth
-        if truth is None or truth.depth(0) is None:
-            raise InputError(
-                "expected a sequence with true depth for --depth simulated, found none in "
-                f"{sequence.name}; use --depth none or --depth files:FOLDER"
-            )
-        return SimulatedDepth(truth.depth, config.seed, config.simulated_depth)
-    if name == "sensor":
-        return SensorDepth(sequence.sensor_depth)
-    if name.startswith("files:"):
-        return FileDepth(Path(name.removeprefix("files:")))
-    raise InputError(
-        f"expected --depth none, simulated, sensor or files:FOLDER, found {name!r}; choose one"
+def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -> Priors:
+    """Return the priors that are named, their files read and checked."""
+    networks = config.networks
+    return Priors(
+        choose_flow(choice, config.flow, networks),
+        choose_features(choice, config.features),
+        choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
+
+
+def load_lpips(trunk: Path | str, heads: Path | str) -> Lpips:
+    """Read the two files of LPIPS."""
+    files = [load_checkpoint(Path(file).expanduser()) for file in (trunk, heads)]
+    return Lpips(*(weights.as_dict() for weights in files))
 
 
 def run_sequence(
     sequence: Sequence,
     config: SlamConfig,
-    depth: str,
+    choice: PriorChoice,
+    priors: Priors,  # as chosen
     folder: RunFolder,
     report: Report | None = None,
+    lpips: Lpips | None = None,
 ) -> RunOutcome:
     """Run SLAM on a sequence and write the run folder, also when it is interrupted."""
     torch.set_num_threads(config.threads)
     start = time.perf_counter()
-    flow, features = ClassicalFlow(config.flow), ClassicalFeatures(config=config.features)
-    priors = Priors(flow, features, choose_depth(depth, sequence, config))
     folder.write_config(as_json(config))
     slam = Slam(sequence, config, priors, report)
     interrupted = False
@@ -91,10 +85,10 @@ def run_sequence(
     except KeyboardInterrupt:
         interrupted = True
         if not slam.mapper.keyframes:  # there is nothing to save yet
-            folder.write_run(_facts(slam, depth, start, "interrupted", INTERRUPTED_EXIT))
+            folder.write_run(_facts(slam, choice, start, "interrupted", INTERRUPTED_EXIT))
             raise
     except MinislamError as error:
-        folder.write_run(_facts(slam, depth, start, f"failed: {error}", FAILED_EXIT))
+        folder.write_run(_facts(slam, choice, start, f"failed: {error}", FAILED_EXIT))
         raise
     seconds = time.perf_counter() - start
     lost = slam.lost_frames()
@@ -102,9 +96,9 @@ def run_sequence(
     exit_code = LOST_EXIT if lost else 0
     if interrupted:
         state, exit_code = "interrupted", INTERRUPTED_EXIT
-    facts = _facts(slam, depth, start, state, exit_code)
+    facts = _facts(slam, choice, start, state, exit_code)
     _write_estimates(folder, slam)
-    metrics = _measure(slam, seconds)
+    metrics = _measure(slam, seconds, lpips)
     folder.write_metrics(metrics)
     outcome = RunOutcome(metrics, facts["warnings"], exit_code, state)
     _write_pictures(folder, slam, outcome)
@@ -112,13 +106,15 @@ def run_sequence(
     return outcome
 
 
-def _facts(slam: Slam, depth: str, start: float, state: str, exit_code: int) -> dict[str, Any]:
+def _facts(
+    slam: Slam, choice: PriorChoice, start: float, state: str, exit_code: int
+) -> dict[str, Any]:
     """Return what run.json says: how the run was asked for, how long it took, how it ended."""
     return {
         "version": minislam.__version__,
         "command": sys.argv,
         "sequence": slam.sequence.description,
-        "depth": depth,
+        "priors": asdict(choice),
         "seed": slam.config.seed,
         "state": state,
         "exit_code": exit_code,
@@ -141,7 +137,7 @@ def _write_estimates(folder: RunFolder, slam: Slam) -> None:
     folder.write_mlp(slam.mapper.mlp.state_dict())
 
 
-def _measure(slam: Slam, seconds: float) -> dict[str, Any]:
+def _measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     views = [
         MappedView(
             _frame_index(slam, index),
@@ -156,6 +152,7 @@ def _measure(slam: Slam, seconds: float) -> dict[str, Any]:
         slam.keyframe_trajectory(),
         views,
         lambda pose: _rendered(slam, pose),
+        lpips,
     )
     metrics["seconds_total"] = seconds
     metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds

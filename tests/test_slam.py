@@ -167,7 +167,11 @@ def test_the_configuration_can_be_used_again(without_uncertainty: RunFolder):
 
 def test_run_json_says_what_was_done(with_depth: RunFolder):
     facts = with_depth.read_run()
-    assert (facts["state"], facts["exit_code"], facts["depth"]) == ("finished", 0, "simulated")
+    assert (facts["state"], facts["exit_code"], facts["priors"]["depth"]) == (
+        "finished",
+        0,
+        "simulated",
+    )
     assert facts["frames"] == FRAMES and facts["lost_frames"] == 0
     assert facts["keyframes"] == len(with_depth.read_keyframe_trajectory())
     assert facts["gaussians"] == len(with_depth.read_map())

@@ -90,6 +90,15 @@ class Lpips:
         with torch.no_grad():
             return float(self.distance(*both))
 
+    def require_size(self, width: int, height: int) -> None:
+        """Refuse images that are too small to compare [px]."""
+        side = self._layout.smallest_side
+        if min(width, height) < side:
+            raise InputError(
+                f"expected images of at least {side}x{side} px for LPIPS with {self.name}, found "
+                f"{width}x{height}; give a larger working size"
+            )
+
     def distance(self, image: Tensor, reference: Tensor) -> Tensor:
         """Return the distance of two images (H, W, 3), differentiable."""
         if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3:
@@ -97,12 +106,7 @@ class Lpips:
                 f"expected two RGB images of one size, found {tuple(image.shape)} and "
                 f"{tuple(reference.shape)}; render at the size of the reference"
             )
-        side = self._layout.smallest_side
-        if min(image.shape[:2]) < side:
-            raise InputError(
-                f"expected images of at least {side}x{side} px for LPIPS with {self.name}, found "
-                f"{image.shape[1]}x{image.shape[0]}; measure larger ones"
-            )
+        self.require_size(image.shape[1], image.shape[0])
         total = image.new_zeros(())
         pairs = zip(self._features(image), self._features(reference), strict=True)
         for level, (a, b) in enumerate(pairs):

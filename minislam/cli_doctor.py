@@ -1,0 +1,139 @@
+"""The sub-command `minislam doctor`: what is installed, does it work, which files are these."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import minislam
+from minislam.errors import InputError, MinislamError
+
+if TYPE_CHECKING:
+    from minislam.priors.networks.checkpoints import Weights
+
+MAX_SELF_TEST_ERROR = 0.1  # px
+CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
+BYTES_PER_MEGABYTE = 1e6
+
+
+def add_doctor_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
+    """Add `doctor` to the sub-commands of a parser."""
+    parser = subparsers.add_parser("doctor", help="say what is installed and whether it works")
+    parser.add_argument(
+        "--weights", metavar="DIR", help="recognise the checkpoint files in a folder instead"
+    )
+    parser.set_defaults(run=run_doctor)
+    return parser
+
+
+def run_doctor(args: argparse.Namespace) -> int:
+    """Print what was found; return the exit code."""
+    if args.weights is not None:
+        return _print_checkpoints(Path(args.weights).expanduser())
+    return _print_installation()
+
+
+def _print_installation() -> int:
+    """Print versions and threads, and measure a flow that is known."""
+    import platform
+
+    import torch
+
+    print(f"minislam {minislam.__version__}, Python {platform.python_version()}")
+    for name in ("numpy", "scipy", "torch", "cv2", "matplotlib"):
+        print(f"  {name:11s} {importlib.import_module(name).__version__}")
+    print(f"  processors  {os.cpu_count()}, torch uses {torch.get_num_threads()} threads")
+    print(f"  CUDA        {torch.cuda.get_device_name() if torch.cuda.is_available() else 'none'}")
+    start = time.perf_counter()
+    error = _self_test()
+    seconds = time.perf_counter() - start
+    print(f"  self-test   flow of a shifted image, off by {error:.3f} px, {seconds:.1f} s")
+    if not error <= MAX_SELF_TEST_ERROR:
+        raise MinislamError(
+            f"expected the self-test to be exact to {MAX_SELF_TEST_ERROR} px, found "
+            f"{error:.3f} px; reinstall opencv-python-headless"
+        )
+    return 0
+
+
+def _self_test() -> float:
+    """Return the error of the flow between an image and the same image shifted [px]."""
+    import torch
+
+    from minislam.priors.flow import ClassicalFlow
+
+    source = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 3, 32, 42, generator=source)
+    smooth = torch.nn.functional.interpolate(coarse, scale_factor=8, mode="bicubic")
+    image = smooth[0].permute(1, 2, 0).clamp(0, 1)
+    _, matches = ClassicalFlow().start_chain(image[:240, :320]).advanced(image[4:244, 8:328])
+    rows, columns = matches.targets.shape[1:3]
+    start = torch.stack(
+        torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), -1
+    )
+    flow = matches.targets[0] - 8 * start
+    middle = flow[8:-8, 8:-8].reshape(-1, 2).median(0).values
+    return float((middle - torch.tensor([-8.0, -4.0])).norm())
+
+
+def _print_checkpoints(folder: Path) -> int:
+    """Print one line for each checkpoint file: which network, how large, whole or not, its flag."""
+    files = []
+    if folder.is_dir():
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in CHECKPOINT_ENDINGS)
+    if not files:
+        raise InputError(
+            f"expected a folder with checkpoint files ({', '.join(CHECKPOINT_ENDINGS)}), found "
+            f"none in {folder}; check the path"
+        )
+    width = max(len(file.name) for file in files)
+    for file in files:
+        size = file.stat().st_size / BYTES_PER_MEGABYTE
+        print(f"{file.name:{width}s}  {size:7.1f} MB  {_verdict(file)}", flush=True)
+    return 0
+
+
+def _verdict(file: Path) -> str:
+    """Say which network a file belongs to, and whether it is complete."""
+    from minislam.priors.networks.checkpoints import describe, load_checkpoint
+
+    try:
+        weights = load_checkpoint(file)
+        network = describe(weights)
+        check, use = _check_and_use(network)
+    except MinislamError as error:
+        return f"unreadable: {error}"
+    if check is None:
+        return f"{network}, of no use here"
+    try:
+        check(weights)
+    except MinislamError as error:
+        return f"{network}, NOT usable: {error}"
+    return f"{network}, complete: {use}"
+
+
+def _check_and_use(network: str) -> tuple[Callable[[Weights], object] | None, str]:
+    """Return how to check a network that `describe` has named, and the flags that use it."""
+    from minislam.evaluation.lpips import recognise_heads, recognise_trunk
+    from minislam.priors.networks.depth_anything import checked_depth_anything
+    from minislam.priors.networks.dinov2 import checked_dino_features
+    from minislam.priors.networks.droid import checked_droid
+    from minislam.priors.networks.metric3d import checked_metric3d
+
+    kinds: list[tuple[str, Callable[[Weights], object], str]] = [
+        ("DROID", checked_droid, "--flow droid --flow-weights"),
+        ("DINOv2", checked_dino_features, "--features dinov2 --features-weights"),
+        ("FiT3D", checked_dino_features, "--features fit3d --features-weights"),
+        ("Metric3D", checked_metric3d, "--depth metric3d --depth-weights"),
+        ("Depth", checked_depth_anything, "--depth depth-anything --depth-weights"),
+        ("LPIPS", lambda weights: recognise_heads(weights.as_dict()), "--lpips-heads"),
+        ("an image", lambda weights: recognise_trunk(weights.as_dict()), "--lpips-trunk"),
+    ]
+    return next(
+        ((check, use) for name, check, use in kinds if network.startswith(name)), (None, "")
+    )

@@ -1,0 +1,151 @@
+"""The sub-command `minislam priors`: features and depth of every frame, written to files.
+
+Heavy networks then run once, where there is a GPU, and `minislam run --features files:DIR --depth
+files:DIR` reads what they said, anywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from minislam.cli_options import add_input, add_priors, input_options, prior_choice, settings
+from minislam.cli_progress import ProgressLine, StopRequest
+from minislam.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from minislam.config import SlamConfig
+    from minislam.data import RecordedSequence
+    from minislam.priors.choice import PriorChoice
+    from minislam.records import Frame
+
+FRAME_DIGITS = 5  # of the file names, as WildGS-SLAM names its own
+
+
+def add_priors_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
+    """Add `priors` to the sub-commands of a parser."""
+    parser = subparsers.add_parser(
+        "priors",
+        help="write features and depth of every frame to files, to run SLAM on elsewhere",
+        usage="minislam priors SEQUENCE --out DIR [--features NAME] [--depth NAME] [options]",
+        allow_abbrev=False,
+    )
+    add_input(parser)
+    parser.add_argument(
+        "--out", required=True, metavar="DIR", help="gets the folders features and depth"
+    )
+    add_priors(parser, default_depth="none")
+    parser.set_defaults(run=run_priors)
+    return parser
+
+
+def run_priors(args: argparse.Namespace) -> int:
+    """Write the priors that are asked for; return the exit code."""
+    import torch
+
+    from minislam.data import open_sequence
+
+    config, choice = settings(args), prior_choice(args, default_depth="none")
+    if args.features is None and choice.depth == "none":
+        raise InputError(
+            "expected --features or --depth, found neither; name what is to be written"
+        )
+    torch.set_num_threads(config.threads)
+    progress = ProgressLine()
+    with StopRequest() as stop:
+
+        def report(stage: str, done: int, of_all: int) -> None:
+            progress.show(stage, done, of_all)
+            stop.check()
+
+        sequence = open_sequence(
+            args.sequence,
+            input_options(args),
+            lambda done, of_all: report("making frames", done, of_all),
+        )
+        print(sequence.description)
+        out = Path(args.out).expanduser()
+        kinds = _kinds(choice, args.features is not None, sequence, config)
+        for kind, (origin, compute) in kinds.items():
+            write_kind(out / kind, origin, sequence, compute, report)
+    print(f"use them with {' '.join(f'--{kind} files:{out}' for kind in kinds)}")
+    return 0
+
+
+def _kinds(
+    choice: PriorChoice, with_features: bool, sequence: RecordedSequence, config: SlamConfig
+) -> dict[str, tuple[str, Callable[[Frame], Tensor | None]]]:
+    """Return what to write: folder name, where it comes from, and how to compute it."""
+    from minislam.config import as_json
+    from minislam.priors.choice import choose_depth, choose_features
+    from minislam.priors.files import DEPTH, FEATURES
+
+    # Whatever the result depends on: files of another command must not be taken for ours.
+    conditions = (
+        f"{sequence.description}; {sequence.camera}; seed {config.seed}; "
+        f"{as_json(config)['networks']}"
+    )
+    kinds: dict[str, tuple[str, Callable[[Frame], Tensor | None]]] = {}
+    if with_features:
+        features = choose_features(choice, config.features)
+        origin = f"{choice.features} {choice.features_weights}; {conditions}"
+        kinds[FEATURES] = (origin, features)
+    if choice.depth != "none":
+        depth = choose_depth(choice, sequence, config.seed, config.simulated_depth, config.networks)
+        origin = f"{choice.depth} {choice.depth_weights}; {conditions}"
+        kinds[DEPTH] = (origin, lambda frame: depth(frame, sequence.camera))
+    return kinds
+
+
+def write_kind(
+    folder: Path,
+    origin: str,
+    sequence: RecordedSequence,
+    compute: Callable[[Frame], Tensor | None],
+    report: Callable[[str, int, int], None],
+) -> None:
+    """Write one .npy file per frame. What an interrupted run has written is not made again."""
+    import numpy as np
+
+    from minislam.data.files import atomic_write, read_text, write_text
+    from minislam.priors.files import INDEX, index_text
+
+    _make(folder)
+    stamps = [(index, frame.timestamp) for index, frame in enumerate(sequence)]
+    text = index_text(origin, stamps)
+    index = folder / INDEX
+    if index.exists() and read_text(index) != text:
+        raise InputError(
+            f"expected an empty folder, or one of the same command, found {folder} with files of "
+            "another; choose another --out"
+        )
+    if not index.exists() and any(folder.iterdir()):
+        raise InputError(
+            f"expected an empty folder {folder}, found files of something else; choose another "
+            "--out"
+        )
+    write_text(index, text)
+    for frame in sequence:
+        path = folder / f"{frame.frame_index:0{FRAME_DIGITS}d}.npy"
+        if not path.exists():
+            values = compute(frame)
+            if values is not None:
+                buffer = io.BytesIO()
+                np.save(buffer, values.float().cpu().numpy())
+                atomic_write(path, buffer.getvalue())
+        report(f"writing {folder.name}", frame.frame_index + 1, len(sequence))
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"expected to be able to make the folder {folder}, but the system says: "
+            f"{error.strerror}; choose another --out"
+        ) from error
