@@ -30,6 +30,7 @@ class Keyframe:
     features: Tensor  # (h', w', C) float32, one vector per patch of the feature grid
     depth: Tensor  # (H, W) float32 world units, 0 where unknown: the mapper's reference D~
     T_camera_world: Tensor  # (4, 4) float64
+    moving_mask: Tensor | None = None  # (H, W) bool, True on movers, if it is given (ablation)
 
 
 @dataclass(frozen=True)

@@ -12,22 +12,22 @@ learnt of each cell, and `_move_map` carries the map along when an adjustment mo
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.config import SlamConfig
-from minislam.errors import TrackingLost
+from minislam.errors import InputError, TrackingLost
 from minislam.geometry import se3_inverse
 from minislam.mapping import Mapper
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.records import Keyframe, Sequence, Trajectory
+from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
-from minislam.uncertainty import tracking_weight
+from minislam.uncertainty import beta_of_mask, tracking_weight
 
 Report = Callable[[str, int, int], None]  # stage, done, of all
 
@@ -56,15 +56,18 @@ class Slam:
             priors.features.dimension,
             config.seed,
         )
+        tracking = config.tracking
+        if config.uncertainty.given_masks:  # they stand on no map, so they need no depth prior
+            tracking = replace(tracking, beta_without_prior=True)
         self.tracker = Tracker(
             sequence.camera,
-            config.tracking,
+            tracking,
             priors.flow,
             priors.features,
             priors.depth,
             self._static_weight,
         )
-        self._stride = priors.flow.stride
+        self._features, self._stride = priors.features, priors.flow.stride
         self._report = report or (lambda stage, done, of_all: None)
         self._poses: dict[int, Tensor] = {}  # T_camera_world of every frame, once known
 
@@ -91,6 +94,9 @@ class Slam:
         with self._timed("all frames"):
             progress = self._progress("posing all frames")
             self._poses = pose_all_frames(self.tracker, self.sequence, progress)
+        if self.config.mapping.pose_refinement.enabled:
+            with self._timed("photometric refinement"):
+                self._refine_other_poses(self._progress("refining the poses"))
 
     def _initialise(self) -> None:
         """Start in two stages (paper Sec. 3.3): without beta, then with what it has learnt."""
@@ -119,13 +125,45 @@ class Slam:
             depths += [self._depth(index) for index in range(first_changed, mapped)]
         self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped], depths)
 
-    def _static_weight(self, features: Tensor) -> Tensor:
-        """Return how far beta trusts each cell of the tracker (h, w), in (0, 1]."""
+    def _refine_other_poses(self, progress: Callable[[int, int], None]) -> None:
+        """Refine the frames between the keyframes: the map from there must look like them."""
+        keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
+        others = [index for index in self._poses if index not in keyframes]
+        for done, index in enumerate(others):
+            frame = self.sequence.frame(index)
+            beta = self._beta(frame, None)
+            pose = self.mapper.refine_pose(self._poses[index], frame.image, beta)
+            self._poses[index] = pose
+            progress(done + 1, len(others))
+
+    def _static_weight(self, index: int) -> Tensor:
+        """Return how far each cell of a keyframe (h, w) can be trusted, in (0, 1]."""
         if not self.config.uncertainty.enabled or not self.mapper.keyframes:
             height, width = self.tracker.grid.shape
             return torch.ones(height, width)
-        beta = self.mapper.predict_beta(features)
+        keyframes = self.tracker.keyframes
+        beta = self._beta(keyframes.frames[index], keyframes.features[index])
         return tracking_weight(beta, self.sequence.camera, self._stride)
+
+    def _beta(self, frame: Frame, features: Tensor | None) -> Tensor:
+        """Return the raw beta (h', w') of a frame: of its given mask, or what the MLP says."""
+        mask = self._given_mask(frame.frame_index)
+        if mask is not None:
+            return beta_of_mask(mask)
+        return self.mapper.predict_beta(self._features(frame) if features is None else features)
+
+    def _given_mask(self, frame_index: int) -> Tensor | None:
+        """Return the mask of movers (H, W) that the sequence gives, if they are asked for."""
+        if not self.config.uncertainty.given_masks:
+            return None
+        truth = self.sequence.ground_truth
+        mask = None if truth is None else truth.moving_mask(frame_index)
+        if mask is None:
+            raise InputError(
+                f"expected a mask of movers for every frame of {self.sequence.name}, found none "
+                f"for frame {frame_index}; set uncertainty.given_masks to false"
+            )
+        return torch.from_numpy(mask)
 
     def _keyframe(self, index: int) -> Keyframe:
         """Return a keyframe as the mapper wants it."""
@@ -139,6 +177,7 @@ class Slam:
             features=keyframes.features[index],
             depth=self._depth(index),
             T_camera_world=keyframes.T_camera_world[index],
+            moving_mask=self._given_mask(frame.frame_index),
         )
 
     def _depth(self, index: int) -> Tensor:

@@ -48,6 +48,22 @@ class DensityConfig:
 
 
 @dataclass(frozen=True)
+class PoseRefinementConfig:
+    """How the poses between the keyframes are refined by re-rendering, at full image size."""
+
+    enabled: bool = parameter(True, "off: those poses stand on flow alone (fast mode of the paper)")
+    iterations: int = parameter(
+        3, "steps per frame at most; official 100 of Adam, ours divide by the curvature"
+    )
+    tolerance: float = parameter(
+        0.01, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
+    )
+    rounding: float = parameter(
+        0.01, "colour difference below which the L1 loss is rounded off [1], one step of noise"
+    )
+
+
+@dataclass(frozen=True)
 class MappingConfig:
     """Budget, window, losses and step lengths. "official" names the authors' code.
 
@@ -58,6 +74,9 @@ class MappingConfig:
     image_scale: float = parameter(0.5, "size of the images used online, of the full size (0, 1]")
     init_iterations: int = parameter(150, "iterations on the first keyframes; official 1050")
     keyframe_iterations: int = parameter(25, "iterations per keyframe; official 450")
+    keyframe_stride: int = parameter(
+        1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode"
+    )
     refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
     refine_full_share: float = parameter(
         0.4, "share of them, the last ones, at full image size [0, 1]; official 1"
@@ -115,6 +134,10 @@ class MappingConfig:
     density: DensityConfig = field(
         default_factory=DensityConfig, metadata={"meaning": "cloning, splitting and pruning"}
     )
+    pose_refinement: PoseRefinementConfig = field(
+        default_factory=PoseRefinementConfig,
+        metadata={"meaning": "photometric refinement of the poses between the keyframes"},
+    )
     freeze_iterations: int = parameter(
         5, "iterations without MLP training after a change of density; official 20 of 450"
     )
@@ -124,6 +147,11 @@ class MappingConfig:
             raise InputError(
                 f"expected an image scale in (0, 1], found {self.image_scale}; "
                 "set mapping.image_scale to 1 for full size or 0.5 for half"
+            )
+        if self.keyframe_stride < 1:
+            raise InputError(
+                f"expected a stride of at least 1 keyframe, found {self.keyframe_stride}; "
+                "set mapping.keyframe_stride to 1 to optimise the map at each of them"
             )
         if self.window_size < 3:
             raise InputError(

@@ -19,17 +19,16 @@ from minislam.mapping.insertion import (
     lies_on_mover,
 )
 from minislam.mapping.losses import render_loss
-from minislam.mapping.views import MappedKeyframe, shrink_image
+from minislam.mapping.pose_refinement import refine_pose
+from minislam.mapping.views import MappedKeyframe, keyframe_misfit
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
 from minislam.splatting import GaussianMap, MapOptimizer, Rendering, render
 from minislam.uncertainty import (
-    Misfit,
     UncertaintyConfig,
     UncertaintyMLP,
     UncertaintyTrainer,
     mapping_weight,
-    measure_misfit,
 )
 
 Progress = Callable[[int, int], None]  # called with the iterations done and their number
@@ -124,6 +123,8 @@ class Mapper:
         )
         self._withdraw_movers()
         self._insert(new)
+        if new % self.config.keyframe_stride != 0:
+            return  # Fast mode: this keyframe waits for the next optimisation.
         probabilities = sampling_probabilities(
             len(self.keyframes), self.window, self.config.window_share
         )
@@ -175,11 +176,34 @@ class Mapper:
             anchors.new_tensor([keyframe.keyframe_index for keyframe in self.keyframes]), anchors
         )
 
+    def refine_pose(
+        self,
+        T_camera_world: Tensor,  # (4, 4) float64
+        image: Tensor,  # (H, W, 3) RGB in [0, 1] of a frame that is no keyframe
+        beta: Tensor,  # (h', w') of that frame
+    ) -> Tensor:  # (4, 4) float64
+        """Return the pose near the given one from which the map looks most like the image."""
+        weight = self._weight_of(beta, self.camera)
+        settings = self.config.pose_refinement
+        return refine_pose(
+            self.gaussians, self.camera, T_camera_world, image, weight, self.background, settings
+        )
+
+    def beta_of(self, keyframe: MappedKeyframe) -> Tensor:
+        """Return the raw beta (h', w') of a keyframe: that of its given mask, or the MLP's."""
+        if keyframe.given_beta is not None:
+            return keyframe.given_beta
+        return self.predict_beta(keyframe.features)
+
     def _weight(self, keyframe: MappedKeyframe, camera: Camera) -> Tensor:
-        """Return the static weight (H, W) of a keyframe; 1 with uncertainty switched off."""
+        """Return the static weight (H, W) of a keyframe."""
+        return self._weight_of(self.beta_of(keyframe), camera)
+
+    def _weight_of(self, beta: Tensor, camera: Camera) -> Tensor:
+        """Return the static weight (H, W) for a beta; 1 with uncertainty switched off."""
         if not self.uncertainty.enabled:
-            return torch.ones(camera.height, camera.width, device=keyframe.image.device)
-        return mapping_weight(self.predict_beta(keyframe.features), camera)
+            return torch.ones(camera.height, camera.width, device=beta.device)
+        return mapping_weight(beta, camera)
 
     @torch.no_grad()
     def _seen(self, position: int) -> Tensor:
@@ -268,33 +292,10 @@ class Mapper:
         self._optimizer.step()
 
         uncertainty = math.nan
-        if self.uncertainty.enabled and self._iteration >= self._frozen_until:
+        if self.uncertainty.is_learnt and self._iteration >= self._frozen_until:
             uncertainty = self._train_mlp(position, rendering)
         self.history.add(loss, uncertainty, len(gaussians))
         self._iteration += 1
-
-    @torch.no_grad()
-    def _misfit(self, keyframe: MappedKeyframe, rendering: Rendering) -> Misfit:
-        """Compare a rendering of any size with its keyframe, at the online image size.
-
-        Always the same size, because the windows of the SSIM are in pixels: beta would mean
-        something else at each size. And it saves time.
-        """
-        camera = self._online_camera
-        size = (camera.height, camera.width)
-        view = keyframe.view(camera)
-        depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
-        depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
-        return measure_misfit(
-            view.image,
-            view.depth,
-            shrink_image(rendering.color, *size),
-            depth,
-            opacity,
-            keyframe.features.shape[:2],
-            self.median_depth / self.config.metric_median,
-            self.uncertainty,
-        )
 
     def _train_mlp(self, position: int, rendering: Rendering) -> float:
         """Take one step of the MLP on a rendering, as a constant, and return L_uncer."""
@@ -302,9 +303,11 @@ class Mapper:
         reach = self.uncertainty.neighbour_keyframes
         nearby = self.keyframes[max(0, position - reach) : position + reach + 1]
         cells = torch.cat([k.features.reshape(-1, features.shape[-1]) for k in nearby])
-        return self._trainer.step(
-            features, self._misfit(self.keyframes[position], rendering), cells
+        depth_unit = self.median_depth / self.config.metric_median
+        misfit = keyframe_misfit(
+            self.keyframes[position], rendering, self._online_camera, depth_unit, self.uncertainty
         )
+        return self._trainer.step(features, misfit, cells)
 
     def _change_density(self) -> None:
         """Clone, split and prune, then let the map settle before the MLP learns again."""

@@ -8,6 +8,8 @@ from torch.nn import functional
 
 from minislam.geometry import Camera
 from minislam.records import Keyframe
+from minislam.splatting import Rendering
+from minislam.uncertainty import Misfit, UncertaintyConfig, beta_of_mask, measure_misfit
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class MappedKeyframe:
     image: Tensor  # (H, W, 3)
     depth: Tensor  # (H, W) world units, 0 where unknown
     T_camera_world: Tensor  # (4, 4) float64
+    given_beta: Tensor | None = None  # (h, w) instead of the MLP's
     _views: dict[tuple[int, int], View] = field(default_factory=dict)
 
     @classmethod
@@ -39,6 +42,7 @@ class MappedKeyframe:
             keyframe.image,
             keyframe.depth,
             keyframe.T_camera_world.double(),
+            None if keyframe.moving_mask is None else beta_of_mask(keyframe.moving_mask),
         )
 
     def view(self, camera: Camera) -> View:
@@ -53,6 +57,34 @@ class MappedKeyframe:
         """Replace the reference depth (H, W)."""
         self.depth = depth
         self._views.clear()
+
+
+@torch.no_grad()
+def keyframe_misfit(
+    keyframe: MappedKeyframe,
+    rendering: Rendering,  # of any size
+    camera: Camera,  # of the size at which they are compared
+    depth_unit: float,  # world units that count as 1 in L_depth
+    config: UncertaintyConfig,
+) -> Misfit:
+    """Compare a rendering with its keyframe, at a size that is always the same.
+
+    The windows of the SSIM are in pixels: at another size, beta would mean something else.
+    """
+    size = (camera.height, camera.width)
+    view = keyframe.view(camera)
+    depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
+    depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
+    return measure_misfit(
+        view.image,
+        view.depth,
+        shrink_image(rendering.color, *size),
+        depth,
+        opacity,
+        keyframe.features.shape[:2],
+        depth_unit,
+        config,
+    )
 
 
 def shrink_image(image: Tensor, height: int, width: int) -> Tensor:

@@ -56,7 +56,7 @@ class Tracker:
         flow: FlowEstimator,
         features: FeatureExtractor,
         depth_prior: DepthPrior,
-        predict_static_weight: Callable[[Tensor], Tensor],  # features -> (h, w) in [0, 1]
+        predict_static_weight: Callable[[int], Tensor],  # keyframe index -> (h, w) in [0, 1]
     ) -> None:
         self.config = config
         self.backend = BackEnd(camera, config, flow)
@@ -194,7 +194,7 @@ class Tracker:
         if not (self.keyframes.has_prior or self.config.beta_without_prior):
             return
         for index in range(first, len(self.keyframes)):
-            weight = self._predict_static_weight(self.keyframes.features[index])
+            weight = self._predict_static_weight(index)
             self.keyframes.static_weights[index] = weight.reshape(-1)
 
     def _require_a_pair(self) -> None:

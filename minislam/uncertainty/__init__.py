@@ -3,13 +3,14 @@
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.training import Misfit, UncertaintyTrainer, measure_misfit
-from minislam.uncertainty.weights import mapping_weight, tracking_weight
+from minislam.uncertainty.weights import beta_of_mask, mapping_weight, tracking_weight
 
 __all__ = [
     "Misfit",
     "UncertaintyConfig",
     "UncertaintyMLP",
     "UncertaintyTrainer",
+    "beta_of_mask",
     "mapping_weight",
     "measure_misfit",
     "paper_uncertainty",

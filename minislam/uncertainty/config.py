@@ -11,6 +11,10 @@ class UncertaintyConfig:
     """How beta is predicted and trained. "official" names the constants of the authors' code."""
 
     enabled: bool = parameter(True, "off: every weight is 1 and nothing is trained (ablation a)")
+    given_masks: bool = parameter(
+        False,
+        "weigh by masks of movers that come with the sequence, train nothing (ablation c)",
+    )
 
     hidden_units: int = parameter(64, "width of the two hidden layers [units], official")
     dropout: float = parameter(0.2, "share of hidden units dropped in training [0, 1), official")
@@ -51,6 +55,11 @@ class UncertaintyConfig:
     neighbour_keyframes: int = parameter(
         2, "keyframes before and after that L_reg_V looks at [keyframes], official"
     )
+
+    @property
+    def is_learnt(self) -> bool:
+        """Tell whether beta comes from the MLP."""
+        return self.enabled and not self.given_masks
 
     def __post_init__(self) -> None:
         if self.median_size < 1 or self.median_size % 2 == 0:

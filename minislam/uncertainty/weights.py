@@ -21,6 +21,7 @@ TRAIN_FRACTION = 0.3  # x: position in NeRF On-the-go's schedule, held fixed by 
 SCHLICK_SLOPE = 0.8  # s: slope of that schedule at its end, official
 WEIGHT_SCALE = 0.5  # numerator of the weight, official
 TRACKING_CAP = 1.0  # a static cell must not count more than the flow's own confidence says
+BETA_OF_MASK = 2.0 * 5.0**0.5  # of a mover in a given mask: the largest that the loss allows
 MAPPING_CUT = 0.1  # below this the weight is 0: no slow leak of a mover over many iterations
 
 
@@ -35,6 +36,12 @@ DATA_RATE = 1 + schlick_bias(TRAIN_FRACTION, SCHLICK_SLOPE)  # 1.6316
 def clipped_beta(beta_raw: Tensor) -> Tensor:
     """Return max(beta_raw, 0.1) + 0.001, the beta of the loss (Eq. 4); shape and gradient kept."""
     return beta_raw.clamp_min(BETA_FLOOR) + BETA_OFFSET
+
+
+def beta_of_mask(moving: Tensor) -> Tensor:
+    """Return the raw beta (H, W) that a given mask (H, W) bool of movers stands for."""
+    mover = torch.full(moving.shape, BETA_OF_MASK, device=moving.device)
+    return torch.where(moving, mover, BETA_FLOOR)
 
 
 def adjusted_beta(beta_raw: Tensor, camera: Camera) -> Tensor:

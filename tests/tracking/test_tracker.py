@@ -39,7 +39,7 @@ def new_tracker(with_depth: bool) -> Tracker:
     camera = Camera(k.fx, k.fy, k.cx, k.cy, *SIZE)
     depth = SensorDepth(lambda index: recording().depth[index]) if with_depth else NoDepth()
 
-    def everything_is_static(features: torch.Tensor) -> torch.Tensor:
+    def everything_is_static(keyframe_index: int) -> torch.Tensor:
         return torch.ones(15, 20)
 
     return Tracker(

@@ -175,7 +175,7 @@ def test_the_tracker_runs_on_it_from_warm_up_to_the_last_adjustment():
     depth = SensorDepth(lambda frame_index: np.full((HEIGHT, WIDTH), 2.0))
     flow = DroidFlow(Weights(tensors, "droid.pth"), DroidFlowConfig(updates=1, chain_updates=1))
     tracker = Tracker(
-        camera, config, flow, ClassicalFeatures(), depth, lambda features: torch.ones(9 * 12)
+        camera, config, flow, ClassicalFeatures(), depth, lambda index: torch.ones(9 * 12)
     )
     for index in range(5):
         tracker.track(Frame(index, index / 10, image(index)))

@@ -1,0 +1,119 @@
+"""Refine a pose by re-rendering: move the camera until the map looks like its image (Sec. 3.4).
+
+The paper lets Adam descend along the renderer's pose gradient, 100 renderings per frame. Here the
+same exact gradient is divided by the curvature of the loss, and three steps suffice. The
+curvature may be approximate: it says how far to go, the gradient alone says where the end is.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera, se3_exp
+from minislam.mapping.config import PoseRefinementConfig
+from minislam.splatting import GaussianMap, Rendering, render
+
+# Levenberg-Marquardt: the share of the curvature's diagonal added at first, and its changes.
+_FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 1e-3, 10.0, 0.3
+# Where the rendering is less opaque its depth says little about how the picture would move.
+_SOLID = 0.9
+
+
+def refine_pose(
+    gaussians: GaussianMap,  # held, without gradient
+    camera: Camera,
+    T_camera_world: Tensor,  # (4, 4) float64, to start from
+    image: Tensor,  # (H, W, 3) RGB in [0, 1], what the camera saw
+    weight: Tensor,  # (H, W) static weight, 0 on movers
+    background: Tensor,  # (3,) RGB
+    config: PoseRefinementConfig,
+) -> Tensor:  # (4, 4) float64
+    """Return the pose near the given one from which the map resembles the image most.
+
+    A step that does not lower the loss is taken back and repeated shorter, so the result is
+    never worse than the start, as far as the loss can tell.
+    """
+    pose = candidate = T_camera_world.double()
+    lowest, damping = math.inf, _FIRST_DAMPING
+    for steps_done in range(config.iterations + 1):
+        twist = torch.zeros(6, dtype=gaussians.means.dtype, device=image.device, requires_grad=True)
+        rendering = render(gaussians, camera, candidate, background, twist=twist)
+        loss = rerendering_loss(rendering, image, weight, config.rounding)
+        improved = float(loss.detach()) < lowest
+        if improved:
+            pose, lowest, damping = candidate, float(loss.detach()), _LESS_DAMPING * damping
+        if steps_done == config.iterations or not math.isfinite(lowest):
+            break
+        if improved:
+            (gradient,) = torch.autograd.grad(loss, twist)
+            bend = curvature(rendering, image, weight, camera, config.rounding)
+            if not bend.diagonal().min() > 0:
+                return pose  # The picture does not depend on the pose: it is empty or uniform.
+        else:
+            damping *= _MORE_DAMPING
+        damped = bend + damping * torch.diag(bend.diagonal())
+        step = -torch.linalg.solve(damped, gradient.double())
+        if _motion(step, rendering, camera) < config.tolerance:
+            return pose
+        candidate = se3_exp(step) @ pose
+    return pose
+
+
+def rerendering_loss(
+    rendering: Rendering,
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    weight: Tensor,  # (H, W) static weight
+    rounding: float,  # colour difference below which |r| becomes a parabola
+) -> Tensor:  # ()
+    """Return the mean of weight * opacity * |I^ - I|, with |r| as sqrt(r^2 + rounding^2).
+
+    The opacity is a constant, as in the official code: the camera must not turn to where the map
+    is empty because nothing can be wrong there.
+    """
+    residual = rendering.color - image
+    absolute = (residual.square() + rounding**2).sqrt().mean(-1)
+    return (weight * rendering.opacity.detach() * absolute).mean()
+
+
+@torch.no_grad()
+def curvature(
+    rendering: Rendering,
+    image: Tensor,  # (H, W, 3)
+    weight: Tensor,  # (H, W)
+    camera: Camera,
+    rounding: float,
+) -> Tensor:  # (6, 6) float64
+    """Return the Gauss-Newton matrix of the loss: the mean of w J J^T / |I^ - I|.
+
+    A twist (rho, phi) moves the point p seen at a pixel by rho + phi x p. The picture there
+    changes by what slides in: with the slope g = (dI^/du, dI^/dv) of the rendering and the
+    projection's Jacobian P,
+
+        a = -P^T g,        J = (a, p x a).
+    """
+    solid = rendering.opacity > _SOLID
+    depth = torch.where(solid, rendering.depth / rendering.opacity, 1)
+    points = camera.backproject(camera.pixel_grid(dtype=depth.dtype, device=depth.device), depth)
+    slope = image_slope(rendering.color)  # (H, W, 3, 2)
+    a = -slope @ camera.project_jacobian(points)  # (H, W, 3, 3)
+    jacobian = torch.cat([a, torch.linalg.cross(points[..., None, :].expand_as(a), a)], -1)
+    absolute = ((rendering.color - image).square() + rounding**2).sqrt()
+    factor = (weight * rendering.opacity * solid)[..., None] / absolute / absolute.numel()
+    rows = jacobian.reshape(-1, 6).double()
+    return rows.T @ (factor.reshape(-1, 1) * rows)
+
+
+def image_slope(image: Tensor) -> Tensor:  # (H, W, 3) -> (H, W, 3, 2)
+    """Return (d/du, d/dv) per pixel and channel by central differences, 0 at the border."""
+    slope = image.new_zeros(*image.shape, 2)
+    slope[:, 1:-1, :, 0] = (image[:, 2:] - image[:, :-2]) / 2
+    slope[1:-1, :, :, 1] = (image[2:] - image[:-2]) / 2
+    return slope
+
+
+def _motion(step: Tensor, rendering: Rendering, camera: Camera) -> float:
+    """Return how far a step moves the picture of a point at mean depth [px], about."""
+    depth = float((rendering.depth.sum() / rendering.opacity.sum().clamp_min(1e-12)).detach())
+    rho, phi = float(step[:3].norm()), float(step[3:].norm())
+    return camera.fx * (phi + rho / max(depth, 1e-12))
