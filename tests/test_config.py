@@ -42,6 +42,17 @@ def test_a_preset_sets_what_it_says_and_nothing_else(name: str):
     assert settings_of(preset(name)) == expected
 
 
+def test_the_paper_presets_differ_as_its_supplement_says():
+    paper, fast = settings_of(preset("paper")), settings_of(preset("paper-fast"))
+    assert {name for name in paper if paper[name] != fast[name]} == {
+        "mapping.keyframe_stride",  # optimise every 5 keyframes
+        "mapping.refine_iterations",  # 3000 iterations of final refinement
+        "mapping.pose_refinement.enabled",  # no photometric refinement of the other frames
+    }
+    assert paper["mapping.refine_iterations"] == 20000
+    assert (fast["mapping.keyframe_stride"], fast["mapping.refine_iterations"]) == (5, 3000)
+
+
 def test_settings_of_deeper_parts_are_named_with_more_dots():
     names = settings_of(SlamConfig())
     assert {"seed", "tracking.window", "mapping.insertion.cell"} <= set(names)
@@ -116,7 +127,7 @@ def test_an_unknown_name_is_answered_with_the_nearest():
 
 
 def test_an_unknown_preset_is_answered_with_all():
-    with pytest.raises(InputError, match="laptop, test, found 'desktop'"):
+    with pytest.raises(InputError, match="laptop, paper, paper-fast, test, found 'desktop'"):
         preset("desktop")
 
 
