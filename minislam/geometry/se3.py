@@ -120,6 +120,25 @@ def se3_inverse(transforms: Tensor) -> Tensor:
     return make_transform(rotation_t, -(rotation_t @ transforms[..., :3, 3:]).squeeze(-1))
 
 
+def se3_normalised(transforms: Tensor) -> Tensor:
+    """Return transforms (..., 4, 4) with their rotations made orthonormal again.
+
+    Every product leaves a rotation off by one rounding error. That is harmless until transposes
+    stand for inverses in products of products, where the error grows with every further one.
+    """
+    rotation = rotation_from_quaternion(quaternion_from_rotation(transforms[..., :3, :3]))
+    return make_transform(rotation, transforms[..., :3, 3])
+
+
+def se3_interpolate(first: Tensor, second: Tensor, share: float) -> Tensor:
+    """Return the pose (..., 4, 4) at `share` of the way from first to second, on a constant twist.
+
+    A share of 2 continues the motion by as much again.
+    """
+    motion = se3_log(second @ se3_inverse(first))
+    return se3_normalised(se3_exp(share * motion) @ first)
+
+
 def se3_adjoint(transforms: Tensor) -> Tensor:
     """Return Ad(T) (..., 6, 6), defined by T exp(xi) T^-1 = exp(Ad(T) xi).
 

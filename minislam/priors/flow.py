@@ -118,14 +118,17 @@ class FlowChain:
     def advanced(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
         gray = grayscale(image)
-        # A steady hand continues its motion, a shaking one does not: try both, keep the better.
-        starts = [self._flow, self._flow + self._increment]
-        errors = [cv2.absdiff(warp(gray, start), self._reference).mean() for start in starts]
-        flow = composed_flow(self._reference, gray, starts[int(np.argmin(errors))])
-        backward = reverse_flow(self._reference, gray, flow)
+        # A steady hand continues its motion, a shaking one does not: try both. Only the finished
+        # flow tells which start was right; a wrong one would be continued from frame to frame.
         texture = texture_confidence(self._reference, self._config)
-        alike = likeness(self._reference, warp(gray, flow), self._config.stride)
-        targets, confidence = grid_matches(flow, backward, alike * texture, self._config)
+        measured = []
+        for start in (self._flow, self._flow + self._increment):
+            flow = composed_flow(self._reference, gray, start)
+            backward = reverse_flow(self._reference, gray, flow)
+            alike = likeness(self._reference, warp(gray, flow), self._config.stride)
+            targets, confidence = grid_matches(flow, backward, alike * texture, self._config)
+            measured.append((flow, targets, confidence))
+        flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
         return chain, as_matches([targets], [confidence], [texture], torch.float32)
 

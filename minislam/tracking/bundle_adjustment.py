@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from minislam.geometry import Camera, se3_adjoint, se3_exp
+from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
@@ -277,5 +277,6 @@ def _damped_step(
     clamped = disparities.clamp_min(MIN_DISPARITY)
     moved = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
     poses = state.T_camera_world.clone()
-    poses[problem.free_poses] = se3_exp(xi.reshape(-1, 6)) @ poses[problem.free_poses]
+    moved_poses = se3_exp(xi.reshape(-1, 6)) @ poses[problem.free_poses]
+    poses[problem.free_poses] = se3_normalised(moved_poses)
     return BundleState(poses, moved)

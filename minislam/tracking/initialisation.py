@@ -15,6 +15,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from minislam.geometry import se3_interpolate, se3_inverse
 from minislam.geometry.distortion import camera_matrix
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.bundle_adjustment import (
@@ -176,10 +177,10 @@ def chain_state(
         last, depths = poses[-1], disparities[-1]
         starts = [last]
         if index > 0:
-            starts.append(last @ torch.linalg.inv(poses[-2]) @ last)
+            starts.append(se3_interpolate(poses[-2], last, 2.0))
         trust = torch.ones_like(depths)
         pose, _ = start_pose(grid, matches, depths, trust, last, starts, robust_scale)
-        carried = carry_disparities(grid, pose @ torch.linalg.inv(last), depths)
+        carried = carry_disparities(grid, pose @ se3_inverse(last), depths)
         known = known_disparities[index + 1]
         poses.append(pose)
         disparities.append(torch.where(known > 0, known, carried))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from minislam.errors import TrackingLost
-from minislam.geometry import Camera, se3_inverse
+from minislam.geometry import Camera, se3_interpolate, se3_inverse
 from minislam.priors.interfaces import (
     DepthPrior,
     FeatureExtractor,
@@ -127,7 +127,7 @@ class Tracker:
             self._add_keyframe(frame, last, disparities)
             return
         before = self.keyframes.T_camera_world[-2]
-        starts = [last, last @ se3_inverse(before) @ last]
+        starts = [last, se3_interpolate(before, last, 2.0)]
         trust = self.keyframes.static_weights[-1]
         pose, _ = start_pose(
             self.grid, matches, disparities, trust, last, starts, self.backend.robust_scale

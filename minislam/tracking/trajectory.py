@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.geometry import se3_exp, se3_inverse, se3_log
+from minislam.geometry import se3_interpolate
 from minislam.records import Sequence
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, motion_only_adjust
@@ -14,11 +14,6 @@ from minislam.tracking.tracker import Tracker, TrackingStatus
 
 ITERATIONS = 8  # Gauss-Newton steps of six unknowns
 ROBUST_NARROWING = 0.5  # the structure is known by now: a narrower Cauchy weight [-]
-
-
-def interpolate_pose(first: Tensor, second: Tensor, share: float) -> Tensor:
-    """Return the pose (4, 4) at `share` of the way from first to second, on a constant twist."""
-    return se3_exp(share * se3_log(second @ se3_inverse(first))) @ first
 
 
 def pose_all_frames(
@@ -53,7 +48,7 @@ def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: 
     start = known[0]
     if len(around) == 2:
         first, second = (keyframes.frames[k].timestamp for k in around)
-        start = interpolate_pose(known[0], known[1], (timestamp - first) / (second - first))
+        start = se3_interpolate(known[0], known[1], (timestamp - first) / (second - first))
     newest, count = len(keyframes), len(around)
     poses = torch.cat([known, start[None]])
     disparities = keyframes.disparities[around]

@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 from minislam.geometry import (
     se3_adjoint,
     se3_exp,
+    se3_interpolate,
     se3_inverse,
     se3_left_jacobian,
     se3_log,
+    se3_normalised,
     so3_exp,
     so3_log,
     transform_points,
@@ -134,6 +136,24 @@ def test_group_axioms(regime: str):
     rotation = a[:, :3, :3]
     assert distance(rotation @ rotation.transpose(-1, -2), identity[:, :3, :3]) < 1e-12
     assert distance(torch.linalg.det(rotation), torch.ones(20, dtype=torch.float64)) < 1e-12
+
+
+def test_a_motion_continued_many_times_stays_rigid():
+    # With last @ inverse(before) @ last the round-off would grow 2.4 times at every step.
+    before, last = random_transforms(2, "normal", 7)
+    identity = torch.eye(3, dtype=torch.float64)
+    for _ in range(200):
+        before, last = last, se3_interpolate(before, last, 2.0)
+        assert distance(last[:3, :3] @ last[:3, :3].T, identity) < 1e-14
+
+
+def test_normalising_repairs_a_rotation_and_leaves_a_good_one():
+    transforms = random_transforms(20, "normal", 8)
+    assert distance(se3_normalised(transforms), transforms) < 1e-14
+    stretched = transforms.clone()
+    stretched[:, :3, :3] *= 1.01
+    repaired = se3_normalised(stretched)
+    assert distance(repaired @ se3_inverse(repaired), torch.eye(4).expand(20, 4, 4)) < 1e-12
 
 
 @pytest.mark.parametrize("regime", REGIMES)

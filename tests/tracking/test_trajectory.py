@@ -7,9 +7,9 @@ import torch
 from helpers import random_transforms
 from torch import Tensor
 
-from minislam.geometry import se3_exp, se3_inverse, se3_log
+from minislam.geometry import se3_exp, se3_interpolate, se3_inverse, se3_log
 from minislam.tracking.tracker import TrackedFrame, TrackingStatus
-from minislam.tracking.trajectory import interpolate_pose, pose_all_frames
+from minislam.tracking.trajectory import pose_all_frames
 from tests.tracking.wall import FRAMES, back_end, true_poses, wall_frame
 
 KEYFRAMES = [0, 3, 5, 8]
@@ -37,7 +37,7 @@ def posed(progress=None) -> dict[int, Tensor]:
 def test_half_way_of_a_shift_is_half_the_shift():
     first, second = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
     second[:3, 3] = torch.tensor([2.0, -4.0, 6.0])
-    half = interpolate_pose(first, second, 0.5)
+    half = se3_interpolate(first, second, 0.5)
     torch.testing.assert_close(half[:3, 3], torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
 
 
@@ -52,7 +52,7 @@ def test_every_frame_that_was_not_lost_has_its_true_pose():
 def test_it_is_the_flow_that_says_so():
     # Interpolation alone is off by more: the path is unsteady.
     truth = true_poses()
-    guess = interpolate_pose(truth[5], truth[8], 2 / 3)
+    guess = se3_interpolate(truth[5], truth[8], 2 / 3)
     assert se3_log(guess @ se3_inverse(truth[7])).norm() > 1e-2
 
 
@@ -74,21 +74,21 @@ def test_progress_counts_the_frames_that_are_not_keyframes():
 @pytest.mark.parametrize("regime", ["normal", "tiny"])
 def test_interpolation_ends_where_it_should_and_walks_evenly(regime: str):
     first, second = random_transforms(2, regime, 0)
-    torch.testing.assert_close(interpolate_pose(first, second, 0.0), first)
-    torch.testing.assert_close(interpolate_pose(first, second, 1.0), second)
-    quarter = interpolate_pose(first, second, 0.25)
-    half = interpolate_pose(first, second, 0.5)
-    torch.testing.assert_close(interpolate_pose(first, half, 0.5), quarter)
+    torch.testing.assert_close(se3_interpolate(first, second, 0.0), first)
+    torch.testing.assert_close(se3_interpolate(first, second, 1.0), second)
+    quarter = se3_interpolate(first, second, 0.25)
+    half = se3_interpolate(first, second, 0.5)
+    torch.testing.assert_close(se3_interpolate(first, half, 0.5), quarter)
 
 
 def test_interpolation_does_not_depend_on_the_choice_of_the_world():
     first, second, other_world = random_transforms(3, "normal", 1)
-    moved = interpolate_pose(first @ other_world, second @ other_world, 0.3)
-    torch.testing.assert_close(moved, interpolate_pose(first, second, 0.3) @ other_world)
+    moved = se3_interpolate(first @ other_world, second @ other_world, 0.3)
+    torch.testing.assert_close(moved, se3_interpolate(first, second, 0.3) @ other_world)
 
 
 def test_a_constant_twist_is_followed_exactly():
     xi = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.4, -0.2], dtype=torch.float64)
     start = random_transforms(1, "normal", 2)[0]
     end = se3_exp(xi) @ start
-    torch.testing.assert_close(interpolate_pose(start, end, 0.4), se3_exp(0.4 * xi) @ start)
+    torch.testing.assert_close(se3_interpolate(start, end, 0.4), se3_exp(0.4 * xi) @ start)
