@@ -45,6 +45,11 @@ class PriorChoice:
     depth_scale: float = 5000.0  # counts of a 16-bit depth .png per world unit
     device: str = "cpu"  # where networks run, cpu or cuda; everything else stays on the CPU
 
+    def __post_init__(self) -> None:
+        """Refuse a device that is none."""
+        if self.device not in ("cpu", "cuda"):
+            raise InputError(f"expected --device cpu or cuda, found {self.device!r}; choose one")
+
 
 @dataclass(frozen=True)
 class NetworksConfig:
@@ -138,8 +143,6 @@ def _weights(choice: PriorChoice, kind: str, name: str, weights: str | None) -> 
 
 def _device(choice: PriorChoice) -> torch.device:
     """Return where networks run, if that exists here."""
-    if choice.device not in ("cpu", "cuda"):
-        raise InputError(f"expected --device cpu or cuda, found {choice.device!r}; choose one")
     if choice.device == "cuda" and not torch.cuda.is_available():
         raise InputError(
             "expected a GPU that this torch can use for --device cuda, found none; leave it out, "

@@ -8,22 +8,14 @@ import torch
 from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights, describe, load_checkpoint
 from minislam.priors.networks.dinov2 import load_dino_features
+from tests.checkpoint_files import tiny_fit3d
 from tests.helpers import frame_of
 from tests.priors.networks import rebuilt
 
 
-def small_vit() -> dict[str, torch.Tensor]:
-    """Return a FiT3D checkpoint with two blocks, small enough to write and break often."""
-    shapes = rebuilt.shapes_of("fit3d_reg_small")
-    kept = {
-        n: s for n, s in shapes.items() if not n.startswith("blocks.") or n[7:9] in ("0.", "1.")
-    }
-    return rebuilt.tensors_of(kept)
-
-
 @pytest.fixture(scope="module")
 def tensors() -> dict[str, torch.Tensor]:
-    return small_vit()
+    return tiny_fit3d()
 
 
 def write(path: Path, content: object) -> Path:
