@@ -27,7 +27,7 @@ from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
-from minislam.uncertainty import beta_of_mask, tracking_weight
+from minislam.uncertainty import HighResolutionFeatures, beta_of_mask, tracking_weight
 
 Report = Callable[[str, int, int], None]  # stage, done, of all
 
@@ -49,6 +49,7 @@ class Slam:
     ) -> None:
         self.sequence, self.config = sequence, config
         self.seconds: dict[str, float] = {}  # spent per stage
+        self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
         self.mapper = Mapper(
             sequence.camera,
             config.mapping,
@@ -63,11 +64,11 @@ class Slam:
             sequence.camera,
             tracking,
             priors.flow,
-            priors.features,
+            self._features,
             priors.depth,
             self._static_weight,
         )
-        self._features, self._stride = priors.features, priors.flow.stride
+        self._stride = priors.flow.stride
         self._report = report or (lambda stage, done, of_all: None)
         self._poses: dict[int, Tensor] = {}  # T_camera_world of every frame, once known
 

@@ -16,6 +16,11 @@ class UncertaintyConfig:
         "weigh by masks of movers that come with the sequence, train nothing (ablation c)",
     )
 
+    grid_factor: int = parameter(
+        1,
+        "beta on a grid so many times as fine, at the square of the cost of features; paper"
+        " supplement, high-resolution uncertainty map",
+    )
     hidden_units: int = parameter(64, "width of the two hidden layers [units], official")
     dropout: float = parameter(0.2, "share of hidden units dropped in training [0, 1), official")
     learning_rate: float = parameter(
