@@ -1,6 +1,12 @@
 """Mapping (Sec. 3.4): a Gaussian map of the static scene, grown keyframe by keyframe."""
 
-from minislam.mapping.config import DensityConfig, InsertionConfig, MappingConfig, paper_mapping
+from minislam.mapping.config import (
+    DensityConfig,
+    InsertionConfig,
+    MappingConfig,
+    PoseRefinementConfig,
+    paper_mapping,
+)
 from minislam.mapping.history import MappingHistory
 from minislam.mapping.mapper import Mapper
 
@@ -10,5 +16,6 @@ __all__ = [
     "Mapper",
     "MappingConfig",
     "MappingHistory",
+    "PoseRefinementConfig",
     "paper_mapping",
 ]

@@ -123,6 +123,40 @@ def test_isotropic_gradient_agrees_with_finite_differences():
     assert_gradients_close(leaf.grad, numerical_gradient(isotropic_loss, scales), relative=1e-6)
 
 
+def test_depth_gradient_agrees_with_finite_differences_floaters_included():
+    reference, opacity = 2 + random_image(13, 5, 6)[..., 0], random_image(14, 5, 6)[..., 0]
+    weight = random_image(15, 5, 6)[..., 0]
+    rendered = 1 + 2.5 * random_image(16, 5, 6)[..., 0]  # on both sides of the reference
+
+    def loss(value: torch.Tensor) -> torch.Tensor:
+        return weighted_depth_loss(value, opacity, reference, weight, 20.0, 0.5).sum()
+
+    leaf = rendered.clone().requires_grad_()
+    loss(leaf).backward()
+    assert_gradients_close(leaf.grad, numerical_gradient(loss, rendered), relative=1e-6)
+
+
+def test_the_whole_render_loss_has_the_gradient_of_its_parts_in_their_shares():
+    image, color = random_image(17, 6, 7), random_image(18, 6, 7)
+    depth, reference = random_image(19, 6, 7)[..., 0] + 2, random_image(20, 6, 7)[..., 0] + 2
+    weight, config = random_image(21, 6, 7)[..., 0], MappingConfig()
+
+    def loss(color: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+        rendering = rendering_of(color, depth)
+        return render_loss(one_gaussian(), rendering, image, reference, weight, 2.5, config).total
+
+    leaves = color.clone().requires_grad_(), depth.clone().requires_grad_()
+    loss(*leaves).backward()
+    expected = numerical_gradient(lambda value: loss(value, depth), color)
+    assert_gradients_close(leaves[0].grad, expected, relative=1e-6)
+    expected = numerical_gradient(lambda value: loss(color, value), depth)
+    assert_gradients_close(leaves[1].grad, expected, relative=1e-6)
+    # lambda_5 : lambda_6 = alpha : 1 - alpha, over all pixels; depth in metres of the constants.
+    metre = 2.5 / config.metric_median
+    outer = weight * torch.sign(depth - reference) / depth.numel() / metre
+    torch.testing.assert_close(leaves[1].grad, (1 - config.color_share) * outer)
+
+
 # Degenerate input
 
 

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -5,7 +6,8 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import se3_exp
-from minislam.mapping import InsertionConfig, Mapper, MappingConfig
+from minislam.mapping import DensityConfig, InsertionConfig, Mapper, MappingConfig
+from minislam.splatting import render
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, GRID, wall_keyframe
 
@@ -161,7 +163,9 @@ def test_each_loss_trains_only_its_own_side():
     assert not torch.equal(means, mapper.gaussians.means)
 
     leaves = mapper._optimizer.gaussians.parameters.values()
-    rendering = mapper.render(mapper.keyframes[0].T_camera_world)
+    pose = mapper.keyframes[0].T_camera_world.float()
+    rendering = render(mapper._optimizer.gaussians, CAMERA, pose)  # with a way back to the map
+    assert rendering.color.requires_grad
     mapper._train_mlp(0, rendering)
     assert all(leaf.grad is None for leaf in leaves)
     assert not torch.equal(weights[0], mapper.mlp.weights[0])
@@ -172,6 +176,50 @@ def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
     mapper.initialise([wall_keyframe(0)])
     assert torch.equal(mapper._weight(mapper.keyframes[0], CAMERA), torch.ones(24, 32))
     assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
+
+
+def test_the_mlp_rests_until_the_map_has_settled_after_a_change_of_density():
+    config = replace(
+        CONFIG,
+        init_iterations=35,
+        freeze_iterations=4,
+        density=DensityConfig(interval=10, max_gaussians=10**6),
+    )
+    mapper = make_mapper(config)
+    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+    resting = [k for k, loss in enumerate(mapper.history.uncertainty) if math.isnan(loss)]
+    assert resting == [10, 11, 12, 13, 20, 21, 22, 23, 30, 31, 32, 33]
+    assert len(set(mapper.history.gaussians)) > 1
+
+
+def test_in_fast_mode_most_keyframes_wait_for_their_optimisation():
+    mapper = make_mapper(replace(CONFIG, init_iterations=2, keyframe_stride=3))
+    mapper.initialise([wall_keyframe(0)])
+    counts = []
+    for index in range(1, 7):
+        mapper.integrate(wall_keyframe(index))
+        counts.append(len(mapper.history.render))
+    # Keyframes 3 and 6 are optimised, with five iterations each; all others are only inserted.
+    assert counts == [2, 2, 7, 7, 7, 12]
+    assert set(mapper.gaussians.anchor_keyframe.tolist()) == set(range(7))
+
+
+def test_given_masks_take_the_place_of_the_mlp():
+    keyframes = []
+    for index in range(3):
+        keyframe = wall_keyframe(index, mover_column=4 + 6 * index)
+        mask = keyframe.depth < 1.5
+        keyframes.append(replace(keyframe, moving_mask=mask))
+    mapper = make_mapper(CONFIG, UncertaintyConfig(given_masks=True))
+    before = [p.detach().clone() for p in mapper.mlp.parameters()]
+    mapper.initialise(keyframes[:2])
+    mapper.integrate(keyframes[2])
+    assert all(torch.equal(a, b) for a, b in zip(before, mapper.mlp.parameters(), strict=True))
+    weight = mapper._weight(mapper.keyframes[0], CAMERA)
+    assert torch.equal(weight == 0, keyframes[0].moving_mask)
+    assert (mapper.gaussians.means[:, 2] < 1.5).sum() == 0
+    empty = wall_keyframe(0)
+    assert psnr(mapper.render(empty.T_camera_world).color, empty.image) > 24
 
 
 # Degenerate input
@@ -240,6 +288,8 @@ def test_impossible_calls_are_refused_in_one_sentence():
         mapper.initialise([])
     with pytest.raises(InputError, match="some known depth"):
         mapper.initialise([replace(wall_keyframe(0), depth=torch.zeros(24, 32))])
+    with pytest.raises(InputError, match="at least 1 keyframe, found 0"):
+        MappingConfig(keyframe_stride=0)
     mapper.initialise([wall_keyframe(0)])
     with pytest.raises(InputError, match="1 keyframes in the map, found 2"):
         mapper.update_keyframes(torch.eye(4, dtype=torch.float64).expand(2, 4, 4))

@@ -79,6 +79,16 @@ def test_variance_of_two_groups_by_hand():
     )
 
 
+def test_only_the_128_most_alike_cells_enter_the_variance():
+    # All are alike, cosine > 0.87, but each more to some than to others.
+    angle = 0.5 * torch.rand(200, generator=generator(10), dtype=torch.float64)  # radian
+    features = torch.stack([angle.cos(), angle.sin()], -1)
+    beta = torch.rand(200, generator=generator(11), dtype=torch.float64)
+    likeness = features @ features.T
+    expected = torch.stack([beta[row.topk(128).indices].var(correction=0) for row in likeness])
+    torch.testing.assert_close(variance_regulariser(beta, features, CONFIG), expected.mean())
+
+
 # Identities
 
 

@@ -1,7 +1,8 @@
 import torch
 
 from minislam.uncertainty import Misfit, UncertaintyConfig, UncertaintyTrainer, measure_misfit
-from tests.helpers import generator
+from minislam.uncertainty.training import uncertainty_loss
+from tests.helpers import assert_gradients_close, generator, numerical_gradient
 
 
 def two_object_misfit() -> tuple[torch.Tensor, Misfit]:
@@ -58,3 +59,38 @@ def test_no_reference_depth_leaves_only_the_ssim_term():
         image, nothing, image, nothing + 2, nothing + 1, (4, 4), 1.0, UncertaintyConfig()
     )
     assert misfit.depth.max() == 0 and misfit.ssim.max() == 0
+
+
+def test_the_gradient_of_the_whole_loss_agrees_with_finite_differences():
+    config = UncertaintyConfig()
+    features, misfit = two_object_misfit()
+    features = features[::3, ::2].double()
+    misfit = Misfit(*(t[::3, ::2].double() for t in (misfit.ssim, misfit.depth + 0.3,
+                                                      misfit.opacity)))  # fmt: skip
+    cells = features.reshape(-1, 4)
+
+    def loss(beta: torch.Tensor) -> torch.Tensor:
+        return uncertainty_loss(beta, misfit, beta.reshape(-1), cells, config)
+
+    beta = 0.2 + torch.rand(2, 4, generator=generator(4), dtype=torch.float64)
+    leaf = beta.clone().requires_grad_()
+    loss(leaf).backward()
+    assert_gradients_close(leaf.grad, numerical_gradient(loss, beta), relative=1e-6)
+
+
+def test_each_lambda_scales_its_own_term():
+    features, misfit = two_object_misfit()
+    misfit = Misfit(misfit.ssim, torch.full((6, 8), 0.4), misfit.opacity)
+    beta = 0.5 + torch.rand(6, 8, generator=generator(5))
+    cells = features.reshape(-1, 4)
+
+    def loss(depth: float, variance: float, log: float) -> float:
+        config = UncertaintyConfig(lambda_depth=depth, lambda_variance=variance, lambda_log=log)
+        return float(uncertainty_loss(beta, misfit, beta.reshape(-1), cells, config))
+
+    clipped = beta + 0.001
+    alone = float((misfit.ssim / clipped**2).mean())
+    assert abs(loss(0, 0, 0) - alone) < 1e-5
+    assert abs(loss(0.2, 0, 0) - alone - float((0.08 / clipped**2).mean())) < 1e-5
+    assert abs(loss(0, 0, 0.5) - alone - 0.5 * float(clipped.log().mean())) < 1e-5
+    assert loss(0, 1, 0) - alone > 0.01 and abs(loss(0, 2, 0) + alone - 2 * loss(0, 1, 0)) < 1e-5

@@ -5,6 +5,7 @@ from minislam.geometry import Camera
 from minislam.uncertainty.weights import (
     DATA_RATE,
     adjusted_beta,
+    beta_of_mask,
     clipped_beta,
     mapping_weight,
     schlick_bias,
@@ -56,6 +57,16 @@ def test_thresholds_of_full_trust_and_of_invisibility():
     assert float(tracking_weight(grid(0.475), CAMERA, 8).max()) < 1
     assert float(mapping_weight(grid(1.4079), CAMERA).min()) > 0
     assert float(mapping_weight(grid(1.4083), CAMERA).max()) == 0
+
+
+def test_a_given_mask_is_full_trust_or_none():
+    moving = torch.zeros(24, 32, dtype=torch.bool)
+    moving[:, 8:16] = True
+    beta = beta_of_mask(moving)
+    assert torch.equal(mapping_weight(beta, CAMERA) == 0, moving)
+    assert float(mapping_weight(beta, CAMERA).max()) == pytest.approx(48.4075, abs=1e-3)
+    weight = tracking_weight(beta, CAMERA, 8)
+    assert (weight[:, [0, 2, 3]] == 1).all() and (weight[:, 1] < 0.02).all()
 
 
 # Identities
