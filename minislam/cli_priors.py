@@ -84,17 +84,18 @@ def _kinds(
     from minislam.config import as_json
     from minislam.priors.choice import choose_depth, choose_features
     from minislam.priors.files import DEPTH, FEATURES
+    from minislam.uncertainty import HighResolutionFeatures
 
     # Whatever the result depends on: files of another command must not be taken for ours.
-    conditions = (
-        f"{sequence.description}; {sequence.camera}; seed {config.seed}; "
-        f"{as_json(config)['networks']}"
-    )
+    tree = as_json(config)
+    constants = {name: tree[name] for name in ("seed", FEATURES, "simulated_depth", "networks")}
+    conditions = f"{sequence.description}; {sequence.camera}; {constants}"
     kinds: dict[str, tuple[str, Callable[[Frame], Tensor | None]]] = {}
     if with_features:
-        features = choose_features(choice, config.features)
-        origin = f"{choice.features} {choice.features_weights}; {conditions}"
-        kinds[FEATURES] = (origin, features)
+        features = choose_features(choice, sequence.camera, config.features)
+        factor = config.uncertainty.grid_factor
+        origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
+        kinds[FEATURES] = (origin, HighResolutionFeatures(features, factor))
     if choice.depth != "none":
         depth = choose_depth(choice, sequence, config.seed, config.simulated_depth, config.networks)
         origin = f"{choice.depth} {choice.depth_weights}; {conditions}"
@@ -104,7 +105,7 @@ def _kinds(
 
 def write_kind(
     folder: Path,
-    origin: str,
+    origin: str,  # one line
     sequence: RecordedSequence,
     compute: Callable[[Frame], Tensor | None],
     report: Callable[[str, int, int], None],
@@ -112,36 +113,26 @@ def write_kind(
     """Write one .npy file per frame. What an interrupted run has written is not made again."""
     import numpy as np
 
-    from minislam.data.files import atomic_write, read_text, write_text
-    from minislam.priors.files import INDEX, index_text
+    from minislam.data.files import atomic_write
+    from minislam.priors.files import index_text
 
-    _make(folder)
-    stamps = [(index, frame.timestamp) for index, frame in enumerate(sequence)]
-    text = index_text(origin, stamps)
-    index = folder / INDEX
-    if index.exists() and read_text(index) != text:
-        raise InputError(
-            f"expected an empty folder, or one of the same command, found {folder} with files of "
-            "another; choose another --out"
-        )
-    if not index.exists() and any(folder.iterdir()):
-        raise InputError(
-            f"expected an empty folder {folder}, found files of something else; choose another "
-            "--out"
-        )
-    write_text(index, text)
+    stamps = [(frame.frame_index, frame.timestamp) for frame in sequence]
+    _claim(folder, index_text(origin, stamps))
     for frame in sequence:
         path = folder / f"{frame.frame_index:0{FRAME_DIGITS}d}.npy"
-        if not path.exists():
-            values = compute(frame)
-            if values is not None:
-                buffer = io.BytesIO()
-                np.save(buffer, values.float().cpu().numpy())
-                atomic_write(path, buffer.getvalue())
+        values = None if path.exists() else compute(frame)
+        if values is not None:
+            buffer = io.BytesIO()
+            np.save(buffer, values.float().cpu().numpy())
+            atomic_write(path, buffer.getvalue())
         report(f"writing {folder.name}", frame.frame_index + 1, len(sequence))
 
 
-def _make(folder: Path) -> None:
+def _claim(folder: Path, index: str) -> None:
+    """Make a folder and write its index, unless it holds something else."""
+    from minislam.data.files import read_text, write_text
+    from minislam.priors.files import INDEX
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -149,3 +140,10 @@ def _make(folder: Path) -> None:
             f"expected to be able to make the folder {folder}, but the system says: "
             f"{error.strerror}; choose another --out"
         ) from error
+    path = folder / INDEX
+    if any(folder.iterdir()) and not (path.exists() and read_text(path) == index):
+        raise InputError(
+            f"expected an empty folder, or one of the same command, found {folder} with other "
+            "files; choose another --out"
+        )
+    write_text(path, index)

@@ -13,12 +13,12 @@ import torch
 import minislam
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
-from minislam.errors import MinislamError
+from minislam.errors import InputError, MinislamError
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.run import MAX_DIFFERENCE, MappedView, measure_run
 from minislam.geometry import se3_inverse
-from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
+from minislam.priors.choice import FILES, PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
 from minislam.slam import Priors, Report, Slam
@@ -51,10 +51,15 @@ class RunOutcome:
 
 def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -> Priors:
     """Return the priors that are named, their files read and checked."""
-    networks = config.networks
+    networks, factor = config.networks, config.uncertainty.grid_factor
+    if choice.features.startswith(FILES) and factor != 1:
+        raise InputError(
+            f"expected uncertainty.grid_factor 1 with --features {FILES}FOLDER, found {factor}; a "
+            "finer grid needs the network: give the factor to minislam priors"
+        )
     return Priors(
         choose_flow(choice, config.flow, networks),
-        choose_features(choice, config.features),
+        choose_features(choice, sequence.camera, config.features),
         choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
 

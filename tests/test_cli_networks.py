@@ -28,13 +28,18 @@ FRONT_END = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory):
-    """Return the folder with the checkpoints; the clip is rendered once, into a cache beside it."""
-    root = tmp_path_factory.mktemp("networks")
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory):
+    """Render the clip once, into a cache of these tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MINISLAM_CACHE", str(root / "cache"))
-        yield write_all(root / "weights")
+        patch.setenv("MINISLAM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder with the checkpoints."""
+    return write_all(tmp_path_factory.mktemp("networks") / "weights")
 
 
 def located(files: Path, arguments: list[str]) -> list[str]:
@@ -138,7 +143,7 @@ def test_what_is_written_is_not_made_again_and_other_files_are_left_alone(tmp_pa
     (tmp_path / "other/features").mkdir(parents=True)
     (tmp_path / "other/features/notes.txt").write_text("mine")
     assert main([*command[:-1], str(tmp_path / "other")]) == 1
-    assert "found files of something else" in the_sentence(capsys)
+    assert "other/features with other files" in the_sentence(capsys)
     (tmp_path / "file").write_text("x")
     assert main([*command[:-1], str(tmp_path / "file")]) == 1
     assert "to make the folder" in the_sentence(capsys)
@@ -234,3 +239,13 @@ def test_priors_without_anything_to_write_and_files_of_another_sequence(
     capsys.readouterr()
     assert main(["run", *CLIP, "--features", f"files:{made}", "-o", str(tmp_path / "out")]) == 1
     assert "found no such frame in" in the_sentence(capsys)
+
+
+def test_a_finer_grid_is_made_with_the_network_not_from_files(tmp_path: Path, capsys):
+    short = ["synth:ball", "--max-frames", "3", "--size", SIZE, "--preset", "test"]
+    finer = ["--uncertainty.grid_factor", "2"]
+    made = ["--out", str(tmp_path / "made")]
+    assert main(["priors", *short, "--features", "classical", *finer, *made]) == 0
+    assert np.load(tmp_path / "made/features/00000.npy").shape[:2] == (24, 32)
+    assert main(["run", *short, "--features", f"files:{tmp_path / 'made'}", *finer]) == 1
+    assert "give the factor to minislam priors" in the_sentence(capsys)

@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 
 from minislam.errors import InputError
+from minislam.geometry import Camera
 from minislam.priors.depth import (
     FileDepth,
     NoDepth,
@@ -23,7 +24,7 @@ from minislam.priors.networks.droid import DroidFlowConfig, load_droid
 from minislam.priors.networks.metric3d import Metric3DConfig, load_metric3d
 from minislam.records import Sequence
 
-_FILES = "files:"
+FILES = "files:"  # before the name of a folder
 _MAKERS = {"dinov2": "DINOv2", "fit3d": "FiT3D"}  # how a checkpoint of these features calls itself
 _NETWORKS = {
     "flow": ("droid",),
@@ -72,7 +73,9 @@ def choose_flow(
     raise InputError(f"expected --flow classical or droid, found {choice.flow!r}; choose one")
 
 
-def choose_features(choice: PriorChoice, classical: ClassicalFeaturesConfig) -> FeatureExtractor:
+def choose_features(
+    choice: PriorChoice, camera: Camera, classical: ClassicalFeaturesConfig
+) -> FeatureExtractor:
     """Return the features: classical, dinov2, fit3d, or files:FOLDER."""
     name = choice.features
     weights = _weights(choice, "features", name, choice.features_weights)
@@ -80,8 +83,8 @@ def choose_features(choice: PriorChoice, classical: ClassicalFeaturesConfig) -> 
         return ClassicalFeatures(config=classical)
     if name in _MAKERS:
         return load_dino_features(weights, _device(choice), kind=_MAKERS[name])
-    if name.startswith(_FILES):
-        return FileFeatures(folder_of(name.removeprefix(_FILES), FEATURES))
+    if name.startswith(FILES):
+        return FileFeatures(folder_of(name.removeprefix(FILES), FEATURES), camera)
     raise InputError(
         f"expected --features classical, dinov2, fit3d or files:FOLDER, found {name!r}; choose one"
     )
@@ -107,8 +110,8 @@ def choose_depth(
         return load_metric3d(weights, _device(choice), networks.metric3d)
     if name == "depth-anything":
         return load_depth_anything(weights, _device(choice), networks.depth_anything)
-    if name.startswith(_FILES):
-        return FileDepth(folder_of(name.removeprefix(_FILES), DEPTH), 1 / choice.depth_scale)
+    if name.startswith(FILES):
+        return FileDepth(folder_of(name.removeprefix(FILES), DEPTH), 1 / choice.depth_scale)
     raise InputError(
         "expected --depth none, simulated, sensor, metric3d, depth-anything or files:FOLDER, found "
         f"{name!r}; choose one"

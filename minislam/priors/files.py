@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from minislam.errors import InputError
+from minislam.geometry import Camera
 from minislam.records import Frame
 
 INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
@@ -71,9 +72,10 @@ class FrameFiles:
 class FileFeatures:
     """Features made elsewhere, from .npy files (h', w', C): a `FeatureExtractor`."""
 
-    def __init__(self, folder: Path | str) -> None:
+    def __init__(self, folder: Path | str, camera: Camera) -> None:
         self._files = FrameFiles(folder, "features", (".npy",))
-        self.dimension = _read_features(self._files.any()).shape[2]
+        rows, _, self.dimension = _read_features(self._files.any()).shape
+        self.stride = max(1, round(camera.height / rows))
 
     def __call__(self, frame: Frame) -> Tensor:  # (h', w', C) float32
         """Read the features of a frame."""

@@ -41,14 +41,14 @@ def folder_with(folder: Path, files: dict[str, np.ndarray]) -> Path:
 
 
 def test_features_are_those_of_the_frame(tmp_path: Path):
-    features = FileFeatures(folder_with(tmp_path, {"00003.npy": grid(3), "4.npy": grid(4)}))
-    assert features.dimension == 6
+    features = FileFeatures(folder_with(tmp_path, {"00003.npy": grid(3), "4.npy": grid(4)}), CAMERA)
+    assert (features.dimension, features.stride) == (6, 15)
     assert torch.equal(features(frame_of(IMAGE, 3)), torch.full((4, 5, 6), 3.0))
     assert torch.equal(features(frame_of(IMAGE, 4)), torch.full((4, 5, 6), 4.0))
 
 
 def test_half_precision_is_read_as_single(tmp_path: Path):
-    features = FileFeatures(folder_with(tmp_path, {"0.npy": grid(0.5).astype(np.float16)}))
+    features = FileFeatures(folder_with(tmp_path, {"0.npy": grid(0.5).astype(np.float16)}), CAMERA)
     assert features(frame_of(IMAGE)).dtype == torch.float32
 
 
@@ -56,7 +56,7 @@ def test_with_an_index_files_belong_to_moments(tmp_path: Path):
     # Made for every frame of 10 per second; a run uses every third, from the second on.
     folder_with(tmp_path, {f"{k:05d}.npy": grid(k) for k in range(8)})
     (tmp_path / INDEX).write_text(index_text("made up", [(k, k / 10) for k in range(8)]))
-    features = FileFeatures(tmp_path)
+    features = FileFeatures(tmp_path, CAMERA)
     for position, index in enumerate(range(1, 8, 3)):
         frame = Frame(position, index / 10, IMAGE)
         assert features(frame).unique().tolist() == [index]
@@ -90,7 +90,7 @@ def test_every_grid_of_whole_patches_covers_its_image(
 ):
     files = {"0.npy": grid(1, height // patch, width // patch)}
     image = torch.zeros(height, width, 3)
-    assert FileFeatures(folder_with(tmp_path, files))(frame_of(image)).shape[2] == 6
+    assert FileFeatures(folder_with(tmp_path, files), CAMERA)(frame_of(image)).shape[2] == 6
 
 
 # Errors
@@ -125,12 +125,13 @@ def saved(values: np.ndarray) -> Callable[[Path], None]:
 def test_bad_folders_of_features_are_one_sentence(tmp_path: Path, write, words: str):
     write(tmp_path)
     with pytest.raises(InputError, match=words) as caught:
-        FileFeatures(tmp_path)(frame_of(IMAGE))
+        FileFeatures(tmp_path, CAMERA)(frame_of(IMAGE))
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file_and_another_network_are_refused(tmp_path: Path):
-    features = FileFeatures(folder_with(tmp_path, {"0.npy": grid(1), "1.npy": grid(1, channels=7)}))
+    files = {"0.npy": grid(1), "1.npy": grid(1, channels=7)}
+    features = FileFeatures(folder_with(tmp_path, files), CAMERA)
     with pytest.raises(InputError, match="found none for frame 2"):
         features(frame_of(IMAGE, 2))
     with pytest.raises(InputError, match=r"expected 6 channels in .*1\.npy .*, found 7"):
