@@ -25,20 +25,39 @@ from minislam.splatting.rendering import MIN_ALPHA
 from minislam.splatting.tiles import PIXELS, TILE
 
 CHUNK = 12  # slots per step: longer steps leave a 2 MB cache, shorter ones cost more calls
+_T, _ALPHAS, _V_WEIGHTS = range(3)  # the buffers of a workspace
+
+
+class Block(NamedTuple):
+    """A number per slot, tile and pixel."""
+
+    all: Tensor  # (n, B, P)
+    slots: tuple[Tensor, ...]  # the same, n times (B, P)
 
 
 class Workspace:
     """What all groups of an image share: the monomials, and buffers for the largest block."""
 
     def __init__(self, tiles: int, like: Tensor) -> None:
-        self._buffers = [like.new_empty((CHUNK + 1) * tiles * PIXELS) for _ in range(4)]
         self.monomials = monomials(like)  # (6, P)
         # 2^(x log2 e), because exp is forty times slower than exp2 where its result underflows.
         self.monomials_log2 = self.monomials * math.log2(math.e)
+        self._buffers = like.new_empty(3, (CHUNK + 1) * tiles * PIXELS)
+        self._blocks: dict[tuple[int, ...], Block] = {}
 
-    def block(self, number: int, rows: int, columns: int) -> Tensor:
-        """Return buffer `number` as an array (rows, columns, PIXELS)."""
-        return self._buffers[number][: rows * columns * PIXELS].view(rows, columns, PIXELS)
+    def block(self, number: int, slots: int, tiles: int, tile_major: bool = False) -> Block:
+        """Return buffer `number` as a block; `tile_major` is the order of its memory."""
+        key = number, slots, tiles
+        # Kept for the next chunk, because cutting a block into slots takes as long as the work on
+        # two of them.
+        if key not in self._blocks:
+            flat = self._buffers[number, : slots * tiles * PIXELS]
+            if tile_major:
+                values = flat.view(tiles, slots, PIXELS).transpose(0, 1)
+            else:
+                values = flat.view(slots, tiles, PIXELS)
+            self._blocks[key] = Block(values, values.unbind(0))
+        return self._blocks[key]
 
 
 class GroupOutput(NamedTuple):
@@ -65,8 +84,8 @@ def exponents(
     """Return the coefficients of ln alpha = ln o - d^T Q d / 2 over the monomials. Eq. (1)."""
     m_x, m_y = offsets
     a, b, c = conics
-    p, q = a * m_x + b * m_y, b * m_x + c * m_y  # Q m
-    constant = log_opacities - 0.5 * (m_x * p + m_y * q)
+    p, q = torch.addcmul(a * m_x, b, m_y), torch.addcmul(b * m_x, c, m_y)  # Q m
+    constant = log_opacities.addcmul(m_x, p, value=-0.5).addcmul_(m_y, q, value=-0.5)
     return torch.stack([constant, p, q, -0.5 * a, -b, -0.5 * c])
 
 
@@ -81,12 +100,20 @@ def exponents_vjp(
     -1/2, -1 and -1/2 times the last three. See `ellipse_vjp`.
     """
     m_x, m_y = offsets
-    g, g_x, g_y, g_xx, g_xy, g_yy = v_exponents
-    first_x, first_y = g_x - m_x * g, g_y - m_y * g
-    second_xx = g_xx - m_x * (g_x + first_x)
-    second_xy = g_xy - m_x * g_y - m_y * first_x
-    second_yy = g_yy - m_y * (g_y + first_y)
-    return torch.stack([g, first_x, first_y, second_xx, second_xy, second_yy])
+    moments = v_exponents.clone()  # then in place, which takes half the time
+    g, g_x, g_y, g_xx, g_xy, g_yy = moments
+    # X^2 to d_x X, X Y to d_x Y, Y^2 to d_y Y
+    g_xx.addcmul_(m_x, g_x, value=-1)
+    g_xy.addcmul_(m_x, g_y, value=-1)
+    g_yy.addcmul_(m_y, g_y, value=-1)
+    # X to d_x, Y to d_y
+    g_x.addcmul_(m_x, g, value=-1)
+    g_y.addcmul_(m_y, g, value=-1)
+    # d_x X to d_x^2, d_x Y to d_x d_y, d_y Y to d_y^2
+    g_xx.addcmul_(m_x, g_x, value=-1)
+    g_xy.addcmul_(m_y, g_x, value=-1)
+    g_yy.addcmul_(m_y, g_y, value=-1)
+    return moments
 
 
 def ellipse_vjp(
@@ -106,92 +133,98 @@ def ellipse_vjp(
 
 def composite(
     coefficients: Tensor,  # (6, K * B) from `exponents`, slot-major
-    features: Tensor,  # (B, K, 4)
+    features: Tensor,  # (K, B, 4)
     background: Tensor,  # (4,)
     inside: Tensor,  # (B, P) 1 on the image, 0 on pixels beyond its border
     workspace: Workspace,
 ) -> GroupOutput:
     """Composite a group of tiles from front to back. Eq. (2)."""
-    tiles, slots, _ = features.shape
+    slots, tiles, _ = features.shape
     checkpoints = inside.new_empty(-(-slots // CHUNK), tiles, PIXELS)
     checkpoints[0] = inside  # T = 0 beyond the border: nothing is shown or counted there
     out = inside.new_zeros(tiles, 4, PIXELS)
     light = inside.new_empty(slots + 1, tiles)  # T_k summed over the pixels of a tile
-    steps = features.diff(dim=1, prepend=torch.zeros_like(features[:, :1]))  # f_k - f_{k-1}
+    steps = features.diff(dim=0, prepend=torch.zeros_like(features[:1]))  # f_k - f_{k-1}
 
     for chunk, first in enumerate(range(0, slots, CHUNK)):
         last = min(first + CHUNK, slots)
-        span = slice(first * tiles, last * tiles)
-        _, T = _alphas_and_transmittances(coefficients[:, span], checkpoints[chunk], workspace)
-        out.baddbmm_(steps[:, first:last].transpose(1, 2), T[:-1].transpose(0, 1))
-        torch.sum(T, 2, out=light[first : last + 1])
+        T = workspace.block(_T, last - first + 1, tiles)
+        T.slots[0].copy_(checkpoints[chunk])
+        # alpha_k waits where T_{k+1} goes: half the memory, so more of it stays in the cache.
+        _alphas(coefficients[:, first * tiles : last * tiles], workspace, out=T.all[1:])
+        _transmittances(T, T.slots[1:])
+        out.baddbmm_(steps[first:last].permute(1, 2, 0), T.all[:-1].transpose(0, 1))
+        torch.sum(T.all, 2, out=light[first : last + 1])
         if last < slots:
-            checkpoints[chunk + 1] = T[-1]
-    transmittance = T[-1].clone()
-    out.addcmul_((background - features[:, -1])[:, :, None], transmittance[:, None])
+            checkpoints[chunk + 1] = T.slots[-1]
+    transmittance = T.slots[-1].clone()
+    out.addcmul_((background - features[-1])[:, :, None], transmittance[:, None])
     return GroupOutput(out, transmittance, light[:-1] - light[1:], checkpoints)
 
 
 def composite_vjp(
     coefficients: Tensor,  # (6, K * B)
-    features: Tensor,  # (B, K, 4)
+    features: Tensor,  # (K, B, 4)
     background: Tensor,  # (4,)
     checkpoints: Tensor,  # (ceil(K / CHUNK), B, P)
     v_out: Tensor,  # (B, 4, P)
     v_transmittance: Tensor,  # (B, P)  dL/dT_K
     workspace: Workspace,
-) -> tuple[Tensor, Tensor]:  # (6, K * B), (B, K, 4)
+) -> tuple[Tensor, Tensor]:  # (6, K * B), (K, B, 4)
     """Pull gradients of a group's pixels back to coefficients and features. Eq. (2).
 
     From back to front, let R_k be v_out . (what slot k and all behind it would show if T
     restarted at 1 there):
 
         R_K = f_background . v_out + v_T_K,
-        R_k = R_{k+1} + alpha_k (f_k . v_out - R_{k+1}),
-        dL/d ln alpha_k = T_k (R_k - R_{k+1}),
+        R_k = R_{k+1} + g_k,   g_k = alpha_k (f_k . v_out - R_{k+1}),
+        dL/d ln alpha_k = T_k g_k,
         dL/df_k = sum over pixels of (T_k - T_{k+1}) v_out.
 
     Nowhere is anything divided by 1 - alpha.
     """
-    tiles, slots, _ = features.shape
+    slots, tiles, _ = features.shape
     v_coefficients = torch.empty_like(coefficients)
-    v_features = torch.empty_like(features)
     v_out_t = v_out.transpose(1, 2).contiguous()
-    R_behind = (background @ v_out).add_(v_transmittance)
+    light = features.new_empty(slots + 1, tiles, 4)  # T_k v_out summed over the pixels of a tile
+    R = (background[:, None] * v_out).sum(1).add_(v_transmittance)
+    excess = torch.empty_like(R)
 
     for chunk in reversed(range(len(checkpoints))):
         first, last = chunk * CHUNK, min((chunk + 1) * CHUNK, slots)
-        count, span = last - first, slice(first * tiles, last * tiles)
-        alphas, T = _alphas_and_transmittances(coefficients[:, span], checkpoints[chunk], workspace)
-        v_weights = workspace.block(2, tiles, count)  # f_k . v_out; bmm cannot fill (n, B, P)
-        torch.bmm(features[:, first:last], v_out, out=v_weights)
-        R = workspace.block(3, count + 1, tiles)
-        R[-1] = R_behind
-        R_k, v_weights_k, alphas_k = R.unbind(0), v_weights.unbind(1), alphas.unbind(0)
-        for k in reversed(range(count)):
-            torch.lerp(R_k[k + 1], v_weights_k[k], alphas_k[k], out=R_k[k])
-        R_behind = R[0].clone()
+        span = slice(first * tiles, last * tiles)
+        T = workspace.block(_T, last - first + 1, tiles)
+        alphas = workspace.block(_ALPHAS, last - first, tiles)
+        v_weights = workspace.block(_V_WEIGHTS, last - first, tiles, tile_major=True)
 
-        v_log_alphas = torch.sub(R[:-1], R[1:], out=alphas).mul_(T[:-1])
-        v_coefficients[:, span] = workspace.monomials @ v_log_alphas.view(-1, PIXELS).T
-        shown = torch.bmm(T.transpose(0, 1), v_out_t)  # (B, n + 1, 4)
-        torch.sub(shown[:, :-1], shown[:, 1:], out=v_features[:, first:last])
-    return v_coefficients, v_features
+        T.slots[0].copy_(checkpoints[chunk])
+        _alphas(coefficients[:, span], workspace, out=alphas.all)
+        _transmittances(T, alphas.slots)
+        light[first : last + 1] = torch.bmm(T.all.transpose(0, 1), v_out_t).transpose(0, 1)
+        # f_k . v_out, in memory tile by tile because bmm fills no other order.
+        torch.bmm(features[first:last].transpose(0, 1), v_out, out=v_weights.all.transpose(0, 1))
+        for v_weight, alpha in zip(v_weights.slots[::-1], alphas.slots[::-1], strict=True):
+            torch.sub(v_weight, R, out=excess)
+            R.add_(alpha.mul_(excess))  # alpha_k is not needed again: g_k takes its place
+        v_log_alphas = alphas.all.mul_(T.all[:-1]).view(-1, PIXELS)
+        torch.mm(workspace.monomials, v_log_alphas.T, out=v_coefficients[:, span])
+    return v_coefficients, light[:-1] - light[1:]
 
 
-def _alphas_and_transmittances(
+def _alphas(
     coefficients: Tensor,  # (6, n * B)
-    T_first: Tensor,  # (B, P)
     workspace: Workspace,
-) -> tuple[Tensor, Tensor]:  # (n, B, P), (n + 1, B, P)
-    """Return alpha of n slots and T before, between and after them."""
-    tiles = len(T_first)
-    count = coefficients.shape[1] // tiles
-    alphas, T = workspace.block(0, count, tiles), workspace.block(1, count + 1, tiles)
-    torch.mm(coefficients.T, workspace.monomials_log2, out=alphas.view(-1, PIXELS))
-    torch.nn.functional.threshold_(alphas.exp2_(), MIN_ALPHA, 0.0)
-    T[0] = T_first
-    T_k, alphas_k = T.unbind(0), alphas.unbind(0)  # once: to index makes a view every time
-    for k in range(count):
-        torch.addcmul(T_k[k], T_k[k], alphas_k[k], value=-1, out=T_k[k + 1])
-    return alphas, T
+    out: Tensor,  # (n, B, P)
+) -> None:
+    """Evaluate alpha of n slots. Eq. (1)."""
+    torch.mm(coefficients.T, workspace.monomials_log2, out=out.view(-1, PIXELS))
+    torch.nn.functional.threshold_(out.exp2_(), MIN_ALPHA, 0.0)
+
+
+def _transmittances(
+    T: Block,  # (n + 1, B, P), the first slot given
+    alphas: tuple[Tensor, ...],  # n times (B, P)
+) -> None:
+    """Fill in T between and after n slots."""
+    for T_k, alpha, T_next in zip(T.slots[:-1], alphas, T.slots[1:], strict=True):
+        torch.addcmul(T_k, T_k, alpha, value=-1, out=T_next)

@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -138,7 +139,17 @@ def _visible_front_to_back(
     # A scale that has run away would overflow to NaN, and one NaN spoils the pose gradient.
     visible = in_front & near_u & near_v & (radius < _MAX_RADIUS) & (opacities > MIN_ALPHA)
     index = visible.nonzero()[:, 0]
-    return index[z[index].argsort(stable=True)]
+    return index.index_select(0, _nearest_first(z.index_select(0, index)))
+
+
+def _nearest_first(depths: Tensor) -> Tensor:  # (V,) positive -> (V,) int64
+    """Return the stable sorting order of depths."""
+    if depths.device.type != "cpu" or depths.dtype != torch.float32:
+        return depths.argsort(stable=True)
+    # Positive floats are in the order of their bits. With the row in the lower half of each key
+    # any sort is stable, and numpy's sort of integers is ten times faster than a stable one.
+    keys = depths.view(torch.int32).long() << 32 | torch.arange(len(depths))
+    return torch.from_numpy(np.sort(keys.numpy())) & 0xFFFFFFFF
 
 
 def _largest_radius(scales: Tensor, inverse_z: Tensor, camera: Camera) -> Tensor:  # (N,) px

@@ -28,7 +28,12 @@ class TileLists(NamedTuple):
 
     groups: list[TileGroup]
     slot_gaussian: Tensor  # (S,) int64
-    slot_tile: Tensor  # (S,) int64
+
+    @property
+    def slot_tile(self) -> Tensor:
+        """Return the tile of each slot, (S,) int64."""
+        tiles = [group.tiles.repeat(group.length) for group in self.groups]
+        return torch.cat([self.slot_gaussian[:0], *tiles])
 
     @property
     def largest_group(self) -> int:
@@ -83,10 +88,10 @@ def build_tile_lists(
     by_length = counts.argsort(stable=True)
     by_length = by_length[counts[by_length] > 0]
     if len(by_length) == 0:
-        return TileLists([], gaussian, tile)
+        return TileLists([], gaussian)
     padding = torch.full((1,), means2d.shape[1], dtype=torch.int64, device=tile.device)
     gaussian_or_padding = torch.cat([gaussian, padding])
-    groups, slot_gaussians, slot_tiles, first_slot = [], [], [], 0
+    groups, slot_gaussians, first_slot = [], [], 0
     for tiles in by_length.split(GROUP):
         length = int(counts[tiles[-1]])
         position = torch.arange(length, device=tile.device)[:, None]
@@ -94,9 +99,8 @@ def build_tile_lists(
         end = first_slot + length * len(tiles)
         groups.append(TileGroup(tiles, length, slice(first_slot, end)))
         slot_gaussians.append(gaussian_or_padding.index_select(0, entry.view(-1)))
-        slot_tiles.append(tiles.repeat(length))
         first_slot = end
-    return TileLists(groups, torch.cat(slot_gaussians), torch.cat(slot_tiles))
+    return TileLists(groups, torch.cat(slot_gaussians))
 
 
 def _entries(
@@ -115,20 +119,21 @@ def _entries(
     half_height = (level * covariances2d[2]).sqrt()
     top = (means2d[1] - half_height).ceil().clamp(0, camera.height)
     bottom = (means2d[1] + half_height).floor().clamp(-1, camera.height - 1)
-    first_row = top.div(TILE, rounding_mode="floor").long()
-    row_count = bottom.div(TILE, rounding_mode="floor").long() - first_row + 1
+    # Where a bound is negative, and long() rounds it up, the count is zero anyway.
+    first_row = (top / TILE).long()
+    row_count = (bottom / TILE).long() - first_row + 1
     row_count = torch.where(visible & (top <= bottom), row_count, 0)
     gaussian, row = _expand(first_row, row_count)
 
     left, right = _column_spans(means2d, conics, covariances2d, level, top, bottom, gaussian, row)
     left = left.ceil().clamp(0, camera.width)
     right = right.floor().clamp(-1, camera.width - 1)
-    first_column = left.div(TILE, rounding_mode="floor").long()
-    column_count = right.div(TILE, rounding_mode="floor").long() - first_column + 1
+    first_column = (left / TILE).long()
+    column_count = (right / TILE).long() - first_column + 1
     column_count = torch.where(left <= right, column_count, 0)
-    span, column = _expand(first_column, column_count)
     _, columns = tile_grid(camera)
-    return gaussian.index_select(0, span), row.index_select(0, span) * columns + column
+    span, tile = _expand(row * columns + first_column, column_count)
+    return gaussian.index_select(0, span), tile
 
 
 def _column_spans(
@@ -174,7 +179,7 @@ def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
 
 def _stable_argsort(keys: Tensor, limit: int) -> Tensor:
     """Return the stable sorting order of integer keys in [0, limit)."""
-    if keys.is_cuda:
+    if keys.device.type != "cpu":
         return keys.argsort(stable=True)
     # numpy sorts 16-bit integers by radix, six times faster than torch sorts 64-bit ones.
     narrow = np.uint16 if limit <= 1 << 16 else np.int64

@@ -31,11 +31,11 @@ def conics_of(seed: int, count: int) -> Tensor:
 
 
 def block(seed: int, slots: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return coefficients (6, K * B), features (B, K, 4) and background (4,)."""
+    """Return coefficients (6, K * B), features (K, B, 4) and background (4,)."""
     count = slots * TILES
     offsets, log_opacities = 4 * normal(seed, 2, count), -normal(seed + 1, count).abs() - 0.02
     coefficients = exponents(offsets, 0.1 * conics_of(seed + 2, count), log_opacities)
-    return coefficients, normal(seed + 3, TILES, slots, 4), normal(seed + 4, 4)
+    return coefficients, normal(seed + 3, slots, TILES, 4), normal(seed + 4, 4)
 
 
 def composite_plainly(coefficients: Tensor, features: Tensor, background: Tensor) -> Tensor:
@@ -45,7 +45,7 @@ def composite_plainly(coefficients: Tensor, features: Tensor, background: Tensor
     transmittance = torch.ones(TILES, PIXELS, dtype=torch.float64)
     shown = torch.zeros(TILES, 4, PIXELS, dtype=torch.float64)
     for k, alpha in enumerate(alphas):
-        shown = shown + features[:, k, :, None] * (transmittance * alpha)[:, None]
+        shown = shown + features[k, :, :, None] * (transmittance * alpha)[:, None]
         transmittance = transmittance * (1 - alpha)
     shown = shown + background[:, None] * transmittance[:, None]
     return torch.cat([shown, 1 - transmittance[:, None]], 1)
@@ -148,7 +148,7 @@ def test_light_blocked_by_many_opaque_slots_gives_finite_gradients():
     slots = 40
     coefficients = torch.zeros(6, slots * TILES, dtype=torch.float32)
     coefficients[0] = -0.01  # alpha 0.99 everywhere: T falls to 1e-80, below any float32
-    features = torch.ones(TILES, slots, 4)
+    features = torch.ones(slots, TILES, 4)
     workspace = Workspace(TILES, features)
     background, inside = torch.zeros(4), torch.ones(TILES, PIXELS)
     out = composite(coefficients, features, background, inside, workspace)

@@ -1,0 +1,23 @@
+"""Which Gaussians are projected, and in which order."""
+
+import pytest
+import torch
+from helpers import generator
+
+from minislam.geometry import Camera
+from minislam.splatting.ellipses import project_gaussians
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nearest_come_first_and_equal_depths_stay_in_map_order(dtype: torch.dtype):
+    count = 500
+    depths = torch.tensor([0.5, 1.0, 1.0 + 2**-20, 3.0, 1e6], dtype=dtype)
+    means = torch.zeros(count, 3, dtype=dtype)
+    means[:, 2] = depths[torch.randint(len(depths), (count,), generator=generator(0))]
+    quats = torch.eye(4, dtype=dtype)[:1].expand(count, 4)
+    projected = project_gaussians(
+        means, quats, 0.01 * torch.ones(count, 3, dtype=dtype), means.new_full((count,), 0.5),
+        None, torch.eye(4, dtype=dtype), Camera(50.0, 50.0, 20.0, 15.0, 40, 30),
+    )  # fmt: skip
+    expected = sorted(range(count), key=lambda row: float(means[row, 2]))  # stable
+    assert projected.index.tolist() == expected
