@@ -1,5 +1,6 @@
 """Measures against the truth: trajectories, images, and the separation of movers."""
 
+from minislam.evaluation.depth import depth_l1
 from minislam.evaluation.images import psnr, ssim
 from minislam.evaluation.novel_views import align_novel_views, truth_to_estimate
 from minislam.evaluation.separability import auroc
@@ -18,6 +19,7 @@ __all__ = [
     "absolute_trajectory_error",
     "align_novel_views",
     "auroc",
+    "depth_l1",
     "path_length",
     "psnr",
     "relative_pose_error",

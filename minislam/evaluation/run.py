@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from minislam.errors import InputError
+from minislam.evaluation.depth import depth_l1
 from minislam.evaluation.images import psnr, ssim
 from minislam.evaluation.novel_views import align_novel_views, truth_to_estimate
 from minislam.evaluation.separability import auroc
@@ -24,7 +25,8 @@ class MappedView:
 
     frame_index: int
     T_world_camera: np.ndarray  # (4, 4) estimated
-    beta: np.ndarray | None  # (H, W), None if beta was switched off
+    beta: np.ndarray | None  # (H, W), None if no beta was learnt
+    depth: np.ndarray | None = None  # (H, W) rendered z in units of the map, 0 where transparent
 
 
 def measure_run(
@@ -39,7 +41,7 @@ def measure_run(
     metrics: dict[str, float | None] = dict.fromkeys(
         (
             "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db",
-            "ssim_novel", "psnr_input_db", "psnr_masked_db", "beta_auroc",
+            "ssim_novel", "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
         )
     )  # fmt: skip
     if lpips is not None:
@@ -52,6 +54,7 @@ def measure_run(
         metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(truth.trajectory)
         if metrics["ate_all_cm"] is not None:
             metrics |= _novel_views(truth, trajectory, render, lpips)
+            metrics["depth_l1_cm"] = _depth_l1_cm(truth, trajectory, views)
     metrics |= _input_views(truth, views, render, lpips)
     metrics["beta_auroc"] = _beta_auroc(truth, views)
     return metrics
@@ -110,6 +113,23 @@ def _input_views(
             masked.append(psnr(rendered, static, mask))
     metrics = {"psnr_input_db": _mean(whole), "psnr_masked_db": _mean(masked)}
     return metrics if lpips is None else {**metrics, "lpips_input": _mean(distances)}
+
+
+def _depth_l1_cm(
+    truth: GroundTruth, trajectory: Trajectory, views: list[MappedView]
+) -> float | None:
+    """Compare the depth of the map in the keyframes with the truth, without the movers."""
+    aligned = absolute_trajectory_error(trajectory, truth.trajectory, max_difference=MAX_DIFFERENCE)
+    errors = []
+    for view in views:
+        reference = truth.depth(view.frame_index)
+        if reference is None or view.depth is None:
+            continue
+        moving = truth.moving_mask(view.frame_index)
+        error = depth_l1(view.depth, reference, aligned.similarity.scale, moving)
+        if error is not None:
+            errors.append(CENTIMETRES * error)
+    return _mean(errors)
 
 
 def _beta_auroc(truth: GroundTruth, views: list[MappedView]) -> float | None:

@@ -14,7 +14,7 @@ from minislam.records import Trajectory
 HEIGHT, WIDTH = 24, 32
 NAMES = [
     "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
-    "psnr_input_db", "psnr_masked_db", "beta_auroc",
+    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
 ]  # fmt: skip
 TURN = random_transforms(1, "normal", 1)[0].numpy()
 TO_ESTIMATE = Similarity(0.4, TURN[:3, :3], TURN[:3, 3])  # the world of the map is another one
@@ -46,6 +46,7 @@ class Truth:
     masks: dict[int, np.ndarray] = field(default_factory=dict)
     static: dict[int, np.ndarray] = field(default_factory=dict)
     novel: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    depths: dict[int, np.ndarray] = field(default_factory=dict)
 
     def moving_mask(self, frame_index: int) -> np.ndarray | None:
         return self.masks.get(frame_index)
@@ -54,7 +55,7 @@ class Truth:
         return self.static.get(frame_index)
 
     def depth(self, frame_index: int) -> np.ndarray | None:
-        return None
+        return self.depths.get(frame_index)
 
     def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
         return self.novel
@@ -191,3 +192,25 @@ def test_without_beta_or_movers_there_is_no_auroc():
     assert measured(Truth(masks={0: left_part(4)}), [view(0)])["beta_auroc"] is None
     beta = np.ones((HEIGHT, WIDTH))
     assert measured(Truth(masks={0: left_part(0)}), [view(0, beta)])["beta_auroc"] is None
+
+
+def test_depth_is_compared_in_the_units_of_the_truth_and_not_on_movers():
+    true_depth = np.full((HEIGHT, WIDTH), 3.0)
+    true_depth[:, :4] = 1.0  # the mover, whom the map does not show
+    true_depth[0] = 0  # unknown
+    of_map = np.full((HEIGHT, WIDTH), (3.0 + 0.02) * TO_ESTIMATE.scale)
+    of_map[-1] = 0  # transparent
+    of_map[-2] += 0.10 * TO_ESTIMATE.scale
+    truth = Truth(trajectory=walk(), masks={0: left_part(4)}, depths={0: true_depth})
+    views = [MappedView(0, np.eye(4), None, of_map), MappedView(1, np.eye(4), None, of_map)]
+    expected = 2.0 + 10.0 / (HEIGHT - 2)  # cm
+    assert measured(truth, views)["depth_l1_cm"] == pytest.approx(expected, abs=1e-6)
+
+
+def test_without_true_depth_or_alignment_there_is_no_depth_error():
+    view_with_depth = MappedView(0, np.eye(4), None, np.ones((HEIGHT, WIDTH)))
+    assert measured(Truth(trajectory=walk()), [view_with_depth])["depth_l1_cm"] is None
+    no_path = Truth(depths={0: np.ones((HEIGHT, WIDTH))})
+    assert measured(no_path, [view_with_depth])["depth_l1_cm"] is None
+    with_path = Truth(trajectory=walk(), depths=no_path.depths)
+    assert measured(with_path, [view(0)])["depth_l1_cm"] is None
