@@ -25,9 +25,14 @@ from minislam.mapping import Mapper
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.tracking.structure import depth_from_disparities
-from minislam.tracking.tracker import Tracker, TrackingStatus
+from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
-from minislam.uncertainty import HighResolutionFeatures, beta_of_mask, tracking_weight
+from minislam.uncertainty import (
+    HighResolutionFeatures,
+    MlpSnapshots,
+    beta_of_mask,
+    tracking_weight,
+)
 
 Report = Callable[[str, int, int], None]  # stage, done, of all
 
@@ -49,6 +54,7 @@ class Slam:
     ) -> None:
         self.sequence, self.config = sequence, config
         self.seconds: dict[str, float] = {}  # spent per stage
+        self.snapshots = MlpSnapshots()  # by frame index
         self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
         self.mapper = Mapper(
             sequence.camera,
@@ -92,6 +98,7 @@ class Slam:
             self._move_map(first_changed=0)
             iterations = self.config.mapping.refine_iterations
             self.mapper.refine(iterations, self._progress("refining the map"))
+            self.snapshots.record(len(self.sequence) - 1, self.mapper.mlp)
         with self._timed("all frames"):
             progress = self._progress("posing all frames")
             self._poses = pose_all_frames(self.tracker, self.sequence, progress)
@@ -107,15 +114,20 @@ class Slam:
             everyone = range(len(self.tracker.keyframes))
             progress = self._progress("first map")
             self.mapper.initialise([self._keyframe(index) for index in everyone], progress)
+            self._record_mlp()
         with self._timed("initialisation"):
             self.tracker.refine_initialisation()
 
     def _map_new_keyframes(self) -> None:
         with self._timed("mapping"):
             mapped = len(self.mapper.keyframes)
-            self._move_map(first_changed=max(0, mapped - self.config.tracking.window))
+            self._move_map(first_changed=min(mapped, self.tracker.backend.take_first_moved()))
             for index in range(mapped, len(self.tracker.keyframes)):
                 self.mapper.integrate(self._keyframe(index))
+            self._record_mlp()
+
+    def _record_mlp(self) -> None:
+        self.snapshots.record(self.tracker.keyframes.frames[-1].frame_index, self.mapper.mlp)
 
     def _move_map(self, first_changed: int) -> None:
         """Carry the map along with keyframes that an adjustment has moved."""
@@ -203,12 +215,17 @@ class Slam:
         stamps = [frame.timestamp for frame in keyframes.frames]
         return _trajectory(stamps, list(keyframes.T_camera_world))
 
+    def online_beta(self, frame_index: int, trained_until: list[int]) -> list[Tensor]:
+        """Return beta (h', w') of one frame, by the MLP as it was after each of these frames."""
+        features = self._features(self.sequence.frame(frame_index))
+        return [self.snapshots.predict(moment, features) for moment in trained_until]
+
     def lost_frames(self) -> list[tuple[int, float, str]]:
         """Return frame index, timestamp and reason of every frame without a pose."""
         return [
-            (t.frame_index, t.timestamp, f"matched_share_{t.matched_share:.3f}")
+            (t.frame_index, t.timestamp, f"{t.status.value}, matched share {t.matched_share:.3f}")
             for t in self.tracker.tracked
-            if t.status is TrackingStatus.LOST
+            if not t.status.is_followed
         ]
 
     @contextmanager

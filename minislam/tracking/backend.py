@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
@@ -44,6 +45,7 @@ class BackEnd:
         self.reports: list[BundleReport] = []
         self.pixel_scale = (camera.width**2 + camera.height**2) ** 0.5 / REFERENCE_DIAGONAL
         self.flow = flow
+        self._first_moved = 0
 
     @property
     def robust_scale(self) -> float | None:
@@ -61,32 +63,66 @@ class BackEnd:
         flow = config.keyframe_flow if known else config.keyframe_flow_without_prior
         return flow * self.pixel_scale
 
-    def adjust_newest(self, steps: list[FlowMatches]) -> None:
+    def adjust_newest(self, steps: list[FlowMatches | None]) -> None:
         """Link the newest keyframe with its like and adjust the window around it.
 
         `steps` are the chained matches from each keyframe to the next, up to the newest: the
         first flow to the newest keyframe starts from them, not from a pose that may be wrong.
+        A step is None where the camera was lost in between.
         """
         count = len(self.keyframes)
         first_free = max(0, count - self.config.window)
         self.match_from_chain(steps, count - 1)
         self.adjust(first_free, self.config.iterations, widening=FIRST_WIDENING)
-        edges = neighbourhood_edges(count - 1, count, self.config.neighbourhood)
-        edges += self._proximity_links(count - 1)
+        edges = self._neighbourhood(count - 1, steps) + self._proximity_links(count - 1)
         for _ in range(self.config.rounds):
             self.match(edges)
             self.adjust(first_free, self.config.iterations)
 
-    def match_from_chain(self, steps: list[FlowMatches], target: int) -> None:
+    def attach_newest(self, like: int) -> bool:
+        """Link the newest keyframe with one that shows the same place, and with its neighbours.
+
+        Return False, and link nothing, if the flow does not confirm that it is the same place.
+        """
+        newest, radius = len(self.keyframes) - 1, self.config.neighbourhood
+        around = range(max(0, like - radius), min(newest, like + radius + 1))
+        edges = self.confirmed(both_directions([(newest, index) for index in around]))
+        if (newest, like) not in edges:
+            return False
+        for _ in range(self.config.rounds):
+            self.match(edges)
+            self.adjust(newest, self.config.iterations, widening=FIRST_WIDENING)
+        return True
+
+    def distance_to_newest(self, T_camera_world: Tensor) -> float:  # px
+        """Return the flow distance of a pose (4, 4) from the newest keyframe."""
+        pair = torch.stack([self.keyframes.T_camera_world[-1], T_camera_world])
+        disparities = self.keyframes.disparities[-1:].expand(2, -1)
+        grid, share = self.grid, self.config.rotation_share
+        there = flow_distances(pair, disparities, grid.rays, grid.pixels, grid.camera, share)
+        return float(there[0, 1])
+
+    def match_from_chain(self, steps: list[FlowMatches | None], target: int) -> None:
         """Measure the flow from the predecessors of a keyframe, started from flow alone."""
         edges, predictions, composed = [], [], None
         for source in range(target - 1, max(-1, target - 1 - self.config.neighbourhood), -1):
             step = steps[source]
+            if step is None:  # the camera was lost in between
+                break
             composed = step if composed is None else compose_matches(step, composed, self.grid)
             edges.append((source, target))
             predictions.append(composed.targets)
         sources, targets = (list(ends) for ends in zip(*edges, strict=True))
         self.graph.record(edges, self.flow.match(sources, targets, torch.cat(predictions)))
+
+    def _neighbourhood(
+        self, keyframe: int, steps: list[FlowMatches | None]
+    ) -> list[tuple[int, int]]:
+        """Return the edges to the predecessors since the camera was last lost."""
+        losses = [k for k in range(keyframe) if steps[k] is None]
+        since = losses[-1] + 1 if losses else 0
+        edges = neighbourhood_edges(keyframe, keyframe + 1, self.config.neighbourhood)
+        return [edge for edge in edges if min(edge) >= since]
 
     def _proximity_links(self, keyframe: int) -> list[tuple[int, int]]:
         """Return edges to older keyframes that see the same, if their flow can be confirmed.
@@ -110,22 +146,36 @@ class BackEnd:
         least = self.config.min_link_share
         return [(i, j) for i, j in edges if min(share[i, j], share[j, i]) >= least]
 
+    def adjust_so_far(self) -> None:
+        """Adjust all keyframes together while the sequence goes on (online global BA).
+
+        The flow that is stored serves again, so the cost is that of the new links.
+        """
+        edges = self._global_links()
+        if edges:
+            self.match(edges)
+        self.adjust(0, self.config.global_iterations)
+
     def adjust_all(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Adjust all keyframes together on fresh flow (final global BA).
 
         The disparity prior is off: it has served to start from, and a single image's depth is
         worse than that of many views.
         """
-        everyone = range(len(self.keyframes))
-        limit = self.config.final_distance * self.pixel_scale
-        pairs = self._proximity_pairs(0, everyone, [], limit, self.config.final_edges)
-        edges = self.graph.edges() + self.confirmed(both_directions(pairs))
+        edges = self.graph.edges() + self._global_links()
         lambda_prior = self.config.lambda_disparity_prior if self.config.final_prior else 0.0
         for done in range(self.config.final_rounds):
             self.match(edges)
             self.adjust(0, self.config.final_iterations, lambda_prior)
             if progress:
                 progress(done + 1, self.config.final_rounds)
+
+    def _global_links(self) -> list[tuple[int, int]]:
+        """Return further edges among all keyframes, over many baselines."""
+        everyone = range(len(self.keyframes))
+        limit = self.config.final_distance * self.pixel_scale
+        pairs = self._proximity_pairs(0, everyone, [], limit, self.config.final_edges)
+        return self.confirmed(both_directions(pairs))
 
     def match(self, edges: list[tuple[int, int]]) -> None:
         """Measure the flow of these edges again and store it in the graph."""
@@ -157,7 +207,13 @@ class BackEnd:
             problem = replace(problem, robust_scale=widening * self.robust_scale)
         state, report = bundle_adjust(problem, self.state, iterations)
         self.state = state
+        self._first_moved = min(self._first_moved, first_free)
         self.reports.append(report)
+
+    def take_first_moved(self) -> int:
+        """Return the first keyframe that has moved since this was last asked."""
+        first, self._first_moved = self._first_moved, len(self.keyframes)
+        return first
 
     @property
     def state(self) -> BundleState:
@@ -210,6 +266,18 @@ class BackEnd:
         self.keyframes.disparities /= scale
         self.keyframes.T_camera_world[:, :3, 3] *= float(scale)
 
+    def distances(self, start: int = 0, rows: range | None = None) -> Tensor:  # (K', K') px
+        """Return the flow distances between the keyframes from `start` on, of some rows or all."""
+        return flow_distances(
+            self.keyframes.T_camera_world[start:],
+            self.keyframes.disparities[start:],
+            self.grid.rays,
+            self.grid.pixels,
+            self.grid.camera,
+            self.config.rotation_share,
+            rows,
+        )
+
     def _proximity_pairs(
         self,
         start: int,  # first keyframe to look at
@@ -219,17 +287,10 @@ class BackEnd:
         links: int,  # per keyframe
     ) -> list[tuple[int, int]]:
         """Return pairs of keyframes that see the same from different places."""
-        distances = flow_distances(
-            self.keyframes.T_camera_world[start:],
-            self.keyframes.disparities[start:],
-            self.grid.rays,
-            self.grid.pixels,
-            self.grid.camera,
-            self.config.rotation_share,
-        )
+        shifted = range(newer.start - start, newer.stop - start)
+        distances = self.distances(start, shifted)
         taken = [
             (i - start, j - start) for i, j in self.graph.edges() + edges if min(i, j) >= start
         ]
-        shifted = range(newer.start - start, newer.stop - start)
         pairs = proximity_pairs(distances, taken, shifted, limit, links)
         return [(i + start, j + start) for i, j in pairs]

@@ -16,6 +16,15 @@ class TrackingConfig:
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement"
     )
+    cull_share: float = parameter(
+        0.3,
+        "a keyframe nearer to the last than this part of the flow that made it is culled [-]; "
+        "official code: 3 of 24 px",
+    )
+    max_culled_in_a_row: int = parameter(2, "keyframes culled one after the other, official code")
+    recently_lost_frames: int = parameter(
+        15, "a camera lost for longer is expected anywhere [frames]"
+    )
     warmup_keyframes: int = parameter(12, "keyframes of the two-stage start, paper Sec. 3.3")
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
@@ -46,6 +55,16 @@ class TrackingConfig:
         "lambda_4: disparity prior, times fx^2, so that it weighs a disparity error by the pixels "
         "that a unit baseline would turn it into [-], Eq. 5",
     )
+    global_interval: int = parameter(
+        20, "keyframes between two online global BAs; 0: none [keyframes], paper supplement"
+    )
+    global_iterations: int = parameter(4, "Gauss-Newton steps of an online global BA")
+    loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
+    loop_min_gap: int = parameter(20, "keyframes between the ends of a loop, official code")
+    loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")
+    loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
+    loop_suppression: int = parameter(10, "no second loop so near to another [keyframes], official")
+    max_loop_residual: float = parameter(3.0, "a loop that stays worse than this is undone [px]")
     final_rounds: int = parameter(3, "rounds of the final global BA")
     final_iterations: int = parameter(4, "Gauss-Newton steps per round of the final global BA")
     final_edges: int = parameter(6, "further links per keyframe in the final global BA")

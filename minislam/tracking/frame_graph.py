@@ -55,6 +55,13 @@ class FrameGraph:
                 self.targets[position], self.confidences[position] = target, confidence
                 self.matched_shares[position] = share
 
+    def remove_newest(self, count: int) -> None:
+        """Forget the `count` edges that were added last."""
+        for _ in range(count):
+            del self._position[self.edges_source.pop(), self.edges_target.pop()]
+            for column in (self.targets, self.confidences, self.matched_shares):
+                column.pop()
+
     def edges(self) -> list[tuple[int, int]]:
         """Return all edges, in the order they were added."""
         return list(zip(self.edges_source, self.edges_target, strict=True))
@@ -128,28 +135,51 @@ def flow_distances(
     pixels: Tensor,  # (N, 2) px
     camera: Camera,
     rotation_share: float,  # beta
-) -> Tensor:  # (K, K) px
+    rows: range | None = None,  # keyframes to compare with all others; None: all
+) -> Tensor:  # (K, K) px, FAR outside the rows and their columns
     """Return how far apart keyframes are, as the mean flow that their geometry predicts.
 
     D = beta |flow| + (1 - beta) |flow without rotation|, averaged over the visible cells and
     both directions: a pure rotation brings no parallax, so it should count, but less.
     """
     count = len(T_camera_world)
-    source, target = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
-    transforms = relative_transforms(T_camera_world, source.reshape(-1), target.reshape(-1))
-    transforms = transforms.to(disparities.dtype)
-    translations = torch.eye(4, dtype=transforms.dtype).repeat(len(transforms), 1, 1)
-    translations[:, :3, 3] = transforms[:, :3, 3]
+    distances = torch.full((count, count), FAR, dtype=disparities.dtype)
+    everyone = torch.arange(count)
+    for row in range(count) if rows is None else rows:
+        one = torch.full((count,), row)
+        there, back = (
+            _directed_distances(
+                relative_transforms(T_camera_world, *ends).to(disparities.dtype),
+                disparities[ends[0]],
+                rays,
+                pixels,
+                camera,
+                rotation_share,
+            )
+            for ends in ((one, everyone), (everyone, one))
+        )
+        distances[row] = distances[:, row] = 0.5 * (there + back)
+    return distances
+
+
+def _directed_distances(
+    T_target_source: Tensor,  # (E, 4, 4)
+    disparities: Tensor,  # (E, N) of the sources
+    rays: Tensor,  # (N, 3)
+    pixels: Tensor,  # (N, 2) px
+    camera: Camera,
+    rotation_share: float,
+) -> Tensor:  # (E,) px, FAR where too little of the source is seen
+    translations = torch.eye(4, dtype=T_target_source.dtype).repeat(len(T_target_source), 1, 1)
+    translations[:, :3, 3] = T_target_source[:, :3, 3]
     total, visible = 0.0, 0.0
-    for motion, share in ((transforms, rotation_share), (translations, 1 - rotation_share)):
-        positions, valid = reproject(motion, disparities[source.reshape(-1)], rays, camera)
+    for motion, share in ((T_target_source, rotation_share), (translations, 1 - rotation_share)):
+        positions, valid = reproject(motion, disparities, rays, camera)
         length = (positions - pixels.T).norm(dim=1)
         total = total + share * (length * valid).sum(1)
         visible = visible + share * valid.sum(1)
-    distance = torch.where(
-        visible >= MIN_VISIBLE_SHARE * len(rays), total / visible.clamp_min(1), FAR
-    ).reshape(count, count)
-    return 0.5 * (distance + distance.T)
+    is_seen = visible >= MIN_VISIBLE_SHARE * len(rays)
+    return torch.where(is_seen, total / visible.clamp_min(1), FAR)
 
 
 def splat_disparities(

@@ -44,3 +44,12 @@ class KeyframeStore:
         self.prior_disparities = torch.cat([self.prior_disparities, prior_disparities[None]])
         trusted = torch.ones_like(disparities)
         self.static_weights = torch.cat([self.static_weights, trusted[None]])
+
+    def remove_newest(self) -> None:
+        """Forget the newest keyframe."""
+        for column in (self.frames, self.features, self.metric_depths):
+            column.pop()
+        self.T_camera_world = self.T_camera_world[:-1]
+        self.disparities = self.disparities[:-1]
+        self.prior_disparities = self.prior_disparities[:-1]
+        self.static_weights = self.static_weights[:-1]

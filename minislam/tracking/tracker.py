@@ -27,13 +27,22 @@ from minislam.tracking.initialisation import (
     first_disparity_hypotheses,
     start_pose,
 )
+from minislam.tracking.loop_closure import close_loops
+from minislam.tracking.relocalisation import Place, Relocaliser
 
 
 class TrackingStatus(Enum):
     """What the tracker knows about one frame."""
 
+    INITIALISING = "initialising"  # followed, but there is no map yet
     OK = "ok"
-    LOST = "lost"
+    RECENTLY_LOST = "recently lost"  # the view is expected back where it was lost
+    LOST = "lost"  # the view may come back anywhere
+
+    @property
+    def is_followed(self) -> bool:
+        """Tell whether the frame gets a pose."""
+        return self in (TrackingStatus.INITIALISING, TrackingStatus.OK)
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,11 @@ class Tracker:
         self._predict_static_weight = predict_static_weight
         self._chain: FlowChain | None = None
         self._passed_over: tuple[Frame, FlowMatches] | None = None  # newest frame, no keyframe
-        self._steps: list[FlowMatches] = []  # keyframe k to k + 1
+        self._steps: list[FlowMatches | None] = []  # keyframe k to k + 1, None across a loss
+        self._relocaliser = Relocaliser(self.grid, self.keyframes, self.backend.pixel_scale)
+        self._lost_in_a_row = 0
+        self._culled_in_a_row = 0
+        self._last_global = 0  # keyframes at the last online global BA
 
     # One frame ----------------------------------------------------------------------------------
 
@@ -85,21 +98,56 @@ class Tracker:
         if not self._is_followed(matches) and self._passed_over is not None:
             # Too far from the last keyframe, but perhaps not from the last frame: make that one
             # a keyframe after all and go on from there.
-            self._insert(*self._passed_over)
+            added = self._insert(*self._passed_over, may_cull=False)
             chain, matches = self._chain.advanced(frame.image)
-            added = True
         share = float(matches.matched_shares)
         if not self._is_followed(matches):
-            # The chain stays where the view was last seen, so that it can be taken up again.
-            self._log(frame, TrackingStatus.LOST, share)
-            return added
+            return self._find_again(frame, share) or added
         self._chain = chain
         self._log(frame, TrackingStatus.OK, share)
         self._passed_over = (frame, matches)
         if not self._is_keyframe(frame, matches):
             return added
-        self._insert(frame, matches)
+        return self._insert(frame, matches) or added
+
+    def _find_again(self, frame: Frame, share: float) -> bool:
+        """Look for a lost camera among all keyframes; return whether there is a new keyframe.
+
+        The chain stays where the view was last seen, so that it can be taken up again there.
+        """
+        self._lost_in_a_row += 1
+        if self.initialised:
+            features = self._features(frame)
+            place = self._relocaliser.find(frame.image, features)
+            if place is not None and self._resume(frame, place):
+                return True
+        recently = self._lost_in_a_row <= self.config.recently_lost_frames
+        self._log(frame, TrackingStatus.RECENTLY_LOST if recently else TrackingStatus.LOST, share)
+        return False
+
+    def _resume(self, frame: Frame, place: Place) -> bool:
+        """Go on from where a frame was recognised, unless the flow from there says otherwise."""
+        keyframes = self.keyframes
+        T_frame_keyframe = place.T_camera_world @ se3_inverse(
+            keyframes.T_camera_world[place.keyframe_index]
+        )
+        disparities = keyframes.disparities[place.keyframe_index]
+        carried = carry_disparities(self.grid, T_frame_keyframe, disparities)
+        newest = len(keyframes)
+        self._steps.append(None)
+        self._add_keyframe(frame, place.T_camera_world, carried)
+        if not self.backend.attach_newest(place.keyframe_index):
+            self._steps.pop()
+            keyframes.remove_newest()
+            self.backend.flow.remove_frame(newest)
+            return False
+        self._chain, self._passed_over = self.backend.flow.start_chain(frame.image), None
+        self._log(frame, TrackingStatus.OK, 1.0)
         return True
+
+    def follows_a_loss(self, keyframe_index: int) -> bool:
+        """Tell whether the camera was lost between a keyframe and the one before it."""
+        return keyframe_index > 0 and self._steps[keyframe_index - 1] is None
 
     def _is_followed(self, matches: FlowMatches) -> bool:
         return float(matches.matched_shares) >= self.config.min_matched_share
@@ -117,24 +165,56 @@ class Tracker:
         elapsed = frame.frame_index - self.keyframes.frames[-1].frame_index
         return may_force and elapsed >= self.config.keyframe_interval
 
-    def _insert(self, frame: Frame, matches: FlowMatches) -> None:
-        """Make a frame a keyframe: pose from its flow, disparities from its predecessor."""
+    def _insert(self, frame: Frame, matches: FlowMatches, may_cull: bool = True) -> bool:
+        """Make a frame a keyframe: pose from its flow, disparities from its predecessor.
+
+        A frame that moved in the image but not in space is culled: only things moved, and two
+        keyframes from one place measure no depth. It stays a frame like others.
+        """
         last, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
+        pose, carried = last, disparities
+        # Poses of the warm-up are all estimated together, in initialise().
+        if self.initialised:
+            starts = [last]
+            if len(self.keyframes) > 1 and self._steps[-1] is not None:
+                before = self.keyframes.T_camera_world[-2]
+                starts.append(se3_interpolate(before, last, 2.0))
+            trust = self.keyframes.static_weights[-1]
+            pose, _ = start_pose(
+                self.grid, matches, disparities, trust, last, starts, self.backend.robust_scale
+            )
+            carried = carry_disparities(self.grid, pose @ se3_inverse(last), disparities)
+            if may_cull and self._is_culled(frame, pose):
+                return False
         self._chain, self._passed_over = self._chain.restarted(), None
         self._steps.append(matches)
-        if not self.initialised:
-            # Poses of the warm-up are all estimated together, in initialise().
-            self._add_keyframe(frame, last, disparities)
-            return
-        before = self.keyframes.T_camera_world[-2]
-        starts = [last, se3_interpolate(before, last, 2.0)]
-        trust = self.keyframes.static_weights[-1]
-        pose, _ = start_pose(
-            self.grid, matches, disparities, trust, last, starts, self.backend.robust_scale
-        )
-        carried = carry_disparities(self.grid, pose @ se3_inverse(last), disparities)
         self._add_keyframe(frame, pose, carried)
-        self.backend.adjust_newest(self._steps)
+        if self.initialised:
+            self.backend.adjust_newest(self._steps)
+            self._adjust_everything_if_due()
+        return True
+
+    def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
+        """Tell whether a keyframe would stand where the last one stands (at most 2 in a row)."""
+        elapsed = frame.frame_index - self.keyframes.frames[-1].frame_index
+        least = self.config.cull_share * self.backend.keyframe_flow
+        may_cull = self._culled_in_a_row < self.config.max_culled_in_a_row
+        is_forced = elapsed >= self.config.keyframe_interval
+        if may_cull and not is_forced and self.backend.distance_to_newest(pose) < least:
+            self._culled_in_a_row += 1
+            return True
+        self._culled_in_a_row = 0
+        return False
+
+    def _adjust_everything_if_due(self) -> None:
+        """Close loops, and every so many keyframes let all of them settle together."""
+        config, count = self.config, len(self.keyframes)
+        closed = config.loop_closure and close_loops(self.backend)
+        is_due = config.global_interval and count - self._last_global >= config.global_interval
+        if is_due and not closed:
+            self.backend.adjust_so_far()
+        if is_due or closed:
+            self._last_global = count
 
     def _add_keyframe(self, frame: Frame, pose: Tensor, carried: Tensor) -> None:
         metric_depth = self._depth_prior(frame, self.grid.camera)
@@ -151,6 +231,9 @@ class Tracker:
             self.update_static_weights(first=index)
 
     def _log(self, frame: Frame, status: TrackingStatus, share: float) -> None:
+        if status is TrackingStatus.OK:
+            self._lost_in_a_row = 0
+            status = status if self.initialised else TrackingStatus.INITIALISING
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, share))
 
     # The stages ---------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from minislam.records import Sequence
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, motion_only_adjust
 from minislam.tracking.reprojection import relative_transforms, reproject
-from minislam.tracking.tracker import Tracker, TrackingStatus
+from minislam.tracking.tracker import Tracker
 
 ITERATIONS = 8  # Gauss-Newton steps of six unknowns
 ROBUST_NARROWING = 0.5  # the structure is known by now: a narrower Cauchy weight [-]
@@ -26,12 +26,12 @@ def pose_all_frames(
     """
     frames, known = tracker.keyframes.frames, tracker.keyframes.T_camera_world
     poses = {frame.frame_index: T for frame, T in zip(frames, known, strict=True)}
-    others = [
-        t for t in tracker.tracked if t.status is TrackingStatus.OK and t.frame_index not in poses
-    ]
+    others = [t for t in tracker.tracked if t.status.is_followed and t.frame_index not in poses]
     for done, tracked in enumerate(others):
         following = sum(f.frame_index < tracked.frame_index for f in frames)
-        around = [k for k in (following - 1, following) if k < len(frames)]
+        around = [following - 1]
+        if following < len(frames) and not tracker.follows_a_loss(following):
+            around.append(following)
         image = sequence.frame(tracked.frame_index).image
         poses[tracked.frame_index] = _pose_between(
             tracker.backend, around, tracked.timestamp, image

@@ -1,0 +1,126 @@
+"""The mask M of the disparity prior: where other views contradict the depth of a single image.
+
+A depth network is wrong in places, and there the prior of Eq. (5) would bend poses and
+disparities. So every connected keyframe j is carried into keyframe i by its own depth: where
+several arrive and too few agree with D~_i, the prior of i is switched off.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from minislam.geometry import Camera, se3_inverse, transform_points
+from minislam.tracking.config import TrackingConfig
+from minislam.tracking.grid import Grid
+
+MIN_DEPTH = 1e-6  # world units: points at or behind the camera are not seen
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """One keyframe, as far as the consistency of depth is concerned."""
+
+    metric_depth: Tensor  # (H, W) D~, world units, 0 where unknown
+    features: Tensor  # (h', w', C)
+    T_camera_world: Tensor  # (4, 4)
+
+
+@dataclass(frozen=True)
+class ConsistencyCounts:
+    """How many other views have a word on each cell, and how many of them agree with it."""
+
+    corresponding: Tensor  # (N,) int64, views from which a point arrives that looks like the cell
+    consistent: Tensor  # (N,) int64, n_i of Eq. (8)
+
+
+def prior_mask(
+    grid: Grid, view: DepthView, others: list[DepthView], config: TrackingConfig
+) -> Tensor:  # (N,) bool
+    """Return M: False where enough views have a word on a cell and too few agree with it. Eq. (8)
+
+    A cell of which nothing is known against it keeps its prior.
+    """
+    counts = depth_consistency(
+        grid, view, others, config.mask_max_depth_error, config.mask_min_similarity
+    )
+    is_judged = counts.corresponding >= config.mask_min_corresponding
+    return ~(is_judged & (counts.consistent < config.mask_min_consistent))
+
+
+def depth_consistency(
+    grid: Grid,
+    view: DepthView,  # i
+    others: list[DepthView],  # j, the keyframes that the frame graph connects with i
+    max_depth_error: float,  # epsilon, relative
+    min_similarity: float,  # gamma, cosine
+) -> ConsistencyCounts:
+    """Count the views whose depth, carried into view i, agrees with that of i.
+
+    n_i = sum_j [ |D~_i - D~_j->i| / D~_j->i < epsilon  and  cos(F_i, F_j) > gamma ]    Eq. (8)
+    """
+    stride = grid.stride
+    depth = view.metric_depth[::stride, ::stride].reshape(-1)
+    cell_features = sample_features(view.features, grid.pixels, grid.camera)
+    corresponding = torch.zeros(len(depth), dtype=torch.int64)
+    consistent = torch.zeros_like(corresponding)
+    for other in others:
+        T_view_other = view.T_camera_world @ se3_inverse(other.T_camera_world)
+        arrived = carried_depth(grid, cell_features, other, T_view_other, min_similarity)
+        has_word = (depth > 0) & (arrived > 0)
+        corresponding += has_word
+        consistent += has_word & ((depth - arrived).abs() < max_depth_error * arrived)
+    return ConsistencyCounts(corresponding, consistent)
+
+
+def carried_depth(
+    grid: Grid,
+    cell_features: Tensor,  # (N, C) of the cells that points are carried to
+    other: DepthView,  # whose pixels are carried
+    T_view_other: Tensor,  # (4, 4)
+    min_similarity: float,  # gamma
+) -> Tensor:  # (N,) D~_j->i, 0 where nothing arrives that looks like the cell
+    """Carry every pixel of another view to the cells of this one by its own depth.
+
+    Several points may fall on one cell. Those that do not look like it are no correspondences;
+    of the others the nearest counts, because it hides the rest: whichever came last would turn a
+    hidden surface into a contradiction.
+    """
+    camera, stride = grid.camera, grid.stride
+    pixels = camera.pixel_grid(dtype=other.metric_depth.dtype).reshape(-1, 2)
+    depth = other.metric_depth.reshape(-1)
+    points = camera.backproject(pixels, depth)
+    points = transform_points(T_view_other.to(points.dtype), points)
+    arrived = points[:, 2]
+    seen = (depth > 0) & (arrived > MIN_DEPTH)
+    points = torch.where(seen[:, None], points, points.new_ones(3))  # 1/z would not be finite
+    column, row = camera.project(points).round().unbind(1)
+    seen &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    # Only the pixels of the grid carry unknowns, one in stride^2.
+    seen &= (column % stride == 0) & (row % stride == 0)
+
+    cell = (row[seen] / stride).long() * grid.shape[1] + (column[seen] / stride).long()
+    features = sample_features(other.features, pixels[seen], camera)
+    alike = functional.cosine_similarity(features, cell_features[cell], dim=1) > min_similarity
+    nearest = depth.new_full((len(cell_features),), torch.inf)
+    nearest.scatter_reduce_(0, cell[alike], arrived[seen][alike], "amin")
+    return torch.where(nearest.isfinite(), nearest, 0)
+
+
+def sample_features(
+    features: Tensor,  # (h', w', C), cells spread evenly over the image
+    pixels: Tensor,  # (N, 2)
+    camera: Camera,
+) -> Tensor:  # (N, C)
+    """Interpolate features bilinearly at pixels; beyond the outermost cells they are held."""
+    size = pixels.new_tensor([camera.width, camera.height])
+    # The image covers [-0.5, size - 0.5], which grid_sample calls [-1, 1].
+    position = ((2 * pixels + 1) / size - 1).to(features.dtype)
+    sampled = functional.grid_sample(
+        features.permute(2, 0, 1)[None],
+        position[None, None],
+        align_corners=False,
+        padding_mode="border",
+    )
+    return sampled[0, :, 0].mT

@@ -1,0 +1,120 @@
+"""Relocalisation: a camera that was lost finds its place again.
+
+The keyframes whose features are most like the frame's are tried. Keypoints matched between the
+images carry the structure of the keyframe to the frame, and the pose follows from points and
+pixels (PnP with RANSAC). No geometry of the lost time is needed.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from minislam.geometry.distortion import camera_matrix
+from minislam.geometry.se3 import make_transform, so3_exp
+from minislam.priors.flow import grayscale
+from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
+
+CANDIDATES = 3  # keyframes that are tried for one frame
+MAX_RATIO = 0.8  # of the distance to the best over the second-best descriptor (Lowe)
+PNP_ERROR = 3.0  # px at 320x240, inlier distance
+PNP_ITERATIONS = 300
+MIN_INLIERS = 20
+MIN_STATIC_WEIGHT = 0.5  # a point on something that may move says nothing about the camera
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a frame was recognised."""
+
+    keyframe_index: int
+    T_camera_world: Tensor  # (4, 4) float64 of the frame
+    inliers: int
+
+
+class Relocaliser:
+    """Finds frames again among the keyframes; remembers the keypoints of those it has tried."""
+
+    def __init__(self, grid: Grid, keyframes: KeyframeStore, pixel_scale: float) -> None:
+        self._grid, self._keyframes = grid, keyframes
+        self._error = PNP_ERROR * pixel_scale
+        self._keypoints: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
+
+    def find(self, image: Tensor, features: Tensor) -> Place | None:
+        """Return the best supported place of an image (H, W, 3) with features (h', w', C)."""
+        seen = _keypoints(image)
+        places = [self._place(seen, index) for index in self._most_alike(features)]
+        found = [place for place in places if place is not None]
+        return max(found, key=lambda place: place.inliers, default=None)
+
+    def _most_alike(self, features: Tensor) -> list[int]:
+        known = torch.stack([_summary(f) for f in self._keyframes.features])
+        likeness = known @ _summary(features)
+        return likeness.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
+
+    def _place(self, seen: tuple[np.ndarray, np.ndarray | None], index: int) -> Place | None:
+        """Return the pose from the keypoints shared with one keyframe, if there are enough."""
+        if index not in self._keypoints:
+            self._keypoints[index] = _keypoints(self._keyframes.frames[index].image)
+        pixels, matched = _shared(self._keypoints[index], seen)
+        if len(pixels) < MIN_INLIERS:
+            return None
+        positions = torch.from_numpy(pixels)[None]
+        structure = torch.stack(
+            [self._keyframes.disparities[index], self._keyframes.static_weights[index]], -1
+        )
+        disparities, trust = self._grid.sample(structure[None], positions)[0].unbind(-1)
+        usable = (disparities > 0) & (trust > MIN_STATIC_WEIGHT)
+        if int(usable.sum()) < MIN_INLIERS:
+            return None
+        points = self._grid.camera.rays(positions[0]) / disparities[:, None]
+        pose = self._pose(points[usable].double().numpy(), matched[usable.numpy()])
+        if pose is None:
+            return None
+        T_frame_keyframe, inliers = pose
+        return Place(index, T_frame_keyframe @ self._keyframes.T_camera_world[index], inliers)
+
+    def _pose(self, points: np.ndarray, pixels: np.ndarray) -> tuple[Tensor, int] | None:
+        """Return T_frame_keyframe and its inliers from points (P, 3) and pixels (P, 2)."""
+        cv2.setRNGSeed(0)
+        found, phi, t, inliers = cv2.solvePnPRansac(
+            points,
+            pixels.astype(np.float64),
+            camera_matrix(self._grid.camera),
+            None,
+            iterationsCount=PNP_ITERATIONS,
+            reprojectionError=self._error,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+        if not found or inliers is None or len(inliers) < MIN_INLIERS:
+            return None
+        rotation = so3_exp(torch.from_numpy(phi[:, 0]))
+        return make_transform(rotation, torch.from_numpy(t[:, 0])), len(inliers)
+
+
+def _summary(features: Tensor) -> Tensor:  # (h', w', C) -> (C,)
+    return normalize(features.flatten(0, 1).mean(0), dim=0)
+
+
+def _keypoints(image: Tensor) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return SIFT positions (P, 2) [px] and descriptors (P, 128) of an image (H, W, 3)."""
+    keypoints, descriptors = cv2.SIFT_create().detectAndCompute(grayscale(image), None)
+    return np.float32([keypoint.pt for keypoint in keypoints]).reshape(-1, 2), descriptors
+
+
+def _shared(
+    first: tuple[np.ndarray, np.ndarray | None], second: tuple[np.ndarray, np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray]:  # (M, 2) and (M, 2) px
+    """Return the positions of the keypoints whose best match is clearly better than the next."""
+    if first[1] is None or second[1] is None or min(len(first[1]), len(second[1])) < 2:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first[1], second[1], k=2)
+    clear = [best for best, other in pairs if best.distance < MAX_RATIO * other.distance]
+    return (
+        first[0][[match.queryIdx for match in clear]],
+        second[0][[match.trainIdx for match in clear]],
+    )
