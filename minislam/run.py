@@ -18,6 +18,7 @@ from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.run import MAX_DIFFERENCE, MappedView, measure_run
 from minislam.geometry import se3_inverse
+from minislam.mapping.views import surface_depth
 from minislam.priors.choice import FILES, PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
@@ -31,6 +32,8 @@ from minislam.viz import (
     figure_png,
     keyframe_strip,
     loss_curves,
+    map_growth,
+    online_uncertainty,
     overview,
     trajectory_plot,
 )
@@ -147,7 +150,8 @@ def _measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         MappedView(
             _frame_index(slam, index),
             se3_inverse(keyframe.T_camera_world).numpy(),
-            _beta_image(slam, index) if slam.config.uncertainty.enabled else None,
+            _beta_image(slam, index) if slam.config.uncertainty.is_learnt else None,
+            surface_depth(slam.mapper.render(keyframe.T_camera_world)).numpy(),
         )
         for index, keyframe in enumerate(slam.mapper.keyframes)
     ]
@@ -182,7 +186,7 @@ def _beta_image(slam: Slam, index: int) -> np.ndarray:
     camera = slam.sequence.camera
     if not slam.config.uncertainty.enabled:
         return np.ones((camera.height, camera.width), np.float32)
-    beta = slam.mapper.predict_beta(slam.mapper.keyframes[index].features)
+    beta = slam.mapper.beta_of(slam.mapper.keyframes[index])
     return resample(beta, camera.height, camera.width).numpy()
 
 
@@ -201,22 +205,41 @@ def _warnings(slam: Slam) -> list[str]:
 
 def _write_pictures(folder: RunFolder, slam: Slam, outcome: RunOutcome) -> None:
     """Write keyframe images, plots and the report."""
+    truth = slam.sequence.ground_truth
+    true_path, unit, estimate = None, "world units", slam.trajectory()
+    plots: dict[str, tuple[str, bytes]] = {}  # caption and PNG, by name
+    if outcome.metrics["ate_all_cm"] is not None:
+        error = absolute_trajectory_error(estimate, truth.trajectory, max_difference=MAX_DIFFERENCE)
+        estimate, true_path, unit = error.estimate, error.truth, "m"
+        over_time = figure_png(ate_over_time(estimate.timestamps, error.errors, unit))
+        plots["ate_over_time"] = "Error over time", over_time
+    plots["trajectory"] = "Trajectory", figure_png(trajectory_plot(estimate, true_path, unit))
+    history = slam.mapper.history
+    curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
+    plots["losses"] = "Losses", figure_png(loss_curves(curves))
+    plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
+    if slam.config.uncertainty.is_learnt:
+        plots["online_uncertainty"] = "What the MLP had learnt by then", _online_beta(slam)
+    for name, (_, png) in plots.items():
+        folder.write_plot(name, png)
+
+    strips = _write_keyframes(folder, slam)
+    middle = len(slam.mapper.keyframes) // 2
+    keyframe, beta = slam.mapper.keyframes[middle], _beta_image(slam, middle)
+    color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).numpy()
+    picture = overview(keyframe.image.numpy(), beta, color, estimate, true_path, unit)
+    folder.write_plot("overview", figure_png(picture))
+    summary = {name: _shown(value) for name, value in outcome.metrics.items()}
+    figures = [plots.pop("trajectory"), *strips, *plots.values()]
+    title = f"minislam: {slam.sequence.name}"
+    folder.write_report(build_report(title, summary, outcome.warnings, figures))
+
+
+def _write_keyframes(folder: RunFolder, slam: Slam) -> list[tuple[str, bytes]]:
+    """Write the pictures of all keyframes; return some of them as strips with captions."""
     strips: list[tuple[str, bytes]] = []
     count = len(slam.mapper.keyframes)
     shown = set(np.linspace(0, count - 1, min(MAX_STRIPS, count)).round().astype(int).tolist())
-    middle = sorted(shown)[len(shown) // 2]
-    truth = slam.sequence.ground_truth
-    true_path = truth.trajectory if truth else None
-    unit = "world units"
-    estimate = slam.trajectory()
-    if outcome.metrics["ate_all_cm"] is not None:
-        error = absolute_trajectory_error(estimate, true_path, max_difference=MAX_DIFFERENCE)
-        estimate, true_path = error.estimate, error.truth
-        unit = "m"
-        png = figure_png(ate_over_time(estimate.timestamps, error.errors, unit))
-        folder.write_plot("ate_over_time", png)
-    else:
-        true_path = None
     for index, keyframe in enumerate(slam.mapper.keyframes):
         rendering = slam.mapper.render(keyframe.T_camera_world)
         image, beta = keyframe.image.numpy(), _beta_image(slam, index)
@@ -229,19 +252,20 @@ def _write_pictures(folder: RunFolder, slam: Slam, outcome: RunOutcome) -> None:
         if index in shown:
             strip = figure_png(keyframe_strip(image, depth, beta, color, f"frame {number}"))
             strips.append((f"Keyframe {index}, frame {number}", strip))
-        if index == middle:
-            picture = overview(image, beta, color, estimate, true_path, unit)
-            folder.write_plot("overview", figure_png(picture))
-    path = figure_png(trajectory_plot(estimate, true_path, unit))
-    folder.write_plot("trajectory", path)
-    history = slam.mapper.history
-    curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
-    losses = figure_png(loss_curves(curves))
-    folder.write_plot("losses", losses)
-    summary = {name: _shown(value) for name, value in outcome.metrics.items()}
-    figures = [("Trajectory", path), *strips, ("Losses", losses)]
-    title = f"minislam: {slam.sequence.name}"
-    folder.write_report(build_report(title, summary, outcome.warnings, figures))
+    return strips
+
+
+def _online_beta(slam: Slam) -> bytes:
+    """Draw how beta of the keyframe with most movement came about: first, then, and at last."""
+    count = len(slam.mapper.keyframes)
+    index = max(range(count), key=lambda k: float(_beta_image(slam, k).mean()))
+    number, moments = _frame_index(slam, index), slam.snapshots.moments
+    later = [moment for moment in moments if moment >= number]
+    chosen = sorted({moments[0], later[0] if later else moments[-1], moments[-1]})
+    betas = slam.online_beta(number, chosen)
+    named = {f"learnt until frame {k}": b.numpy() for k, b in zip(chosen, betas, strict=True)}
+    image = slam.mapper.keyframes[index].image.numpy()
+    return figure_png(online_uncertainty(image, named, f"uncertainty of frame {number}"))
 
 
 def _shown(value: float | None) -> str:

@@ -25,8 +25,8 @@ INPUT = ["synth:person", "--stride", "3", "--max-frames", str(FRAMES), "--size",
 COMMAND = ["run", *INPUT, "--preset", "test"]
 METRICS = [
     "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
-    "psnr_input_db", "psnr_masked_db", "beta_auroc", "seconds_total", "frames_per_second",
-    "peak_memory_mb",
+    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "seconds_total",
+    "frames_per_second", "peak_memory_mb",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0
@@ -181,13 +181,16 @@ def test_run_json_says_what_was_done(with_depth: RunFolder):
 
 def test_pictures_and_report_are_there(finished: RunFolder):
     plots = {path.stem for path in (finished.path / "plots").iterdir()}
-    assert plots == {"ate_over_time", "losses", "overview", "trajectory"}
+    always = {"ate_over_time", "gaussians", "losses", "overview", "trajectory"}
+    config = from_json(finished.read_config())
+    learnt = {"online_uncertainty"} if config.uncertainty.is_learnt else set()
+    assert plots == always | learnt
     keyframes = len(finished.read_keyframe_trajectory())
     pictures = sorted((finished.path / "keyframes").glob("*.png"))
     assert len(pictures) == 4 * keyframes
     assert cv2.imread(str(pictures[0])).shape == (72, 96, 3)
     report = (finished.path / "report.html").read_text()
-    assert "ate_all_cm" in report and report.count("<img") == 2 + min(6, keyframes)
+    assert "ate_all_cm" in report and report.count("<img") == len(plots) - 1 + min(6, keyframes)
     assert not list(finished.path.rglob("*.tmp"))
 
 

@@ -11,6 +11,8 @@ from minislam.records import Keyframe
 from minislam.splatting import Rendering
 from minislam.uncertainty import Misfit, UncertaintyConfig, beta_of_mask, measure_misfit
 
+_OPAQUE = 0.5  # opacity from which on a surface is seen rather than a gap
+
 
 @dataclass(frozen=True)
 class View:
@@ -85,6 +87,12 @@ def keyframe_misfit(
         depth_unit,
         config,
     )
+
+
+def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
+    """Return the mean z of what is seen [world units], 0 where the map is mostly transparent."""
+    depth = rendering.depth / rendering.opacity.clamp_min(_OPAQUE)
+    return torch.where(rendering.opacity > _OPAQUE, depth, 0)
 
 
 def shrink_image(image: Tensor, height: int, width: int) -> Tensor:

@@ -4,6 +4,8 @@ from minislam.viz.figures import (
     ate_over_time,
     keyframe_strip,
     loss_curves,
+    map_growth,
+    online_uncertainty,
     overview,
     trajectory_plot,
 )
@@ -19,7 +21,9 @@ __all__ = [
     "figure_png",
     "keyframe_strip",
     "loss_curves",
+    "map_growth",
     "new_figure",
+    "online_uncertainty",
     "overview",
     "show_figure",
     "show_image",

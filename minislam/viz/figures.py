@@ -13,6 +13,7 @@ from minislam.viz.style import (
     STRIP,
     TRUTH_STYLE,
     WIDE,
+    beta_limits,
     beta_to_rgb,
     depth_to_rgb,
     new_figure,
@@ -81,6 +82,34 @@ def loss_curves(history: Mapping[str, Series[float]]) -> Figure:
     if history:
         axes.legend(frameon=False, fontsize=8)
     axes.grid(alpha=0.3)
+    return figure
+
+
+def map_growth(gaussians: Series[int]) -> Figure:
+    """Draw the number of Gaussians in the map over the iterations."""
+    figure = new_figure(WIDE)
+    axes = figure.subplots()
+    axes.plot(np.arange(len(gaussians)), gaussians, color=ESTIMATE_STYLE["color"])
+    axes.set(xlabel="iteration", ylabel="Gaussians in the map", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def online_uncertainty(
+    image: np.ndarray,  # (H, W, 3) RGB in [0, 1] of one frame
+    betas: Mapping[str, np.ndarray],  # what the MLP had learnt by then -> (h, w) beta of the frame
+    title: str = "",
+) -> Figure:
+    """Draw how beta of one frame changed while the MLP learnt, all in the same colours."""
+    figure = new_figure((WIDE[0], STRIP[1]))
+    axes = figure.subplots(1, 1 + len(betas))
+    show_image(axes[0], image, "input")
+    together = np.concatenate([np.ravel(beta) for beta in betas.values()])
+    limits = beta_limits(together)
+    for place, (name, beta) in zip(axes[1:], betas.items(), strict=True):
+        show_image(place, beta_to_rgb(beta, limits), name, image.shape[:2])
+    if title:
+        figure.suptitle(title, fontsize=10)
     return figure
 
 

@@ -69,10 +69,15 @@ def beta_to_rgb(
 ) -> np.ndarray:  # (h, w, 3) in [0, 1]
     """Colour an uncertainty map: magma over log beta, dark is certain."""
     beta = np.asarray(beta, dtype=np.float64)
-    low, high = limits or np.quantile(beta, _QUANTILES)
-    low = max(low, np.finfo(np.float64).tiny)
-    high = max(high, _LEAST_BETA_RATIO * low)
+    low, high = limits or beta_limits(beta)
     return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), BETA_COLORMAP)
+
+
+def beta_limits(beta: np.ndarray) -> tuple[float, float]:
+    """Return the beta that is darkest and the one that is brightest, for maps of any shape."""
+    low, high = np.quantile(np.asarray(beta, dtype=np.float64), _QUANTILES)
+    low = max(float(low), float(np.finfo(np.float64).tiny))
+    return low, max(float(high), _LEAST_BETA_RATIO * low)
 
 
 def _mapped(values: np.ndarray, low: float, high: float, colormap: str) -> np.ndarray:

@@ -1,0 +1,41 @@
+"""The MLP as it was at earlier moments: how the system found out what moves."""
+
+from torch import Tensor
+from torch.func import functional_call
+
+from minislam.uncertainty.mlp import UncertaintyMLP
+
+_MOST = 32  # copies kept; a copy for DINOv2 features takes 115 kB
+
+
+class MlpSnapshots:
+    """Copies of the weights of an MLP, at most 32, spread evenly over the run."""
+
+    def __init__(self) -> None:
+        self._weights: dict[int, dict[str, Tensor]] = {}  # by moment, in order
+        self._mlp: UncertaintyMLP | None = None
+        self._spacing, self._calls = 1, 0
+
+    @property
+    def moments(self) -> list[int]:
+        """Return the moments of the copies, in order."""
+        return list(self._weights)
+
+    def record(self, moment: int, mlp: UncertaintyMLP) -> None:
+        """Keep a copy of the weights; of very many calls only every second, every fourth, ..."""
+        self._mlp = mlp
+        if self._calls % self._spacing == 0:
+            self._weights[moment] = {k: v.detach().clone() for k, v in mlp.state_dict().items()}
+        self._calls += 1
+        if len(self._weights) > _MOST:
+            self._weights = dict(list(self._weights.items())[::2])
+            self._spacing *= 2
+
+    def predict(
+        self,
+        moment: int,
+        features: Tensor,  # (h', w', C)
+    ) -> Tensor:  # (h', w')
+        """Return the raw beta that the newest copy up to a moment predicts, or else the first."""
+        newest = max((m for m in self._weights if m <= moment), default=self.moments[0])
+        return functional_call(self._mlp, self._weights[newest], (features,)).detach()
