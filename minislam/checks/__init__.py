@@ -1,0 +1,32 @@
+"""Answers to the exercises of the notebooks: each check takes the student's function.
+
+A check calls the function with a few inputs, compares with the package, and answers in a sentence
+that names the first number that is wrong. It never raises, so a notebook with open exercises
+still runs from top to bottom.
+"""
+
+from minislam.checks.geometry import check_reproject, check_resized_intrinsics
+from minislam.checks.grading import NOT_YET, PASSED, WRONG, Case, Verdict, check_function
+from minislam.checks.splatting import (
+    check_conic_vjp,
+    check_pixel_color,
+    check_projected_covariance,
+    check_twist_vjp,
+)
+from minislam.checks.start_here import check_mapping_weight
+
+__all__ = [
+    "NOT_YET",
+    "PASSED",
+    "WRONG",
+    "Case",
+    "Verdict",
+    "check_conic_vjp",
+    "check_function",
+    "check_mapping_weight",
+    "check_pixel_color",
+    "check_projected_covariance",
+    "check_reproject",
+    "check_resized_intrinsics",
+    "check_twist_vjp",
+]

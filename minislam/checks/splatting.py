@@ -1,0 +1,142 @@
+"""Exercises of notebooks 02 and 03."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from minislam.checks.grading import Case, Verdict, check_function
+from minislam.geometry import Camera, se3_exp, transform_points
+from minislam.splatting.projection import (
+    conics_from_footprints,
+    conics_from_footprints_vjp,
+    to_camera_twist_vjp,
+)
+from minislam.splatting.reference import project_covariances
+from minislam.splatting.rendering import LOW_PASS_VARIANCE
+
+
+def check_projected_covariance(
+    student: Callable[[Tensor, Tensor, Tensor, Camera], Tensor],
+) -> Verdict:
+    """Check (covariance_world, mean_world, T_camera_world, camera) -> Sigma' (2, 2) in px^2."""
+    camera = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
+    factor = torch.tensor([[0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.05]], dtype=torch.float64)
+
+    def reference(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
+        point = transform_points(pose, mean[None])
+        return project_covariances(covariance[None], point, pose, camera)[0]
+
+    def unfiltered(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
+        low_pass = LOW_PASS_VARIANCE * torch.eye(2, dtype=covariance.dtype)
+        return reference(covariance, mean, pose, camera) - low_pass
+
+    def not_turned(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
+        rotation = pose[:3, :3]
+        return reference(rotation.T @ covariance @ rotation, mean, pose, camera)
+
+    def turned_back(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
+        twice = pose[:3, :3].T @ pose[:3, :3].T
+        return reference(twice @ covariance @ twice.T, mean, pose, camera)
+
+    def case(x: float, turn: float, description: str) -> Case:
+        pose = se3_exp(torch.tensor([0.1, -0.1, 0.2, turn, -turn, 0.5 * turn], dtype=torch.float64))
+        mean = torch.tensor([x, 0.1, 2.5], dtype=torch.float64)
+        return Case((factor @ factor.T, mean, pose, camera), description)
+
+    cases = [case(-0.1, 0.0, "a camera that is not turned"), case(0.6, 0.2, "a turned camera")]
+    hints = [
+        (unfiltered, "The low-pass filter is missing: add 0.3 I."),
+        (not_turned, "Sigma is still in the world frame: turn it by W before J."),
+        (turned_back, "This turns Sigma the wrong way: it is W Sigma W^T."),
+    ]
+    return check_function(student, reference, cases, hints=hints)
+
+
+def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
+    """Check (alphas, colors, background) -> color (3,) of one pixel, nearest Gaussian first."""
+
+    def blend(light: Tensor, alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        return (light[:-1] * alphas) @ colors + light[-1] * background
+
+    def transmittances(alphas: Tensor) -> Tensor:  # (K,) -> (K + 1,)
+        return torch.cat([alphas.new_ones(1), (1 - alphas).cumprod(0)])
+
+    def reference(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        return blend(transmittances(alphas), alphas, colors, background)
+
+    def without_background(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        return reference(alphas, colors, torch.zeros_like(background))
+
+    def far_first(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        return reference(alphas.flip(0), colors.flip(0), background)
+
+    def shades_itself(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        light = transmittances(alphas)
+        return blend(torch.cat([light[1:], light[-1:]]), alphas, colors, background)
+
+    colors = torch.tensor([[0.9, 0.1, 0.2], [0.3, 0.8, 0.4], [0.2, 0.5, 1.0]], dtype=torch.float64)
+    alphas = torch.tensor([0.3, 0.6, 0.5], dtype=torch.float64)
+    grey = torch.full((3,), 0.6, dtype=torch.float64)
+    cases = [
+        Case((alphas, colors, torch.zeros_like(grey)), "three Gaussians on black"),
+        Case((alphas, colors, grey), "three Gaussians on grey"),
+        Case((alphas[:0], colors[:0], grey), "no Gaussian at all"),
+    ]
+    hints = [
+        (without_background, "The background is missing: add T_end times its colour."),
+        (far_first, "This starts with the farthest: the list is sorted nearest first."),
+        (shades_itself, "T_i holds only the Gaussians in front of i, not i itself."),
+    ]
+    return check_function(student, reference, cases, hints=hints)
+
+
+def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
+    """Check (footprints, conics, v_conics) -> v_footprints (2, 3, N)."""
+
+    def scaled(off_diagonal: float, all_of_it: float) -> Callable[..., Tensor]:
+        scale = all_of_it * torch.tensor([[1.0], [off_diagonal], [1.0]], dtype=torch.float64)
+        return lambda V, conics, v: conics_from_footprints_vjp(V, conics, scale * v)
+
+    V = torch.tensor([[[3.0], [1.0], [0.5]], [[-1.0], [2.0], [0.0]]], dtype=torch.float64)
+    conics, _ = conics_from_footprints(V)
+    v_a, v_all = ([[1.0], [0.0], [0.0]], [[0.7], [-1.2], [0.4]])
+    cases = [
+        Case((V, conics, torch.tensor(v_a, dtype=torch.float64)), "a gradient of a alone"),
+        Case((V, conics, torch.tensor(v_all, dtype=torch.float64)), "a gradient of a, b and c"),
+    ]
+    hints = [
+        (scaled(1, -1), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
+        (scaled(1, 0.5), "A factor 2 is missing: V appears twice in V V^T."),
+        (scaled(2, 1), "b is counted twice: it stands twice in Q, so each place gets v_b / 2."),
+    ]
+    # Gradients of conics are small numbers: an error of 1 % must not pass as rounding.
+    return check_function(student, conics_from_footprints_vjp, cases, 1e-9, hints)
+
+
+def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> Verdict:
+    """Check (points, factors, v_points, v_factors) -> v_twist (6,) of (rho, phi)."""
+    source = torch.Generator().manual_seed(0)
+    points, v_points = torch.randn(2, 3, 4, generator=source, dtype=torch.float64)
+    factors, v_factors = torch.randn(2, 3, 3, 4, generator=source, dtype=torch.float64)
+    signs = torch.tensor([1.0, 1, 1, -1, -1, -1], dtype=torch.float64)
+
+    def points_only(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
+        return to_camera_twist_vjp(x, B, v_x, torch.zeros_like(v_B))
+
+    def swapped(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
+        return signs * to_camera_twist_vjp(x, B, v_x, v_B)
+
+    def rotation_first(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
+        return to_camera_twist_vjp(x, B, v_x, v_B).roll(3)
+
+    cases = [
+        Case((points, factors, v_points, torch.zeros_like(v_factors)), "means alone"),
+        Case((points, factors, v_points, v_factors), "means and factors"),
+    ]
+    hints = [
+        (points_only, "The factors turn with the camera as well: add B x v_B, column by column."),
+        (swapped, "The cross product is the wrong way round: v_phi = x cross v_x."),
+        (rotation_first, "The order is (rho, phi), translation first."),
+    ]
+    return check_function(student, to_camera_twist_vjp, cases, hints=hints)
