@@ -9,7 +9,7 @@ a hand-held camera; it shares no code with the package that is tested on it.
 
 from .errors import SynthError
 from .poses import Intrinsics, default_intrinsics
-from .scenes import SEQUENCES, SUMMARIES, Scene, scene
+from .scenes import SEQUENCES, SUMMARIES, Scene, default_frames, scene
 from .sequence import SyntheticFrame, SyntheticSequence, generate, render_frame, render_view
 from .writing import cached_sequence, write_sequence
 
@@ -22,6 +22,7 @@ __all__ = [
     "SyntheticFrame",
     "SyntheticSequence",
     "cached_sequence",
+    "default_frames",
     "default_intrinsics",
     "generate",
     "render_frame",

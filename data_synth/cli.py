@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from .errors import SynthError
-from .scenes import SUMMARIES
+from .scenes import SUMMARIES, default_frames
 from .sequence import Progress
 from .writing import write_sequence
 
@@ -26,8 +26,9 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error("name a sequence and a folder: python -m data_synth crowd --out data/crowd")
     try:
         size = parse_size(options.size)
+        frames = default_frames(options.name) if options.frames is None else options.frames
         folder = write_sequence(
-            options.name, options.seed, options.frames, size, options.out, progress_printer()
+            options.name, options.seed, frames, size, options.out, progress_printer()
         )
     except SynthError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -38,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted: nothing was written", file=sys.stderr)
         return EXIT_INTERRUPTED
-    print(f"{options.name}, seed {options.seed}, {options.frames} frames: {folder}")
+    print(f"{options.name}, seed {options.seed}, {frames} frames: {folder}")
     return 0
 
 
@@ -50,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("name", nargs="?", help="the sequence; --list shows them")
     parser.add_argument("--out", type=Path, help="the folder to write")
     parser.add_argument("--seed", type=int, default=0, help="another path, other textures")
-    parser.add_argument("--frames", type=int, default=100, help="at 30 Hz (default 100)")
+    parser.add_argument("--frames", type=int, help="at 30 Hz (default 100; loop 400)")
     parser.add_argument("--size", default="320x240", help="width x height [px] (default 320x240)")
     parser.add_argument("--list", action="store_true", help="list the sequences")
     return parser

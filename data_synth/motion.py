@@ -12,6 +12,8 @@ from .poses import Array, look_at, rigid
 FRAME_RATE = 30.0  # Hz
 CLIP_FRAMES = 100  # frames of the choreography; longer sequences play it forth and back
 CLIP_SECONDS = (CLIP_FRAMES - 1) / FRAME_RATE
+ROUND_FRAMES = 360  # frames of one walk around a room
+ROUND_SECONDS = ROUND_FRAMES / FRAME_RATE
 EVENNESS = 0.95  # of the camera's speed: 0 swings like a pendulum, 1 turns back abruptly
 PATH_SAMPLES = 200  # per clip, for lengths of paths
 
@@ -83,11 +85,56 @@ class HandheldPath:
         position = self.centre + swing
         target = self.target + self.target_reach * np.sin(0.7 * angle + 1.0)
         target = target + self.follow * swing
-        amplitude, frequency, first, second = self.tremble.T
-        shake = np.sin(2 * np.pi * frequency * time + first)
-        shake = amplitude * (shake + 0.5 * np.sin(2 * np.pi * 1.83 * frequency * time + second))
+        shake = _shake(self.tremble, time)
         T_world_level = look_at(position + shake[:3], target)
         return T_world_level @ rigid(Rotation.from_rotvec(shake[3:]).as_matrix(), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class RoundPath:
+    """A walk around the middle of a room, looking across it, that comes back to its start."""
+
+    centre: Array  # (3,) [m]
+    reach: Array  # (3,) radii on the floor, and the amplitude of the height [m]
+    start: float  # direction of the first place from the centre [rad]
+    turn: float  # +1 or -1, the sense of the walk
+    look_down: float  # m, how far below the camera the point is that it looks at
+    tremble: Array  # (6, 4) as of a HandheldPath
+
+    def __call__(self, time: float) -> Array:
+        """Return T_world_camera (4, 4) at a time [s]."""
+        angle = self.start + self.turn * 2 * np.pi * time / ROUND_SECONDS
+        swing = self.reach * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)])
+        shake = _shake(self.tremble, time)
+        across = self.centre - [0.0, 0.0, self.look_down]
+        T_world_level = look_at(self.centre + swing + shake[:3], across)
+        return T_world_level @ rigid(Rotation.from_rotvec(shake[3:]).as_matrix(), np.zeros(3))
+
+
+def _shake(tremble: Array, time: float) -> Array:  # (6,) [m, rad]
+    amplitude, frequency, first, second = tremble.T
+    shake = np.sin(2 * np.pi * frequency * time + first)
+    return amplitude * (shake + 0.5 * np.sin(2 * np.pi * 1.83 * frequency * time + second))
+
+
+def _draw_tremble(rng: np.random.Generator) -> Array:
+    tremble = np.empty((6, 4))
+    tremble[:, 0] = np.repeat([0.003, 0.005], 3) * rng.uniform(0.7, 1.3, 6)
+    tremble[:, 1] = rng.uniform(1.2, 2.6, 6)
+    tremble[:, 2:] = rng.uniform(0, 2 * np.pi, (6, 2))
+    return tremble
+
+
+def round_path(rng: np.random.Generator, centre: Array) -> RoundPath:
+    """Draw a walk around a place."""
+    return RoundPath(
+        centre=np.asarray(centre) + rng.uniform(-0.05, 0.05, 3),
+        reach=np.array([1.2, 0.75, 0.1]) * rng.uniform(0.95, 1.05, 3),
+        start=rng.uniform(0, 2 * np.pi),
+        turn=float(rng.choice([-1.0, 1.0])),
+        look_down=rng.uniform(0.1, 0.25),
+        tremble=_draw_tremble(rng),
+    )
 
 
 def path_length(path: Callable[[float], Array], frames: int = CLIP_FRAMES) -> float:
@@ -102,10 +149,7 @@ def handheld_path(rng: np.random.Generator, centre: Array, target: Array) -> Han
     reach = np.array([side, 0.34, 0.13]) * rng.uniform(0.85, 1.15, 3)
     cycles = np.array([0.95, 0.75, 1.2]) * rng.uniform(0.9, 1.1, 3)
     phases = np.array([rng.uniform(-0.5, 0.5), rng.uniform(0, 6.28), rng.uniform(0, 6.28)])
-    tremble = np.empty((6, 4))
-    tremble[:, 0] = np.repeat([0.003, 0.005], 3) * rng.uniform(0.7, 1.3, 6)
-    tremble[:, 1] = rng.uniform(1.2, 2.6, 6)
-    tremble[:, 2:] = rng.uniform(0, 2 * np.pi, (6, 2))
+    tremble = _draw_tremble(rng)
     wanted = rng.uniform(4.2, 4.8)
     arguments = {
         "centre": np.asarray(centre) + rng.uniform(-0.1, 0.1, 3),

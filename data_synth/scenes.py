@@ -1,8 +1,9 @@
 """The sequences: which room, who moves, and how the camera walks.
 
-The names follow the motion-capture sequences of Wild-SLAM, plus three of our own: `static`
-(nothing moves), `lowtexture` (one person in a nearly bare room) and `wandering` (a person who
-stands for most of the clip, then walks).
+The names follow the motion-capture sequences of Wild-SLAM, plus four of our own: `static`
+(nothing moves), `lowtexture` (one person in a nearly bare room), `wandering` (a person who stands
+for most of the clip, then walks) and `loop` (nothing moves; the camera walks once around the room,
+400 frames, and ends where it began).
 """
 
 import zlib
@@ -14,7 +15,15 @@ import numpy as np
 from . import scripts
 from .cast import Cast, Mover
 from .errors import SynthError
-from .motion import HandheldPath, clip_phase, handheld_path
+from .motion import (
+    CLIP_FRAMES,
+    ROUND_FRAMES,
+    HandheldPath,
+    RoundPath,
+    clip_phase,
+    handheld_path,
+    round_path,
+)
 from .rooms import Room, bare_room, living_room, workshop
 from .shapes import Part
 
@@ -27,7 +36,7 @@ class Scene:
     seed: int
     room: Room
     movers: tuple[Mover, ...]
-    path: HandheldPath
+    path: HandheldPath | RoundPath
 
     def mover_parts(self, time: float) -> list[list[Part]]:
         """Return the parts of each mover at a time [s]."""
@@ -39,6 +48,7 @@ class Scene:
         return [clip_phase(time) >= mover.moves_from for mover in self.movers]
 
 
+_MIDDLE = np.array([0.0, -0.95, 1.42])  # m, of the floor that the furniture leaves free
 WARM_HUES = (0.0, 0.92, 0.83, 0.12, 0.97)  # movers in the cool room
 COOL_HUES = (0.6, 0.68, 0.78, 0.87, 0.48)  # movers in the warm room
 
@@ -50,6 +60,7 @@ class _Script:
     summary: str
     movers: Callable[[Cast], list[Mover]]
     furnish: Callable[[np.random.Generator], Room] = living_room
+    round_trip: bool = False  # the camera walks around the room
 
 
 _SCRIPTS: dict[str, _Script] = {
@@ -66,9 +77,16 @@ _SCRIPTS: dict[str, _Script] = {
     "static": _Script("nothing moves", scripts.no_movers),
     "lowtexture": _Script("one person, a nearly bare room", scripts.person_movers, bare_room),
     "wandering": _Script("a person stands, then walks", scripts.wandering_movers, workshop),
+    "loop": _Script("nothing moves; once around the room", scripts.no_movers, round_trip=True),
 }
 SEQUENCES: tuple[str, ...] = tuple(_SCRIPTS)
 SUMMARIES: dict[str, str] = {name: script.summary for name, script in _SCRIPTS.items()}
+
+
+def default_frames(name: str) -> int:
+    """Return the number of frames that tells the whole story of a sequence."""
+    script = _SCRIPTS.get(name)
+    return ROUND_FRAMES + 40 if script and script.round_trip else CLIP_FRAMES
 
 
 def scene(name: str, seed: int = 0) -> Scene:
@@ -83,6 +101,8 @@ def scene(name: str, seed: int = 0) -> Scene:
     room_rng, mover_rng, path_rng = rng.spawn(3)
     room = script.furnish(room_rng)
     hues = WARM_HUES if script.furnish is workshop else COOL_HUES
+    if script.round_trip:
+        return Scene(name, seed, room, (), round_path(path_rng, _MIDDLE))
     path = handheld_path(path_rng, room.camera_centre, room.camera_target)
     movers = tuple(script.movers(Cast(mover_rng, hues, path)))
     return Scene(name, seed, room, movers, path)

@@ -18,7 +18,6 @@ from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.records import Frame
 
-_SYNTHETIC_FRAMES = 100
 _SYNTHETIC_SIZE = (320, 240)  # px
 
 
@@ -149,7 +148,7 @@ def _open_synthetic(
             f"expected synth:NAME or synth:NAME:SEED with NAME one of "
             f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"
         )
-    frames = _SYNTHETIC_FRAMES
+    frames = data_synth.default_frames(name)
     if options.max_frames is not None:
         frames = options.start + options.stride * options.max_frames
     size = options.size or _SYNTHETIC_SIZE

@@ -7,7 +7,7 @@ from scipy.ndimage import map_coordinates
 
 import data_synth
 from data_synth import SEQUENCES, SynthError, default_intrinsics, generate, render_view, scene
-from data_synth.motion import FRAME_RATE, path_length
+from data_synth.motion import FRAME_RATE, ROUND_FRAMES, path_length
 from data_synth.render import camera_rays, trace
 from data_synth.sequence import in_order, novel_poses, render_frame
 
@@ -41,7 +41,7 @@ def moving_share(view, frame):
 
 
 def test_every_sequence_with_movers_has_its_share_checked():
-    assert set(SEQUENCES) == {*SHARES, "static"}
+    assert set(SEQUENCES) == {*SHARES, "static", "loop"}
 
 
 @pytest.mark.parametrize("name", SHARES)
@@ -54,6 +54,21 @@ def test_movers_fill_the_share_of_the_image_that_the_sequence_promises(name):
     if name != "table2":
         assert shares[:11].mean() <= 22  # the first half is not dominated by movers
     assert 4 < path_length(view.path) < 5
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_loop_ends_where_it_began_and_keeps_clear_of_the_furniture(seed: int):
+    view = scene("loop", seed)
+    frames = data_synth.default_frames("loop")
+    poses = np.array([view.path(frame / FRAME_RATE) for frame in range(frames)])
+    again = np.linalg.inv(poses[0]) @ poses[ROUND_FRAMES]
+    turned = np.arccos(np.clip((np.trace(again[:3, :3]) - 1) / 2, -1, 1))
+    assert np.linalg.norm(again[:3, 3]) < 0.05 and turned < 0.05
+    headings = poses[:ROUND_FRAMES, :3, 2]
+    assert headings[:, :2].min() < -0.9 and headings[:, :2].max() > 0.9  # all around
+    for frame in range(0, frames, 20):
+        depth, _ = trace(view.room.parts, camera_rays(CAMERA, poses[frame]))
+        assert depth.min() > 0.4
 
 
 @pytest.fixture(scope="module")
