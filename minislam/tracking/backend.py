@@ -15,6 +15,7 @@ from minislam.tracking.bundle_adjustment import (
     bundle_adjust,
 )
 from minislam.tracking.config import TrackingConfig
+from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.frame_graph import (
     FrameGraph,
     both_directions,
@@ -75,6 +76,7 @@ class BackEnd:
         self.match_from_chain(steps, count - 1)
         self.adjust(first_free, self.config.iterations, widening=FIRST_WIDENING)
         edges = self._neighbourhood(count - 1, steps) + self._proximity_links(count - 1)
+        mask_priors(self.keyframes, self.grid, edges, self.config, first=count - 1)
         for _ in range(self.config.rounds):
             self.match(edges)
             self.adjust(first_free, self.config.iterations)
@@ -254,7 +256,7 @@ class BackEnd:
             targets=targets,
             weights=weights,
             prior_disparities=prior,
-            prior_weights=strength * (prior > 0),
+            prior_weights=strength * (prior > 0) * self.keyframes.prior_masks,
             free_poses=movable,
             free_disparities=free,
             robust_scale=self.robust_scale,

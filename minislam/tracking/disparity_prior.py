@@ -14,6 +14,7 @@ from torch.nn import functional
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
 
 MIN_DEPTH = 1e-6  # world units: points at or behind the camera are not seen
 
@@ -33,6 +34,25 @@ class ConsistencyCounts:
 
     corresponding: Tensor  # (N,) int64, views from which a point arrives that looks like the cell
     consistent: Tensor  # (N,) int64, n_i of Eq. (8)
+
+
+def mask_priors(
+    keyframes: KeyframeStore,
+    grid: Grid,
+    edges: list[tuple[int, int]],  # (source, target), keyframe index
+    config: TrackingConfig,
+    first: int = 0,
+) -> None:
+    """Set the mask of the keyframes from `first` on, by those that the edges connect them with."""
+    if not config.prior_mask:
+        return
+    rows = zip(keyframes.metric_depths, keyframes.features, keyframes.T_camera_world, strict=True)
+    views = [None if depth is None else DepthView(depth, *rest) for depth, *rest in rows]
+    for index in range(first, len(views)):
+        if views[index] is not None:
+            targets = dict.fromkeys(target for source, target in edges if source == index)
+            others = [views[target] for target in targets if views[target] is not None]
+            keyframes.prior_masks[index] = prior_mask(grid, views[index], others, config)
 
 
 def prior_mask(

@@ -16,6 +16,7 @@ class KeyframeStore:
         self.T_camera_world = torch.zeros(0, 4, 4, dtype=torch.float64)  # (K, 4, 4)
         self.disparities = torch.zeros(0, cells)  # (K, N) 1/world unit
         self.prior_disparities = torch.zeros(0, cells)  # (K, N) 1/D~, 0 where unknown
+        self.prior_masks = torch.zeros(0, cells, dtype=torch.bool)  # (K, N) M; False: prior off
         self.static_weights = torch.zeros(0, cells)  # (K, N) what beta leaves of a cell's weight
 
     def __len__(self) -> int:
@@ -43,6 +44,7 @@ class KeyframeStore:
         self.disparities = torch.cat([self.disparities, disparities[None]])
         self.prior_disparities = torch.cat([self.prior_disparities, prior_disparities[None]])
         trusted = torch.ones_like(disparities)
+        self.prior_masks = torch.cat([self.prior_masks, trusted[None].bool()])
         self.static_weights = torch.cat([self.static_weights, trusted[None]])
 
     def remove_newest(self) -> None:
@@ -52,4 +54,5 @@ class KeyframeStore:
         self.T_camera_world = self.T_camera_world[:-1]
         self.disparities = self.disparities[:-1]
         self.prior_disparities = self.prior_disparities[:-1]
+        self.prior_masks = self.prior_masks[:-1]
         self.static_weights = self.static_weights[:-1]

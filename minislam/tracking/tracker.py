@@ -19,6 +19,7 @@ from minislam.priors.interfaces import (
 from minislam.records import Frame
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
+from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.initialisation import (
     best_hypothesis,
@@ -265,7 +266,9 @@ class Tracker:
     def refine_initialisation(self) -> None:
         """Adjust the warm-up keyframes again, now that beta is known (second stage)."""
         self.update_static_weights()
-        self._warm_up(self.backend.graph.edges(), self.config.warmup_rounds_with_beta)
+        edges = self.backend.graph.edges()
+        mask_priors(self.keyframes, self.grid, edges, self.config)
+        self._warm_up(edges, self.config.warmup_rounds_with_beta)
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Adjust all keyframes together, with the newest beta."""
