@@ -53,10 +53,10 @@ class PoseRefinementConfig:
 
     enabled: bool = parameter(True, "off: those poses stand on flow alone (fast mode of the paper)")
     iterations: int = parameter(
-        3, "steps per frame at most; official 100 of Adam, ours divide by the curvature"
+        5, "steps per frame at most; official 100 of Adam, ours divide by the curvature"
     )
     tolerance: float = parameter(
-        0.01, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
+        0.05, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
     )
     rounding: float = parameter(
         0.01, "colour difference below which the L1 loss is rounded off [1], one step of noise"
@@ -198,6 +198,6 @@ def paper_mapping() -> MappingConfig:
         insertion=InsertionConfig(cell=4, footprint=0.22, opacity=0.5),
         density=DensityConfig(max_gaussians=1_000_000),
         # The official 100 steps of Adam go as far as a few of ours: these are for hard frames.
-        pose_refinement=PoseRefinementConfig(iterations=10),
+        pose_refinement=PoseRefinementConfig(iterations=10, tolerance=0.01),
         freeze_iterations=20,
     )

@@ -1,7 +1,7 @@
 """Refine a pose by re-rendering: move the camera until the map looks like its image (Sec. 3.4).
 
 The paper lets Adam descend along the renderer's pose gradient, 100 renderings per frame. Here the
-same exact gradient is divided by the curvature of the loss, and three steps suffice. The
+same exact gradient is divided by the curvature of the loss, and two or three steps suffice. The
 curvature may be approximate: it says how far to go, the gradient alone says where the end is.
 """
 

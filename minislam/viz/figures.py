@@ -20,6 +20,8 @@ from minislam.viz.style import (
     show_image,
 )
 
+_AVERAGED = 30  # iterations
+
 
 def keyframe_strip(
     image: np.ndarray,  # (H, W, 3) RGB in [0, 1], what the camera saw
@@ -64,25 +66,45 @@ def ate_over_time(
     axes.plot(timestamps - timestamps[0], errors, color=ESTIMATE_STYLE["color"])
     rmse = float(np.sqrt(np.mean(np.square(errors))))
     axes.axhline(rmse, color="tab:red", linewidth=1, label=f"rmse {rmse:.4g}")
-    axes.set(xlabel="time [s]", ylabel=f"position error [{unit}]", ylim=(0, None))
+    axes.set(xlabel="time [s]", ylabel=f"position error [{unit}]")
+    axes.set_ylim(0, 1.1 * float(np.max(errors, initial=np.finfo(float).eps)))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     return figure
 
 
 def loss_curves(history: Mapping[str, Series[float]]) -> Figure:
-    """Draw loss values per iteration, one curve per name; the scale is logarithmic."""
+    """Draw losses per iteration: those that stay positive on a logarithmic scale at the left.
+
+    Each iteration looks at another keyframe, so the values jump; the thick line is their mean
+    over the last iterations. NaN, where nothing was trained, is left out.
+    """
+    curves = {name: np.asarray(values, dtype=np.float64) for name, values in history.items()}
+    logarithmic = {n: v for n, v in curves.items() if np.all(v[np.isfinite(v)] > 0)}
+    linear = {n: v for n, v in curves.items() if n not in logarithmic}
     figure = new_figure(WIDE)
-    axes = figure.subplots()
-    for name, values in history.items():
-        axes.plot(np.arange(len(values)), values, label=name, linewidth=1)
-    axes.set(xlabel="iteration", ylabel="loss")
-    if any(np.any(np.asarray(values) > 0) for values in history.values()):
-        axes.set_yscale("log", nonpositive="mask")
-    if history:
-        axes.legend(frameon=False, fontsize=8)
-    axes.grid(alpha=0.3)
+    panels = [panel for panel in (logarithmic, linear) if panel] or [{}]
+    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        for number, (name, values) in enumerate(panel.items()):
+            shown = np.flatnonzero(np.isfinite(values))
+            color = f"C{number}" if panel is logarithmic else "C2"
+            axes.plot(shown, values[shown], color=color, linewidth=0.5, alpha=0.3)
+            axes.plot(shown, _running_mean(values[shown]), color=color, label=name)
+        axes.set(xlabel="iteration", ylabel="loss")
+        if panel is logarithmic and any(len(values) for values in panel.values()):
+            axes.set_yscale("log")
+        if panel:
+            axes.legend(frameon=False, fontsize=8)
+        axes.grid(alpha=0.3)
     return figure
+
+
+def _running_mean(values: np.ndarray) -> np.ndarray:
+    """Return the mean of each value and those before it, at most so many as are averaged."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    end = np.arange(1, len(values) + 1)
+    start = np.maximum(0, end - _AVERAGED)
+    return (total[end] - total[start]) / (end - start)
 
 
 def map_growth(gaussians: Series[int]) -> Figure:
@@ -90,7 +112,8 @@ def map_growth(gaussians: Series[int]) -> Figure:
     figure = new_figure(WIDE)
     axes = figure.subplots()
     axes.plot(np.arange(len(gaussians)), gaussians, color=ESTIMATE_STYLE["color"])
-    axes.set(xlabel="iteration", ylabel="Gaussians in the map", ylim=(0, None))
+    top = 1.1 * max([1, *gaussians])
+    axes.set(xlabel="iteration", ylabel="Gaussians in the map", ylim=(0, top))
     axes.grid(alpha=0.3)
     return figure
 

@@ -18,7 +18,7 @@ from minislam.uncertainty import UncertaintyConfig
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
 
-CONFIG = PoseRefinementConfig(iterations=8)
+CONFIG = PoseRefinementConfig(iterations=8, tolerance=0.01)
 BLACK = torch.zeros(3)
 OFF = se3_exp(torch.tensor([0.03, -0.02, 0.04, 0.01, -0.015, 0.02], dtype=torch.float64))
 

@@ -14,6 +14,8 @@ from minislam.viz import (
     figure_png,
     keyframe_strip,
     loss_curves,
+    map_growth,
+    online_uncertainty,
     overview,
     show_figure,
     trajectory_plot,
@@ -37,6 +39,10 @@ FIGURES = {
     "no pose": lambda: trajectory_plot(path(0)),
     "ate": lambda: ate_over_time(np.arange(5.0), np.arange(5.0)),
     "losses": lambda: loss_curves({"render": [3, 2, 1], "uncertainty": [0.0, -1]}),
+    "losses with pauses": lambda: loss_curves({"uncertainty": [1.0, np.nan, -1.0, np.nan]}),
+    "growth": lambda: map_growth([10, 30, 20]),
+    "empty map": lambda: map_growth([]),
+    "online": lambda: online_uncertainty(IMAGE, {"first": BETA, "last": 3 * BETA}, "frame 5"),
     "no losses": lambda: loss_curves({}),
     "overview": lambda: overview(IMAGE, BETA, IMAGE, path(9), path(9)),
 }
@@ -56,6 +62,20 @@ def test_axes_carry_units_and_truth_is_black_dashed():
     truth = figure.axes[0].lines[0]
     assert (truth.get_color(), truth.get_linestyle()) == ("black", "--")
     assert FIGURES["ate"]().axes[0].get_xlabel() == "time [s]"
+
+
+def test_losses_of_both_signs_have_a_linear_panel_of_their_own():
+    figure = loss_curves({"L_render": [3.0, 2.0, 1.0], "L_uncer": [0.5, np.nan, -1.0]})
+    assert [axes.get_yscale() for axes in figure.axes] == ["log", "linear"]
+    mean = figure.axes[1].lines[1]
+    np.testing.assert_allclose(mean.get_xydata(), [[0, 0.5], [2, -0.25]])  # the pause is left out
+
+
+def test_online_betas_share_their_colours():
+    figure = online_uncertainty(IMAGE, {"first": BETA, "last": 3 * BETA})
+    first, last = (axes.images[0].get_array()[0, 0] for axes in figure.axes[1:])
+    assert not np.allclose(first, last)
+    assert [axes.get_title() for axes in figure.axes] == ["input", "first", "last"]
 
 
 def test_figures_do_not_touch_the_state_of_pyplot():
