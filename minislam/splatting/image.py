@@ -42,6 +42,7 @@ class CompositedImage(NamedTuple):
     opacity: Tensor  # (H, W)
     contribution: Tensor  # (V,) px, sum of a Gaussian's weight over all pixels
     groups: list[CompositedGroup]
+    workspace: Workspace  # for the backward: no second one, fewer pages taken and given back
 
 
 def composite_image(
@@ -84,11 +85,13 @@ def composite_image(
             )
         )
     opacity = from_tiles(opacities, camera)[0].clone()
-    return CompositedImage(from_tiles(canvas, camera), opacity, contribution[:-1], groups)
+    shown = from_tiles(canvas, camera)
+    return CompositedImage(shown, opacity, contribution[:-1], groups, workspace)
 
 
 def composite_image_vjp(
     groups: list[CompositedGroup],
+    workspace: Workspace,
     count: int,  # V
     background: Tensor,  # (4,)
     v_features: Tensor,  # (4, H, W)
@@ -99,7 +102,6 @@ def composite_image_vjp(
     v_canvas = to_tiles(v_features, camera)
     v_transmittances = to_tiles(-v_opacity[None], camera)[:, 0]
     sums = v_features.new_zeros(10, count + 1)  # the last column collects the padding
-    workspace = Workspace(max((len(group.tiles) for group in groups), default=0), v_features)
     for group in groups:
         v_coefficients, v_group = composite_vjp(
             group.coefficients, group.features, background, group.checkpoints,

@@ -88,7 +88,8 @@ class _Render(torch.autograd.Function):
         per_gaussian[1, ellipses.index] = image.contribution
         color = image.features[:3].permute(1, 2, 0).contiguous()
         outputs = color, image.features[3].clone(), image.opacity, per_gaussian[0], per_gaussian[1]
-        ctx.state = ellipses, image.groups, T, background, camera, len(means), twist
+        tiles = image.groups, image.workspace
+        ctx.state = ellipses, tiles, T, background, camera, len(means), twist
         ctx.mark_non_differentiable(*outputs[3:])
         return outputs
 
@@ -102,7 +103,7 @@ class _Render(torch.autograd.Function):
         _v_radii: Tensor,
         _v_contribution: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        ellipses, groups, T, background, camera, count, twist = ctx.state
+        ellipses, tiles, T, background, camera, count, twist = ctx.state
         needs_means, needs_quats, needs_scales, needs_opacities, needs_colors = (
             ctx.needs_input_grad[:5]
         )
@@ -110,7 +111,7 @@ class _Render(torch.autograd.Function):
         v_image = torch.cat([v_color.permute(2, 0, 1), v_depth[None]])
         with _denormals_flushed():
             moments, v_features = composite_image_vjp(
-                groups, len(ellipses.index), background, v_image, v_opacity, camera
+                *tiles, len(ellipses.index), background, v_image, v_opacity, camera
             )
             v = project_gaussians_vjp(
                 ellipses, moments, v_features[3], T, camera, needs_quats or needs_scales
