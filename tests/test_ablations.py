@@ -1,0 +1,128 @@
+"""Every preset and every switch of the paper's ablations runs to the end, and does something.
+
+12 frames of `synth:person`, every fifth, tiny: what a switch does to the accuracy is measured on
+longer clips (README), not here.
+"""
+
+import numpy as np
+import pytest
+
+from minislam.config import PRESETS, SlamConfig, preset, with_settings
+from minislam.data import InputOptions, open_sequence
+from minislam.errors import InputError
+from minislam.priors.depth import SimulatedDepth
+from minislam.priors.features import ClassicalFeatures
+from minislam.priors.flow import ClassicalFlow
+from minislam.records import Sequence
+from minislam.slam import Priors, Slam
+
+FRAMES = 12
+# Budgets cut down to seconds; what makes a preset or an ablation what it is stays.
+SHORT = {
+    "tracking.warmup_keyframes": 6,
+    "tracking.warmup_rounds": 1,
+    "tracking.rounds": 1,
+    "tracking.final_rounds": 1,
+    "mapping.image_scale": 1.0,
+    "mapping.init_iterations": 12,
+    "mapping.keyframe_iterations": 2,
+    "mapping.refine_iterations": 12,
+}
+ABLATIONS = {
+    "no uncertainty (a)": {"uncertainty.enabled": False},
+    "no depth term in L_uncer (b)": {"uncertainty.lambda_depth": 0.0},
+    "given masks instead of beta (c)": {"uncertainty.given_masks": True},
+    "no disparity prior (d)": {"tracking.lambda_disparity_prior": 0.0},
+    "prior kept in the final BA": {"tracking.final_prior": True},
+    "no photometric refinement": {"mapping.pose_refinement.enabled": False},
+    "map optimised every 5 keyframes": {"mapping.keyframe_stride": 5},
+    "no L_reg_V": {"uncertainty.lambda_variance": 0.0},
+    "no L_iso": {"mapping.lambda_isotropic": 0.0},
+    "no SSIM in L_color": {"mapping.lambda_ssim": 0.0},
+    "high-resolution uncertainty": {"uncertainty.grid_factor": 2},
+}
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINISLAM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield open_sequence(
+            "synth:person", InputOptions(stride=5, max_frames=FRAMES, size=(64, 48))
+        )
+
+
+def finished(sequence: Sequence, config: SlamConfig) -> Slam:
+    depth = SimulatedDepth(sequence.ground_truth.depth, config.seed, config.simulated_depth)
+    slam = Slam(sequence, config, Priors(ClassicalFlow(), ClassicalFeatures(), depth))
+    slam.run()
+    return slam
+
+
+@pytest.fixture(scope="module")
+def usual(sequence: Sequence) -> Slam:
+    return finished(sequence, with_settings(SlamConfig(), SHORT))
+
+
+def assert_whole(slam: Slam) -> None:
+    poses = slam.trajectory().T_world_camera
+    assert len(poses) + len(slam.lost_frames()) == FRAMES and np.isfinite(poses).all()
+    assert len(slam.mapper.gaussians) > 100
+    assert all(
+        bool(values.isfinite().all()) for values in slam.mapper.gaussians.parameters.values()
+    )
+    assert len(slam.mapper.keyframes) == len(slam.tracker.keyframes)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_runs_to_the_end(sequence: Sequence, name: str):
+    slam = finished(sequence, with_settings(preset(name), SHORT))
+    assert_whole(slam)
+    refined = slam.config.mapping.pose_refinement.enabled
+    assert ("photometric refinement" in slam.seconds) == refined == (name != "paper-fast")
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_every_ablation_runs_to_the_end_and_changes_the_result(
+    sequence, usual: Slam, ablation: str
+):
+    slam = finished(sequence, with_settings(SlamConfig(), SHORT | ABLATIONS[ablation]))
+    assert_whole(slam)
+    same_path = np.array_equal(slam.trajectory().T_world_camera, usual.trajectory().T_world_camera)
+    first, second = slam.mapper.gaussians.means, usual.mapper.gaussians.means
+    same_map = first.shape == second.shape and bool((first == second).all())
+    assert not (same_path and same_map)
+
+
+def test_the_time_of_every_stage_is_told(usual: Slam):
+    assert list(usual.seconds) == [
+        "tracking", "initialisation", "mapping", "final adjustment", "refinement", "all frames",
+        "photometric refinement",
+    ]  # fmt: skip
+
+
+def test_only_the_poses_between_the_keyframes_are_refined(sequence: Sequence, usual: Slam):
+    changed = {"mapping.pose_refinement.enabled": False}
+    without = finished(sequence, with_settings(SlamConfig(), SHORT | changed))
+    keyframes = {frame.frame_index for frame in usual.tracker.keyframes.frames}
+    different = {
+        index
+        for index, pose in usual._poses.items()
+        if not np.array_equal(pose.numpy(), without._poses[index].numpy())
+    }
+    assert different and not different & keyframes
+
+
+def test_beta_of_a_frame_is_known_for_earlier_states_of_the_mlp(usual: Slam):
+    moments = usual.snapshots.moments
+    assert moments[-1] == FRAMES - 1 and len(moments) > 2
+    first, last = usual.online_beta(7, [moments[0], moments[-1]])
+    assert first.shape == last.shape == (48 // 7, 64 // 7)
+    assert not np.allclose(first.numpy(), last.numpy())
+
+
+def test_masks_are_asked_of_a_sequence_that_has_them(sequence: Sequence, monkeypatch):
+    monkeypatch.setattr(sequence.ground_truth, "moving_mask", lambda frame_index: None)
+    config = with_settings(SlamConfig(), SHORT | ABLATIONS["given masks instead of beta (c)"])
+    with pytest.raises(InputError, match=r"a mask of movers for every frame of .*found none"):
+        finished(sequence, config)
