@@ -1,0 +1,347 @@
+"""The mask M of the disparity prior, Eq. (8)."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import random_transforms
+from torch import Tensor
+from tracking.golden import transforms_of
+from tracking.scene import CAMERA, STRIDE, uniform
+from tracking.wall import back_end
+
+from minislam.geometry import Camera, se3_exp
+from minislam.tracking.config import TrackingConfig
+from minislam.tracking.disparity_prior import (
+    ConsistencyCounts,
+    DepthView,
+    carried_depth,
+    depth_consistency,
+    mask_priors,
+    prior_mask,
+    sample_features,
+)
+from minislam.tracking.grid import Grid
+
+CONFIG = TrackingConfig(prior_mask=True)
+EPSILON, GAMMA = 0.02, 0.9  # paper
+GRID = Grid.of(CAMERA, 1)  # every pixel is a cell
+SHAPE = (CAMERA.height, CAMERA.width)
+WALL, BOX = 2.0, 1.0  # world units in front of all cameras
+WALL_LOOK, BOX_LOOK = torch.eye(2, dtype=torch.float64)  # features
+STEP = 0.1  # world units sideways: the wall moves by 3 px, the box by 6 px
+NOWHERE = (9.0, 9.0)
+
+
+def view(offset: float, box: tuple[float, float] = NOWHERE, look: Tensor = BOX_LOOK) -> DepthView:
+    """Return what a camera at x = offset sees: a wall, and a box from x = box[0] to box[1]."""
+    column = CAMERA.rays(GRID.pixels.double())[:, 0].reshape(SHAPE)
+    on_box = (column * BOX + offset >= box[0]) & (column * BOX + offset <= box[1])
+    depth = torch.where(on_box, BOX, WALL).double()
+    features = torch.where(on_box[..., None], look, WALL_LOOK)
+    sideways = torch.tensor([-offset, 0, 0, 0, 0, 0], dtype=torch.float64)
+    return DepthView(depth, features, se3_exp(sideways))
+
+
+def scaled_depth(seen: DepthView, factor: float, columns: slice) -> DepthView:
+    depth = seen.metric_depth.clone()
+    depth[:, columns] *= factor
+    return replace(seen, metric_depth=depth)
+
+
+def columns_of(cells: Tensor) -> list[int]:
+    """Return the columns in which this is true, the same in every row."""
+    rows = cells.reshape(SHAPE)
+    assert (rows == rows[:1]).all()
+    return rows[0].nonzero().squeeze(1).tolist()
+
+
+def counted(ours: DepthView, others: list[DepthView]) -> ConsistencyCounts:
+    return depth_consistency(GRID, ours, others, EPSILON, GAMMA)
+
+
+# Known answers
+
+
+def test_a_wrong_patch_is_masked_and_everything_else_is_kept():
+    wrong = scaled_depth(view(0.0), 0.7, slice(30, 40))
+    mask = prior_mask(GRID, wrong, [view(STEP), view(-STEP)], CONFIG)
+    assert columns_of(~mask) == list(range(30, 40))
+
+
+@pytest.mark.parametrize(
+    ("factor", "masked"), [(1.0198, 0), (1.0202, 10), (0.9802, 0), (0.9798, 10)]
+)
+def test_the_error_is_relative_to_the_depth_that_arrives(factor: float, masked: int):
+    wrong = scaled_depth(view(0.0), factor, slice(30, 40))
+    mask = prior_mask(GRID, wrong, [view(STEP), view(-STEP)], CONFIG)
+    assert len(columns_of(~mask)) == masked
+
+
+def test_one_other_view_is_not_enough_to_mask():
+    # On purpose: the official code masks on one contradiction, the paper wants more than one
+    # correspondence.
+    wrong = scaled_depth(view(0.0), 0.7, slice(None))
+    assert prior_mask(GRID, wrong, [view(STEP)], CONFIG).all()
+    # Of two neighbours, 3 px on either side see the outermost 3 columns each.
+    mask = prior_mask(GRID, wrong, [view(STEP), view(-STEP)], CONFIG)
+    assert columns_of(mask) == [0, 1, 2, 77, 78, 79]
+
+
+def test_two_views_that_agree_outvote_one_that_does_not():
+    others = [scaled_depth(view(STEP), 1.03, slice(None)), view(-STEP), view(2 * STEP)]
+    counts, mask = counted(view(0.0), others), prior_mask(GRID, view(0.0), others, CONFIG)
+    in_all_views = (slice(None), slice(10, 70))
+    assert (counts.corresponding.reshape(SHAPE)[in_all_views] == 3).all()
+    assert (counts.consistent.reshape(SHAPE)[in_all_views] == 2).all()
+    assert mask.reshape(SHAPE)[in_all_views].all()
+
+
+def test_depth_is_carried_along_the_viewing_direction():
+    # We stand 0.5 in front of the other camera: its wall is 1.5 away from us.
+    forward = torch.tensor([0, 0, -0.5, 0, 0, 0], dtype=torch.float64)
+    looks = WALL_LOOK.expand(len(GRID.pixels), 2)
+    arrived = carried_depth(GRID, looks, view(0.0), se3_exp(forward), GAMMA)
+    hit = arrived > 0
+    assert torch.allclose(arrived[hit], torch.tensor(1.5, dtype=torch.float64))
+    # 0.75^2 of our pixels are hit: the other's are spread over a wider image.
+    assert abs(float(hit.double().mean()) - 0.75**2) < 0.02
+
+
+@pytest.mark.parametrize("offset", [STEP, -STEP])
+def test_an_occluded_surface_is_not_counted_as_inconsistent(offset: float):
+    # The neighbour sees wall that the box hides from us, and all looks alike. If the last point
+    # written counted instead of the nearest, one of the two directions would fail.
+    box = (0.005, 0.305)
+    ours, other = (view(x, box, look=WALL_LOOK) for x in (0.0, offset))
+    counts = counted(ours, [other])
+    assert torch.equal(counts.corresponding, counts.consistent)
+    on_box = ours.metric_depth.reshape(-1) == BOX
+    assert counts.consistent[on_box].all()
+    # And it is true that something is hidden: without the box more wall arrives.
+    without_box = replace(other, metric_depth=torch.where(other.metric_depth < WALL, 0, WALL))
+    assert counted(ours, [without_box]).corresponding[on_box].any()
+
+
+def test_a_moving_thing_with_unlike_features_is_skipped():
+    ours = view(0.0)
+    others = [view(STEP, box=(0.0, 0.2)), view(-STEP, box=(0.05, 0.25))]
+    counts = counted(ours, others)
+    assert torch.equal(counts.corresponding, counts.consistent)
+    assert prior_mask(GRID, ours, others, CONFIG).all()
+    # If it looked like the wall it would be a contradiction.
+    blind = replace(CONFIG, mask_min_similarity=-2.0)
+    assert not prior_mask(GRID, ours, others, blind).all()
+
+
+def test_features_are_sampled_where_their_cells_lie():
+    # Each cell holds the pixel of its centre, so sampling must return the pixel itself.
+    camera = Camera(50.0, 50.0, 20.0, 10.0, width=45, height=29)
+    rows, columns = 4, 6
+    u = (torch.arange(columns, dtype=torch.float64) + 0.5) * 45 / columns - 0.5
+    v = (torch.arange(rows, dtype=torch.float64) + 0.5) * 29 / rows - 0.5
+    features = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+    pixels = torch.tensor([[3.25, 3.125], [12.0, 7.0], [40.75, 24.875]], dtype=torch.float64)
+    assert torch.allclose(sample_features(features, pixels, camera), pixels)
+    corner = torch.tensor([[0.0, 28.0]], dtype=torch.float64)
+    held = torch.tensor([[3.25, 24.875]], dtype=torch.float64)
+    assert torch.allclose(sample_features(features, corner, camera), held)
+
+
+# The official answer
+
+
+@cache
+def official() -> dict[str, Tensor]:
+    file = Path(__file__).parents[1] / "data" / "tracking" / "official_mask.npz"
+    with np.load(file) as arrays:
+        return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
+
+
+def official_views() -> tuple[Grid, DepthView, list[DepthView]]:
+    o = official()
+    camera = Camera(*o["K"].tolist(), width=84, height=56)
+    disparities = o["mono_disp"].double()
+    depths = torch.where(disparities > 0, disparities.reciprocal(), 0)
+    poses = transforms_of(o["poses"])
+    order = [int(o["idx"]), *o["refs"].tolist()]
+    ours, *others = [DepthView(depths[k], o["feats"][k].double(), poses[k]) for k in order]
+    return Grid.of(camera, 1), ours, others
+
+
+def points_per_pixel() -> Tensor:  # (H W,)
+    """Return the largest number of points that one view puts on each pixel."""
+    grid, ours, others = official_views()
+    largest = torch.zeros(len(grid.pixels), dtype=torch.int64)
+    for other in others:
+        depth = other.metric_depth.reshape(-1)
+        known = depth > 0
+        points = grid.camera.backproject(grid.pixels.double(), depth)[known]
+        motion = ours.T_camera_world @ torch.linalg.inv(other.T_camera_world)
+        u, v = grid.camera.project(points @ motion[:3, :3].T + motion[:3, 3]).round().T
+        inside = (u >= 0) & (u < 84) & (v >= 0) & (v < 56)
+        index = (84 * v + u)[inside].long()
+        largest = largest.maximum(torch.bincount(index, minlength=len(largest)))
+    return largest
+
+
+def test_counts_equal_the_official_ones_where_a_view_puts_at_most_one_point():
+    grid, ours, others = official_views()
+    counts = depth_consistency(grid, ours, others, EPSILON, GAMMA)
+    comparable = (points_per_pixel() <= 1) & (ours.metric_depth.reshape(-1) > 0)
+    assert comparable.double().mean() > 0.8
+    consistent = official()["acc"].reshape(-1).long()
+    inconsistent = official()["bad"].reshape(-1).long()
+    assert torch.equal(counts.consistent[comparable], consistent[comparable])
+    contradicting = counts.corresponding - counts.consistent
+    assert torch.equal(contradicting[comparable], inconsistent[comparable])
+
+
+def test_the_mask_equals_the_official_one():
+    """Differences on purpose, and how they are taken out of the comparison.
+
+    * Official: at least one view contradicts and at most one agrees. Ours, as the paper says: at
+      least two have a word and at most one agrees. The official rule is applied to our counts.
+    * Official: of several points on a pixel the last one written counts. Ours: the nearest. That
+      is the one in a thousand that may differ.
+    """
+    grid, ours, others = official_views()
+    counts = depth_consistency(grid, ours, others, EPSILON, GAMMA)
+    contradicted = counts.corresponding > counts.consistent
+    official_rule = ~(contradicted & (counts.consistent <= 1))
+    expected = official()["mask"].reshape(-1)
+    assert 0.02 < (~expected).double().mean() < 0.2
+    assert (official_rule == expected).double().mean() >= 0.999
+    # On these views the two rules say the same, because nearly every pixel is seen by two.
+    mask = prior_mask(grid, ours, others, CONFIG)
+    assert (mask == expected).double().mean() >= 0.999
+
+
+# Identities
+
+
+def counts_of(views: list[DepthView]) -> tuple[Tensor, Tensor]:
+    grid = official_views()[0]
+    counts = depth_consistency(grid, views[0], views[1:], EPSILON, GAMMA)
+    return counts.corresponding, counts.consistent
+
+
+def assert_same_counts(views: list[DepthView]) -> None:
+    _, ours, others = official_views()
+    for actual, expected in zip(counts_of(views), counts_of([ours, *others]), strict=True):
+        assert torch.equal(actual, expected)
+
+
+def test_it_does_not_depend_on_where_the_world_stands():
+    _, ours, others = official_views()
+    move = random_transforms(1, "normal", seed=3)[0]
+    assert_same_counts(
+        [replace(v, T_camera_world=v.T_camera_world @ move) for v in [ours, *others]]
+    )
+
+
+def test_it_does_not_depend_on_the_unit_of_length():
+    _, ours, others = official_views()
+    unit = torch.ones(4, 4, dtype=torch.float64)
+    unit[:3, 3] = 3.7
+    assert_same_counts(
+        [
+            DepthView(3.7 * v.metric_depth, v.features, unit * v.T_camera_world)
+            for v in [ours, *others]
+        ]
+    )
+
+
+def test_it_does_not_depend_on_the_order_of_views_or_the_length_of_features():
+    _, ours, others = official_views()
+    longer = [replace(v, features=(2.0 + n) * v.features) for n, v in enumerate(others)]
+    assert_same_counts([replace(ours, features=0.1 * ours.features), *longer[::-1]])
+
+
+def test_cells_are_pixels_of_the_full_image():
+    _, ours, others = official_views()
+    fine, coarse = official_views()[0], Grid.of(official_views()[0].camera, STRIDE)
+    every_pixel = prior_mask(fine, ours, others, CONFIG).reshape(56, 84)
+    cells = prior_mask(coarse, ours, others, CONFIG).reshape(coarse.shape)
+    assert torch.equal(cells, every_pixel[::STRIDE, ::STRIDE])
+
+
+# Degenerate input
+
+
+def test_without_other_views_everything_is_kept():
+    counts = counted(view(0.0), [])
+    assert not counts.corresponding.any() and not counts.consistent.any()
+    assert prior_mask(GRID, view(0.0), [], CONFIG).all()
+
+
+def test_where_no_depth_is_known_nothing_is_judged():
+    hole = scaled_depth(view(0.0), 0.0, slice(20, 30))
+    counts = counted(hole, [view(STEP), view(-STEP)])
+    assert columns_of(counts.corresponding == 0) == list(range(20, 30))
+    blind = scaled_depth(view(STEP), 0.0, slice(None))
+    assert not counted(view(0.0), [blind]).corresponding.any()
+
+
+def test_cameras_that_look_away_have_no_word():
+    turned = torch.tensor([0, 0, 0, 0, torch.pi, 0], dtype=torch.float64)
+    behind = replace(view(0.0), T_camera_world=se3_exp(turned))
+    assert not counted(view(0.0), [behind]).corresponding.any()
+    looks = WALL_LOOK.expand(len(GRID.pixels), 2)
+    assert (carried_depth(GRID, looks, view(0.0), se3_exp(turned), GAMMA) == 0).all()
+
+
+# In the back-end
+
+
+def back_end_with_depths(config: TrackingConfig):
+    """Return four keyframes in front of the wall; the depth of the last is wrong on the left."""
+    backend = back_end([0, 1, 2, 3], config)
+    keyframes = backend.keyframes
+    for index in range(4):
+        disparities = keyframes.disparities[index].reshape(backend.grid.shape)
+        fine = torch.nn.functional.interpolate(
+            disparities[None, None], (49, 73), mode="bilinear", align_corners=True
+        )
+        depth = torch.zeros(SHAPE)
+        depth[:49, :73] = 1 / fine[0, 0]
+        if index == 3:
+            depth[:, :40] *= 1.3
+        keyframes.metric_depths[index] = depth
+        keyframes.features[index] = 1.0 + uniform(index, 3, 4, 2).float() / 100
+        cells = depth[::STRIDE, ::STRIDE].reshape(-1)
+        keyframes.prior_disparities[index] = cells.reciprocal()
+    return backend
+
+
+EDGES = [(3, 0), (0, 3), (3, 1), (1, 3), (3, 2), (2, 3)]
+
+
+def test_the_prior_of_a_masked_cell_has_no_weight():
+    backend = back_end_with_depths(CONFIG)
+    backend.match(EDGES)
+    mask_priors(backend.keyframes, backend.grid, EDGES, CONFIG, first=3)
+    mask = backend.keyframes.prior_masks
+    assert mask[:3].all(), "only the keyframes from `first` on are judged"
+    last = mask[3].reshape(backend.grid.shape)
+    assert last[:, 5:].all() and not last[2:5, 2:5].any()
+    weights = backend.problem(range(len(EDGES)), first_free=0).prior_weights
+    strength = CONFIG.lambda_disparity_prior * CAMERA.fx**2
+    assert torch.allclose(weights, strength * mask.float())
+
+
+def test_the_mask_can_be_switched_off():
+    off = replace(CONFIG, prior_mask=False)
+    backend = back_end_with_depths(off)
+    mask_priors(backend.keyframes, backend.grid, EDGES, off)
+    assert backend.keyframes.prior_masks.all()
+
+
+def test_keyframes_without_depth_are_passed_over():
+    backend = back_end_with_depths(CONFIG)
+    backend.keyframes.metric_depths[0] = backend.keyframes.metric_depths[3] = None
+    mask_priors(backend.keyframes, backend.grid, EDGES, CONFIG)
+    assert backend.keyframes.prior_masks.all()
