@@ -218,7 +218,7 @@ def _write_pictures(folder: RunFolder, slam: Slam, outcome: RunOutcome) -> None:
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
     plots["losses"] = "Losses", figure_png(loss_curves(curves))
     plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
-    if slam.config.uncertainty.is_learnt:
+    if slam.config.uncertainty.is_learnt and slam.snapshots.moments:
         plots["online_uncertainty"] = "What the MLP had learnt by then", _online_beta(slam)
     for name, (_, png) in plots.items():
         folder.write_plot(name, png)
