@@ -63,6 +63,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # The fast mode of the paper's supplement: four times as fast for 0.02 cm of ATE.
     "paper-fast": _paper_settings()
     | {
+        "tracking.prior_mask": False,
         "mapping.keyframe_stride": 5,
         "mapping.refine_iterations": 3000,
         "mapping.pose_refinement.enabled": False,

@@ -33,6 +33,7 @@ ABLATIONS = {
     "no depth term in L_uncer (b)": {"uncertainty.lambda_depth": 0.0},
     "given masks instead of beta (c)": {"uncertainty.given_masks": True},
     "no disparity prior (d)": {"tracking.lambda_disparity_prior": 0.0},
+    "no mask M": {"tracking.prior_mask": False},
     "prior kept in the final BA": {"tracking.final_prior": True},
     "no photometric refinement": {"mapping.pose_refinement.enabled": False},
     "map optimised every 5 keyframes": {"mapping.keyframe_stride": 5},

@@ -45,6 +45,7 @@ def test_a_preset_sets_what_it_says_and_nothing_else(name: str):
 def test_the_paper_presets_differ_as_its_supplement_says():
     paper, fast = settings_of(preset("paper")), settings_of(preset("paper-fast"))
     assert {name for name in paper if paper[name] != fast[name]} == {
+        "tracking.prior_mask",  # no mask M
         "mapping.keyframe_stride",  # optimise every 5 keyframes
         "mapping.refine_iterations",  # 3000 iterations of final refinement
         "mapping.pose_refinement.enabled",  # no photometric refinement of the other frames
