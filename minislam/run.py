@@ -132,6 +132,7 @@ def _facts(
         "keyframes": len(slam.tracker.keyframes),
         "lost_frames": len(slam.lost_frames()),
         "gaussians": len(slam.mapper.gaussians),
+        "health": [asdict(health) for health in slam.tracker.health],
     }
 
 
@@ -198,9 +199,22 @@ def _warnings(slam: Slam) -> list[str]:
             f"{lost} of {len(slam.tracker.tracked)} frames could not be followed and have no "
             "pose; lost_frames.txt lists them"
         )
+    warnings += _health_warnings(slam)
     if not slam.tracker.keyframes.has_prior:
         warnings.append("without a depth prior the unit of length is arbitrary")
     return warnings
+
+
+def _health_warnings(slam: Slam) -> list[str]:
+    """Return what a user should know about how the keyframes hang together."""
+    health, least = slam.tracker.health, slam.config.tracking.min_parallax
+    without = sum(keyframe.parallax < least for keyframe in health)
+    if not without or 2 * without < len(health):
+        return []
+    return [
+        f"{without} of {len(health)} keyframes show hardly any parallax: the camera turned or "
+        "stood, so the distances it covered are not determined"
+    ]
 
 
 def _write_pictures(folder: RunFolder, slam: Slam, outcome: RunOutcome) -> None:

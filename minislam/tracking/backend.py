@@ -26,7 +26,7 @@ from minislam.tracking.frame_graph import (
 from minislam.tracking.grid import Grid
 from minislam.tracking.initialisation import compose_matches
 from minislam.tracking.keyframes import KeyframeStore
-from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
 
 REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that the thresholds in px belong to
 # A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
@@ -51,10 +51,7 @@ class BackEnd:
     @property
     def robust_scale(self) -> float | None:
         """Return the width of the Cauchy weight [px], None for plain least squares."""
-        config = self.config
-        known = self.keyframes.has_prior
-        scale = config.robust_scale if known else config.robust_scale_without_prior
-        return scale * self.pixel_scale or None
+        return self.config.robust_scale * self.pixel_scale or None
 
     @property
     def keyframe_flow(self) -> float:
@@ -207,6 +204,11 @@ class BackEnd:
         problem = self.problem(self.graph.select(first_free), first_free, lambda_prior)
         if self.robust_scale:
             problem = replace(problem, robust_scale=widening * self.robust_scale)
+        if first_free > 0:
+            # While a camera only turns, its flow says nothing about depth: what depths came with
+            # it hold the scale until it moves again.
+            known = problem.free_disparities & self._has_parallax(problem)
+            problem = replace(problem, free_disparities=known)
         state, report = bundle_adjust(problem, self.state, iterations)
         self.state = state
         self._first_moved = min(self._first_moved, first_free)
@@ -261,6 +263,19 @@ class BackEnd:
             free_disparities=free,
             robust_scale=self.robust_scale,
         )
+
+    def parallaxes(self, sources: Tensor, targets: Tensor) -> Tensor:  # (E,), (E,) -> (E,) px
+        """Return the mean parallax of edges, as the present geometry has it."""
+        transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
+        disparities = self.keyframes.disparities[sources]
+        return mean_parallax(transforms, disparities, self.grid.rays, self.grid.camera)
+
+    def _has_parallax(self, problem: BundleProblem) -> Tensor:  # (K,) bool
+        """Tell which keyframes are linked with another place, not only with another direction."""
+        most = torch.zeros(len(self.keyframes))
+        seen = self.parallaxes(problem.edges_source, problem.edges_target)
+        most.scatter_reduce_(0, problem.edges_source, seen, "amax")
+        return most >= self.config.min_parallax * self.pixel_scale
 
     def normalise_scale(self) -> None:
         """Choose the unit of length so that the median disparity is one: nothing else fixes it."""

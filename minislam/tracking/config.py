@@ -40,11 +40,6 @@ class TrackingConfig:
     robust_scale: float = parameter(
         1.0, "width of the Cauchy weight inside Sigma [px]; 0: plain least squares"
     )
-    robust_scale_without_prior: float = parameter(
-        4.0,
-        "the same without a depth prior: a narrow weight would take for an outlier what is still "
-        "to be corrected [px]",
-    )
     beta_without_prior: bool = parameter(
         False,
         "weigh by beta also without a depth prior: the map then stands on the tracker's own "
@@ -69,6 +64,9 @@ class TrackingConfig:
         2, "views that must see a cell to judge it: more than one, paper supplement"
     )
     mask_min_consistent: int = parameter(2, "of which this many must agree, official code")
+    min_parallax: float = parameter(
+        2.0, "a keyframe with less to all it is linked with keeps its disparities [px]"
+    )
     global_interval: int = parameter(
         20, "keyframes between two online global BAs; 0: none [keyframes], paper supplement"
     )

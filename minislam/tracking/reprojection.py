@@ -70,6 +70,23 @@ def reproject(
     return torch.stack([u, v], 1), valid
 
 
+def mean_parallax(
+    T_target_source: Tensor,  # (E, 4, 4)
+    disparities: Tensor,  # (E, N)
+    rays: Tensor,  # (N, 3)
+    camera: Camera,
+) -> Tensor:  # (E,) px
+    """Return how far the translation alone moves the cells of each edge in the image, on average.
+
+    It is the difference between the flow and the flow of a camera that only turned.
+    """
+    turned, still_seen = reproject(T_target_source, torch.zeros_like(disparities), rays, camera)
+    positions, valid = reproject(T_target_source, disparities, rays, camera)
+    both = (valid & still_seen).to(positions.dtype)
+    shift = (positions - turned).norm(dim=1)
+    return (shift * both).sum(1) / both.sum(1).clamp_min(1)
+
+
 def reproject_with_jacobians(
     T_target_source: Tensor,  # (E, 4, 4)
     disparities: Tensor,  # (E, N)

@@ -21,6 +21,7 @@ from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.frame_graph import neighbourhood_edges
+from minislam.tracking.health import KeyframeHealth, health_of_newest
 from minislam.tracking.initialisation import (
     best_hypothesis,
     carry_disparities,
@@ -73,6 +74,7 @@ class Tracker:
         self.keyframes = self.backend.keyframes
         self.grid = self.backend.grid
         self.tracked: list[TrackedFrame] = []
+        self.health: list[KeyframeHealth] = []  # of every keyframe after the warm-up
         self.initialised = False
         self._features, self._depth_prior = features, depth_prior
         self._predict_static_weight = predict_static_weight
@@ -142,6 +144,7 @@ class Tracker:
             keyframes.remove_newest()
             self.backend.flow.remove_frame(newest)
             return False
+        self.health.append(health_of_newest(self.backend))
         self._chain, self._passed_over = self.backend.flow.start_chain(frame.image), None
         self._log(frame, TrackingStatus.OK, 1.0)
         return True
@@ -192,6 +195,7 @@ class Tracker:
         self._add_keyframe(frame, pose, carried)
         if self.initialised:
             self.backend.adjust_newest(self._steps)
+            self.health.append(health_of_newest(self.backend))
             self._adjust_everything_if_due()
         return True
 
