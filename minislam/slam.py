@@ -217,7 +217,12 @@ class Slam:
 
     def online_beta(self, frame_index: int, trained_until: list[int]) -> list[Tensor]:
         """Return beta (h', w') of one frame, by the MLP as it was after each of these frames."""
-        features = self._features(self.sequence.frame(frame_index))
+        keyframes = self.tracker.keyframes
+        numbers = [frame.frame_index for frame in keyframes.frames]
+        if frame_index in numbers:  # a network must not look twice
+            features = keyframes.features[numbers.index(frame_index)]
+        else:
+            features = self._features(self.sequence.frame(frame_index))
         return [self.snapshots.predict(moment, features) for moment in trained_until]
 
     def lost_frames(self) -> list[tuple[int, float, str]]:
