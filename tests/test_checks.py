@@ -16,6 +16,8 @@ from minislam.checks import (
     check_projected_covariance,
     check_reproject,
     check_resized_intrinsics,
+    check_schur_step,
+    check_target_jacobian,
     check_twist_vjp,
 )
 from minislam.geometry import Camera, se3_inverse, transform_points
@@ -64,6 +66,25 @@ def weight_of(beta: Tensor) -> Tensor:
     return torch.where(weight < 0.1, 0.0, weight)
 
 
+def jacobian_of_target(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
+    def seen(points: Tensor) -> Tensor:
+        return camera.project(points)
+
+    columns = []
+    for axis in torch.eye(3, dtype=torch.float64):
+        moved = disparities[:, None] * axis
+        columns.append(torch.func.jvp(seen, (points,), (moved,))[1])
+    for axis in torch.eye(3, dtype=torch.float64):
+        moved = torch.linalg.cross(axis.expand_as(points), points)
+        columns.append(torch.func.jvp(seen, (points,), (moved,))[1])
+    return torch.stack(columns, -1)
+
+
+def step_of_all(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    matrix = torch.cat([torch.cat([H, E], 1), torch.cat([E.T, C.diag()], 1)])
+    return torch.linalg.solve(matrix, torch.cat([g, s])).split((len(g), len(s)))
+
+
 CHECKS = [
     (check_mapping_weight, weight_of),
     (check_resized_intrinsics, resized),
@@ -72,6 +93,8 @@ CHECKS = [
     (check_pixel_color, blended),
     (check_conic_vjp, conic_pulled_back),
     (check_twist_vjp, twist_pulled_back),
+    (check_target_jacobian, jacobian_of_target),
+    (check_schur_step, step_of_all),
 ]
 
 
@@ -82,10 +105,16 @@ def test_a_solution_passes_and_an_empty_one_is_not_yet(check, solution):
     assert check(lambda *arguments: None).status == NOT_YET
 
 
+def scaled(factor: float, answer: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
+    if isinstance(answer, tuple):
+        return tuple(factor * part for part in answer)
+    return factor * answer
+
+
 @pytest.mark.parametrize(("check", "solution"), CHECKS)
 def test_a_flipped_sign_or_one_percent_is_wrong_and_the_sentence_has_the_number(check, solution):
-    for wrong in (lambda *a: -solution(*a), lambda *a: 1.01 * solution(*a)):
-        verdict = check(wrong)
+    for factor in (-1, 1.01):
+        verdict = check(lambda *a, factor=factor: scaled(factor, solution(*a)))
         assert verdict.status == WRONG and ", expected " in verdict.sentence
         assert repr(verdict).startswith("Wrong: for ")
 
@@ -128,6 +157,24 @@ def test_known_mistakes_of_gradients_are_named():
     assert "turn with the camera" in verdict.sentence
     verdict = check_twist_vjp(lambda *a: twist_pulled_back(*a).roll(3))
     assert "translation first" in verdict.sentence
+
+
+def test_known_mistakes_of_bundle_adjustment_are_named():
+    first_three = torch.tensor([1.0, 1, 1, -1, -1, -1], dtype=torch.float64)
+    verdict = check_target_jacobian(lambda *a: first_three * jacobian_of_target(*a))
+    assert "wrong way round" in verdict.sentence
+    verdict = check_target_jacobian(lambda X, d, K: jacobian_of_target(X, torch.ones_like(d), K))
+    assert "for any disparities" in verdict.sentence and "d rho" in verdict.sentence
+    assert "residual" in check_target_jacobian(lambda *a: -jacobian_of_target(*a)).sentence
+
+    def alone(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        xi = torch.linalg.solve(H, g)
+        return xi, (s - E.T @ xi) / C
+
+    assert "subtract E C^-1 E^T" in check_schur_step(alone).sentence
+    verdict = check_schur_step(lambda H, E, C, g, s: (step_of_all(H, E, C, g, s)[0], s / C))
+    assert "follow the poses" in verdict.sentence
+    assert check_schur_step(lambda *a: (a[3], None)).status == WRONG
 
 
 def test_shapes_types_nan_and_exceptions_are_answered_in_words():

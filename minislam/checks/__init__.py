@@ -5,6 +5,7 @@ that names the first number that is wrong. It never raises, so a notebook with o
 still runs from top to bottom.
 """
 
+from minislam.checks.bundle_adjustment import check_schur_step, check_target_jacobian
 from minislam.checks.geometry import check_reproject, check_resized_intrinsics
 from minislam.checks.grading import NOT_YET, PASSED, WRONG, Case, Verdict, check_function
 from minislam.checks.splatting import (
@@ -28,5 +29,7 @@ __all__ = [
     "check_projected_covariance",
     "check_reproject",
     "check_resized_intrinsics",
+    "check_schur_step",
+    "check_target_jacobian",
     "check_twist_vjp",
 ]

@@ -1,0 +1,101 @@
+"""Exercises of notebook 05."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from minislam.checks.grading import Case, Verdict, check_function
+from minislam.geometry import Camera, se3_exp
+from minislam.tracking.reprojection import reproject_with_jacobians, scaled_points
+
+
+def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -> Verdict:
+    """Check (points X (N, 3), disparities (N,), camera) -> dp / d(rho, phi) (N, 2, 6) in px."""
+    camera = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
+    rays = camera.rays(torch.tensor([[0.0, 0.0], [100.0, 52.0], [60.5, 10.25]]).double())
+    motion = se3_exp(torch.tensor([[0.1, -0.2, 0.3, 0.1, 0.2, -0.1]], dtype=torch.float64))
+
+    def reference(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
+        # A camera that stands still sees each cell where its ray points: X = ray of the cell.
+        rays = points / points[:, 2:]
+        still = torch.eye(4, dtype=points.dtype)[None]
+        ratio = disparities / points[:, 2]
+        return (
+            reproject_with_jacobians(still, ratio[None], rays, camera).J_target[0].permute(2, 1, 0)
+        )
+
+    def signed(*signs: float) -> Callable[..., Tensor]:
+        factors = torch.tensor(signs, dtype=torch.float64)
+        return lambda *arguments: factors * reference(*arguments)
+
+    def of_the_point(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
+        return reference(points, torch.ones_like(disparities), camera)
+
+    def rotation_first(*arguments: Tensor) -> Tensor:
+        return reference(*arguments).roll(3, -1)
+
+    def case(disparities: list[float], description: str) -> Case:
+        d = torch.tensor(disparities, dtype=torch.float64)
+        return Case((scaled_points(motion, d[None], rays)[0].T, d, camera), description)
+
+    cases = [
+        case([1.0, 1.0, 1.0], "disparities of 1"),
+        case([0.5, 0.25, 0.8], "any disparities"),
+        case([0.0, 0.0, 0.0], "points at infinity"),
+    ]
+    hints = [
+        (of_the_point, "X is d times the point, so it moves by d rho, not by rho."),
+        (
+            signed(1, 1, 1, -1, -1, -1),
+            "The rotation is the wrong way round: phi x X = -hat(X) phi.",
+        ),
+        (signed(-1, -1, -1, -1, -1, -1), "This is the derivative of the residual p~ - p."),
+        (rotation_first, "The order is (rho, phi), translation first."),
+    ]
+    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
+
+
+def check_schur_step(
+    student: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+) -> Verdict:
+    """Check (H, E, diagonal of C, g, s) -> the steps of the poses and of the disparities."""
+
+    def solved(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        xi = torch.linalg.solve(H - E / C @ E.T, g - E @ (s / C))
+        return xi, (s - E.T @ xi) / C
+
+    def joined(function: Callable[..., tuple[Tensor, Tensor]]) -> Callable[..., Tensor | None]:
+        def both(*arguments: Tensor) -> Tensor | None:
+            answer = function(*arguments)
+            return None if answer is None else torch.cat(tuple(answer))
+
+        return both
+
+    def poses_alone(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        xi = torch.linalg.solve(H, g)
+        return xi, (s - E.T @ xi) / C
+
+    def not_substituted(*arguments: Tensor) -> tuple[Tensor, Tensor]:
+        return solved(*arguments)[0], arguments[4] / arguments[2]
+
+    def old_gradient(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor):
+        xi = torch.linalg.solve(H - E / C @ E.T, g)
+        return xi, (s - E.T @ xi) / C
+
+    def case(poses: int, cells: int, description: str) -> Case:
+        source = torch.Generator().manual_seed(poses)
+        J = torch.randn(4 * cells, 6 * poses, generator=source, dtype=torch.float64)
+        r = torch.randn(4 * cells, generator=source, dtype=torch.float64)
+        # Each cell has four residuals, and they know of no other cell.
+        mine = torch.eye(cells, dtype=torch.float64).repeat_interleave(4, 0)
+        Jd = mine * torch.randn(4 * cells, 1, generator=source, dtype=torch.float64)
+        return Case((J.T @ J, J.T @ Jd, Jd.square().sum(0), J.T @ r, Jd.T @ r), description)
+
+    cases = [case(1, 5, "one pose and 5 cells"), case(3, 20, "three poses and 20 cells")]
+    hints = [
+        (joined(poses_alone), "The disparities do not stand still: subtract E C^-1 E^T from H."),
+        (joined(old_gradient), "The right-hand side changes too: g - E C^-1 s."),
+        (joined(not_substituted), "The disparities must follow the poses: s - E^T xi."),
+    ]
+    return check_function(joined(student), joined(solved), cases, tolerance=1e-9, hints=hints)
