@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from minislam.geometry import Camera, se3_exp
+from minislam.geometry import Camera, se3_exp, se3_inverse, se3_log
 from minislam.mapping.config import PoseRefinementConfig
 from minislam.splatting import GaussianMap, Rendering, render
 
@@ -29,12 +29,30 @@ def refine_pose(
     background: Tensor,  # (3,) RGB
     config: PoseRefinementConfig,
 ) -> Tensor:  # (4, 4) float64
-    """Return the pose near the given one from which the map resembles the image most.
+    """Move a pose towards the one from which the map resembles the image most.
+
+    The start is a measurement too: `config.share` says how far to go from one to the other.
+    """
+    start = T_camera_world.double()
+    best = _most_alike_pose(gaussians, camera, start, image, weight, background, config)
+    return se3_exp(config.share * se3_log(best @ se3_inverse(start))) @ start
+
+
+def _most_alike_pose(
+    gaussians: GaussianMap,
+    camera: Camera,
+    start: Tensor,  # (4, 4) float64
+    image: Tensor,  # (H, W, 3)
+    weight: Tensor,  # (H, W)
+    background: Tensor,  # (3,)
+    config: PoseRefinementConfig,
+) -> Tensor:  # (4, 4) float64
+    """Return the pose near the start from which the map resembles the image most.
 
     A step that does not lower the loss is taken back and repeated shorter, so the result is
     never worse than the start, as far as the loss can tell.
     """
-    pose = candidate = T_camera_world.double()
+    pose = candidate = start
     lowest, damping = math.inf, _FIRST_DAMPING
     for steps_done in range(config.iterations + 1):
         twist = torch.zeros(6, dtype=gaussians.means.dtype, device=image.device, requires_grad=True)
