@@ -216,7 +216,10 @@ def test_a_wrong_depth_costs_no_earlier_run_its_files(depth: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--preset", "desktop"], "a preset among laptop, paper, paper-fast, test, found 'desktop'"),
+        (
+            ["--preset", "desktop"],
+            "a preset among laptop, paper, paper-fast, test, found 'desktop'",
+        ),
         (["--tracking.window", "many"], "tracking.window to be of type int like 10, found 'many'"),
         (["--config", "nowhere.json"], "a readable file nowhere.json"),
         (["--stride", "0"], "stride of at least 1, found 0"),
