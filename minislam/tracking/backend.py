@@ -27,6 +27,7 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.initialisation import compose_matches
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
+from minislam.tracking.robust import RobustKernel
 
 REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that the thresholds in px belong to
 # A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
@@ -49,9 +50,10 @@ class BackEnd:
         self._first_moved = 0
 
     @property
-    def robust_scale(self) -> float | None:
-        """Return the width of the Cauchy weight [px], None for plain least squares."""
-        return self.config.robust_scale * self.pixel_scale or None
+    def robust(self) -> RobustKernel | None:
+        """Return the robust weight inside Sigma, None for plain least squares."""
+        scale, power = self.config.robust_scale, self.config.robust_power
+        return RobustKernel(scale * self.pixel_scale, power) if scale > 0 else None
 
     @property
     def keyframe_flow(self) -> float:
@@ -202,8 +204,8 @@ class BackEnd:
     ) -> None:
         """Run a bundle adjustment over the edges that touch the free keyframes."""
         problem = self.problem(self.graph.select(first_free), first_free, lambda_prior)
-        if self.robust_scale:
-            problem = replace(problem, robust_scale=widening * self.robust_scale)
+        if self.robust:
+            problem = replace(problem, robust=self.robust.widened(widening))
         if first_free > 0:
             # While a camera only turns, its flow says nothing about depth: what depths came with
             # it hold the scale until it moves again.
@@ -238,11 +240,11 @@ class BackEnd:
         edges_target = torch.tensor([self.graph.edges_target[p] for p in positions])
         targets = torch.stack([self.graph.targets[p] for p in positions])
         confidences = torch.stack([self.graph.confidences[p] for p in positions])
-        static = self.keyframes.static_weights
+        trust = self.keyframes.trust
         # Eq. (5) weighs by beta of the source. A learned confidence also notices a target that
         # is covered by a mover; a classical one does not, so beta of the target counts as well.
-        seen = self.grid.sample(static[edges_target][..., None], targets.mT)[..., 0]
-        weights = confidences * (static[sources] * seen)[:, None]
+        seen = self.grid.sample(trust[edges_target][..., None], targets.mT)[..., 0]
+        weights = confidences * (trust[sources] * seen)[:, None]
         prior = self.keyframes.prior_disparities
         if lambda_prior is None:
             lambda_prior = self.config.lambda_disparity_prior
@@ -261,7 +263,7 @@ class BackEnd:
             prior_weights=strength * (prior > 0) * self.keyframes.prior_masks,
             free_poses=movable,
             free_disparities=free,
-            robust_scale=self.robust_scale,
+            robust=self.robust,
         )
 
     def parallaxes(self, sources: Tensor, targets: Tensor) -> Tensor:  # (E,), (E,) -> (E,) px

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
+from minislam.tracking.robust import RobustKernel
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # share of the mean diagonal C that is added to all of it [-]
@@ -39,7 +40,7 @@ class BundleProblem:
     prior_weights: Tensor  # (K, N) lambda_4 M [px^2 per disparity^2], 0 where there is no prior
     free_poses: Tensor  # (K,) bool
     free_disparities: Tensor  # (K,) bool
-    robust_scale: float | None = None  # px, width of the Cauchy weight; None: plain least squares
+    robust: RobustKernel | None = None  # None: plain least squares
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def motion_only_adjust(
 
 
 def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
-    """Return the residuals p~ - p (E, 2, N) [px] and the weights (E, 2, N) with Cauchy applied."""
+    """Return the residuals p~ - p (E, 2, N) [px] and the weights (E, 2, N), robust one included."""
     residual, weight, _, _ = _weighted_residuals(problem, state)
     return residual, weight
 
@@ -133,23 +134,21 @@ def _weighted_residuals(problem: BundleProblem, state: BundleState):
     )
     residual = problem.targets - linear.positions
     weight = problem.weights * linear.valid[:, None]
-    if problem.robust_scale is None:
-        return residual, weight, linear, transforms
-    squared = residual.square().sum(1, keepdim=True)
-    return residual, weight / (1 + squared / problem.robust_scale**2), linear, transforms
+    if problem.robust is not None:
+        weight = weight * problem.robust.weight(residual.square().sum(1, keepdim=True))
+    return residual, weight, linear, transforms
 
 
 def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
-    """Return Eq. (5) in px^2, with the Cauchy loss c^2 log(1 + r^2 / c^2) if it is robust."""
+    """Return Eq. (5) in px^2, with the robust loss if there is one."""
     # Points behind the target would leave the sum, and the cheapest camera would look away from
     # all of them: each counts as a miss by the width of the image.
     residual = torch.where(valid[:, None], residual, float(problem.camera.width))
     weight = problem.weights
-    if problem.robust_scale is None:
+    if problem.robust is None:
         flow_cost = (weight * residual.square()).sum(dtype=torch.float64)
     else:
-        scale2 = problem.robust_scale**2
-        loss = scale2 * torch.log1p(residual.square().sum(1) / scale2)
+        loss = problem.robust.loss(residual.square().sum(1))
         flow_cost = (weight.mean(1) * loss).sum(dtype=torch.float64)
     difference = state.disparities - problem.prior_disparities
     return float(flow_cost + (problem.prior_weights * difference.square()).sum(dtype=torch.float64))

@@ -26,6 +26,8 @@ from minislam.tracking.bundle_adjustment import (
 )
 from minislam.tracking.frame_graph import splat_disparities
 from minislam.tracking.grid import Grid
+from minislam.tracking.motion_memory import inherited_trust, updated_trust
+from minislam.tracking.robust import RobustKernel
 
 ESSENTIAL_THRESHOLD = 0.7  # px, RANSAC inlier distance to the epipolar line
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
@@ -56,7 +58,7 @@ def start_pose(
     trust: Tensor,  # (N,) in [0, 1] of the source cells
     T_source_world: Tensor,  # (4, 4)
     starts: list[Tensor],  # candidates (4, 4) for T_target_world
-    robust_scale: float | None,  # px
+    robust: RobustKernel | None,
 ) -> tuple[Tensor, float]:
     """Return T_target_world (4, 4) that explains the flow best, and its cost [px^2].
 
@@ -74,13 +76,12 @@ def start_pose(
         free_poses=torch.tensor([False, True]),
         free_disparities=torch.tensor([False, False]),
     )
-    widenings = POSE_ROBUST_WIDENING if robust_scale else (1.0,)
+    widenings = POSE_ROBUST_WIDENING if robust else (1.0,)
     ends = []
     for start in starts:
         state = BundleState(torch.stack([T_source_world, start]), disparities.expand(2, -1))
         for widening in widenings:
-            narrowed = robust_scale and widening * robust_scale
-            problem = replace(problem, robust_scale=narrowed)
+            problem = replace(problem, robust=robust and robust.widened(widening))
             state, report = motion_only_adjust(problem, state, POSE_ITERATIONS)
         ends.append((report.cost_after, state.T_camera_world[1]))
     cost, pose = min(ends, key=lambda end: end[0])
@@ -168,23 +169,28 @@ def chain_state(
     chain: list[FlowMatches],  # K - 1 matches, keyframe k to k + 1
     first_disparities: Tensor,  # (N,)
     known_disparities: Tensor,  # (K, N), 0 where there is no depth prior
-    robust_scale: float | None,  # px
-) -> BundleState:
+    robust: RobustKernel | None,
+    memory_scale: float | None,  # px; None: motion is not remembered
+) -> tuple[BundleState, Tensor]:  # and the trust (K, N) in the cells
     """Return poses and disparities of K keyframes, each from its predecessor."""
     identity = torch.eye(4, dtype=torch.float64)
     poses, disparities = [identity], [first_disparities]
+    trust = [torch.ones_like(first_disparities)]
     for index, matches in enumerate(chain):
         last, depths = poses[-1], disparities[-1]
         starts = [last]
         if index > 0:
             starts.append(se3_interpolate(poses[-2], last, 2.0))
-        trust = torch.ones_like(depths)
-        pose, _ = start_pose(grid, matches, depths, trust, last, starts, robust_scale)
-        carried = carry_disparities(grid, pose @ se3_inverse(last), depths)
+        pose, _ = start_pose(grid, matches, depths, trust[-1], last, starts, robust)
+        motion = pose @ se3_inverse(last)
+        if memory_scale is not None:
+            trust[-1] = updated_trust(grid, matches, depths, motion, trust[-1], memory_scale)
+        trust.append(inherited_trust(grid, matches, trust[-1]))
+        carried = carry_disparities(grid, motion, depths)
         known = known_disparities[index + 1]
         poses.append(pose)
         disparities.append(torch.where(known > 0, known, carried))
-    return BundleState(torch.stack(poses), torch.stack(disparities))
+    return BundleState(torch.stack(poses), torch.stack(disparities)), torch.stack(trust)
 
 
 def best_hypothesis(problem: BundleProblem, states: list[BundleState]) -> BundleState:

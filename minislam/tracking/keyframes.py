@@ -18,6 +18,7 @@ class KeyframeStore:
         self.prior_disparities = torch.zeros(0, cells)  # (K, N) 1/D~, 0 where unknown
         self.prior_masks = torch.zeros(0, cells, dtype=torch.bool)  # (K, N) M; False: prior off
         self.static_weights = torch.zeros(0, cells)  # (K, N) what beta leaves of a cell's weight
+        self.motion_trust = torch.zeros(0, cells)  # (K, N) how well a cell has followed the camera
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -26,6 +27,11 @@ class KeyframeStore:
     def has_prior(self) -> bool:
         """Tell whether any keyframe came with a depth prior."""
         return any(depth is not None for depth in self.metric_depths)
+
+    @property
+    def trust(self) -> Tensor:  # (K, N) in [0, 1]
+        """How far each cell counts as static, by what it looks like and by what it did."""
+        return self.static_weights * self.motion_trust
 
     def append(
         self,
@@ -46,6 +52,7 @@ class KeyframeStore:
         trusted = torch.ones_like(disparities)
         self.prior_masks = torch.cat([self.prior_masks, trusted[None].bool()])
         self.static_weights = torch.cat([self.static_weights, trusted[None]])
+        self.motion_trust = torch.cat([self.motion_trust, trusted[None]])
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
@@ -56,3 +63,4 @@ class KeyframeStore:
         self.prior_disparities = self.prior_disparities[:-1]
         self.prior_masks = self.prior_masks[:-1]
         self.static_weights = self.static_weights[:-1]
+        self.motion_trust = self.motion_trust[:-1]

@@ -67,9 +67,8 @@ def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseN
     positions, valid = predicted_positions(problem, state)
     residual = problem.targets - positions
     weight = problem.weights * valid[:, None]
-    if problem.robust_scale is not None:
-        squared = residual.square().sum(1, keepdim=True)
-        weight = weight / (1 + squared / problem.robust_scale**2)
+    if problem.robust is not None:
+        weight = weight * problem.robust.weight(residual.square().sum(1, keepdim=True))
     # The flow and the prior are rows of one least-squares problem.
     J = torch.cat(
         [

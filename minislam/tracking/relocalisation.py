@@ -65,7 +65,7 @@ class Relocaliser:
             return None
         positions = torch.from_numpy(pixels)[None]
         structure = torch.stack(
-            [self._keyframes.disparities[index], self._keyframes.static_weights[index]], -1
+            [self._keyframes.disparities[index], self._keyframes.trust[index]], -1
         )
         disparities, trust = self._grid.sample(structure[None], positions)[0].unbind(-1)
         usable = (disparities > 0) & (trust > MIN_STATIC_WEIGHT)

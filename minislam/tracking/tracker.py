@@ -30,6 +30,7 @@ from minislam.tracking.initialisation import (
     start_pose,
 )
 from minislam.tracking.loop_closure import close_loops
+from minislam.tracking.motion_memory import inherited_trust, updated_trust
 from minislam.tracking.relocalisation import Place, Relocaliser
 
 
@@ -183,21 +184,50 @@ class Tracker:
             if len(self.keyframes) > 1 and self._steps[-1] is not None:
                 before = self.keyframes.T_camera_world[-2]
                 starts.append(se3_interpolate(before, last, 2.0))
-            trust = self.keyframes.static_weights[-1]
+            trust = self.keyframes.trust[-1]
             pose, _ = start_pose(
-                self.grid, matches, disparities, trust, last, starts, self.backend.robust_scale
+                self.grid, matches, disparities, trust, last, starts, self.backend.robust
             )
             carried = carry_disparities(self.grid, pose @ se3_inverse(last), disparities)
             if may_cull and self._is_culled(frame, pose):
                 return False
+            self._remember_motion(matches, pose)
         self._chain, self._passed_over = self._chain.restarted(), None
         self._steps.append(matches)
         self._add_keyframe(frame, pose, carried)
         if self.initialised:
+            self._inherit_trust(matches)
             self.backend.adjust_newest(self._steps)
             self.health.append(health_of_newest(self.backend))
             self._adjust_everything_if_due()
         return True
+
+    @property
+    def _memory_scale(self) -> float | None:  # px
+        # Without a depth prior structure and motion are found together: neither judges the other.
+        if self.config.motion_memory <= 0 or not self.keyframes.has_prior:
+            return None
+        return self.config.motion_memory * self.backend.pixel_scale
+
+    def _remember_motion(self, matches: FlowMatches, pose: Tensor) -> None:
+        """Note which cells of the newest keyframe follow the camera to its next pose."""
+        keyframes, scale = self.keyframes, self._memory_scale
+        if scale is None:
+            return
+        keyframes.motion_trust[-1] = updated_trust(
+            self.grid,
+            matches,
+            keyframes.disparities[-1],
+            pose @ se3_inverse(keyframes.T_camera_world[-1]),
+            keyframes.motion_trust[-1],
+            scale,
+        )
+
+    def _inherit_trust(self, matches: FlowMatches) -> None:
+        """Give the newest keyframe what is remembered of the cells that flow to its own."""
+        if self._memory_scale is not None:
+            trust = self.keyframes.motion_trust
+            trust[-1] = inherited_trust(self.grid, matches, trust[-2])
 
     def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
         """Tell whether a keyframe would stand where the last one stands (at most 2 in a row)."""
@@ -249,18 +279,21 @@ class Tracker:
         count = len(self.keyframes)
         for target in range(1, count):
             self.backend.match_from_chain(self._steps, target)
-        states = [
+        chained = [
             chain_state(
                 self.grid,
                 self._steps,
                 first,
                 self.keyframes.prior_disparities,
-                self.backend.robust_scale,
+                self.backend.robust,
+                self._memory_scale,
             )
             for first in self._first_disparities()
         ]
+        if self._memory_scale is not None:  # then there is a prior and with it one hypothesis
+            self.keyframes.motion_trust = chained[0][1]
         problem = self.backend.problem(range(len(self.backend.graph)), first_free=0)
-        self.backend.state = best_hypothesis(problem, states)
+        self.backend.state = best_hypothesis(problem, [state for state, _ in chained])
         self.initialised = True
         both_ways = neighbourhood_edges(0, count, self.config.neighbourhood)
         self._warm_up(both_ways, self.config.warmup_rounds)

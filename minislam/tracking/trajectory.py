@@ -13,7 +13,7 @@ from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.tracker import Tracker
 
 ITERATIONS = 8  # Gauss-Newton steps of six unknowns
-ROBUST_NARROWING = 0.5  # the structure is known by now: a narrower Cauchy weight [-]
+ROBUST_NARROWING = 0.5  # the structure is known by now: a narrower robust weight [-]
 
 
 def pose_all_frames(
@@ -63,19 +63,18 @@ def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: 
     backend.flow.remove_frame(newest)
 
     empty = torch.zeros(count + 1, len(grid.rays))
-    robust_scale = backend.robust_scale and ROBUST_NARROWING * backend.robust_scale
     problem = BundleProblem(
         camera=grid.camera,
         rays=grid.rays,
         edges_source=sources,
         edges_target=targets,
         targets=matches.targets.flatten(1, 2).mT,
-        weights=matches.confidences.flatten(1, 2).mT * keyframes.static_weights[around, None],
+        weights=matches.confidences.flatten(1, 2).mT * keyframes.trust[around, None],
         prior_disparities=empty,
         prior_weights=empty,
         free_poses=torch.arange(count + 1) == count,
         free_disparities=torch.zeros(count + 1, dtype=torch.bool),
-        robust_scale=robust_scale,
+        robust=backend.robust and backend.robust.widened(ROBUST_NARROWING),
     )
     state = BundleState(poses, torch.cat([disparities, empty[:1]]))
     state, _ = motion_only_adjust(problem, state, ITERATIONS)

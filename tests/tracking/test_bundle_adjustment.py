@@ -27,6 +27,10 @@ from minislam.tracking.bundle_adjustment import (
     residuals,
 )
 from minislam.tracking.reference import dense_normal_equations, dense_step
+from minislam.tracking.robust import RobustKernel
+
+# Plain least squares, Cauchy, Geman-McClure.
+ROBUST = [None, RobustKernel(1.5, 1), RobustKernel(1.5)]
 
 
 def one_step(problem: BundleProblem, state: BundleState, damping: float, absolute: float):
@@ -78,7 +82,7 @@ def test_robust_weights_recover_from_thirty_percent_outliers():
     is_outlier = (uniform(70, len(targets), 1, CELLS) < 0.3).expand_as(targets)
     spoilt = torch.where(is_outlier, targets + 25 * normal(71, *targets.shape), targets)
     plain = replace(known.problem, targets=spoilt)
-    robust = replace(plain, robust_scale=0.5)
+    robust = replace(plain, robust=RobustKernel(0.5))
     start = perturbed(known, 0.01)
     misled, _ = bundle_adjust(plain, start, iterations=20)
     recovered, _ = bundle_adjust(robust, start, iterations=20)
@@ -91,7 +95,9 @@ def test_robust_weights_recover_from_thirty_percent_outliers():
 def test_cauchy_weights_by_hand():
     known = known_problem(2)
     shift = torch.tensor([3.0, 4.0])[:, None]
-    problem = replace(known.problem, targets=known.problem.targets + shift, robust_scale=2.5)
+    problem = replace(
+        known.problem, targets=known.problem.targets + shift, robust=RobustKernel(2.5, 1)
+    )
     residual, weight = residuals(problem, known.truth)
     torch.testing.assert_close(residual, shift.double().expand_as(residual))
     torch.testing.assert_close(weight, problem.weights / (1 + 25 / 6.25))  # |r| = 5 px
@@ -100,11 +106,11 @@ def test_cauchy_weights_by_hand():
 # Identities
 
 
-@pytest.mark.parametrize("robust_scale", [None, 1.5])
+@pytest.mark.parametrize("robust", ROBUST)
 @pytest.mark.parametrize(("damping", "absolute"), [(0.0, 0.0), (1e-2, 1e-3)])
-def test_elimination_of_disparities_changes_nothing(robust_scale, damping: float, absolute: float):
+def test_elimination_of_disparities_changes_nothing(robust, damping: float, absolute: float):
     known = with_prior(known_problem(3), weight=3.0)
-    problem = replace(noisy(known, 1.0), robust_scale=robust_scale)
+    problem = replace(noisy(known, 1.0), robust=robust)
     start = perturbed(known, 0.02)
     eliminated = one_step(problem, start, damping, absolute)
     assert distance(eliminated, start) > 0.01
@@ -139,12 +145,12 @@ def test_normal_equations_are_those_of_the_dense_twin():
     torch.testing.assert_close(ours.disparity_gradient.reshape(-1), dense.vector[split:], **close)
 
 
-@pytest.mark.parametrize("robust_scale", [None, 1.5])
-def test_the_gradient_is_that_of_the_cost(robust_scale):
+@pytest.mark.parametrize("robust", ROBUST)
+def test_the_gradient_is_that_of_the_cost(robust):
     # d cost = -2 (g . xi + s . dd): the weights of the solve belong to the cost that is reported.
     known = with_prior(known_problem(3), weight=3.0)
     weights = known.problem.weights.mean(1, keepdim=True).expand_as(known.problem.weights)
-    problem = replace(noisy(known, 1.0), robust_scale=robust_scale, weights=weights)
+    problem = replace(noisy(known, 1.0), robust=robust, weights=weights)
     start, step = perturbed(known, 0.02), 1e-6
     equations = bundle_adjustment._normal_equations(problem, start)
     xi, added = normal(5, 2, 6), normal(6, 3, CELLS)
@@ -192,10 +198,10 @@ def test_an_edge_of_zero_weight_might_as_well_not_be_there():
     assert distance(end, expected) < 1e-12
 
 
-@pytest.mark.parametrize("robust_scale", [None, 1.5])
-def test_doubled_weights_change_nothing(robust_scale):
+@pytest.mark.parametrize("robust", ROBUST)
+def test_doubled_weights_change_nothing(robust):
     known = two_fixed_poses(known_problem())
-    problem = replace(noisy(known, 1.0), robust_scale=robust_scale)
+    problem = replace(noisy(known, 1.0), robust=robust)
     doubled = replace(problem, weights=2 * problem.weights)
     start = perturbed(known, 0.02)
     end, report = bundle_adjust(problem, start, 3, damping=0.0, absolute_damping=0.0)

@@ -25,6 +25,7 @@ from minislam.tracking.bundle_adjustment import (
     bundle_adjust,
     residuals,
 )
+from minislam.tracking.robust import RobustKernel
 
 # Steps that are not taken
 
@@ -33,10 +34,10 @@ def scaled_disparities(state: BundleState, factor: float) -> BundleState:
     return replace(state, disparities=factor * state.disparities)
 
 
-@pytest.mark.parametrize("robust_scale", [None, 1.0])
-def test_cost_never_rises_over_accepted_steps(robust_scale):
+@pytest.mark.parametrize("robust", [None, RobustKernel(1.0, 1), RobustKernel(3.0)])
+def test_cost_never_rises_over_accepted_steps(robust):
     known = known_problem()
-    problem = replace(noisy(known, 1.0), robust_scale=robust_scale)
+    problem = replace(noisy(known, 1.0), robust=robust)
     start = perturbed(known, 0.15)  # far off: undamped steps overshoot
     costs = [bundle_adjust(problem, start, n)[1].cost_after for n in range(9)]
     assert costs[0] == bundle_adjust(problem, start, 3)[1].cost_before
@@ -177,11 +178,11 @@ def test_points_behind_the_target_have_no_weight():
     assert forward.any() and not forward.all()
 
 
-@pytest.mark.parametrize("robust_scale", [None, 2.0])
-def test_looking_away_does_not_pay(robust_scale):
+@pytest.mark.parametrize("robust", [None, RobustKernel(2.0)])
+def test_looking_away_does_not_pay(robust):
     # Without a price for points behind the camera, the state with no valid point costs nothing.
     known = known_problem(2)
-    problem = replace(known.problem, robust_scale=robust_scale)
+    problem = replace(known.problem, robust=robust)
     poses = known.truth.T_camera_world.clone()
     poses[1] = se3_exp(torch.tensor([0, 0, 0, 0, torch.pi, 0], dtype=torch.float64)) @ poses[1]
     away = BundleState(poses, known.truth.disparities)

@@ -20,6 +20,7 @@ from minislam.tracking.initialisation import (
     triangulate,
 )
 from minislam.tracking.reprojection import reproject
+from minislam.tracking.robust import RobustKernel
 
 GRID = Grid.of(CAMERA, STRIDE)
 CELLS = len(GRID.rays)
@@ -154,13 +155,13 @@ def test_composed_matches_are_the_matches_of_the_composed_motion():
     torch.testing.assert_close(composed[inside], expected[inside], rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("robust_scale", [None, 2.0])
-def test_a_pose_is_found_from_matches_and_disparities(robust_scale: float | None):
+@pytest.mark.parametrize("robust", [None, RobustKernel(2.0)])
+def test_a_pose_is_found_from_matches_and_disparities(robust: RobustKernel | None):
     truth, disparities = sideways(), room_disparities()
     before = se3_exp(0.3 * normal(8, 6))
     matches = seen_matches(truth, disparities)
     trust = torch.ones(CELLS)
-    pose, cost = start_pose(GRID, matches, disparities, trust, before, [before], robust_scale)
+    pose, cost = start_pose(GRID, matches, disparities, trust, before, [before], robust)
     torch.testing.assert_close(pose, truth @ before, rtol=0, atol=1e-5)
     assert cost < 1e-6
 
@@ -183,7 +184,7 @@ def test_the_cheapest_of_several_starts_is_kept():
     matches, trust = seen_matches(truth, disparities), torch.ones(CELLS)
     behind = se3_exp(torch.tensor([0.0, 0, -40.0, 0, 0, 0], dtype=torch.float64))
     for starts in ([behind, identity], [identity, behind]):
-        pose, _ = start_pose(GRID, matches, disparities, trust, identity, starts, 2.0)
+        pose, _ = start_pose(GRID, matches, disparities, trust, identity, starts, RobustKernel(2.0))
         torch.testing.assert_close(pose, truth, rtol=0, atol=1e-5)
 
 
@@ -193,7 +194,7 @@ def test_a_chain_with_known_disparities_finds_every_pose():
         truth.append(se3_exp(0.02 * normal(seed, 6)) @ sideways(0.2) @ truth[-1])
     known = torch.stack([room_disparities(seed) for seed in range(4)])
     chain = [seen_matches(truth[k + 1] @ se3_inverse(truth[k]), known[k]) for k in range(3)]
-    state = chain_state(GRID, chain, known[0], known, 2.0)
+    state, _ = chain_state(GRID, chain, known[0], known, RobustKernel(2.0), None)
     torch.testing.assert_close(state.T_camera_world, torch.stack(truth), rtol=0, atol=1e-4)
     assert torch.equal(state.disparities, known)
 
@@ -202,7 +203,7 @@ def test_a_chain_carries_disparities_where_none_are_known():
     first, unknown = torch.full((CELLS,), 0.5), torch.zeros(2, CELLS)
     forward = torch.eye(4, dtype=torch.float64)
     forward[2, 3] = -0.4  # depth 2 becomes 1.6
-    state = chain_state(GRID, [seen_matches(forward, first)], first, unknown, None)
+    state, _ = chain_state(GRID, [seen_matches(forward, first)], first, unknown, None, None)
     torch.testing.assert_close(state.T_camera_world[1], forward, rtol=0, atol=1e-5)
     expected = torch.full((CELLS,), 1 / 1.6)
     torch.testing.assert_close(state.disparities[1], expected, rtol=1e-4, atol=0)

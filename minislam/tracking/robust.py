@@ -1,0 +1,37 @@
+"""The robust weight inside Sigma of Eq. (5), for a flow that brings no learned confidence.
+
+    weight(r) = (1 + r^2 / c^2)^-p
+
+is the derivative of a loss by r^2. With p = 1 it is Cauchy's, which grows like log r and so never
+stops asking about an outlier; with p = 2 it is that of Geman and McClure, bounded by c^2: beyond
+a few c it does not matter how far away a mover has gone, only how many cells it has.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class RobustKernel:
+    """A robust loss of squared residuals."""
+
+    scale: float  # c, px
+    power: float = 2.0  # p >= 1
+
+    def weight(self, squared: Tensor) -> Tensor:
+        """Return d loss / d r^2, in (0, 1], of squared residuals [px^2]."""
+        return (1 + squared / self.scale**2) ** -self.power
+
+    def loss(self, squared: Tensor) -> Tensor:
+        """Return the loss [px^2] of squared residuals [px^2]; r^2 for small ones."""
+        ratio = squared / self.scale**2
+        if self.power == 1:
+            return self.scale**2 * torch.log1p(ratio)
+        bounded = 1 - (1 + ratio) ** (1 - self.power)
+        return self.scale**2 / (self.power - 1) * bounded
+
+    def widened(self, factor: float) -> "RobustKernel":
+        """Return the same kernel with `factor` times its scale."""
+        return replace(self, scale=factor * self.scale)
