@@ -16,7 +16,7 @@ from minislam.tracking.reprojection import reproject
 
 MIN_CONFIDENCE = 0.1  # of a match that has a say [-]
 # Distrust comes at once, trust comes back slowly: a mover also pauses. [-], share of the new
-LOSS_RATE, RECOVERY_RATE = 0.7, 0.3
+LOSS_RATE, RECOVERY_RATE = 0.9, 0.1
 
 
 def updated_trust(

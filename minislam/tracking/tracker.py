@@ -1,8 +1,6 @@
 """The tracker: follows the camera, keeps keyframes, and has them adjusted (paper Sec. 3.3)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum
 
 import torch
 from torch import Tensor
@@ -32,30 +30,7 @@ from minislam.tracking.initialisation import (
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.motion_memory import inherited_trust, updated_trust
 from minislam.tracking.relocalisation import Place, Relocaliser
-
-
-class TrackingStatus(Enum):
-    """What the tracker knows about one frame."""
-
-    INITIALISING = "initialising"  # followed, but there is no map yet
-    OK = "ok"
-    RECENTLY_LOST = "recently lost"  # the view is expected back where it was lost
-    LOST = "lost"  # the view may come back anywhere
-
-    @property
-    def is_followed(self) -> bool:
-        """Tell whether the frame gets a pose."""
-        return self in (TrackingStatus.INITIALISING, TrackingStatus.OK)
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """The tracker's word on one frame."""
-
-    frame_index: int
-    timestamp: float  # second
-    status: TrackingStatus
-    matched_share: float  # of the last keyframe, [-]
+from minislam.tracking.status import TrackedFrame, TrackingStatus
 
 
 class Tracker:

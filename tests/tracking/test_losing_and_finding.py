@@ -6,7 +6,7 @@ import torch
 
 from minislam.geometry import se3_inverse
 from minislam.records import Frame
-from minislam.tracking.tracker import TrackingStatus
+from minislam.tracking.status import TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
 from tests.tracking.test_tracker import (
     CONFIG,

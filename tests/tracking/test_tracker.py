@@ -16,7 +16,8 @@ from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame, Trajectory
 from minislam.tracking.config import TrackingConfig
-from minislam.tracking.tracker import Tracker, TrackingStatus
+from minislam.tracking.status import TrackingStatus
+from minislam.tracking.tracker import Tracker
 
 SIZE = (160, 120)
 FRAMES = 30

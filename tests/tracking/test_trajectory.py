@@ -8,7 +8,7 @@ from helpers import random_transforms
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_interpolate, se3_inverse, se3_log
-from minislam.tracking.tracker import TrackedFrame, TrackingStatus
+from minislam.tracking.status import TrackedFrame, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
 from tests.tracking.wall import FRAMES, back_end, true_poses, wall_frame
 
