@@ -58,6 +58,11 @@ class PoseRefinementConfig:
     tolerance: float = parameter(
         0.05, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
     )
+    farthest: float = parameter(
+        1.0,
+        "a pose that moves the picture by more is not believed: matched flow is better than that "
+        "[px of a 320x240 image]",
+    )
     share: float = parameter(
         0.75,
         "how far to go from the pose that the flow says to the one that the picture says [0, 1]; "

@@ -18,6 +18,7 @@ from minislam.splatting import GaussianMap, Rendering, render
 _FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 1e-3, 10.0, 0.3
 # Where the rendering is less opaque its depth says little about how the picture would move.
 _SOLID = 0.9
+REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that `farthest` belongs to
 
 
 def refine_pose(
@@ -49,17 +50,21 @@ def _most_alike_pose(
 ) -> Tensor:  # (4, 4) float64
     """Return the pose near the start from which the map resembles the image most.
 
-    A step that does not lower the loss is taken back and repeated shorter, so the result is
+    A pose that would move the picture by more than `config.farthest` is not believed: then the
+    start is returned. A step that does not lower the loss is taken back and repeated shorter, so the result is
     never worse than the start, as far as the loss can tell.
     """
     pose = candidate = start
     lowest, damping = math.inf, _FIRST_DAMPING
+    farthest = config.farthest * math.hypot(camera.width, camera.height) / REFERENCE_DIAGONAL
     for steps_done in range(config.iterations + 1):
         twist = torch.zeros(6, dtype=gaussians.means.dtype, device=image.device, requires_grad=True)
         rendering = render(gaussians, camera, candidate, background, twist=twist)
         loss = rerendering_loss(rendering, image, weight, config.rounding)
         improved = float(loss.detach()) < lowest
         if improved:
+            if _motion(se3_log(candidate @ se3_inverse(start)), rendering, camera) > farthest:
+                return start  # Flow is not that wrong: the map must be, or it is blurred.
             pose, lowest, damping = candidate, float(loss.detach()), _LESS_DAMPING * damping
         if steps_done == config.iterations or not math.isfinite(lowest):
             break

@@ -18,7 +18,8 @@ from minislam.uncertainty import UncertaintyConfig
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
 
-CONFIG = PoseRefinementConfig(iterations=8, tolerance=0.01, share=1.0)
+# `farthest` belongs to 320x240: these images are a tenth of that.
+CONFIG = PoseRefinementConfig(iterations=8, tolerance=0.01, share=1.0, farthest=100.0)
 BLACK = torch.zeros(3)
 OFF = se3_exp(torch.tensor([0.03, -0.02, 0.04, 0.01, -0.015, 0.02], dtype=torch.float64))
 
@@ -86,6 +87,12 @@ def test_the_share_says_how_far_to_go_from_flow_to_picture():
     torch.testing.assert_close(
         se3_log(half @ se3_inverse(OFF)) * 2, se3_log(whole @ se3_inverse(OFF))
     )
+
+
+def test_a_picture_that_contradicts_the_flow_is_not_believed():
+    weight, strict = torch.ones(24, 32), replace(CONFIG, farthest=1.0)
+    pose = refine_pose(textured_wall(), CAMERA, OFF, TRUE_IMAGE, weight, BLACK, strict)
+    assert torch.equal(pose, OFF)
 
 
 def test_a_mover_of_weight_zero_does_not_pull_and_with_weight_one_it_does():
