@@ -51,8 +51,8 @@ def _most_alike_pose(
     """Return the pose near the start from which the map resembles the image most.
 
     A pose that would move the picture by more than `config.farthest` is not believed: then the
-    start is returned. A step that does not lower the loss is taken back and repeated shorter, so the result is
-    never worse than the start, as far as the loss can tell.
+    start is returned. A step that does not lower the loss is taken back and repeated shorter, so
+    the result is never worse than the start, as far as the loss can tell.
     """
     pose = candidate = start
     lowest, damping = math.inf, _FIRST_DAMPING
