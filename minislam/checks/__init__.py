@@ -8,6 +8,7 @@ still runs from top to bottom.
 from minislam.checks.bundle_adjustment import check_schur_step, check_target_jacobian
 from minislam.checks.geometry import check_reproject, check_resized_intrinsics
 from minislam.checks.grading import NOT_YET, PASSED, WRONG, Case, Verdict, check_function
+from minislam.checks.slam import check_ate, check_separability
 from minislam.checks.splatting import (
     check_conic_vjp,
     check_pixel_color,
@@ -15,6 +16,7 @@ from minislam.checks.splatting import (
     check_twist_vjp,
 )
 from minislam.checks.start_here import check_mapping_weight
+from minislam.checks.tracking import check_flow_distance, check_suppressed
 
 __all__ = [
     "NOT_YET",
@@ -22,7 +24,9 @@ __all__ = [
     "WRONG",
     "Case",
     "Verdict",
+    "check_ate",
     "check_conic_vjp",
+    "check_flow_distance",
     "check_function",
     "check_mapping_weight",
     "check_pixel_color",
@@ -30,6 +34,8 @@ __all__ = [
     "check_reproject",
     "check_resized_intrinsics",
     "check_schur_step",
+    "check_separability",
+    "check_suppressed",
     "check_target_jacobian",
     "check_twist_vjp",
 ]
