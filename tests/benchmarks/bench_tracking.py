@@ -1,0 +1,109 @@
+"""Time the hot paths of tracking on one thread: the bundle adjustment and the flow.
+
+    python tests/benchmarks/bench_tracking.py
+
+Times are processor time, medians; the ratio to the dense normal equations is what a busy machine
+does not change.
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+
+from data_synth import generate
+from minislam.geometry import Camera, se3_exp
+from minislam.priors.flow import ClassicalFlow
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
+from minislam.tracking.grid import Grid
+from minislam.tracking.reference import dense_step
+from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.robust import RobustKernel
+
+CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
+STRIDE = 8
+REPEATS = 7
+STEP = (0.02, 0.005, 0.01, 0.001, -0.003, 0.002)  # twist from keyframe to keyframe
+
+
+def milliseconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
+    """Return the median processor time of a call."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        times.append(time.process_time() - start)
+    return 1e3 * statistics.median(times)
+
+
+def problem(
+    keyframes: int, edges: int, camera: Camera = CAMERA, dtype: torch.dtype = torch.float32
+) -> tuple[BundleProblem, BundleState]:
+    """Return a problem of neighbouring keyframes with noisy flow, and a state that is near."""
+    grid, source = Grid.of(camera, STRIDE), torch.Generator().manual_seed(0)
+    cells = len(grid.rays)
+    poses = se3_exp(torch.arange(keyframes)[:, None] * torch.tensor(STEP, dtype=torch.float64))
+    disparities = 0.2 + 0.3 * torch.rand(keyframes, cells, generator=source, dtype=dtype)
+    near = [
+        (i, j)
+        for radius in range(1, keyframes)
+        for i in range(keyframes)
+        for j in (i - radius, i + radius)
+        if 0 <= j < keyframes
+    ][:edges]
+    sources, targets = (torch.tensor(ends) for ends in zip(*near, strict=True))
+    rays = grid.rays.to(dtype)
+    transforms = relative_transforms(poses, sources, targets).to(dtype)
+    positions, _ = reproject(transforms, disparities[sources], rays, camera)
+    noise = torch.randn(positions.shape, generator=source, dtype=dtype)
+    nothing = torch.zeros_like(disparities)
+    made = BundleProblem(
+        camera=camera,
+        rays=rays,
+        edges_source=sources,
+        edges_target=targets,
+        targets=positions + noise,
+        weights=torch.ones_like(positions),
+        prior_disparities=nothing,
+        prior_weights=nothing,
+        free_poses=torch.arange(keyframes) > 0,
+        free_disparities=torch.ones(keyframes, dtype=torch.bool),
+        robust=RobustKernel(1.0),
+    )
+    return made, BundleState(poses, 1.02 * disparities)
+
+
+def bench_bundle_adjustment() -> None:
+    """Print the time of one Gauss-Newton iteration."""
+    for keyframes, edges in ((8, 30), (80, 480)):
+        made, state = problem(keyframes, edges)
+        once = milliseconds(lambda: bundle_adjust(made, state, 0))
+        # Each iteration linearises once more: at the state it has reached.
+        twice = milliseconds(lambda: bundle_adjust(made, state, 1))
+        print(f"BA, {edges} edges, {keyframes} keyframes, 30x40 cells: {twice - once:.1f} ms")
+    small = Camera(40.0, 40.0, 24.0, 16.0, 48, 32)
+    made, state = problem(4, 12, small, torch.float64)
+    ours = milliseconds(lambda: bundle_adjust(made, state, 1))
+    dense = milliseconds(lambda: dense_step(made, state, 1e-4, 1e-6), repeats=3)
+    print(f"dense normal equations against ours, 12 edges of 4x6 cells: {dense / ours:.0f} times")
+
+
+def bench_flow() -> None:
+    """Print the time of the flow of one edge, and of one step of the chain."""
+    clip = generate("static", seed=0, frames=5)
+    images = [torch.from_numpy(image) for image in clip.rgb]
+    flow = ClassicalFlow()
+    for index in (0, 4):
+        flow.add_frame(index, images[index])
+    still = CAMERA.pixel_grid(STRIDE)[None]
+    edge = milliseconds(lambda: flow.match([0], [4], still))
+    chain = flow.start_chain(images[0])
+    step = milliseconds(lambda: chain.advanced(images[1]))
+    print(f"flow at 320x240: {edge:.0f} ms per edge, {step:.0f} ms per frame of the chain")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    bench_bundle_adjustment()
+    bench_flow()
