@@ -9,6 +9,7 @@ does not change.
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 
@@ -78,9 +79,9 @@ def bench_bundle_adjustment() -> None:
     """Print the time of one Gauss-Newton iteration."""
     for keyframes, edges in ((8, 30), (80, 480)):
         made, state = problem(keyframes, edges)
-        once = milliseconds(lambda: bundle_adjust(made, state, 0))
+        once = milliseconds(partial(bundle_adjust, made, state, 0))
         # Each iteration linearises once more: at the state it has reached.
-        twice = milliseconds(lambda: bundle_adjust(made, state, 1))
+        twice = milliseconds(partial(bundle_adjust, made, state, 1))
         print(f"BA, {edges} edges, {keyframes} keyframes, 30x40 cells: {twice - once:.1f} ms")
     small = Camera(40.0, 40.0, 24.0, 16.0, 48, 32)
     made, state = problem(4, 12, small, torch.float64)
