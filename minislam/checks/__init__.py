@@ -8,6 +8,7 @@ still runs from top to bottom.
 from minislam.checks.bundle_adjustment import check_schur_step, check_target_jacobian
 from minislam.checks.geometry import check_reproject, check_resized_intrinsics
 from minislam.checks.grading import NOT_YET, PASSED, WRONG, Case, Verdict, check_function
+from minislam.checks.mapping import check_deformed_means, check_sampling
 from minislam.checks.slam import check_ate, check_separability
 from minislam.checks.splatting import (
     check_conic_vjp,
@@ -17,6 +18,7 @@ from minislam.checks.splatting import (
 )
 from minislam.checks.start_here import check_mapping_weight
 from minislam.checks.tracking import check_flow_distance, check_suppressed
+from minislam.checks.uncertainty import check_best_beta, check_feature_variance
 
 __all__ = [
     "NOT_YET",
@@ -25,7 +27,10 @@ __all__ = [
     "Case",
     "Verdict",
     "check_ate",
+    "check_best_beta",
     "check_conic_vjp",
+    "check_deformed_means",
+    "check_feature_variance",
     "check_flow_distance",
     "check_function",
     "check_mapping_weight",
@@ -33,6 +38,7 @@ __all__ = [
     "check_projected_covariance",
     "check_reproject",
     "check_resized_intrinsics",
+    "check_sampling",
     "check_schur_step",
     "check_separability",
     "check_suppressed",
