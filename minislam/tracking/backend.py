@@ -53,7 +53,8 @@ class BackEnd:
     def robust(self) -> RobustKernel | None:
         """Return the robust weight inside Sigma, None for plain least squares."""
         scale, power = self.config.robust_scale, self.config.robust_power
-        return RobustKernel(scale * self.pixel_scale, power) if scale > 0 else None
+        # Matching is not more precise in a smaller image: there the scale stays as it is.
+        return RobustKernel(scale * max(self.pixel_scale, 1.0), power) if scale > 0 else None
 
     @property
     def keyframe_flow(self) -> float:
