@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from minislam.checks import NOT_YET, PASSED, WRONG
 from minislam.geometry import se3_exp
 from minislam.records import Frame
 
@@ -70,3 +71,16 @@ def random_transforms(count: int, regime: str, seed: int) -> Tensor:
         "half_turn": torch.pi - 1e-7 * torch.rand(count, 1, generator=source, dtype=torch.float64),
     }[regime]
     return se3_exp(torch.cat([xi[:, :3], angle * axis], -1))
+
+
+def unfinished(*arguments: object) -> Tensor:
+    """Stand in for an exercise that has not been begun."""
+    raise NotImplementedError
+
+
+def assert_graded(check: Callable, solution: Callable) -> None:
+    """Assert that a check passes a solution, waits for an empty one, and rejects one 1 % off."""
+    assert check(solution).status == PASSED
+    assert check(unfinished).status == NOT_YET
+    verdict = check(lambda *arguments: 1.01 * solution(*arguments))
+    assert verdict.status == WRONG and ", expected " in verdict.sentence

@@ -21,6 +21,7 @@ from minislam.checks import (
     check_twist_vjp,
 )
 from minislam.geometry import Camera, se3_inverse, transform_points
+from tests.helpers import unfinished
 
 
 def resized(camera: Camera, width: int, height: int) -> Tensor:
@@ -31,10 +32,6 @@ def resized(camera: Camera, width: int, height: int) -> Tensor:
 
 def reprojected(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
     return camera.project(transform_points(pose, camera.backproject(pixels, 1 / disparities)))
-
-
-def unfinished(*arguments) -> Tensor:
-    raise NotImplementedError
 
 
 def projected(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:

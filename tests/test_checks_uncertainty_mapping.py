@@ -5,14 +5,13 @@ import torch
 from torch import Tensor
 
 from minislam.checks import (
-    NOT_YET,
-    PASSED,
     WRONG,
     check_best_beta,
     check_deformed_means,
     check_feature_variance,
     check_sampling,
 )
+from tests.helpers import assert_graded
 
 
 def best_beta(misfit: Tensor, lambda_log: float) -> Tensor:
@@ -49,20 +48,9 @@ CHECKS = [
 ]
 
 
-def unfinished(*arguments) -> Tensor:
-    raise NotImplementedError
-
-
 @pytest.mark.parametrize(("check", "solution"), CHECKS)
-def test_a_solution_passes_and_an_empty_one_is_not_yet(check, solution):
-    assert check(solution).status == PASSED
-    assert check(unfinished).status == NOT_YET
-
-
-@pytest.mark.parametrize(("check", "solution"), CHECKS)
-def test_one_percent_is_wrong_and_the_sentence_has_the_number(check, solution):
-    verdict = check(lambda *arguments: 1.01 * solution(*arguments))
-    assert verdict.status == WRONG and ", expected " in verdict.sentence
+def test_a_solution_passes_and_one_percent_is_wrong(check, solution):
+    assert_graded(check, solution)
 
 
 def test_known_mistakes_of_uncertainty_are_named():

@@ -33,8 +33,6 @@ REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that the thresholds in px
 # A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
 # correct would look like outliers. So the weight is wide at first. [-]
 FIRST_WIDENING = 8.0
-# Flow is precise to a fraction of a pixel however small the image is. [-]
-LEAST_ROBUST_SHRINK = 1.0
 HORIZON = 3  # windows of keyframes among which a new one looks for proximity links
 
 
@@ -55,8 +53,8 @@ class BackEnd:
     def robust(self) -> RobustKernel | None:
         """Return the robust weight inside Sigma, None for plain least squares."""
         scale, power = self.config.robust_scale, self.config.robust_power
-        shrink = max(self.pixel_scale, LEAST_ROBUST_SHRINK)
-        return RobustKernel(scale * shrink, power) if scale > 0 else None
+        # Matching is no more precise in a smaller image: there the scale stays as it is.
+        return RobustKernel(scale * max(self.pixel_scale, 1.0), power) if scale > 0 else None
 
     @property
     def keyframe_flow(self) -> float:

@@ -38,7 +38,8 @@ class TrackingConfig:
     rounds: int = parameter(2, "rounds of flow and BA per keyframe")
     iterations: int = parameter(3, "Gauss-Newton steps per round")
     robust_scale: float = parameter(
-        1.0, "c: width of the robust weight inside Sigma [px]; 0: plain least squares"
+        1.0,
+        "c: width of the robust weight inside Sigma, also in smaller images [px]; 0: least squares",
     )
     robust_power: float = parameter(
         2.0, "p of that weight (1 + r^2/c^2)^-p; 1: Cauchy, 2: Geman-McClure [-]"

@@ -98,27 +98,23 @@ class Tracker:
         if self.initialised:
             features = self._features(frame)
             place = self._relocaliser.find(frame.image, features)
-            if place is not None and self._resume(frame, place):
+            if place is not None and self._resume(frame, place, features):
                 return True
         recently = self._lost_in_a_row <= self.config.recently_lost_frames
         self._log(frame, TrackingStatus.RECENTLY_LOST if recently else TrackingStatus.LOST, share)
         return False
 
-    def _resume(self, frame: Frame, place: Place) -> bool:
+    def _resume(self, frame: Frame, place: Place, features: Tensor) -> bool:
         """Go on from where a frame was recognised, unless the flow from there says otherwise."""
-        keyframes = self.keyframes
-        T_frame_keyframe = place.T_camera_world @ se3_inverse(
-            keyframes.T_camera_world[place.keyframe_index]
-        )
-        disparities = keyframes.disparities[place.keyframe_index]
-        carried = carry_disparities(self.grid, T_frame_keyframe, disparities)
-        newest = len(keyframes)
+        keyframes, like = self.keyframes, place.keyframe_index
+        T_frame_like = place.T_camera_world @ se3_inverse(keyframes.T_camera_world[like])
+        carried = carry_disparities(self.grid, T_frame_like, keyframes.disparities[like])
         self._steps.append(None)
-        self._add_keyframe(frame, place.T_camera_world, carried)
-        if not self.backend.attach_newest(place.keyframe_index):
+        self._add_keyframe(frame, place.T_camera_world, carried, features)
+        if not self.backend.attach_newest(like):
             self._steps.pop()
             keyframes.remove_newest()
-            self.backend.flow.remove_frame(newest)
+            self.backend.flow.remove_frame(len(keyframes))
             return False
         self.health.append(health_of_newest(self.backend))
         self._chain, self._passed_over = self.backend.flow.start_chain(frame.image), None
@@ -226,7 +222,9 @@ class Tracker:
         if is_due or closed:
             self._last_global = count
 
-    def _add_keyframe(self, frame: Frame, pose: Tensor, carried: Tensor) -> None:
+    def _add_keyframe(
+        self, frame: Frame, pose: Tensor, carried: Tensor, features: Tensor | None = None
+    ) -> None:
         metric_depth = self._depth_prior(frame, self.grid.camera)
         prior = torch.zeros_like(carried)
         if metric_depth is not None:
@@ -234,7 +232,7 @@ class Tracker:
             prior = torch.where(depth > 0, depth.clamp_min(1e-6).reciprocal(), prior)
         disparities = torch.where(prior > 0, prior, carried)
         index = len(self.keyframes)
-        features = self._features(frame)
+        features = self._features(frame) if features is None else features
         self.keyframes.append(frame, features, metric_depth, pose, disparities, prior)
         self.backend.flow.add_frame(index, frame.image)
         if self.initialised:
