@@ -132,6 +132,7 @@ def _facts(
         "keyframes": len(slam.tracker.keyframes),
         "lost_frames": len(slam.lost_frames()),
         "gaussians": len(slam.mapper.gaussians),
+        "focal_length": asdict(slam.focal_length) if slam.focal_length else None,
         "health": [asdict(health) for health in slam.tracker.health],
     }
 
@@ -199,10 +200,21 @@ def _warnings(slam: Slam) -> list[str]:
             f"{lost} of {len(slam.tracker.tracked)} frames could not be followed and have no "
             "pose; lost_frames.txt lists them"
         )
-    warnings += _health_warnings(slam)
+    warnings += _focal_length_warnings(slam) + _health_warnings(slam)
     if not slam.tracker.keyframes.has_prior:
         warnings.append("without a depth prior the unit of length is arbitrary")
     return warnings
+
+
+def _focal_length_warnings(slam: Slam) -> list[str]:
+    fit = slam.focal_length
+    if fit is None or not fit.is_doubtful:
+        return []
+    factor = f"{fit.factor:.2f}"
+    return [
+        f"the flow fits {factor} times the present focal length better, with {fit.saved:.0%} less "
+        f"cost: check the calibration, or give {factor} times the present --fx and --fy"
+    ]
 
 
 def _health_warnings(slam: Slam) -> list[str]:

@@ -24,6 +24,7 @@ from minislam.geometry import se3_inverse
 from minislam.mapping import Mapper
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
+from minislam.tracking.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
@@ -55,6 +56,7 @@ class Slam:
         self.sequence, self.config = sequence, config
         self.seconds: dict[str, float] = {}  # spent per stage
         self.snapshots = MlpSnapshots()  # by frame index
+        self.focal_length: FocalLengthFit | None = None  # which one the flow wants, at the end
         self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
         self.mapper = Mapper(
             sequence.camera,
@@ -94,6 +96,7 @@ class Slam:
 
         with self._timed("final adjustment"):
             self.tracker.finish(self._progress("final adjustment"))
+            self.focal_length = check_focal_length(self.tracker.backend)
         with self._timed("refinement"):
             self._move_map(first_changed=0)
             iterations = self.config.mapping.refine_iterations

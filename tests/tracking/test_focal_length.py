@@ -1,0 +1,83 @@
+"""The focal length that the flow wants: found where the camera turns, untold where it does not."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from minislam.geometry import se3_exp
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.focal_length import FocalLengthFit, check_focal_length, fit_focal_length
+from minislam.tracking.reprojection import relative_transforms, reproject
+from tests.tracking.scene import CAMERA, RAYS, known_problem, noisy, normal, poses_on_an_arc
+from tests.tracking.wall import back_end
+
+NOISE = 0.1  # px
+FOUND = 0.005  # relative
+
+
+def seen_through(problem: BundleProblem, factor: float) -> BundleProblem:
+    """Return the problem of someone who believes in `factor` times the true focal length."""
+    camera = problem.camera
+    wrong = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    rays = problem.rays / problem.rays.new_tensor([factor, factor, 1.0])
+    return replace(problem, camera=wrong, rays=rays)
+
+
+def without_turning() -> tuple[BundleProblem, BundleState]:
+    """Return a problem, with noise, of a camera that keeps its direction."""
+    known = known_problem()
+    poses = se3_exp(torch.zeros(4, 6, dtype=torch.float64))
+    poses[:, :3, 3] = poses_on_an_arc(4, seed=0)[:, :3, 3]
+    state = BundleState(poses, known.truth.disparities)
+    ends = known.problem.edges_source, known.problem.edges_target
+    transforms = relative_transforms(poses, *ends)
+    targets, _ = reproject(transforms, state.disparities[ends[0]], RAYS, CAMERA)
+    targets = targets + NOISE * normal(9, *targets.shape)
+    return replace(known.problem, targets=targets), state
+
+
+@pytest.mark.parametrize("factor", [0.75, 0.9, 1.0, 1.1, 1.3])
+def test_the_true_focal_length_is_found(factor: float):
+    known = known_problem(keyframes=8)
+    fit = fit_focal_length(seen_through(noisy(known, NOISE), factor), known.truth)
+    assert fit.given == pytest.approx(factor * CAMERA.fx)
+    assert fit.factor * factor == pytest.approx(1, rel=FOUND)
+    assert fit.is_doubtful == (factor != 1)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
+def test_a_camera_that_does_not_turn_tells_nothing(factor: float):
+    problem, state = without_turning()
+    fit = fit_focal_length(seen_through(problem, factor), state)
+    assert fit.factor is None and not fit.is_doubtful
+
+
+def test_residuals_below_what_any_flow_can_do_tell_nothing():
+    # One keyframe twice: whatever the focal length, all residuals are zero up to rounding.
+    backend = back_end([0, 0])
+    backend.match([(0, 1), (1, 0)])
+    assert check_focal_length(backend).factor is None
+
+
+def test_a_focal_length_out_of_reach_is_no_estimate():
+    known = known_problem()
+    fit = fit_focal_length(seen_through(noisy(known, NOISE), 2.0), known.truth)
+    assert fit.factor is None
+
+
+def test_the_check_changes_nothing():
+    backend = back_end([0, 3, 6])
+    backend.match([(0, 1), (1, 0), (1, 2), (2, 1)])
+    poses, disparities = backend.state.T_camera_world.clone(), backend.state.disparities.clone()
+    check_focal_length(backend)
+    assert torch.equal(backend.state.T_camera_world, poses)
+    assert torch.equal(backend.state.disparities, disparities)
+
+
+@pytest.mark.parametrize(
+    ("factor", "saved", "is_doubtful"),
+    [(1.1, 0.3, True), (0.9, 0.3, True), (1.01, 0.3, False), (1.1, 0.001, False)],
+)
+def test_only_a_clear_difference_is_worth_saying(factor: float, saved: float, is_doubtful: bool):
+    assert FocalLengthFit(272.0, factor, saved).is_doubtful == is_doubtful
