@@ -219,7 +219,8 @@ def _focal_length_warnings(slam: Slam) -> list[str]:
 
 def _health_warnings(slam: Slam) -> list[str]:
     """Return what a user should know about how the keyframes hang together."""
-    health, least = slam.tracker.health, slam.config.tracking.min_parallax
+    health = slam.tracker.health
+    least = slam.config.tracking.min_parallax * slam.tracker.backend.pixel_scale
     without = sum(keyframe.parallax < least for keyframe in health)
     if not without or 2 * without < len(health):
         return []

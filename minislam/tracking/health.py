@@ -22,20 +22,19 @@ class KeyframeHealth:
     parallax: float  # px, the most that translation contributes to the flow of a link
 
 
-def health_of_newest(backend: BackEnd) -> KeyframeHealth:
-    """Judge the newest keyframe by its links."""
-    newest = len(backend.keyframes) - 1
-    frame_index = backend.keyframes.frames[newest].frame_index
-    links = [p for p, edge in enumerate(backend.graph.edges()) if max(edge) == newest]
+def health_of(backend: BackEnd, keyframe: int) -> KeyframeHealth:
+    """Judge a keyframe by its links."""
+    frame_index = backend.keyframes.frames[keyframe].frame_index
+    links = [p for p, edge in enumerate(backend.graph.edges()) if keyframe in edge]
     if not links:
-        return KeyframeHealth(newest, frame_index, 0.0, 0.0, 0.0, 0.0)
+        return KeyframeHealth(keyframe, frame_index, 0.0, 0.0, 0.0, 0.0)
     problem = backend.problem(links, first_free=0)
     residual, weight = residuals(problem, backend.state)
     length, weight = residual.norm(dim=1), weight.mean(1)
     trusted = weight > 0.5 * weight.amax()
     parallax = backend.parallaxes(problem.edges_source, problem.edges_target)
     return KeyframeHealth(
-        newest,
+        keyframe,
         frame_index,
         matched_share=max(backend.graph.matched_shares[p] for p in links),
         mean_weight=float(weight.mean()),

@@ -19,7 +19,7 @@ from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.frame_graph import neighbourhood_edges
-from minislam.tracking.health import KeyframeHealth, health_of_newest
+from minislam.tracking.health import KeyframeHealth, health_of
 from minislam.tracking.initialisation import (
     best_hypothesis,
     carry_disparities,
@@ -50,7 +50,7 @@ class Tracker:
         self.keyframes = self.backend.keyframes
         self.grid = self.backend.grid
         self.tracked: list[TrackedFrame] = []
-        self.health: list[KeyframeHealth] = []  # of every keyframe after the warm-up
+        self.health: list[KeyframeHealth] = []  # of every keyframe, when it came
         self.initialised = False
         self._features, self._depth_prior = features, depth_prior
         self._predict_static_weight = predict_static_weight
@@ -116,7 +116,7 @@ class Tracker:
             keyframes.remove_newest()
             self.backend.flow.remove_frame(len(keyframes))
             return False
-        self.health.append(health_of_newest(self.backend))
+        self.health.append(health_of(self.backend, len(self.keyframes) - 1))
         self._chain, self._passed_over = self.backend.flow.start_chain(frame.image), None
         self._log(frame, TrackingStatus.OK, 1.0)
         return True
@@ -169,7 +169,7 @@ class Tracker:
         if self.initialised:
             self._inherit_trust(matches)
             self.backend.adjust_newest(self._steps)
-            self.health.append(health_of_newest(self.backend))
+            self.health.append(health_of(self.backend, len(self.keyframes) - 1))
             self._adjust_everything_if_due()
         return True
 
@@ -279,6 +279,7 @@ class Tracker:
         edges = self.backend.graph.edges()
         mask_priors(self.keyframes, self.grid, edges, self.config)
         self._warm_up(edges, self.config.warmup_rounds_with_beta)
+        self.health = [health_of(self.backend, index) for index in range(len(self.keyframes))]
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Adjust all keyframes together, with the newest beta."""

@@ -10,7 +10,7 @@ from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
-from minislam.tracking.health import health_of_newest
+from minislam.tracking.health import health_of
 from minislam.tracking.loop_closure import close_loops, loop_pairs
 from tests.tracking.wall import TrueFlow, back_end, true_poses
 
@@ -101,7 +101,7 @@ def test_a_short_sequence_has_no_loops():
 def test_health_at_the_truth():
     backend = back_end([0, 1, 2])
     backend.match(neighbourhood_edges(0, 3, 2))
-    health = health_of_newest(backend)
+    health = health_of(backend, 2)
     assert health.keyframe_index == 2 and health.matched_share == 1
     assert health.median_residual < 1e-3 and health.parallax > 3
 
@@ -111,14 +111,14 @@ def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
     poses = backend.keyframes.T_camera_world
     poses[2] = se3_exp(torch.tensor([0, 0, 0, 0.01, 0.02, 0], dtype=torch.float64)) @ poses[1]
     backend.match([(2, 1), (1, 2)])
-    assert health_of_newest(backend).parallax < 0.1
+    assert health_of(backend, 2).parallax < 0.1
     before = backend.keyframes.disparities.clone()
     backend.adjust(first_free=2, iterations=3)
     assert torch.equal(backend.keyframes.disparities, before)
 
 
 def test_a_keyframe_without_links_is_reported_as_such():
-    health = health_of_newest(back_end([0, 1]))
+    health = health_of(back_end([0, 1]), 1)
     assert health.matched_share == 0 and health.parallax == 0
 
 
