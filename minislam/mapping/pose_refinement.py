@@ -107,31 +107,48 @@ def curvature(
     camera: Camera,
     rounding: float,
 ) -> Tensor:  # (6, 6) float64
-    """Return the Gauss-Newton matrix of the loss: the mean of w J J^T / |I^ - I|.
+    """Return the Gauss-Newton matrix of the loss: the mean of w J^T J / |I^ - I|.
 
-    A twist (rho, phi) moves the point p seen at a pixel by rho + phi x p. The picture there
-    changes by what slides in: with the slope g = (dI^/du, dI^/dv) of the rendering and the
-    projection's Jacobian P,
+    A twist moves the point seen at a pixel by A px per unit. The picture there changes by what
+    slides in: with the slope g = (dI^/du, dI^/dv) of a channel, J = -g^T A. All channels share A,
 
-        a = -P^T g,        J = (a, p x a).
+        sum_c w J_c^T J_c / |r_c| = A^T G A,        G = sum_c w g_c g_c^T / |r_c|   (2x2).
     """
     solid = rendering.opacity > _SOLID
-    depth = torch.where(solid, rendering.depth / rendering.opacity, 1)
-    points = camera.backproject(camera.pixel_grid(dtype=depth.dtype, device=depth.device), depth)
-    slope = image_slope(rendering.color)  # (H, W, 3, 2)
-    a = -slope @ camera.project_jacobian(points)  # (H, W, 3, 3)
-    jacobian = torch.cat([a, torch.linalg.cross(points[..., None, :].expand_as(a), a)], -1)
     absolute = ((rendering.color - image).square() + rounding**2).sqrt()
     factor = (weight * rendering.opacity * solid)[..., None] / absolute / absolute.numel()
-    rows = jacobian.reshape(-1, 6).double()
-    return rows.T @ (factor.reshape(-1, 1) * rows)
+    slope_u, slope_v = image_slope(rendering.color)
+    weighted_u, weighted_v = factor * slope_u, factor * slope_v
+    uu, vv = (weighted_u * slope_u).sum(-1), (weighted_v * slope_v).sum(-1)
+    uv = (weighted_u * slope_v).sum(-1)
+    u, v = pixel_motion(torch.where(solid, rendering.depth / rendering.opacity, 1), camera)
+    bend = u.flatten(1) @ (uu * u + uv * v).flatten(1).T
+    bend += v.flatten(1) @ (uv * u + vv * v).flatten(1).T
+    return bend.double()
 
 
-def image_slope(image: Tensor) -> Tensor:  # (H, W, 3) -> (H, W, 3, 2)
+def pixel_motion(
+    depth: Tensor,  # (H, W) z in world units
+    camera: Camera,
+) -> tuple[Tensor, Tensor]:  # (6, H, W), (6, H, W)
+    """Return du / d(rho, phi) and dv / d(rho, phi) of what each pixel shows: the A above.
+
+    A twist moves the point p by rho + phi x p. With its ray (x, y, 1) and e = 1/z, they are
+
+        fx (e, 0, -e x, -x y, 1 + x^2, -y),        fy (0, e, -e y, -1 - y^2, x y, x).
+    """
+    x, y, _ = camera.rays(camera.pixel_grid(dtype=depth.dtype, device=depth.device)).unbind(-1)
+    e, zero = 1 / depth, torch.zeros_like(depth)
+    u = torch.stack([e, zero, -e * x, -x * y, 1 + x * x, -y]).mul_(camera.fx)
+    v = torch.stack([zero, e, -e * y, -1 - y * y, x * y, x]).mul_(camera.fy)
+    return u, v
+
+
+def image_slope(image: Tensor) -> Tensor:  # (H, W, 3) -> (2, H, W, 3)
     """Return (d/du, d/dv) per pixel and channel by central differences, 0 at the border."""
-    slope = image.new_zeros(*image.shape, 2)
-    slope[:, 1:-1, :, 0] = (image[:, 2:] - image[:, :-2]) / 2
-    slope[1:-1, :, :, 1] = (image[2:] - image[:-2]) / 2
+    slope = image.new_zeros(2, *image.shape)
+    slope[0, :, 1:-1] = (image[:, 2:] - image[:, :-2]) / 2
+    slope[1, 1:-1] = (image[2:] - image[:-2]) / 2
     return slope
 
 
