@@ -150,7 +150,7 @@ def _write_estimates(folder: RunFolder, slam: Slam) -> None:
 def _measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     views = [
         MappedView(
-            _frame_index(slam, index),
+            keyframe.frame_index,
             se3_inverse(keyframe.T_camera_world).numpy(),
             _beta_image(slam, index) if slam.config.uncertainty.is_learnt else None,
             surface_depth(slam.mapper.render(keyframe.T_camera_world)).numpy(),
@@ -175,12 +175,6 @@ def _measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
 def _rendered(slam: Slam, T_world_camera: np.ndarray) -> np.ndarray:
     pose = se3_inverse(torch.from_numpy(T_world_camera))
     return slam.mapper.render(pose).color.clamp(0, 1).numpy()
-
-
-def _frame_index(slam: Slam, index: int) -> int:
-    """Return which frame a keyframe of the map is."""
-    keyframe_index = slam.mapper.keyframes[index].keyframe_index
-    return slam.tracker.keyframes.frames[keyframe_index].frame_index
 
 
 def _beta_image(slam: Slam, index: int) -> np.ndarray:
@@ -271,7 +265,7 @@ def _write_keyframes(folder: RunFolder, slam: Slam) -> list[tuple[str, bytes]]:
         rendering = slam.mapper.render(keyframe.T_camera_world)
         image, beta = keyframe.image.numpy(), _beta_image(slam, index)
         color, depth = rendering.color.clamp(0, 1).numpy(), rendering.depth.numpy()
-        number = _frame_index(slam, index)
+        number = keyframe.frame_index
         folder.write_keyframe_image(number, "input", image)
         folder.write_keyframe_image(number, "render", color)
         folder.write_keyframe_image(number, "depth", depth_to_rgb(depth))
@@ -286,7 +280,7 @@ def _online_beta(slam: Slam) -> bytes:
     """Draw how beta of the keyframe with most movement came about: first, then, and at last."""
     count = len(slam.mapper.keyframes)
     index = max(range(count), key=lambda k: float(_beta_image(slam, k).mean()))
-    number, moments = _frame_index(slam, index), slam.snapshots.moments
+    number, moments = slam.mapper.keyframes[index].frame_index, slam.snapshots.moments
     later = [moment for moment in moments if moment >= number]
     chosen = sorted({moments[0], later[0] if later else moments[-1], moments[-1]})
     betas = slam.online_beta(number, chosen)

@@ -3,14 +3,23 @@
 import json
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from minislam.errors import InputError
 
 
 def atomic_write(path: Path | str, content: bytes) -> None:
-    """Write a file so that a crash leaves the old file or the new one, never half of one.
+    """Write a file so that a crash leaves the old file or the new one, never half of one."""
+    with atomic_file(path) as file:
+        file.write(content)
+
+
+@contextmanager
+def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
+    """Open a file to write, as a whole or not at all.
 
     The bytes go to a temporary file in the same folder (os.replace is atomic only within one
     file system), reach the disk (fsync), and then take the final name.
@@ -19,13 +28,15 @@ def atomic_write(path: Path | str, content: bytes) -> None:
     temporary = path.with_name(path.name + ".tmp")
     try:
         with open(temporary, "wb") as file:
-            file.write(content)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except OSError as error:
+    except BaseException as error:  # an interruption, too, leaves nothing half written behind
         if temporary.is_file():
             temporary.unlink()
+        if not isinstance(error, OSError):
+            raise
         raise InputError(
             f"expected to be able to write {path}, but the system says: {error.strerror or error}; "
             "choose an output folder that is writable and has space left"

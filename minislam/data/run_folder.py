@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.files import atomic_write, read_bytes, read_json, write_json, write_text
 from minislam.data.images import encode_png
 from minislam.data.ply import GaussianArrays, read_ply, write_ply
@@ -54,7 +55,7 @@ class RunFolder:
         if path.is_dir() and any(path.iterdir()) and not overwrite:
             raise InputError(
                 f"expected a new or empty output folder, but {path} holds files; choose another "
-                "name or add --overwrite"
+                "name or add --overwrite (or --resume, to go on with an interrupted run)"
             )
         try:
             for folder in _FOLDERS:
@@ -119,6 +120,23 @@ class RunFolder:
     def write_report(self, html: str) -> None:
         """Write the report to open in a browser."""
         write_text(self.path / REPORT, html)
+
+    def write_checkpoint(self, tree: dict[str, Any]) -> None:
+        """Write what an interrupted run needs to go on."""
+        write_checkpoint(self.path / CHECKPOINT, tree)
+
+    def read_checkpoint(self) -> dict[str, Any]:
+        """Return what an interrupted run needs to go on."""
+        if not (self.path / CHECKPOINT).exists():
+            raise InputError(
+                f"expected {CHECKPOINT} of an interrupted run in {self.path}, found none; give the "
+                "folder of such a run, or leave out --resume to start anew"
+            )
+        return read_checkpoint(self.path / CHECKPOINT)
+
+    def remove_checkpoint(self) -> None:
+        """Remove what a finished run no longer needs."""
+        (self.path / CHECKPOINT).unlink(missing_ok=True)
 
     def read_config(self) -> dict[str, Any]:
         """Return the resolved configuration of the run."""

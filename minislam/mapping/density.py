@@ -1,6 +1,7 @@
 """Clone, split and prune Gaussians: put them where the images ask for detail."""
 
 from dataclasses import fields
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -9,15 +10,18 @@ from minislam.geometry import Camera
 from minislam.geometry.se3 import rotation_from_quaternion
 from minislam.mapping.config import DensityConfig
 from minislam.splatting import GaussianMap, MapOptimizer
+from minislam.stateful import Stateful
 
 _CHILDREN = 2  # of a Gaussian that is split, 3DGS
 
 
-class ScreenGradients:
+class ScreenGradients(Stateful):
     """Mean length of dL/d(projected mean) of each Gaussian over the views that saw it.
 
     In half images instead of pixels, so that the threshold holds for every image size.
     """
+
+    STATE: ClassVar = {"total": Tensor, "views": Tensor}
 
     def __init__(self, count: int) -> None:
         self.total = torch.zeros(count)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,10 +21,11 @@ from minislam.mapping.insertion import (
 )
 from minislam.mapping.losses import render_loss
 from minislam.mapping.pose_refinement import refine_pose
-from minislam.mapping.views import MappedKeyframe, keyframe_misfit
+from minislam.mapping.views import MappedKeyframe, keyframe_misfit, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
 from minislam.splatting import GaussianMap, MapOptimizer, Rendering, render
+from minislam.stateful import Stateful
 from minislam.uncertainty import (
     UncertaintyConfig,
     UncertaintyMLP,
@@ -34,8 +36,15 @@ from minislam.uncertainty import (
 Progress = Callable[[int, int], None]  # called with the iterations done and their number
 
 
-class Mapper:
+class Mapper(Stateful):
     """Grow and optimise the map of the static scene, and train the MLP on what does not fit."""
+
+    STATE: ClassVar = {
+        "keyframes": list[MappedKeyframe], "window": list[int], "median_depth": float,
+        "background": Tensor, "history": MappingHistory, "_trainer": UncertaintyTrainer,
+        "_generator": torch.Generator, "_optimizer": MapOptimizer, "_gradients": ScreenGradients,
+        "_iteration": int, "_frozen_until": int,
+    }  # fmt: skip
 
     def __init__(
         self,
@@ -89,13 +98,7 @@ class Mapper:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
         if not keyframes:
             raise InputError("expected at least one keyframe to start the map from, found none")
-        depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in keyframes])
-        if len(depths) == 0:
-            raise InputError(
-                "expected some known depth in the first keyframes, found none; the images hold "
-                "too little texture or parallax: move the camera more, or give a depth prior"
-            )
-        self.median_depth = float(depths.median())
+        self.median_depth = median_depth(keyframes)
         if self.config.mean_background:
             self.background = torch.stack([k.image.mean((0, 1)) for k in keyframes]).mean(0)
         for keyframe in keyframes:
@@ -113,21 +116,16 @@ class Mapper:
             raise InputError("expected an initialised map, found none; call initialise first")
         self.keyframes.append(MappedKeyframe.from_record(keyframe))
         new = len(self.keyframes) - 1
-        self.window = update_window(
-            self.window,
-            new,
-            {position: self._seen(position) for position in [new, *self.window]},
-            torch.stack([k.T_camera_world for k in self.keyframes]),
-            self.config.window_size,
-            self.config.window_overlap,
-        )
+        seen = {position: self._seen(position) for position in [new, *self.window]}
+        poses = torch.stack([k.T_camera_world for k in self.keyframes])
+        size, overlap = self.config.window_size, self.config.window_overlap
+        self.window = update_window(self.window, new, seen, poses, size, overlap)
         self._withdraw_movers()
         self._insert(new)
         if new % self.config.keyframe_stride != 0:
             return  # Fast mode: this keyframe waits for the next optimisation.
-        probabilities = sampling_probabilities(
-            len(self.keyframes), self.window, self.config.window_share
-        )
+        share = self.config.window_share
+        probabilities = sampling_probabilities(len(self.keyframes), self.window, share)
         cameras = [self._online_camera] * self.config.keyframe_iterations
         self._optimise(cameras, probabilities, progress)
 
@@ -160,14 +158,18 @@ class Mapper:
         for keyframe, pose in zip(self.keyframes, T_camera_world.double(), strict=True):
             keyframe.T_camera_world = pose
 
-    def refine(self, iterations: int, progress: Progress | None = None) -> None:
-        """Optimise map and MLP over all keyframes, the last part at full image size."""
-        self._exchange_movers()
+    def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
+        """Optimise map and MLP over all keyframes, the last part at full image size.
+
+        It can be taken up again in another process after the iterations that are done.
+        """
+        if done == 0:
+            self._exchange_movers()
         count = len(self.keyframes)
         uniform = torch.full((count,), 1 / count, dtype=torch.float64)
         full = round(iterations * self.config.refine_full_share)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
-        self._optimise(cameras, uniform, progress, self.config.refine_rate_end)
+        self._optimise(cameras, uniform, progress, self.config.refine_rate_end, done)
 
     def _anchor_rows(self) -> Tensor:
         """Return (N,) the position in `keyframes` of each Gaussian's anchor."""
@@ -260,13 +262,14 @@ class Mapper:
         probabilities: Tensor,  # (K,) of the keyframes
         progress: Progress | None,
         last_rate: float = 1.0,  # all steps shrink to this share of themselves, log-linear
+        first: int = 0,  # iteration to begin with
     ) -> None:
         """Run the iterations, each on a keyframe drawn at random."""
         if len(self._optimizer.gaussians) == 0:
             return  # There is nothing to optimise: all was pruned, or nothing was inserted.
-        for done, camera in enumerate(cameras):
+        for done in range(first, len(cameras)):
             position = torch.multinomial(probabilities, 1, generator=self._generator)
-            self._step(int(position), camera, last_rate ** (done / len(cameras)))
+            self._step(int(position), cameras[done], last_rate ** (done / len(cameras)))
             if self._iteration % self.config.density.interval == 0:
                 self._change_density()
             if progress is not None:
@@ -286,9 +289,8 @@ class Mapper:
         )
         loss.total.backward()
         self._gradients.add(offsets.grad, rendering.radii, camera)
-        self._optimizer.rates = self.config.rates_at(
-            self._iteration, self.median_depth, rate_factor
-        )
+        rates = self.config.rates_at(self._iteration, self.median_depth, rate_factor)
+        self._optimizer.rates = rates
         self._optimizer.step()
 
         uncertainty = math.nan

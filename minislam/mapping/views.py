@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.records import Keyframe
 from minislam.splatting import Rendering
+from minislam.stateful import FrameOf, Tree
 from minislam.uncertainty import Misfit, UncertaintyConfig, beta_of_mask, measure_misfit
 
 _OPAQUE = 0.5  # opacity from which on a surface is seen rather than a gap
@@ -28,6 +30,7 @@ class MappedKeyframe:
     """A keyframe in the map. The pose and the reference depth change when tracking says so."""
 
     keyframe_index: int
+    frame_index: int
     features: Tensor  # (h', w', C)
     image: Tensor  # (H, W, 3)
     depth: Tensor  # (H, W) world units, 0 where unknown
@@ -40,12 +43,23 @@ class MappedKeyframe:
         """Take over what the tracker handed out."""
         return cls(
             keyframe.keyframe_index,
+            keyframe.frame_index,
             keyframe.features,
             keyframe.image,
             keyframe.depth,
             keyframe.T_camera_world.double(),
             None if keyframe.moving_mask is None else beta_of_mask(keyframe.moving_mask),
         )
+
+    def saved_state(self) -> Tree:
+        """Return the state: all but what the image is good for."""
+        made_again = ("image", "_views")
+        return {name: value for name, value in vars(self).items() if name not in made_again}
+
+    @classmethod
+    def restored(cls, state: Tree, frame_of: FrameOf) -> "MappedKeyframe":
+        """Return the keyframe of a saved state, its image read again."""
+        return cls(**state, image=frame_of(state["frame_index"]).image)
 
     def view(self, camera: Camera) -> View:
         """Return the keyframe at the size of `camera`, made once."""
@@ -59,6 +73,17 @@ class MappedKeyframe:
         """Replace the reference depth (H, W)."""
         self.depth = depth
         self._views.clear()
+
+
+def median_depth(keyframes: list[Keyframe]) -> float:  # world units
+    """Return the median of all known depths."""
+    depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in keyframes])
+    if len(depths) == 0:
+        raise InputError(
+            "expected some known depth in the first keyframes, found none; the images hold "
+            "too little texture or parallax: move the camera more, or give a depth prior"
+        )
+    return float(depths.median())
 
 
 @torch.no_grad()

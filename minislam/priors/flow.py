@@ -7,6 +7,7 @@ composed ("warp-compose"). Confidence is forward-backward agreement times textur
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from minislam.parameters import parameter
 from minislam.priors.interfaces import FlowMatches
+from minislam.stateful import Stateful
 
 LIKENESS_WINDOW = (9, 9)  # px
 LEAST_VARIANCE = 1e-5  # of brightness in [0, 1]: below it there is nothing to correlate
@@ -34,7 +36,7 @@ class ClassicalFlowConfig:
     workers: int = parameter(2, "threads that compute flows side by side; no effect on the result")
 
 
-class ClassicalFlow:
+class ClassicalFlow(Stateful):
     """DIS flow between registered keyframes, started from a predicted reprojection."""
 
     def __init__(self, config: ClassicalFlowConfig = ClassicalFlowConfig()) -> None:
@@ -95,13 +97,15 @@ class ClassicalFlow:
         return FlowChain(gray, gray, standing, standing, self.config)
 
 
-class FlowChain:
+class FlowChain(Stateful):
     """The flow from one reference frame to the newest frame, carried from frame to frame.
 
     The previous frame's flow predicts the next one, so a displacement of any length is followed
     as long as each step of it is short. It needs no pose: it starts the pose. A chain is never
     changed: the next frame gives a new one, and a bad frame can be passed over.
     """
+
+    STATE: ClassVar = dict.fromkeys(("_reference", "_newest", "_flow", "_increment"), np.ndarray)
 
     def __init__(
         self,

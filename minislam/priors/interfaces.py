@@ -38,7 +38,10 @@ class FlowChain(Protocol):
 
 
 class FlowEstimator(Protocol):
-    """Dense correspondence between keyframes, started from a prediction."""
+    """Dense correspondence between keyframes, started from a prediction.
+
+    For checkpoints, it and its chains are `Stateful`, too.
+    """
 
     stride: int  # px between neighbouring grid cells
 

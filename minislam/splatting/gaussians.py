@@ -1,6 +1,7 @@
 """The map: one row per Gaussian in six tensors, and the Adam that lives and dies with the rows."""
 
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.parameters import parameter
+from minislam.stateful import FrameOf, Stateful, Tree
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ class LearningRates:
     colors: float = parameter(7.05e-4, "step of the colours [per iteration]")
 
 
-class MapOptimizer:
+class MapOptimizer(Stateful):
     """Adam over the rows of a map; moments and step counts are kept per Gaussian.
 
     A row that is added starts with zero moments and a step count of zero, so Adam's bias
@@ -122,6 +124,12 @@ class MapOptimizer:
     step of a late row would be (1 - beta1) / sqrt(1 - beta2) = 3.2 times too long.
     """
 
+    STATE: ClassVar = {
+        "gaussians": GaussianMap,
+        "_first": dict[str, Tensor],
+        "_second": dict[str, Tensor],
+        "_steps": Tensor,
+    }
     BETAS = (0.9, 0.999)  # decay of the first and second moment, Adam's defaults
     EPSILON = 1e-15  # floor of the denominator: 3DGS, gradients per pixel mean are tiny
 
@@ -133,6 +141,11 @@ class MapOptimizer:
     def _set_rows(self, gaussians: GaussianMap) -> None:
         leaves = [t.detach().clone().requires_grad_() for t in gaussians.parameters.values()]
         self.gaussians = GaussianMap(*leaves, gaussians.anchor_keyframe)
+
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state."""
+        super().restore_state(state, frame_of)
+        self._set_rows(self.gaussians)
 
     def reset_moments(self) -> None:
         """Forget all moments and step counts, as for a new optimiser."""

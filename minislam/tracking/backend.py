@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
+from minislam.stateful import Stateful
 from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleReport,
@@ -36,8 +38,13 @@ FIRST_WIDENING = 8.0
 HORIZON = 3  # windows of keyframes among which a new one looks for proximity links
 
 
-class BackEnd:
+class BackEnd(Stateful):
     """Holds what tracking has estimated, and makes it consistent."""
+
+    STATE: ClassVar = {
+        "keyframes": KeyframeStore, "graph": FrameGraph, "flow": FlowEstimator,
+        "reports": list[BundleReport], "_first_moved": int,
+    }  # fmt: skip
 
     def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
         self.config = config
@@ -288,15 +295,9 @@ class BackEnd:
 
     def distances(self, start: int = 0, rows: range | None = None) -> Tensor:  # (K', K') px
         """Return the flow distances between the keyframes from `start` on, of some rows or all."""
-        return flow_distances(
-            self.keyframes.T_camera_world[start:],
-            self.keyframes.disparities[start:],
-            self.grid.rays,
-            self.grid.pixels,
-            self.grid.camera,
-            self.config.rotation_share,
-            rows,
-        )
+        state, grid, share = self.state, self.grid, self.config.rotation_share
+        poses, disparities = state.T_camera_world[start:], state.disparities[start:]
+        return flow_distances(poses, disparities, grid.rays, grid.pixels, grid.camera, share, rows)
 
     def _proximity_pairs(
         self,

@@ -1,10 +1,13 @@
 """The frame graph: which keyframes are compared, and what the flow between them measured."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowMatches
+from minislam.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.reprojection import relative_transforms, reproject, scaled_points
 
 # A pair whose cells mostly leave the view has no meaningful distance. [-]; DROID-SLAM: 0.75.
@@ -14,8 +17,16 @@ KEPT_SHARE = 0.8
 FAR = 1000.0  # px, the distance of such a pair
 
 
-class FrameGraph:
+class FrameGraph(Stateful):
     """Directed edges (source, target) between keyframes, each with its flow measurement."""
+
+    STATE: ClassVar = {
+        "edges_source": list[int],
+        "edges_target": list[int],
+        "targets": list[Tensor],
+        "confidences": list[Tensor],
+        "matched_shares": list[float],
+    }
 
     def __init__(self) -> None:
         self.edges_source: list[int] = []
@@ -30,6 +41,11 @@ class FrameGraph:
 
     def __contains__(self, edge: tuple[int, int]) -> bool:
         return edge in self._position
+
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state."""
+        super().restore_state(state, frame_of)
+        self._position = {edge: position for position, edge in enumerate(self.edges())}
 
     def record(self, edges: list[tuple[int, int]], matches: FlowMatches) -> None:
         """Store the matches of these edges, adding the edges that are new.

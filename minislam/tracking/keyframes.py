@@ -1,13 +1,28 @@
 """The tracker's memory: one row per keyframe, growing as long as the sequence does."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from minislam.records import Frame
+from minislam.stateful import Stateful
 
 
-class KeyframeStore:
+class KeyframeStore(Stateful):
     """Everything the tracker knows of its keyframes."""
+
+    STATE: ClassVar = {
+        "frames": list[Frame],
+        "features": list[Tensor],  # a network's take long to make again
+        "metric_depths": list[Tensor | None],
+        "T_camera_world": Tensor,
+        "disparities": Tensor,
+        "prior_disparities": Tensor,
+        "prior_masks": Tensor,
+        "static_weights": Tensor,
+        "motion_trust": Tensor,
+    }
 
     def __init__(self, cells: int) -> None:
         self.frames: list[Frame] = []

@@ -10,13 +10,49 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from minislam.geometry import se3_inverse
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import reproject
 
 MIN_CONFIDENCE = 0.1  # of a match that has a say [-]
 # Distrust comes at once, trust comes back slowly: a mover also pauses. [-], share of the new
 LOSS_RATE, RECOVERY_RATE = 0.9, 0.1
+
+
+class MotionMemory:
+    """Keeps the trust in the cells of the newest keyframe."""
+
+    def __init__(self, grid: Grid, keyframes: KeyframeStore, scale: float) -> None:
+        self._grid, self._keyframes = grid, keyframes
+        self._scale = scale  # px, of the residuals that still count; 0: nothing is remembered
+
+    @property
+    def scale(self) -> float | None:
+        """Return the scale of the residuals [px], None while nothing is remembered."""
+        # Without a depth prior structure and motion are found together: neither judges the other.
+        return self._scale if self._scale > 0 and self._keyframes.has_prior else None
+
+    def remember(self, matches: FlowMatches, T_camera_world: Tensor) -> None:
+        """Note which cells of the newest keyframe follow the camera to its next pose (4, 4)."""
+        keyframes, scale = self._keyframes, self.scale
+        if scale is None:
+            return
+        keyframes.motion_trust[-1] = updated_trust(
+            self._grid,
+            matches,
+            keyframes.disparities[-1],
+            T_camera_world @ se3_inverse(keyframes.T_camera_world[-1]),
+            keyframes.motion_trust[-1],
+            scale,
+        )
+
+    def inherit(self, matches: FlowMatches) -> None:
+        """Give the newest keyframe what is remembered of the cells that flow to its own."""
+        if self.scale is not None:
+            trust = self._keyframes.motion_trust
+            trust[-1] = inherited_trust(self._grid, matches, trust[-2])
 
 
 def updated_trust(

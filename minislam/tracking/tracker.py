@@ -1,6 +1,7 @@
 """The tracker: follows the camera, keeps keyframes, and has them adjusted (paper Sec. 3.3)."""
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from minislam.priors.interfaces import (
     FlowMatches,
 )
 from minislam.records import Frame
+from minislam.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import mask_priors
@@ -28,13 +30,26 @@ from minislam.tracking.initialisation import (
     start_pose,
 )
 from minislam.tracking.loop_closure import close_loops
-from minislam.tracking.motion_memory import inherited_trust, updated_trust
+from minislam.tracking.motion_memory import MotionMemory
 from minislam.tracking.relocalisation import Place, Relocaliser
 from minislam.tracking.status import TrackedFrame, TrackingStatus
 
 
-class Tracker:
+class Tracker(Stateful):
     """Turns frames into keyframes with poses and disparities."""
+
+    STATE: ClassVar = {
+        "backend": BackEnd,
+        "tracked": list[TrackedFrame],
+        "health": list[KeyframeHealth],
+        "initialised": bool,
+        "_chain": FlowChain,
+        "_passed_over": tuple[Frame, FlowMatches] | None,
+        "_steps": list[FlowMatches | None],
+        "_lost_in_a_row": int,
+        "_culled_in_a_row": int,
+        "_last_global": int,
+    }
 
     def __init__(
         self,
@@ -57,10 +72,20 @@ class Tracker:
         self._chain: FlowChain | None = None
         self._passed_over: tuple[Frame, FlowMatches] | None = None  # newest frame, no keyframe
         self._steps: list[FlowMatches | None] = []  # keyframe k to k + 1, None across a loss
+        memory_scale = config.motion_memory * self.backend.pixel_scale
+        self._motion = MotionMemory(self.grid, self.keyframes, memory_scale)
         self._relocaliser = Relocaliser(self.grid, self.keyframes, self.backend.pixel_scale)
         self._lost_in_a_row = 0
         self._culled_in_a_row = 0
         self._last_global = 0  # keyframes at the last online global BA
+
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state; the flow looks at the keyframes' images again."""
+        if state["_chain"] is not None:
+            self._chain = self.backend.flow.start_chain(frame_of(0).image)  # any: to be filled
+        super().restore_state(state, frame_of)
+        for index, frame in enumerate(self.keyframes.frames):
+            self.backend.flow.add_frame(index, frame.image)
 
     # One frame ----------------------------------------------------------------------------------
 
@@ -162,43 +187,16 @@ class Tracker:
             carried = carry_disparities(self.grid, pose @ se3_inverse(last), disparities)
             if may_cull and self._is_culled(frame, pose):
                 return False
-            self._remember_motion(matches, pose)
+            self._motion.remember(matches, pose)
         self._chain, self._passed_over = self._chain.restarted(), None
         self._steps.append(matches)
         self._add_keyframe(frame, pose, carried)
         if self.initialised:
-            self._inherit_trust(matches)
+            self._motion.inherit(matches)
             self.backend.adjust_newest(self._steps)
             self.health.append(health_of(self.backend, len(self.keyframes) - 1))
             self._adjust_everything_if_due()
         return True
-
-    @property
-    def _memory_scale(self) -> float | None:  # px
-        # Without a depth prior structure and motion are found together: neither judges the other.
-        if self.config.motion_memory <= 0 or not self.keyframes.has_prior:
-            return None
-        return self.config.motion_memory * self.backend.pixel_scale
-
-    def _remember_motion(self, matches: FlowMatches, pose: Tensor) -> None:
-        """Note which cells of the newest keyframe follow the camera to its next pose."""
-        keyframes, scale = self.keyframes, self._memory_scale
-        if scale is None:
-            return
-        keyframes.motion_trust[-1] = updated_trust(
-            self.grid,
-            matches,
-            keyframes.disparities[-1],
-            pose @ se3_inverse(keyframes.T_camera_world[-1]),
-            keyframes.motion_trust[-1],
-            scale,
-        )
-
-    def _inherit_trust(self, matches: FlowMatches) -> None:
-        """Give the newest keyframe what is remembered of the cells that flow to its own."""
-        if self._memory_scale is not None:
-            trust = self.keyframes.motion_trust
-            trust[-1] = inherited_trust(self.grid, matches, trust[-2])
 
     def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
         """Tell whether a keyframe would stand where the last one stands (at most 2 in a row)."""
@@ -259,11 +257,11 @@ class Tracker:
                 first,
                 self.keyframes.prior_disparities,
                 self.backend.robust,
-                self._memory_scale,
+                self._motion.scale,
             )
             for first in self._first_disparities()
         ]
-        if self._memory_scale is not None:  # then there is a prior and with it one hypothesis
+        if self._motion.scale is not None:  # then there is a prior and with it one hypothesis
             self.keyframes.motion_trust = chained[0][1]
         problem = self.backend.problem(range(len(self.backend.graph)), first_free=0)
         self.backend.state = best_hypothesis(problem, [state for state, _ in chained])

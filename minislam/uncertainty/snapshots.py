@@ -1,19 +1,24 @@
 """The MLP as it was at earlier moments: how the system found out what moves."""
 
+from typing import ClassVar
+
 from torch import Tensor
 from torch.func import functional_call
 
+from minislam.stateful import Stateful
 from minislam.uncertainty.mlp import UncertaintyMLP
 
 _MOST = 32  # copies kept; a copy for DINOv2 features takes 115 kB
 
 
-class MlpSnapshots:
+class MlpSnapshots(Stateful):
     """Copies of the weights of an MLP, at most 32, spread evenly over the run."""
 
-    def __init__(self) -> None:
+    STATE: ClassVar = {"_weights": dict[int, dict[str, Tensor]], "_spacing": int, "_calls": int}
+
+    def __init__(self, mlp: UncertaintyMLP | None = None) -> None:
         self._weights: dict[int, dict[str, Tensor]] = {}  # by moment, in order
-        self._mlp: UncertaintyMLP | None = None
+        self._mlp = mlp
         self._spacing, self._calls = 1, 0
 
     @property

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from minislam.stateful import FrameOf, Stateful, Tree, saved
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.grid import resample
 from minislam.uncertainty.losses import (
@@ -63,7 +64,7 @@ def uncertainty_loss(
     return cells.mean() + config.lambda_variance * regulariser
 
 
-class UncertaintyTrainer:
+class UncertaintyTrainer(Stateful):
     """Own the MLP, its Adam and its random source for a whole run."""
 
     def __init__(
@@ -81,6 +82,23 @@ class UncertaintyTrainer:
         self.optimizer = torch.optim.Adam(
             self.mlp.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
+
+    def saved_state(self) -> Tree:
+        """Return the state: weights, Adam's moments and the random source."""
+        return saved(
+            {
+                "mlp": self.mlp.state_dict(),
+                "adam": self.optimizer.state_dict()["state"],
+                "generator": self.generator,
+            }
+        )
+
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state."""
+        self.mlp.load_state_dict(state["mlp"])
+        moments = {int(number): moment for number, moment in state["adam"].items()}
+        self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
+        self.generator.set_state(state["generator"])
 
     @torch.no_grad()
     def predict(self, features: Tensor) -> Tensor:

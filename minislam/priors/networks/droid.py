@@ -6,6 +6,7 @@ so a later answer builds on the earlier ones while the geometry between them imp
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -27,6 +28,7 @@ from minislam.priors.networks.droid_network import (
     update,
 )
 from minislam.priors.networks.vit import normalise
+from minislam.stateful import FrameOf, Stateful, Tree, saved
 
 _SMALLEST_GRID = 2 ** (LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
 
@@ -59,7 +61,7 @@ class _EdgeState:
     target: Tensor  # (h, w, 2) cells
 
 
-class DroidFlow:
+class DroidFlow(Stateful):
     """Learned flow between registered keyframes, refined around a predicted reprojection."""
 
     stride = STRIDE
@@ -79,6 +81,14 @@ class DroidFlow:
         """Forget a keyframe and the edges that touch it."""
         del self._frames[keyframe_index]
         self._edges = {e: state for e, state in self._edges.items() if keyframe_index not in e}
+
+    def saved_state(self) -> Tree:
+        """Return the state: of the edges. The frames are encoded again."""
+        return {"edges": [[*edge, saved(state)] for edge, state in self._edges.items()]}
+
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state."""
+        self._edges = {(i, j): _EdgeState(**edge) for i, j, edge in state["edges"]}
 
     @torch.no_grad()
     def match(
@@ -172,8 +182,10 @@ class DroidFlow:
         return DroidChain(self, self.encode(image), None, None)
 
 
-class DroidChain:
+class DroidChain(Stateful):
     """The flow from one reference frame to the newest; a `FlowChain` that never changes."""
+
+    STATE: ClassVar = {"_reference": EncodedFrame, "_newest": EncodedFrame, "_target": Tensor}
 
     def __init__(
         self,

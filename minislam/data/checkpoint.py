@@ -1,0 +1,93 @@
+"""Checkpoint files: a tree of plain values as named arrays and one text, in a .npz file.
+
+Nothing in such a file is ever executed. `numpy.load` opens it, and the name of an array is its
+path in the tree: "slam/tracker/backend/keyframes/disparities".
+"""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.data.files import atomic_file, read_bytes
+from minislam.errors import InputError
+
+_TREE = "tree.json"  # the array that holds the text
+_ARRAY, _TENSOR = "@array", "@tensor"  # keys of what stands in the text for either
+
+
+def write_checkpoint(path: Path | str, tree: Any) -> None:
+    """Write dictionaries and lists of tensors, arrays, numbers, text and None, atomically.
+
+    A tensor that occurs twice is stored once, and is one tensor again when it is read.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    names: dict[int, str] = {}  # by identity of the tensor or array
+
+    def plain(value: Any, name: str) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(item, f"{name}/{key}") for key, item in value.items()}
+        if isinstance(value, list):
+            return [plain(item, f"{name}/{number}") for number, item in enumerate(value)]
+        if not isinstance(value, Tensor | np.ndarray):
+            return value
+        known = names.setdefault(id(value), name.removeprefix("/"))
+        if isinstance(value, np.ndarray):
+            arrays[known] = value
+            return {_ARRAY: known}
+        arrays[known] = _once(value.detach()).cpu().numpy()
+        return {_TENSOR: [known, list(value.shape), list(value.stride()), str(value.device)]}
+
+    text = json.dumps(plain(tree, "")).encode()
+    with atomic_file(path) as file:
+        np.savez(file, **{_TREE: np.frombuffer(text, np.uint8)}, **arrays)
+
+
+def read_checkpoint(path: Path | str) -> Any:
+    """Return the tree that was written, each tensor on the device it was on."""
+    content = io.BytesIO(read_bytes(path))
+    try:
+        with np.load(content, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        tree = json.loads(arrays.pop(_TREE).tobytes())
+        tensors: dict[str, Tensor] = {}
+
+        def whole(value: Any) -> Any:
+            if isinstance(value, list):
+                return [whole(item) for item in value]
+            if not isinstance(value, dict):
+                return value
+            if _ARRAY in value:
+                return arrays[value[_ARRAY]]
+            if _TENSOR not in value:
+                return {key: whole(item) for key, item in value.items()}
+            name, *layout = value[_TENSOR]
+            if name not in tensors:
+                tensors[name] = _strided(arrays[name], *layout)
+            return tensors[name]
+
+        return whole(tree)
+    except Exception as error:  # damaged bytes fail inside zipfile and numpy in many ways
+        raise InputError(
+            f"expected a checkpoint in {path}, but the file cannot be read; it is damaged or from "
+            "another program: start again with --overwrite"
+        ) from error
+
+
+def _once(tensor: Tensor) -> Tensor:
+    """Return the part of an expanded tensor that lies in memory."""
+    for dimension, stride in enumerate(tensor.stride()):
+        if stride == 0 and tensor.shape[dimension] > 1:
+            tensor = tensor.narrow(dimension, 0, 1)
+    return tensor
+
+
+def _strided(array: np.ndarray, shape: list[int], strides: list[int], device: str) -> Tensor:
+    """Return the tensor as it lay in memory: sums add up in that order, so its bytes matter."""
+    stored = torch.from_numpy(array)
+    tensor = torch.empty_strided(stored.shape, strides, dtype=stored.dtype, device=device)
+    return tensor.copy_(stored).expand(shape)
