@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from minislam.mapping.config import MappingConfig
 from minislam.splatting import GaussianMap, Rendering
@@ -32,18 +33,56 @@ def ssim_loss(
     image: Tensor,  # (H, W, 3) RGB in [0, 1], constant
 ) -> Tensor:  # (H, W) in [0, 2]
     """Return 1 - SSIM per pixel, mean over channels: a map, so that each pixel has its weight."""
-    x, y = rendered.permute(2, 0, 1), image.permute(2, 0, 1)
-    # The two that need no gradient are kept apart: a third less work in the backward pass.
-    mean_y, mean_yy = gaussian_blur(torch.stack([y, y * y]), SSIM_WINDOW, SSIM_SIGMA)
-    moving = gaussian_blur(torch.stack([x, x * x, x * y]), SSIM_WINDOW, SSIM_SIGMA)
-    mean_x, mean_xx, mean_xy = moving
-    variance_x, variance_y = mean_xx - mean_x * mean_x, mean_yy - mean_y * mean_y
-    covariance = mean_xy - mean_x * mean_y
-    numerator = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
-    denominator = (mean_x * mean_x + mean_y * mean_y + SSIM_C1) * (
-        variance_x + variance_y + SSIM_C2
-    )
-    return (1 - numerator / denominator).mean(0)
+    return _SsimLoss.apply(rendered, image)
+
+
+class _SsimLoss(torch.autograd.Function):
+    """The loss above and its backward: torch alone would keep several times as many maps."""
+
+    @staticmethod
+    def forward(ctx, rendered: Tensor, image: Tensor) -> Tensor:
+        x, y = (picture.permute(2, 0, 1).contiguous() for picture in (rendered, image))
+        moments = gaussian_blur(torch.stack([x, x * x, x * y, y, y * y]), SSIM_WINDOW, SSIM_SIGMA)
+        ssim, slopes = ssim_of_moments(*moments)
+        ctx.save_for_backward(x, y, slopes)
+        return 1 - ssim.mean(0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_loss: Tensor) -> tuple[Tensor, None]:  # (H, W) -> (H, W, 3)
+        x, y, slopes = ctx.saved_tensors
+        # The window is symmetric: a blur is its own transpose.
+        v_mean_x, v_mean_xx, v_mean_xy = gaussian_blur(
+            slopes * (v_loss / -len(x)), SSIM_WINDOW, SSIM_SIGMA
+        )
+        v_x = v_mean_x + 2 * x * v_mean_xx + y * v_mean_xy
+        return v_x.permute(1, 2, 0), None
+
+
+def ssim_of_moments(
+    mean_x: Tensor,  # (3, H, W) local means of x,
+    mean_xx: Tensor,  # x^2,
+    mean_xy: Tensor,  # x y,
+    mean_y: Tensor,  # y
+    mean_yy: Tensor,  # and y^2
+) -> tuple[Tensor, Tensor]:  # (3, H, W), (3, 3, H, W)
+    """Return the SSIM, and its derivatives by the first three means.
+
+    It is a quotient, A B / (C D), of
+
+        A = 2 m_x m_y + C1,            B = 2 (m_xy - m_x m_y) + C2,
+        C = m_x^2 + m_y^2 + C1,        D = m_xx - m_x^2 + m_yy - m_y^2 + C2,
+
+    so that dS/dm_xx = -S / D, dS/dm_xy = 2 A / (C D) and
+    dS/dm_x = 2 m_y (B - A) / (C D) - 2 m_x S (1 / C - 1 / D).
+    """
+    product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    A, B = 2 * product + SSIM_C1, 2 * (mean_xy - product) + SSIM_C2
+    C, D = squares + SSIM_C1, mean_xx + mean_yy - squares + SSIM_C2
+    inverse = 1 / (C * D)
+    ssim = A * B * inverse
+    by_mean = 2 * inverse * (mean_y * (B - A) - mean_x * ssim * (D - C))
+    return ssim, torch.stack([by_mean, -ssim / D, 2 * A * inverse])
 
 
 def color_loss(

@@ -17,6 +17,7 @@ SSIM_SIGMA = 1.5  # px
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # stabilise l and c on flat patches of images in [0, 1]
 SSIM_C3 = SSIM_C2 / 2  # the usual choice, with which l c s is the classic SSIM
 STRUCTURE_CAP = 0.98  # of c and s: one perfect factor must not hide the two others
+STRIP = 32  # px blurred by one matrix product: wider ones multiply more zeros (measured)
 
 
 def gaussian_blur(
@@ -26,24 +27,34 @@ def gaussian_blur(
 ) -> Tensor:  # (..., H, W)
     """Blur by a normalised Gaussian window, zero beyond the border: B_rows @ image @ B_columns.
 
-    As two products with banded matrices it is some twenty times faster on a CPU, gradient
-    included, than as a convolution of a few channels.
+    As products with strips of the banded matrices it is far faster on a CPU than as a
+    convolution of a few channels, and three times as fast as with the whole matrices.
     """
-    rows = _blur_matrix(images.shape[-2], size, sigma, images.dtype, images.device)
-    columns = _blur_matrix(images.shape[-1], size, sigma, images.dtype, images.device)
-    return rows @ (images @ columns)
+    height, width = images.shape[-2:]
+    kind = size, sigma, images.dtype, images.device
+    wide = torch.cat([images[..., seen] @ B for seen, B in _blur_strips(width, *kind)], -1)
+    return torch.cat([B.T @ wide[..., seen, :] for seen, B in _blur_strips(height, *kind)], -2)
 
 
 @lru_cache(maxsize=16)
-def _blur_matrix(
+def _blur_strips(
     length: int, size: int, sigma: float, dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    """Return the symmetric matrix (length, length) that blurs a row of pixels, made once."""
+) -> list[tuple[slice, Tensor]]:
+    """Return the matrix that blurs a row of pixels, made once, as strips of its columns.
+
+    Each strip comes with the pixels that it sees; the rows of all others would be zero.
+    """
     position = torch.arange(length, dtype=dtype, device=device)
-    window = torch.arange(size, dtype=dtype, device=device) - size // 2
+    reach = size // 2
+    window = torch.arange(size, dtype=dtype, device=device) - reach
     total = torch.exp(-0.5 * (window / sigma) ** 2).sum()
-    distance = (position[:, None] - position[None, :]).abs()
-    return torch.exp(-0.5 * (distance / sigma) ** 2) * (distance <= size // 2) / total
+    strips = []
+    for first in range(0, length, STRIP):
+        seen = slice(max(first - reach, 0), first + STRIP + reach)
+        distance = (position[seen, None] - position[None, first : first + STRIP]).abs()
+        blur = torch.exp(-0.5 * (distance / sigma) ** 2) * (distance <= reach) / total
+        strips.append((seen, blur))
+    return strips
 
 
 def ssim_components(
@@ -128,16 +139,18 @@ def variance_regulariser(
     Each cell is compared with its most similar cells, itself included, of cosine > 0.75.
     """
     unit = functional.normalize(features.detach(), dim=-1)
-    similarity = unit @ unit.T
-    count = min(config.neighbours, len(beta_raw))
-    cosine, index = similarity.topk(count, dim=-1)
-    alike = (cosine > config.similarity).to(beta_raw)
+    cosine = unit @ unit.T
     # A cell is always alike to itself, even when its feature vector is zero.
-    alike[:, 0] = 1
-    neighbour_beta = beta_raw[index]
+    cosine.fill_diagonal_(1)
+    alike = cosine > config.similarity
+    crowded = alike.sum(-1) > config.neighbours
+    if crowded.any():
+        most_alike = cosine[crowded].topk(config.neighbours, dim=-1).values
+        alike[crowded] &= cosine[crowded] >= most_alike[:, -1:]
+    alike = alike.to(beta_raw)
     number = alike.sum(-1)
-    mean = (alike * neighbour_beta).sum(-1) / number
-    variance = (alike * (neighbour_beta - mean[:, None]) ** 2).sum(-1) / number
+    mean = alike @ beta_raw / number
+    variance = (alike * (beta_raw - mean[:, None]) ** 2).sum(-1) / number
     return variance.mean()
 
 

@@ -116,6 +116,28 @@ def test_color_loss_gradient_agrees_with_finite_differences():
     assert_gradients_close(leaf.grad, expected, relative=1e-6)
 
 
+def test_ssim_gradient_agrees_with_autograd_through_its_definition():
+    image, rendered = random_image(22, 40, 37), random_image(23, 40, 37)  # wider than a strip
+    weight = random_image(24, 40, 37)[..., 0]
+    leaf, twin = (rendered.clone().requires_grad_() for _ in range(2))
+    loss = ssim_loss(leaf, image)
+    (weight * loss).sum().backward()
+
+    def local_mean(channels: torch.Tensor) -> torch.Tensor:
+        window = torch.exp(-0.5 * (torch.arange(-5, 6, dtype=torch.float64) / 1.5) ** 2)
+        window = window[:, None] * window / window.sum() ** 2
+        return torch.nn.functional.conv2d(channels[:, None], window[None, None], padding=5)[:, 0]
+
+    x, y = twin.permute(2, 0, 1), image.permute(2, 0, 1)
+    m_x, m_y, m_xx, m_xy, m_yy = (local_mean(c) for c in (x, y, x * x, x * y, y * y))
+    above = (2 * m_x * m_y + 1e-4) * (2 * (m_xy - m_x * m_y) + 9e-4)
+    below = (m_x**2 + m_y**2 + 1e-4) * (m_xx - m_x**2 + m_yy - m_y**2 + 9e-4)
+    expected = (1 - above / below).mean(0)
+    (weight * expected).sum().backward()
+    torch.testing.assert_close(loss, expected)
+    assert_gradients_close(leaf.grad, twin.grad, relative=1e-9)
+
+
 def test_isotropic_gradient_agrees_with_finite_differences():
     scales = random_image(12, 4, 1)[:, 0]
     leaf = scales.clone().requires_grad_()
