@@ -26,11 +26,12 @@ from minislam.cli_options import (
     input_options,
     lpips_of,
     prior_choice,
+    resumed_settings,
     settings,
 )
 from minislam.cli_priors import add_priors_parser
 from minislam.cli_progress import ProgressLine, StopRequest
-from minislam.errors import MinislamError
+from minislam.errors import InputError, MinislamError
 
 if TYPE_CHECKING:
     from minislam.data import InputOptions
@@ -81,7 +82,9 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     demo.add_argument("-o", "--output", default="output/demo", help="run folder, output/demo")
-    demo.set_defaults(run=_demo, sequence=DEMO_SEQUENCE, overwrite=True, depth="simulated")
+    demo.set_defaults(
+        run=_demo, sequence=DEMO_SEQUENCE, overwrite=True, resume=False, depth="simulated"
+    )
 
     run = commands.add_parser(
         "run",
@@ -90,7 +93,11 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         allow_abbrev=False,  # half a setting's name might be another setting tomorrow
     )
     run.add_argument("-o", "--output", help="run folder, default output/NAME_TIME")
-    run.add_argument("--overwrite", action="store_true", help="replace an earlier run")
+    earlier = run.add_mutually_exclusive_group()
+    earlier.add_argument("--overwrite", action="store_true", help="replace an earlier run")
+    earlier.add_argument(
+        "--resume", action="store_true", help="go on with the interrupted run in OUTPUT"
+    )
     add_input(run)
     add_priors(run, default_depth="simulated for synth:, else none")
     add_flow(run)
@@ -127,7 +134,11 @@ def _run_until(
     from minislam.data import RunFolder, open_sequence
     from minislam.run import choose_priors, run_sequence
 
-    config = settings(args)
+    if args.resume and output is None:
+        raise InputError(
+            "expected --output FOLDER with --resume, found none; give that of the interrupted run"
+        )
+    config = resumed_settings(args, output) if args.resume else settings(args)
     progress = ProgressLine()
 
     def report(stage: str, done: int, of_all: int) -> None:
@@ -145,8 +156,8 @@ def _run_until(
         print(f"WARNING: {warning}", file=sys.stderr)
     # First what may be wrong: it must not cost an earlier run its files.
     priors, lpips = choose_priors(choice, sequence, config), lpips_of(args, sequence.camera)
-    folder = RunFolder.create(output, args.overwrite)
-    outcome = run_sequence(sequence, config, choice, priors, folder, report, lpips)
+    folder = RunFolder(output) if args.resume else RunFolder.create(output, args.overwrite)
+    outcome = run_sequence(sequence, config, choice, priors, folder, report, lpips, args.resume)
     print(f"{outcome.state}:")
     for name, value in outcome.metrics.items():
         print(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
@@ -154,6 +165,8 @@ def _run_until(
         if warning not in sequence.warnings:
             print(f"WARNING: {warning}", file=sys.stderr)
     print(f"results in {folder.path}; open {folder.path}/report.html")
+    if outcome.state == "interrupted":
+        print(f"to go on, repeat the command with -o {folder.path} --resume")
     return outcome.exit_code
 
 

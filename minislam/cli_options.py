@@ -80,7 +80,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     """Add presets, and every constant of the system under its name. This needs torch."""
     from minislam.config import PRESETS, SlamConfig, meanings_of, settings_of
 
-    parser.add_argument("--preset", default="laptop", help=f"{', '.join(PRESETS)}; laptop")
+    parser.add_argument("--preset", help=f"{', '.join(PRESETS)}; laptop")
     parser.add_argument("--config", help="JSON file of settings, like config.json of a run")
     parser.add_argument("--seed", type=int, help="of every random draw, 0")
     parser.add_argument(
@@ -138,12 +138,15 @@ def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
     return lpips
 
 
-def settings(args: argparse.Namespace) -> SlamConfig:
-    """Return the configuration: preset, then file, then single settings, each over the last."""
+def settings(args: argparse.Namespace, then: SlamConfig | None = None) -> SlamConfig:
+    """Return the configuration: preset, then file, then single settings, each over the last.
+
+    Of a run that goes on, `then` is its configuration: in the place of a preset that is not given.
+    """
     from minislam.config import flattened, preset, with_settings
     from minislam.data.files import read_json
 
-    config = preset(args.preset)
+    config = then if then and args.preset is None else preset(args.preset or "laptop")
     if args.config:
         config = with_settings(config, flattened(read_json(args.config)))
     given = {
@@ -156,3 +159,20 @@ def settings(args: argparse.Namespace) -> SlamConfig:
     if args.no_uncertainty:
         given["uncertainty.enabled"] = False
     return with_settings(config, given)
+
+
+def resumed_settings(args: argparse.Namespace, output: str) -> SlamConfig:
+    """Return the configuration of an interrupted run, which the options must not contradict."""
+    from minislam.config import from_json, settings_of
+    from minislam.data import RunFolder
+    from minislam.errors import InputError
+
+    then = from_json(RunFolder(output).read_config())
+    now = settings_of(settings(args, then))
+    for name, value in settings_of(then).items():
+        if now[name] != value:
+            raise InputError(
+                f"expected {name} = {value} like the interrupted run in {output}, found "
+                f"{now[name]}; leave the settings out, or start anew in another folder"
+            )
+    return then

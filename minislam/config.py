@@ -23,6 +23,9 @@ class SlamConfig:
     """The whole configuration. Names with dots reach every part: `tracking.window`."""
 
     seed: int = parameter(0, "of every random draw: same seed, same bytes")
+    checkpoint_share: float = parameter(
+        0.01, "of a run's time, how much writing checkpoints may take [-]; 0 writes none"
+    )
     threads: int = parameter(1, "of torch; more are slower on a busy machine")
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)

@@ -2,7 +2,6 @@
 
 import resource
 import sys
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,9 @@ from minislam.mapping.views import surface_depth
 from minislam.priors.choice import FILES, PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
-from minislam.slam import Priors, Report, Slam
+from minislam.resume import Checkpoints
+from minislam.slam import Priors, Slam
+from minislam.steps import Report
 from minislam.uncertainty.grid import resample
 from minislam.viz import (
     ate_over_time,
@@ -79,43 +80,51 @@ def run_sequence(
     choice: PriorChoice,
     priors: Priors,  # as chosen
     folder: RunFolder,
-    report: Report | None = None,
+    report: Report,
     lpips: Lpips | None = None,
+    resume: bool = False,
 ) -> RunOutcome:
-    """Run SLAM on a sequence and write the run folder, also when it is interrupted."""
+    """Run SLAM on a sequence and write the run folder, also when it is interrupted.
+
+    With `resume`, an interrupted run goes on from the checkpoint in its folder.
+    """
     torch.set_num_threads(config.threads)
-    start = time.perf_counter()
+    checkpoints = Checkpoints(folder, sequence, config, choice)
+    slam = Slam(sequence, config, priors, report, checkpoints.keep)
+    if resume:
+        checkpoints.restore(slam)
     folder.write_config(as_json(config))
-    slam = Slam(sequence, config, priors, report)
     interrupted = False
     try:
         slam.run()
     except KeyboardInterrupt:
         interrupted = True
         if not slam.mapper.keyframes:  # there is nothing to save yet
-            folder.write_run(_facts(slam, choice, start, "interrupted", INTERRUPTED_EXIT))
+            folder.write_run(_facts(slam, choice, checkpoints, "interrupted", INTERRUPTED_EXIT))
             raise
     except MinislamError as error:
-        folder.write_run(_facts(slam, choice, start, f"failed: {error}", FAILED_EXIT))
+        folder.write_run(_facts(slam, choice, checkpoints, f"failed: {error}", FAILED_EXIT))
         raise
-    seconds = time.perf_counter() - start
+    seconds = checkpoints.run_seconds
     lost = slam.lost_frames()
     state = "finished, partly lost" if lost else "finished"
     exit_code = LOST_EXIT if lost else 0
     if interrupted:
         state, exit_code = "interrupted", INTERRUPTED_EXIT
-    facts = _facts(slam, choice, start, state, exit_code)
+    facts = _facts(slam, choice, checkpoints, state, exit_code)
     _write_estimates(folder, slam)
     metrics = _measure(slam, seconds, lpips)
     folder.write_metrics(metrics)
     outcome = RunOutcome(metrics, facts["warnings"], exit_code, state)
     _write_pictures(folder, slam, outcome)
     folder.write_run(facts)
+    if not interrupted:
+        folder.remove_checkpoint()
     return outcome
 
 
 def _facts(
-    slam: Slam, choice: PriorChoice, start: float, state: str, exit_code: int
+    slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int
 ) -> dict[str, Any]:
     """Return what run.json says: how the run was asked for, how long it took, how it ended."""
     return {
@@ -126,8 +135,9 @@ def _facts(
         "seed": slam.config.seed,
         "state": state,
         "exit_code": exit_code,
-        "warnings": _warnings(slam),
-        "seconds": {"total": time.perf_counter() - start, **slam.seconds},
+        "warnings": _warnings(slam) + ([checkpoints.problem] if checkpoints.problem else []),
+        "seconds": {"total": checkpoints.run_seconds, **slam.steps.seconds},
+        "checkpoint_seconds": checkpoints.seconds,
         "frames": len(slam.tracker.tracked),
         "keyframes": len(slam.tracker.keyframes),
         "lost_frames": len(slam.lost_frames()),

@@ -9,21 +9,22 @@ The two arrows that go back are two calls: the tracker asks `_static_weight` for
 learnt of each cell, and `_move_map` carries the map along when an adjustment moves keyframes.
 """
 
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.config import SlamConfig
-from minislam.errors import InputError, TrackingLost
+from minislam.errors import InputError, MinislamError, TrackingLost
 from minislam.geometry import se3_inverse
 from minislam.mapping import Mapper
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
+from minislam.stateful import Stateful
+from minislam.steps import Report, Steps
 from minislam.tracking.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
@@ -35,7 +36,7 @@ from minislam.uncertainty import (
     tracking_weight,
 )
 
-Report = Callable[[str, int, int], None]  # stage, done, of all
+Keep = Callable[["Slam", bool], None]  # a checkpoint; True: at all events, not if it is time
 
 
 @dataclass(frozen=True)
@@ -47,15 +48,24 @@ class Priors:
     depth: DepthPrior
 
 
-class Slam:
+class Slam(Stateful):
     """Monocular SLAM in a scene with moving things. Its parts can be read at any time."""
 
+    STATE: ClassVar = {
+        "tracker": Tracker, "mapper": Mapper, "snapshots": MlpSnapshots, "steps": Steps,
+        "focal_length": FocalLengthFit | None, "_poses": dict[int, Tensor],
+    }  # fmt: skip
+
     def __init__(
-        self, sequence: Sequence, config: SlamConfig, priors: Priors, report: Report | None = None
+        self,
+        sequence: Sequence,
+        config: SlamConfig,
+        priors: Priors,
+        report: Report = lambda stage, done, of_all: None,
+        keep: Keep = lambda slam, at_all_events: None,
     ) -> None:
         self.sequence, self.config = sequence, config
-        self.seconds: dict[str, float] = {}  # spent per stage
-        self.snapshots = MlpSnapshots()  # by frame index
+        self.steps = Steps(report, lambda at_all_events: keep(self, at_all_events))
         self.focal_length: FocalLengthFit | None = None  # which one the flow wants, at the end
         self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
         self.mapper = Mapper(
@@ -65,6 +75,7 @@ class Slam:
             priors.features.dimension,
             config.seed,
         )
+        self.snapshots = MlpSnapshots(self.mapper.mlp)  # by frame index
         tracking = config.tracking
         if config.uncertainty.given_masks:  # they stand on no map, so they need no depth prior
             tracking = replace(tracking, beta_without_prior=True)
@@ -77,57 +88,74 @@ class Slam:
             self._static_weight,
         )
         self._stride = priors.flow.stride
-        self._report = report or (lambda stage, done, of_all: None)
         self._poses: dict[int, Tensor] = {}  # T_camera_world of every frame, once known
 
     def run(self) -> None:
-        """Process the sequence from the first frame to the final map."""
+        """Process the sequence to the final map, from its start or from a restored state."""
         warmup = self.config.tracking.warmup_keyframes
-        for done, frame in enumerate(self.sequence):
-            with self._timed("tracking"):
+        for frame in self._frames_left():
+            with self.steps.timed("tracking"):
                 is_keyframe = self.tracker.track(frame)
             if is_keyframe and self.tracker.initialised:
                 self._map_new_keyframes()
             elif is_keyframe and len(self.tracker.keyframes) >= warmup:
                 self._initialise()
-            self._report("tracking and mapping", done + 1, len(self.sequence))
+            self.steps.finish("tracking and mapping", frame.frame_index + 1, len(self.sequence))
         if not self.tracker.initialised:
             self._initialise()
 
-        with self._timed("final adjustment"):
-            self.tracker.finish(self._progress("final adjustment"))
-            self.focal_length = check_focal_length(self.tracker.backend)
-        with self._timed("refinement"):
-            self._move_map(first_changed=0)
-            iterations = self.config.mapping.refine_iterations
-            self.mapper.refine(iterations, self._progress("refining the map"))
-            self.snapshots.record(len(self.sequence) - 1, self.mapper.mlp)
-        with self._timed("all frames"):
-            progress = self._progress("posing all frames")
-            self._poses = pose_all_frames(self.tracker, self.sequence, progress)
+        self.steps.once("final adjustment", self._adjust_all)
+        self.steps.once("refinement", self._refine_map)
+        self.steps.once("all frames", self._pose_all_frames)
         if self.config.mapping.pose_refinement.enabled:
-            with self._timed("photometric refinement"):
-                self._refine_other_poses(self._progress("refining the poses"))
+            self.steps.once("photometric refinement", self._refine_other_poses)
+
+    def _frames_left(self) -> Iterator[Frame]:
+        """Walk through the frames to come. One that cannot be read costs none before it."""
+        for index in range(self.steps.done("tracking and mapping"), len(self.sequence)):
+            try:
+                frame = self.sequence.frame(index)
+            except MinislamError:
+                self.steps.keep(True)
+                raise
+            yield frame
 
     def _initialise(self) -> None:
         """Start in two stages (paper Sec. 3.3): without beta, then with what it has learnt."""
-        with self._timed("initialisation"):
+        with self.steps.timed("initialisation"):
             self.tracker.initialise()
-        with self._timed("mapping"):
+        with self.steps.timed("mapping"):
             everyone = range(len(self.tracker.keyframes))
-            progress = self._progress("first map")
+            progress = self.steps.progress("first map")
             self.mapper.initialise([self._keyframe(index) for index in everyone], progress)
             self._record_mlp()
-        with self._timed("initialisation"):
+        with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
 
     def _map_new_keyframes(self) -> None:
-        with self._timed("mapping"):
+        with self.steps.timed("mapping"):
             mapped = len(self.mapper.keyframes)
             self._move_map(first_changed=min(mapped, self.tracker.backend.take_first_moved()))
             for index in range(mapped, len(self.tracker.keyframes)):
                 self.mapper.integrate(self._keyframe(index))
             self._record_mlp()
+
+    def _adjust_all(self) -> None:
+        self.tracker.finish(self.steps.progress("final adjustment"))
+        self.focal_length = check_focal_length(self.tracker.backend)
+
+    def _refine_map(self) -> None:
+        stage = "refining the map"
+        done = self.steps.done(stage)
+        if done == 0:
+            self._move_map(first_changed=0)
+        iterations = self.config.mapping.refine_iterations
+        self.mapper.refine(iterations, self.steps.finishing(stage), done)
+        self.snapshots.record(len(self.sequence) - 1, self.mapper.mlp)
+
+    def _pose_all_frames(self) -> None:
+        progress = self.steps.progress("posing all frames")
+        self._poses = pose_all_frames(self.tracker, self.sequence, progress)
 
     def _record_mlp(self) -> None:
         self.snapshots.record(self.tracker.keyframes.frames[-1].frame_index, self.mapper.mlp)
@@ -141,16 +169,16 @@ class Slam:
             depths += [self._depth(index) for index in range(first_changed, mapped)]
         self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped], depths)
 
-    def _refine_other_poses(self, progress: Callable[[int, int], None]) -> None:
+    def _refine_other_poses(self) -> None:
         """Refine the frames between the keyframes: the map from there must look like them."""
+        stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
         others = [index for index in self._poses if index not in keyframes]
-        for done, index in enumerate(others):
-            frame = self.sequence.frame(index)
-            beta = self._beta(frame, None)
-            pose = self.mapper.refine_pose(self._poses[index], frame.image, beta)
-            self._poses[index] = pose
-            progress(done + 1, len(others))
+        for done in range(self.steps.done(stage), len(others)):
+            frame = self.sequence.frame(others[done])
+            pose, beta = self._poses[frame.frame_index], self._beta(frame, None)
+            self._poses[frame.frame_index] = self.mapper.refine_pose(pose, frame.image, beta)
+            self.steps.finish(stage, done + 1, len(others))
 
     def _static_weight(self, index: int) -> Tensor:
         """Return how far each cell of a keyframe (h, w) can be trusted, in (0, 1]."""
@@ -235,17 +263,6 @@ class Slam:
             for t in self.tracker.tracked
             if not t.status.is_followed
         ]
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-    def _progress(self, stage: str) -> Callable[[int, int], None]:
-        return lambda done, of_all: self._report(stage, done, of_all)
 
 
 def _trajectory(timestamps: list[float], T_camera_world: list[Tensor]) -> Trajectory:

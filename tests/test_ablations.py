@@ -80,7 +80,7 @@ def test_every_preset_runs_to_the_end(sequence: Sequence, name: str):
     slam = finished(sequence, with_settings(preset(name), SHORT))
     assert_whole(slam)
     refined = slam.config.mapping.pose_refinement.enabled
-    assert ("photometric refinement" in slam.seconds) == refined == (name != "paper-fast")
+    assert ("photometric refinement" in slam.steps.seconds) == refined == (name != "paper-fast")
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS)
@@ -96,7 +96,7 @@ def test_every_ablation_runs_to_the_end_and_changes_the_result(
 
 
 def test_the_time_of_every_stage_is_told(usual: Slam):
-    assert list(usual.seconds) == [
+    assert list(usual.steps.seconds) == [
         "tracking", "initialisation", "mapping", "final adjustment", "refinement", "all frames",
         "photometric refinement",
     ]  # fmt: skip
