@@ -17,7 +17,8 @@ from minislam.cli import main
 from minislam.cli_progress import ProgressLine, StopRequest
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (20, 27, 3)).astype(np.uint8)
-RUN_FILES = {"checkpoint.npz", "config.json", "keyframes", "plots", "run.json"}  # that a failed run may leave
+# What a failed run may leave.
+RUN_FILES = {"checkpoint.npz", "config.json", "keyframes", "plots", "run.json"}
 
 
 def texture(shift: int) -> np.ndarray:

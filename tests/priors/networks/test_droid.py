@@ -136,6 +136,23 @@ def test_a_chain_never_changes_and_restarts_at_its_newest_image():
     assert torch.equal(from_newest.targets, fresh.targets)
 
 
+@torch.inference_mode()
+def test_flow_and_chain_go_on_from_a_saved_state():
+    flow, frames = flow_with_frames(), [Frame(k, 0.1 * k, image(k)) for k in range(3)]
+    flow.match([0, 1], [1, 2], still(2))
+    chain, _ = flow.start_chain(image(0)).advanced(image(1))
+    other = flow_with_frames()
+    other.restore_state(flow.saved_state(), frames.__getitem__)
+    resumed = other.start_chain(image(2))
+    resumed.restore_state(chain.saved_state(), frames.__getitem__)
+    expected, found = (f.match([1], [2], still()) for f in (flow, other))
+    assert torch.equal(found.targets, expected.targets)
+    (_, expected), (_, found) = (c.advanced(image(2)) for c in (chain, resumed))
+    assert torch.equal(found.targets, expected.targets)
+    afresh = flow_with_frames().match([1], [2], still())
+    assert not torch.equal(afresh.targets, flow.match([1], [2], still()).targets)
+
+
 def test_matches_are_ordinary_tensors_of_the_callers_kind():
     matches = flow_with_frames(updates=1).match([0], [1], still().double())
     assert not matches.targets.requires_grad

@@ -1,0 +1,320 @@
+"""A run that was interrupted anywhere goes on to the files of one that was not, byte by byte."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import minislam
+from minislam import resume
+from minislam.cli import main
+from minislam.cli_progress import ProgressLine
+from minislam.config import preset, with_settings
+from minislam.data import InputOptions, RunFolder, open_sequence
+from minislam.data.checkpoint import read_checkpoint, write_checkpoint
+from minislam.errors import InputError
+from minislam.priors.choice import PriorChoice
+
+FRAMES = 16
+INPUT = ["--stride", "3", "--max-frames", str(FRAMES), "--size", "96x72"]
+SETTINGS = [
+    "--preset", "test", "--mapping.init_iterations", "20", "--mapping.keyframe_iterations", "5",
+    "--mapping.refine_iterations", "20",
+]  # fmt: skip
+SAME = ("trajectory.txt", "keyframe_trajectory.txt", "lost_frames.txt", "map.ply", "config.json")
+OF_TIME = ("seconds_total", "frames_per_second", "peak_memory_mb")  # the only other differences
+TRACKING = "tracking and mapping"  # initialised at frame 8
+
+
+class PowerCut(BaseException):
+    """Nothing is written any more."""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory):
+    """Return where the runs go; the frames are rendered once, into a cache beside them."""
+    root = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINISLAM_CACHE", str(root / "cache"))
+        yield root
+
+
+def run(source: object, out: Path, *more: str, inputs: list[str] = INPUT) -> int:
+    return main(["run", str(source), *inputs, *SETTINGS, "-o", str(out), *more])
+
+
+def run_until(event: BaseException, stage: str, step: int, source: object, out: Path, *more: str):
+    """Run until a step of a stage has been reported, and then meet with an event."""
+    usual = ProgressLine.show
+
+    def show(line: ProgressLine, name: str, done: int, of_all: int) -> None:
+        usual(line, name, done, of_all)
+        if (name, done) == (stage, step):
+            raise event
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ProgressLine, "show", show)
+        return run(source, out, *more)
+
+
+@pytest.fixture(scope="module")
+def whole(root: Path) -> Path:
+    assert run("synth:person", root / "whole") == 0
+    return root / "whole"
+
+
+def assert_same_results(whole: Path, out: Path, names: tuple[str, ...] = SAME) -> None:
+    for name in names:
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    runs = [RunFolder(path) for path in (whole, out)]
+    expected, found = (folder.read_metrics() for folder in runs)
+    assert [name for name in expected if expected[name] != found[name]] == list(OF_TIME)
+    expected, found = (folder.read_mlp() for folder in runs)
+    assert all(bool((expected[name] == found[name]).all()) for name in expected)
+    expected, found = (folder.read_run() for folder in runs)
+    assert found["health"] == expected["health"] and found["state"] == expected["state"]
+    assert list(found["seconds"]) == list(expected["seconds"])
+    pictures = sorted(path.name for path in (whole / "keyframes").iterdir())
+    assert sorted(path.name for path in (out / "keyframes").iterdir()) == pictures
+
+
+# The same bytes
+
+
+def test_a_run_interrupted_in_every_stage_goes_on_to_the_same_bytes(whole: Path, root: Path):
+    out, again = root / "often", []
+    for stage, step in [
+        (TRACKING, 2),
+        (TRACKING, 11),
+        (TRACKING, FRAMES),
+        ("refining the map", 7),
+        ("refining the poses", 2),
+    ]:
+        assert run_until(KeyboardInterrupt(), stage, step, "synth:person", out, *again) == 130
+        assert RunFolder(out).read_run()["state"] == "interrupted"
+        again = ["--resume"]
+    before = RunFolder(out).read_run()["seconds"]
+    assert run("synth:person", out, "--resume") == 0
+    assert_same_results(whole, out)
+    after = RunFolder(out).read_run()["seconds"]
+    assert after["tracking"] == before["tracking"] and after["total"] > sum(before.values()) / 2
+
+
+@pytest.mark.parametrize("step", [5, 10])
+def test_after_a_power_cut_the_last_checkpoint_serves(step: int, whole: Path, root: Path):
+    out = root / f"cut{step}"
+    often = ("--checkpoint_share", "1e9")  # one after every step
+    with pytest.raises(PowerCut):
+        run_until(PowerCut(), TRACKING, step, "synth:person", out, *often)
+    assert not (out / "run.json").exists()
+    state = RunFolder(out).read_checkpoint()["slam"]
+    assert state["steps"]["_done"] == {TRACKING: step - 1}
+    assert run("synth:person", out, "--resume", *often) == 0
+    assert_same_results(whole, out, SAME[:-1])
+
+
+@pytest.fixture(scope="module")
+def photos(whole: Path, root: Path) -> Path:
+    """Return a folder of photos, about which nothing else is known."""
+    found = sorted((root / "cache").rglob("rgb/*.png"))[: 3 * FRAMES : 3]
+    (root / "photos").mkdir()
+    for number, path in enumerate(found):
+        shutil.copy(path, root / "photos" / f"{number:02d}.png")
+    return root / "photos"
+
+
+def test_without_a_depth_prior_after_a_damaged_image_was_replaced(photos: Path, root: Path, capsys):
+    inputs = ["--fx", "80"]
+    assert run(photos, root / "photos_whole", inputs=inputs) == 0
+    content = (photos / "12.png").read_bytes()
+    (photos / "12.png").write_bytes(content[:300])
+    assert run(photos, root / "photos_broken", inputs=inputs) == 1
+    assert "12.png (300 bytes) is damaged" in capsys.readouterr().err
+    (photos / "12.png").write_bytes(content)
+    state = RunFolder(root / "photos_broken").read_checkpoint()["slam"]
+    assert state["steps"]["_done"] == {TRACKING: 12}
+    assert run(photos, root / "photos_broken", "--resume", inputs=inputs) == 0
+    assert_same_results(root / "photos_whole", root / "photos_broken")
+
+
+def test_settings_come_from_the_folder(whole: Path, root: Path):
+    out = root / "short"
+    assert run_until(KeyboardInterrupt(), TRACKING, 3, "synth:person", out) == 130
+    assert main(["run", "synth:person", *INPUT, "-o", str(out), "--resume"]) == 0
+    assert_same_results(whole, out)
+
+
+def test_a_finished_run_keeps_no_checkpoint(whole: Path, capsys):
+    assert not (whole / "checkpoint.npz").exists()
+    assert run("synth:person", whole, "--resume") == 1
+    assert "expected checkpoint.npz of an interrupted run" in capsys.readouterr().err
+
+
+# What is refused, and costs nothing
+
+
+@pytest.fixture(scope="module")
+def interrupted(whole: Path, root: Path) -> Path:
+    out = root / "interrupted"
+    assert run_until(KeyboardInterrupt(), TRACKING, 2, "synth:person", out) == 130
+    return out
+
+
+REFUSALS = [
+    (
+        ["--stride", "2", "--max-frames", "24", *INPUT[4:]],  # the same frames are rendered
+        "expected sequence.description = .*16 of 48.* found .*24 of 48",
+    ),
+    ([*INPUT, "--fx", "99"], "expected sequence.description = .* found .*given"),
+    ([*INPUT, "--depth", "none"], "expected priors.depth = simulated .* found none"),
+    ([*INPUT, "--tracking.window", "3"], "expected tracking.window = 10 .* found 3; leave"),
+    ([*INPUT, "--seed", "7"], "expected seed = 0 .* found 7"),
+    ([*INPUT, "--preset", "laptop"], "expected tracking.warmup_keyframes = 6 .* found 12"),
+    ([*INPUT, "--no-uncertainty"], "expected uncertainty.enabled = True .* found False"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), REFUSALS, ids=[words for _, words in REFUSALS])
+def test_another_run_is_refused(arguments: list[str], words: str, interrupted: Path, capsys):
+    before = contents(interrupted)
+    assert main(["run", "synth:person", *arguments, "-o", str(interrupted), "--resume"]) == 1
+    assert_one_sentence(words, capsys)
+    assert contents(interrupted) == before
+
+
+def truncate(folder: Path) -> None:
+    content = (folder / "checkpoint.npz").read_bytes()
+    (folder / "checkpoint.npz").write_bytes(content[: len(content) // 2])
+
+
+def grow_older(folder: Path) -> None:
+    tree = read_checkpoint(folder / "checkpoint.npz")
+    write_checkpoint(folder / "checkpoint.npz", tree | {"version": "0.0"})
+
+
+def change_an_image(folder: Path) -> None:
+    tree = read_checkpoint(folder / "checkpoint.npz")
+    tree["sequence"]["first_image"] += 1
+    write_checkpoint(folder / "checkpoint.npz", tree)
+
+
+def change_the_settings(folder: Path) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    config["tracking"]["window"] = 4
+    (folder / "config.json").write_text(json.dumps(config))
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (truncate, "expected a checkpoint in .*checkpoint.npz, but the file cannot be read"),
+        (grow_older, f"expected version = 0.0 .* found {minislam.__version__}"),
+        (change_an_image, r"expected sequence.first_image = \d+ like"),
+        (change_the_settings, "expected settings.tracking.window = 10 like .* found 4"),
+        (
+            lambda folder: (folder / "checkpoint.npz").unlink(),
+            "expected checkpoint.npz of an inter",
+        ),
+        (
+            lambda folder: (folder / "config.json").unlink(),
+            "expected a readable file .*config.json",
+        ),
+        (shutil.rmtree, "expected a run folder, but .* does not exist"),
+    ],
+)
+def test_a_harmed_folder_is_refused(
+    harm: Callable[[Path], None], words: str, interrupted: Path, tmp_path: Path, capsys
+):
+    out = shutil.copytree(interrupted, tmp_path / "out")
+    harm(out)
+    before = contents(out)
+    assert main(["run", "synth:person", *INPUT, "-o", str(out), "--resume"]) == 1
+    assert_one_sentence(words, capsys)
+    assert contents(out) == before
+
+
+def test_a_folder_must_be_named_and_resume_is_no_overwrite(interrupted: Path, capsys):
+    assert main(["run", "synth:person", *INPUT, "--resume"]) == 1
+    assert_one_sentence("expected --output FOLDER with --resume, found none", capsys)
+    with pytest.raises(SystemExit) as ended:
+        run("synth:person", interrupted, "--resume", "--overwrite")
+    assert ended.value.code == 2 and "not allowed with" in capsys.readouterr().err
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def assert_one_sentence(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("minislam:")]
+    assert len(said) == 1 and re.search(words, said[0]), said
+
+
+# How often
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    clock = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(resume, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    return clock
+
+
+class Folder:
+    """Stands for a run folder on a disk that takes two seconds, or is full."""
+
+    path, is_full, written = Path("out"), False, 0
+
+    def __init__(self, clock: SimpleNamespace) -> None:
+        self.clock = clock
+
+    def write_checkpoint(self, tree: dict[str, object]) -> None:
+        self.clock.now += 2
+        if self.is_full:
+            raise InputError("expected to be able to write, but the disk is full")
+        self.written += 1
+
+
+def checkpoints(folder: Folder, share: str) -> resume.Checkpoints:
+    config = with_settings(preset("test"), {"checkpoint_share": share})
+    sequence = open_sequence(
+        "synth:person", InputOptions(stride=3, max_frames=FRAMES, size=(96, 72))
+    )
+    return resume.Checkpoints(folder, sequence, config, PriorChoice())
+
+
+SLAM = SimpleNamespace(saved_state=dict)
+
+
+def test_checkpoints_take_no_larger_share_of_the_time(whole: Path, clock: SimpleNamespace):
+    folder = Folder(clock)
+    kept = checkpoints(folder, "0.01")
+    for _ in range(1000):
+        clock.now += 1
+        kept.keep(SLAM, False)
+    assert folder.written == 5 and kept.seconds == 10  # at 1, 201, 401, ... seconds
+    kept.keep(SLAM, True)
+    assert folder.written == 6
+
+
+def test_a_share_of_zero_writes_none(whole: Path, clock: SimpleNamespace):
+    folder = Folder(clock)
+    kept = checkpoints(folder, "0")
+    kept.keep(SLAM, False)
+    kept.keep(SLAM, True)
+    assert folder.written == 0
+
+
+def test_a_full_disk_ends_no_run(whole: Path, clock: SimpleNamespace):
+    folder = Folder(clock)
+    kept = checkpoints(folder, "0.01")
+    folder.is_full = True
+    kept.keep(SLAM, True)
+    assert "the last checkpoint is older" in kept.problem and "the disk is full" in kept.problem
+    folder.is_full = False
+    kept.keep(SLAM, True)
+    assert kept.problem is None
