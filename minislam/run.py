@@ -23,7 +23,7 @@ from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
 from minislam.resume import Checkpoints
 from minislam.slam import Priors, Slam
-from minislam.steps import Report
+from minislam.steps import Report, silent
 from minislam.uncertainty.grid import resample
 from minislam.viz import (
     ate_over_time,
@@ -80,7 +80,7 @@ def run_sequence(
     choice: PriorChoice,
     priors: Priors,  # as chosen
     folder: RunFolder,
-    report: Report,
+    report: Report = silent,
     lpips: Lpips | None = None,
     resume: bool = False,
 ) -> RunOutcome:

@@ -24,7 +24,7 @@ from minislam.mapping import Mapper
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.stateful import Stateful
-from minislam.steps import Report, Steps
+from minislam.steps import Report, Steps, silent
 from minislam.tracking.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
@@ -61,7 +61,7 @@ class Slam(Stateful):
         sequence: Sequence,
         config: SlamConfig,
         priors: Priors,
-        report: Report = lambda stage, done, of_all: None,
+        report: Report = silent,
         keep: Keep = lambda slam, at_all_events: None,
     ) -> None:
         self.sequence, self.config = sequence, config

@@ -10,6 +10,10 @@ from minislam.stateful import Stateful
 Report = Callable[[str, int, int], None]  # stage, done, of all; KeyboardInterrupt stops the run
 
 
+def silent(stage: str, done: int, of_all: int) -> None:
+    """Report nothing."""
+
+
 class Steps(Stateful):
     """Counts steps and seconds per stage."""
 
