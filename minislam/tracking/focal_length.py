@@ -20,9 +20,9 @@ ITERATIONS = 10  # Gauss-Newton steps at each focal length
 MIN_RISE = 0.01
 # No flow is better than this, and what seems to be says nothing. [px]
 MIN_RESIDUAL = 0.05
-# What a user should hear of: a larger difference, with more of the cost saved, than a right focal
-# length has ever shown (0.8 % and 0.2 %). [-]
-WORTH_SAYING, WORTH_SAVING = 0.03, 0.02
+# What a user should hear of: a larger difference that saves more of the cost than was ever seen
+# with a right focal length (4.7 %, saving 1.9 %, in two seconds of real video). [-]
+WORTH_SAYING, WORTH_SAVING = 0.05, 0.04
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ def fit_focal_length(problem: BundleProblem, state: BundleState) -> FocalLengthF
     if rise < MIN_RISE * max(lowest, floor):
         return FocalLengthFit(problem.camera.fx, None, 0.0)
     factor = math.exp(STEP * (middle - slope / (2 * rise)))
-    saved = 1 - (lowest - slope**2 / (4 * rise)) / max(ends[0][1], floor)
-    return FocalLengthFit(problem.camera.fx, factor, min(max(saved, 0.0), 1.0))
+    saved = ends[0][1] - lowest + slope**2 / (4 * rise)
+    return FocalLengthFit(problem.camera.fx, factor, saved / max(ends[0][1], floor))
 
 
 def _adjusted(problem: BundleProblem, start: BundleState, step: int) -> tuple[BundleState, float]:

@@ -33,9 +33,9 @@ ESSENTIAL_THRESHOLD = 0.7  # px, RANSAC inlier distance to the epipolar line
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
 # A start that is off by 10 degrees is off by 50 px, where a narrow robust weight sees only
 # outliers: the weight is narrowed step by step.
-POSE_ROBUST_WIDENING = (16.0, 4.0, 1.0)  # [-], times the final width
+ROBUST_WIDENING = (16.0, 4.0, 1.0)  # [-], times the final width
 MIN_CELLS_FOR_ESSENTIAL = 40  # confident cells; five define the matrix, noise wants many more
-HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps before hypotheses are compared
+HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps per width before hypotheses are compared
 DISPARITY_SPREAD = 20.0  # largest ratio of a triangulated disparity to the median, both ways
 
 
@@ -76,7 +76,7 @@ def start_pose(
         free_poses=torch.tensor([False, True]),
         free_disparities=torch.tensor([False, False]),
     )
-    widenings = POSE_ROBUST_WIDENING if robust else (1.0,)
+    widenings = ROBUST_WIDENING if robust else (1.0,)
     ends = []
     for start in starts:
         state = BundleState(torch.stack([T_source_world, start]), disparities.expand(2, -1))
@@ -197,8 +197,15 @@ def best_hypothesis(problem: BundleProblem, states: list[BundleState]) -> Bundle
     """Adjust every hypothesis on the same measurements and return the cheapest.
 
     Comparing is safe where a threshold is not: a wrong basin can have small residuals too, but
-    on the same measurements the right one has smaller ones.
+    on the same measurements the right one has smaller ones. A guess that is far off only leaves
+    its basin while the robust weight is wide; a depth prior makes one hypothesis, which is near.
     """
-    adjusted = [bundle_adjust(problem, state, HYPOTHESIS_ITERATIONS) for state in states]
-    best = min(range(len(states)), key=lambda index: adjusted[index][1].cost_after)
-    return adjusted[best][0]
+    robust = problem.robust
+    widenings = ROBUST_WIDENING if robust and len(states) > 1 else (1.0,)
+    ends = []
+    for state in states:
+        for widening in widenings:
+            problem = replace(problem, robust=robust and robust.widened(widening))
+            state, report = bundle_adjust(problem, state, HYPOTHESIS_ITERATIONS)
+        ends.append((report.cost_after, state))
+    return min(ends, key=lambda end: end[0])[1]

@@ -1,13 +1,15 @@
 """The first geometry, on matches of a known scene: exact at first, then spoilt."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
-from tracking.scene import CAMERA, STRIDE, normal, uniform
+from tracking.scene import CAMERA, STRIDE, known_problem, normal, perturbed, uniform
 
 from minislam.geometry import se3_exp, se3_inverse
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
 from minislam.tracking.grid import Grid
 from minislam.tracking.initialisation import (
     best_hypothesis,
@@ -281,3 +283,14 @@ def test_the_best_hypothesis_is_the_one_that_explains_the_matches():
     for states in ([wrong, right], [right, wrong]):
         best = best_hypothesis(problem, states)
         torch.testing.assert_close(best.T_camera_world, poses, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", [50, 60, 70])
+def test_guesses_that_are_far_off_still_find_the_truth(seed: int):
+    known = known_problem()
+    problem = replace(known.problem, robust=RobustKernel(0.3))
+    guess = perturbed(known, 0.2, seed)
+    # A weight that is narrow from the start stays in the basin of the guess.
+    assert bundle_adjust(problem, guess, 36)[1].cost_after > 1
+    best = best_hypothesis(problem, [guess, guess])
+    assert bundle_adjust(problem, best, 0)[1].cost_after < 1e-6
