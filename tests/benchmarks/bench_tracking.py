@@ -15,16 +15,22 @@ import torch
 
 from data_synth import generate
 from minislam.geometry import Camera, se3_exp
+from minislam.priors.depth import SensorDepth
+from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
+from minislam.records import Frame
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
+from minislam.tracking.config import TrackingConfig
 from minislam.tracking.grid import Grid
 from minislam.tracking.reference import dense_step
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.robust import RobustKernel
+from minislam.tracking.tracker import Tracker
 
 CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
 STRIDE = 8
 REPEATS = 7
+LOOP_FRAMES, LOOP_SIZE = 400, (160, 120)
 STEP = (0.02, 0.005, 0.01, 0.001, -0.003, 0.002)  # twist from keyframe to keyframe
 
 
@@ -104,7 +110,42 @@ def bench_flow() -> None:
     print(f"flow at 320x240: {edge:.0f} ms per edge, {step:.0f} ms per frame of the chain")
 
 
+def bench_keyframes() -> None:
+    """Print the time of a keyframe early and late in a long sequence, without global BAs."""
+    clip = generate("loop", seed=0, frames=LOOP_FRAMES, size=LOOP_SIZE)
+    k = clip.intrinsics
+    camera = Camera(k.fx, k.fy, k.cx, k.cy, *LOOP_SIZE)
+    cells = Grid.of(camera, STRIDE).shape
+    tracker = Tracker(
+        camera,
+        TrackingConfig(global_interval=0),
+        ClassicalFlow(),
+        ClassicalFeatures(),
+        SensorDepth(lambda index: clip.depth[index]),
+        lambda keyframe_index: torch.ones(cells),
+    )
+    times: list[float] = []
+    for index, image in enumerate(clip.rgb):
+        frame = Frame(index, float(clip.timestamps[index]), torch.from_numpy(image))
+        start = time.process_time()
+        is_keyframe = tracker.track(frame)
+        elapsed = time.process_time() - start
+        everyone_moved = tracker.backend.take_first_moved() == 0  # a loop was closed
+        if is_keyframe and tracker.initialised and not everyone_moved:
+            times.append(1e3 * elapsed)
+        if not tracker.initialised and len(tracker.keyframes) == tracker.config.warmup_keyframes:
+            tracker.initialise()
+            tracker.refine_initialisation()
+    quarter = len(times) // 4
+    early, late = statistics.median(times[:quarter]), statistics.median(times[-quarter:])
+    print(
+        f"one keyframe at {LOOP_SIZE[0]}x{LOOP_SIZE[1]}: {early:.0f} ms in the first quarter, "
+        f"{late:.0f} ms in the last of {len(tracker.keyframes)} keyframes"
+    )
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)
     bench_bundle_adjustment()
     bench_flow()
+    bench_keyframes()
