@@ -22,7 +22,7 @@ MIN_RISE = 0.01
 MIN_RESIDUAL = 0.05
 # What a user should hear of: a larger difference that saves more of the cost than was ever seen
 # with a right focal length (4.7 %, saving 1.9 %, in two seconds of real video). [-]
-WORTH_SAYING, WORTH_SAVING = 0.05, 0.04
+WORTH_SAYING, WORTH_SAVING = 0.05, 0.025
 
 
 @dataclass(frozen=True)
