@@ -87,7 +87,7 @@ class MappingConfig:
     keyframe_stride: int = parameter(
         1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode"
     )
-    refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
+    refine_iterations: int = parameter(700, "iterations at the end; official 20000, fast 3000")
     refine_full_share: float = parameter(
         0.4, "share of them, the last ones, at full image size [0, 1]; official 1"
     )

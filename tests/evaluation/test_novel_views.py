@@ -3,7 +3,11 @@
 import numpy as np
 from helpers import random_transforms
 
-from minislam.evaluation.novel_views import align_novel_views, truth_to_estimate
+from minislam.evaluation.novel_views import (
+    align_novel_views,
+    oriented_truth_to_estimate,
+    truth_to_estimate,
+)
 from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
 
@@ -40,3 +44,25 @@ def test_a_point_seen_by_both_keeps_its_pixel():
     np.testing.assert_allclose(
         ray(moved, similarity.transform_points(point)), ray(pose, point), atol=1e-12
     )
+
+
+def test_orientations_find_the_turn_that_noisy_centres_on_a_line_leave_open():
+    source = np.random.default_rng(0)
+    poses = random_transforms(30, "normal", 4).numpy()
+    poses[:, :3, 3] = np.linspace(0, 1, 30)[:, None] * [1.0, 0.0, 0.0]
+    poses[:, 1:3, 3] += 0.01 * source.standard_normal((30, 2))  # hardly off the line
+    turn = random_transforms(1, "normal", 5)[0].numpy()
+    truth, world = Trajectory(np.arange(30.0), poses), Similarity(2.0, turn[:3, :3], turn[:3, 3])
+    exact = world.transform_poses(poses)
+    found = oriented_truth_to_estimate(Trajectory(np.arange(30.0), exact), truth)
+    np.testing.assert_allclose(found.rotation, world.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.translation, world.translation, atol=1e-12)
+    assert abs(found.scale - 2.0) < 1e-12
+
+    noisy = exact.copy()
+    noisy[:, :3, 3] += 0.01 * source.standard_normal((30, 3))
+    estimate = Trajectory(np.arange(30.0), noisy)
+    by_centres = truth_to_estimate(estimate, truth)
+    by_cameras = oriented_truth_to_estimate(estimate, truth)
+    assert np.abs(by_centres.rotation - world.rotation).max() > 0.02
+    np.testing.assert_allclose(by_cameras.rotation, world.rotation, atol=1e-12)
