@@ -1,0 +1,79 @@
+"""Follow the camera through moving things, with one safeguard after the other.
+
+    python tests/benchmarks/bench_movers.py [NAME:SEED ...]
+
+Tracking alone, 100 frames at 320x240 with the simulated depth prior. The ATE of the keyframes in
+cm, before and after the final adjustment: by least squares, with the robust weight, with the
+memory of what has moved as well, and with true masks besides. About 20 s a column.
+"""
+
+import sys
+from dataclasses import replace
+
+import torch
+
+from minislam.config import SlamConfig
+from minislam.data import open_sequence
+from minislam.evaluation import absolute_trajectory_error
+from minislam.priors.choice import PriorChoice
+from minislam.records import Sequence
+from minislam.run import choose_priors
+from minislam.slam import Slam
+from minislam.tracking.config import TrackingConfig
+
+SEQUENCES = (
+    "static", "ball", "crowd", "umbrella", "person", "racket", "stones", "anymal1", "anymal2",
+    "table1", "table2",
+)  # fmt: skip
+SEED = 31
+COLUMNS = {  # heading: constants, true masks
+    "least squares": (TrackingConfig(robust_scale=0.0, motion_memory=0.0), False),
+    "+ robust": (TrackingConfig(motion_memory=0.0), False),
+    "+ memory": (TrackingConfig(), False),
+    "true masks": (TrackingConfig(), True),
+}
+
+
+def errors(sequence: Sequence, tracking: TrackingConfig, masks: bool) -> tuple[float, float]:
+    """Return the ATE of the keyframes before and after the final adjustment [cm]."""
+    config = replace(SlamConfig(), tracking=tracking)
+    slam = Slam(sequence, config, choose_priors(PriorChoice(depth="simulated"), sequence, config))
+    tracker, truth = slam.tracker, sequence.ground_truth
+    stride = tracker.grid.stride
+
+    def true_weight(index: int) -> torch.Tensor:
+        moving = truth.moving_mask(tracker.keyframes.frames[index].frame_index)
+        return 1.0 - torch.from_numpy(moving[::stride, ::stride]).float()
+
+    if masks:
+        tracker._predict_static_weight = true_weight
+    for frame in sequence:
+        is_start = tracker.track(frame) and not tracker.initialised
+        if is_start and len(tracker.keyframes) >= tracking.warmup_keyframes:
+            tracker.initialise()
+            tracker.refine_initialisation()
+
+    def ate() -> float:
+        found = absolute_trajectory_error(slam.keyframe_trajectory(), truth.trajectory)
+        return 100 * found.statistics["rmse"]
+
+    before = ate()
+    tracker.finish()
+    return before, ate()
+
+
+def main() -> None:
+    """Print one row per sequence."""
+    torch.set_num_threads(1)
+    print(f"{'sequence':<14}" + "".join(f"{heading:>18}" for heading in COLUMNS))
+    for name in sys.argv[1:] or [f"{name}:{SEED}" for name in SEQUENCES]:
+        sequence = open_sequence(f"synth:{name}")
+        cells = [
+            f"{before:.2f} -> {after:.2f}"
+            for before, after in (errors(sequence, *column) for column in COLUMNS.values())
+        ]
+        print(f"{name:<14}" + "".join(f"{cell:>18}" for cell in cells), flush=True)
+
+
+if __name__ == "__main__":
+    main()
