@@ -26,21 +26,12 @@ SETTINGS = [
     "--mapping.refine_iterations", "20",
 ]  # fmt: skip
 SAME = ("trajectory.txt", "keyframe_trajectory.txt", "lost_frames.txt", "map.ply", "config.json")
-OF_TIME = ("seconds_total", "frames_per_second", "peak_memory_mb")  # the only other differences
+OF_TIME = ("seconds_total", "frames_per_second", "peak_memory_mb")  # all that may differ
 TRACKING = "tracking and mapping"  # initialised at frame 8
 
 
 class PowerCut(BaseException):
     """Nothing is written any more."""
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory):
-    """Return where the runs go; the frames are rendered once, into a cache beside them."""
-    root = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MINISLAM_CACHE", str(root / "cache"))
-        yield root
 
 
 def run(source: object, out: Path, *more: str, inputs: list[str] = INPUT) -> int:
@@ -72,7 +63,7 @@ def assert_same_results(whole: Path, out: Path, names: tuple[str, ...] = SAME) -
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     runs = [RunFolder(path) for path in (whole, out)]
     expected, found = (folder.read_metrics() for folder in runs)
-    assert [name for name in expected if expected[name] != found[name]] == list(OF_TIME)
+    assert {name for name in expected if expected[name] != found[name]} <= set(OF_TIME)
     expected, found = (folder.read_mlp() for folder in runs)
     assert all(bool((expected[name] == found[name]).all()) for name in expected)
     expected, found = (folder.read_run() for folder in runs)

@@ -53,15 +53,6 @@ end_header
 """
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory):
-    """Return where the runs go; the frames are rendered once, into a cache beside them."""
-    root = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MINISLAM_CACHE", str(root / "cache"))
-        yield root
-
-
 def run(out: Path, *more: str) -> RunFolder:
     assert main([*COMMAND, "-o", str(out), *more]) == 0
     return RunFolder(out)
