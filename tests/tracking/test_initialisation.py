@@ -190,6 +190,29 @@ def test_the_cheapest_of_several_starts_is_kept():
         torch.testing.assert_close(pose, truth, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("mover_disparity", [1.0, 1.5])
+def test_a_near_mover_does_not_take_the_pose_along(mover_disparity: float):
+    # A robust weight that is only narrowed from wide ends in the mover, 0.26 to 0.35 away.
+    is_mover = GRID.pixels[:, 0] < 0.3 * CAMERA.width
+    disparities = torch.where(is_mover, mover_disparity, room_disparities())
+    truth = se3_exp(torch.tensor([0.15, 0.02, 0.05, 0.01, -0.03, 0.0], dtype=torch.float64))
+    seen, seen_of_mover = (
+        flat(seen_matches(motion, disparities))[0] for motion in (truth, sideways(0.3))
+    )
+    targets = torch.where(is_mover[:, None], seen_of_mover, seen)
+    known = disparities * (1 + 0.03 * normal(0, CELLS).float())
+    pose, _ = start_pose(
+        GRID,
+        matches_to(targets),
+        known,
+        torch.ones(CELLS),
+        torch.eye(4).double(),
+        [torch.eye(4).double()],
+        RobustKernel(1.0),
+    )
+    assert (pose - truth)[:3, 3].norm() < 0.05
+
+
 def test_a_chain_with_known_disparities_finds_every_pose():
     truth = [torch.eye(4, dtype=torch.float64)]
     for seed in range(3):
