@@ -8,18 +8,19 @@ memory of what has moved as well, and with true masks besides. About 20 s a colu
 """
 
 import sys
-from dataclasses import replace
 
+import numpy as np
 import torch
 
 from minislam.config import SlamConfig
 from minislam.data import open_sequence
 from minislam.evaluation import absolute_trajectory_error
+from minislam.geometry import se3_inverse
 from minislam.priors.choice import PriorChoice
-from minislam.records import Sequence
+from minislam.records import Sequence, Trajectory
 from minislam.run import choose_priors
-from minislam.slam import Slam
 from minislam.tracking.config import TrackingConfig
+from minislam.tracking.tracker import Tracker
 
 SEQUENCES = (
     "static", "ball", "crowd", "umbrella", "person", "racket", "stones", "anymal1", "anymal2",
@@ -36,17 +37,17 @@ COLUMNS = {  # heading: constants, true masks
 
 def errors(sequence: Sequence, tracking: TrackingConfig, masks: bool) -> tuple[float, float]:
     """Return the ATE of the keyframes before and after the final adjustment [cm]."""
-    config = replace(SlamConfig(), tracking=tracking)
-    slam = Slam(sequence, config, choose_priors(PriorChoice(depth="simulated"), sequence, config))
-    tracker, truth = slam.tracker, sequence.ground_truth
-    stride = tracker.grid.stride
+    priors = choose_priors(PriorChoice(depth="simulated"), sequence, SlamConfig())
+    truth = sequence.ground_truth
 
-    def true_weight(index: int) -> torch.Tensor:
+    def static_weight(index: int) -> torch.Tensor:
         moving = truth.moving_mask(tracker.keyframes.frames[index].frame_index)
-        return 1.0 - torch.from_numpy(moving[::stride, ::stride]).float()
+        stride = tracker.grid.stride
+        return 1.0 - float(masks) * torch.from_numpy(moving[::stride, ::stride]).float()
 
-    if masks:
-        tracker._predict_static_weight = true_weight
+    tracker = Tracker(
+        sequence.camera, tracking, priors.flow, priors.features, priors.depth, static_weight
+    )
     for frame in sequence:
         is_start = tracker.track(frame) and not tracker.initialised
         if is_start and len(tracker.keyframes) >= tracking.warmup_keyframes:
@@ -54,7 +55,9 @@ def errors(sequence: Sequence, tracking: TrackingConfig, masks: bool) -> tuple[f
             tracker.refine_initialisation()
 
     def ate() -> float:
-        found = absolute_trajectory_error(slam.keyframe_trajectory(), truth.trajectory)
+        stamps = [frame.timestamp for frame in tracker.keyframes.frames]
+        poses = se3_inverse(tracker.keyframes.T_camera_world).numpy()
+        found = absolute_trajectory_error(Trajectory(np.array(stamps), poses), truth.trajectory)
         return 100 * found.statistics["rmse"]
 
     before = ate()
