@@ -35,11 +35,7 @@ def _rotation_coefficients(angle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def so3_exp(phi: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) of rotation vectors phi (..., 3) [rad] (Rodrigues)."""
-    angle = _safe_norm(phi)
-    a, b, _ = _rotation_coefficients(angle)
-    skew = hat(phi)
-    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
-    return eye + a[..., None, None] * skew + b[..., None, None] * skew @ skew
+    return _rotation_and_left_jacobian(phi)[0]
 
 
 def so3_log(rotations: Tensor) -> Tensor:
@@ -102,9 +98,8 @@ def rotation_from_quaternion(quats_wxyz: Tensor) -> Tensor:
 
 def se3_exp(xi: Tensor) -> Tensor:
     """Return the transforms (..., 4, 4) of tangent vectors xi = (rho, phi) (..., 6)."""
-    rho, phi = xi[..., :3], xi[..., 3:]
-    translation = (so3_left_jacobian(phi) @ rho[..., None]).squeeze(-1)
-    return make_transform(so3_exp(phi), translation)
+    rotation, V = _rotation_and_left_jacobian(xi[..., 3:])
+    return make_transform(rotation, (V @ xi[..., :3, None]).squeeze(-1))
 
 
 def se3_log(transforms: Tensor) -> Tensor:
@@ -154,10 +149,16 @@ def se3_adjoint(transforms: Tensor) -> Tensor:
 
 def so3_left_jacobian(phi: Tensor) -> Tensor:
     """Return V(phi) (..., 3, 3), with exp((rho, phi)) = (exp(phi), V(phi) rho)."""
-    _, b, c = _rotation_coefficients(_safe_norm(phi))
+    return _rotation_and_left_jacobian(phi)[1]
+
+
+def _rotation_and_left_jacobian(phi: Tensor) -> tuple[Tensor, Tensor]:
+    """Return exp(phi) and V(phi), (..., 3, 3) each: three coefficients serve both."""
+    a, b, c = (x[..., None, None] for x in _rotation_coefficients(_safe_norm(phi)))
     skew = hat(phi)
+    squared = skew @ skew
     eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
-    return eye + b[..., None, None] * skew + c[..., None, None] * skew @ skew
+    return eye + a * skew + b * squared, eye + b * skew + c * squared
 
 
 def se3_left_jacobian(xi: Tensor) -> Tensor:

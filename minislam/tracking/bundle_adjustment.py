@@ -17,7 +17,11 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
-from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
+from minislam.tracking.reprojection import (
+    Linearisation,
+    relative_transforms,
+    reproject_with_jacobians,
+)
 from minislam.tracking.robust import RobustKernel
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
@@ -64,8 +68,16 @@ class BundleState:
 
 
 @dataclass(frozen=True)
+class _Linearised:
+    cost: float  # px^2
+    residual: Tensor  # (E, 2, N) px
+    weight: Tensor  # (E, 2, N), the robust one included
+    reprojection: Linearisation
+    transforms: Tensor  # (E, 4, 4) T_target_source
+
+
+@dataclass(frozen=True)
 class _NormalEquations:
-    cost: float
     pose_pose: Tensor  # H (6P, 6P) float64
     pose_gradient: Tensor  # g (6P,) float64
     disparity_diagonal: Tensor  # C (K, N)
@@ -85,16 +97,18 @@ def bundle_adjust(
     A step that fails or raises the cost is thrown away and tried again with ten times the
     damping; if none helps, the state is returned as it was, with the reason.
     """
-    equations = _normal_equations(problem, state)
-    cost_before, accepted, reason = equations.cost, 0, "all iterations used"
+    current, equations = _linearised(problem, state), None
+    cost_before, accepted, reason = current.cost, 0, "all iterations used"
     converged = True
     level = damping
     while accepted < iterations:
+        if equations is None:
+            equations = _normal_equations(problem, state, current)
         candidate = _damped_step(problem, state, equations, level, absolute_damping)
-        trial = None if candidate is None else _normal_equations(problem, candidate)
-        if trial is not None and trial.cost <= equations.cost:
-            settled = equations.cost - trial.cost <= 1e-9 * equations.cost
-            state, equations, accepted = candidate, trial, accepted + 1
+        trial = None if candidate is None else _linearised(problem, candidate)
+        if trial is not None and trial.cost <= current.cost:
+            settled = current.cost - trial.cost <= 1e-9 * current.cost
+            state, current, equations, accepted = candidate, trial, None, accepted + 1
             level = max(level / 10, damping)
             if settled:
                 reason = "cost settled"
@@ -106,7 +120,7 @@ def bundle_adjust(
             converged = candidate is not None
             reason = "no step lowers the cost" if converged else "normal equations are singular"
             break
-    report = BundleReport(converged, cost_before, equations.cost, accepted, level, reason)
+    report = BundleReport(converged, cost_before, current.cost, accepted, level, reason)
     return state, report
 
 
@@ -120,23 +134,24 @@ def motion_only_adjust(
 
 def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
     """Return the residuals p~ - p (E, 2, N) [px] and the weights (E, 2, N), robust one included."""
-    residual, weight, _, _ = _weighted_residuals(problem, state)
-    return residual, weight
+    linearised = _linearised(problem, state)
+    return linearised.residual, linearised.weight
 
 
-def _weighted_residuals(problem: BundleProblem, state: BundleState):
+def _linearised(problem: BundleProblem, state: BundleState) -> _Linearised:
     dtype = problem.targets.dtype
     transforms = relative_transforms(
         state.T_camera_world, problem.edges_source, problem.edges_target
     )
-    linear = reproject_with_jacobians(
+    reprojection = reproject_with_jacobians(
         transforms.to(dtype), state.disparities[problem.edges_source], problem.rays, problem.camera
     )
-    residual = problem.targets - linear.positions
-    weight = problem.weights * linear.valid[:, None]
+    residual = problem.targets - reprojection.positions
+    weight = problem.weights * reprojection.valid[:, None]
     if problem.robust is not None:
         weight = weight * problem.robust.weight(residual.square().sum(1, keepdim=True))
-    return residual, weight, linear, transforms
+    cost = _cost(problem, state, residual, reprojection.valid)
+    return _Linearised(cost, residual, weight, reprojection, transforms)
 
 
 def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
@@ -154,30 +169,31 @@ def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: T
     return float(flow_cost + (problem.prior_weights * difference.square()).sum(dtype=torch.float64))
 
 
-def _normal_equations(problem: BundleProblem, state: BundleState) -> _NormalEquations:
-    residual, weight, linear, transforms = _weighted_residuals(problem, state)
-    cost = _cost(problem, state, residual, linear.valid)
+def _normal_equations(
+    problem: BundleProblem, state: BundleState, at: _Linearised
+) -> _NormalEquations:
+    residual, weight, J = at.residual, at.weight, at.reprojection.J_target
     edges, cells = residual.shape[0], residual.shape[2]
-    J = linear.J_target
     weighted_J = (J * weight[:, None]).reshape(edges, 6, 2 * cells)
     A = (weighted_J @ J.reshape(edges, 6, 2 * cells).mT).double()  # (E, 6, 6)
     b = (weighted_J @ residual.reshape(edges, 2 * cells, 1)).squeeze(-1).double()  # (E, 6)
 
-    adjoint = se3_adjoint(transforms)
+    adjoint = se3_adjoint(at.transforms)
     H, g = _assemble_poses(problem, A, b, adjoint)
 
-    free = problem.free_disparities[problem.edges_source].to(J.dtype)
-    J_disparity = linear.J_disparity * free[:, None, None]
-    weighted_Jd = weight * J_disparity
-    E_target = (J * weighted_Jd[:, None]).sum(2)  # (E, 6, N)
-    E_source = -adjoint.mT.to(J.dtype) @ E_target
     held_prior = problem.prior_weights * problem.free_disparities[:, None]
     C = held_prior.clone()
     s = held_prior * (problem.prior_disparities - state.disparities)
+    if not problem.free_disparities.any():
+        return _NormalEquations(H, g, C, s, [])
+    free = problem.free_disparities[problem.edges_source].to(J.dtype)
+    J_disparity = at.reprojection.J_disparity * free[:, None, None]
+    weighted_Jd = weight * J_disparity
+    E_target = J[:, :, 0] * weighted_Jd[:, None, 0] + J[:, :, 1] * weighted_Jd[:, None, 1]
+    E_source = -adjoint.mT.to(J.dtype) @ E_target
     C.index_add_(0, problem.edges_source, (weighted_Jd * J_disparity).sum(1))
     s.index_add_(0, problem.edges_source, (weighted_Jd * residual).sum(1))
-    blocks = _source_blocks(problem, E_target, E_source)
-    return _NormalEquations(cost, H, g, C, s, blocks)
+    return _NormalEquations(H, g, C, s, _source_blocks(problem, E_target, E_source))
 
 
 def _pose_slots(problem: BundleProblem) -> Tensor:

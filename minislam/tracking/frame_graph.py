@@ -8,7 +8,12 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowMatches
 from minislam.stateful import FrameOf, Stateful, Tree
-from minislam.tracking.reprojection import relative_transforms, reproject, scaled_points
+from minislam.tracking.reprojection import (
+    lengths,
+    relative_transforms,
+    reproject,
+    scaled_points,
+)
 
 # A pair whose cells mostly leave the view has no meaningful distance. [-]; DROID-SLAM: 0.75.
 MIN_VISIBLE_SHARE = 0.5
@@ -191,7 +196,7 @@ def _directed_distances(
     total, visible = 0.0, 0.0
     for motion, share in ((T_target_source, rotation_share), (translations, 1 - rotation_share)):
         positions, valid = reproject(motion, disparities, rays, camera)
-        length = (positions - pixels.T).norm(dim=1)
+        length = lengths(positions - pixels.T)
         total = total + share * (length * valid).sum(1)
         visible = visible + share * valid.sum(1)
     is_seen = visible >= MIN_VISIBLE_SHARE * len(rays)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.bundle_adjustment import residuals
+from minislam.tracking.reprojection import lengths
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ def health_of(backend: BackEnd, keyframe: int) -> KeyframeHealth:
         return KeyframeHealth(keyframe, frame_index, 0.0, 0.0, 0.0, 0.0)
     problem = backend.problem(links, first_free=0)
     residual, weight = residuals(problem, backend.state)
-    length, weight = residual.norm(dim=1), weight.mean(1)
+    length, weight = lengths(residual), weight.mean(1)
     trusted = weight > 0.5 * weight.amax()
     parallax = backend.parallaxes(problem.edges_source, problem.edges_target)
     return KeyframeHealth(

@@ -11,6 +11,7 @@ from torch import Tensor
 from minislam.tracking.backend import FIRST_WIDENING, BackEnd
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import FAR, both_directions, proximity_pairs
+from minislam.tracking.reprojection import lengths
 
 
 def loop_pairs(
@@ -68,4 +69,4 @@ def _residual(backend: BackEnd, first_edge: int) -> float:
     problem = backend.problem(range(first_edge, len(backend.graph)), first_free=0)
     residual, _ = residuals(problem, backend.state)
     weight = problem.weights.mean(1)
-    return float((weight * residual.norm(dim=1)).sum() / weight.sum().clamp_min(1e-6))
+    return float((weight * lengths(residual)).sum() / weight.sum().clamp_min(1e-6))

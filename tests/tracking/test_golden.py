@@ -29,6 +29,11 @@ from minislam.tracking.bundle_adjustment import (
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
 
 
+def normal_equations(problem: BundleProblem, state: BundleState):
+    linearised = bundle_adjustment._linearised(problem, state)
+    return bundle_adjustment._normal_equations(problem, state, linearised)
+
+
 def damped_diagonal(problem: BundleProblem, diagonal: Tensor) -> Tensor:
     """Return the official diagonal C: with eta wherever there is no prior."""
     return diagonal + golden.golden()["eta"].reshape(6, -1) * (problem.prior_weights == 0)
@@ -37,7 +42,7 @@ def damped_diagonal(problem: BundleProblem, diagonal: Tensor) -> Tensor:
 def official_step(
     problem: BundleProblem, state: BundleState, damping: float, absolute_damping: float
 ) -> BundleState:
-    equations = bundle_adjustment._normal_equations(problem, state)
+    equations = normal_equations(problem, state)
     diagonal = damped_diagonal(problem, equations.disparity_diagonal) / (1 + damping)
     equations = replace(equations, disparity_diagonal=diagonal)
     after = bundle_adjustment._damped_step(problem, state, equations, damping, absolute_damping)
@@ -80,7 +85,7 @@ def test_residuals_and_derivatives_of_one_edge():
 def test_normal_equations():
     g = golden.golden()
     problem, state = golden.problem(first_free=1, prior=True), golden.state()
-    equations = bundle_adjustment._normal_equations(problem, state)
+    equations = normal_equations(problem, state)
     diagonal = damped_diagonal(problem, equations.disparity_diagonal)
     assert_gradients_close(equations.pose_pose, g["lin_H"], relative=1e-10)
     assert_gradients_close(equations.pose_gradient.reshape(5, 6), g["lin_g"], relative=1e-10)
@@ -91,7 +96,7 @@ def test_normal_equations():
 def test_reduced_system():
     g = golden.golden()
     problem = golden.problem(first_free=1, prior=True)
-    equations = bundle_adjustment._normal_equations(problem, golden.state())
+    equations = normal_equations(problem, golden.state())
     S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
     for source, rows, E in equations.source_blocks:
         S.index_put_((rows[:, None], rows), -(E / g["lin_C"][source]) @ E.mT, accumulate=True)
