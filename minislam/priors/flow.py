@@ -19,6 +19,8 @@ from minislam.priors.interfaces import FlowMatches
 from minislam.stateful import Stateful
 
 LIKENESS_WINDOW = (9, 9)  # px
+LK_WINDOW = (9, 9)  # px
+MAX_REMAINDER = 1.0  # px: what DIS leaves over is less, or the window sees something else
 LEAST_VARIANCE = 1e-5  # of brightness in [0, 1]: below it there is nothing to correlate
 
 
@@ -76,9 +78,8 @@ class ClassicalFlow(Stateful):
             forward, backward = flow_of[edge], flow_of.get((target, source))
             if backward is None:
                 backward = reverse_flow(self._images[source], self._images[target], forward)
-            warped = warp(self._images[target], forward)
-            alike = likeness(self._images[source], warped, self.stride)
-            return grid_matches(forward, backward, alike * self._textures[source], self.config)
+            images, texture = (self._images[source], self._images[target]), self._textures[source]
+            return measured_on_grid(*images, forward, backward, texture, self.config)
 
         with ThreadPoolExecutor(self.config.workers) as pool:
             measured = list(pool.map(measure, edges))
@@ -129,8 +130,9 @@ class FlowChain(Stateful):
         for start in (self._flow, self._flow + self._increment):
             flow = composed_flow(self._reference, gray, start)
             backward = reverse_flow(self._reference, gray, flow)
-            alike = likeness(self._reference, warp(gray, flow), self._config.stride)
-            targets, confidence = grid_matches(flow, backward, alike * texture, self._config)
+            targets, confidence = measured_on_grid(
+                self._reference, gray, flow, backward, texture, self._config
+            )
             measured.append((flow, targets, confidence))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
@@ -171,14 +173,19 @@ def likeness(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
     It is the squared normalised cross-correlation, blind to exposure. Forward and backward flow
     agree with each other on a black target and, here and there, on any other: this asks the images.
     """
-    a, b = source.astype(np.float32) / 255, warped.astype(np.float32) / 255
-    mean_a, mean_b, mean_aa, mean_bb, mean_ab = (
-        cv2.boxFilter(product, -1, LIKENESS_WINDOW) for product in (a, b, a * a, b * b, a * b)
-    )
-    covariance = mean_ab - mean_a * mean_b
-    variances = (mean_aa - mean_a**2) * (mean_bb - mean_b**2)
-    correlation = covariance / np.sqrt(np.maximum(variances, LEAST_VARIANCE**2))
+    (mean, variance), (warped_mean, warped_variance) = map(local_statistics, (source, warped))
+    product = source.astype(np.float32) * warped.astype(np.float32) / 255**2
+    covariance = cv2.boxFilter(product, -1, LIKENESS_WINDOW) - mean * warped_mean
+    floor = LEAST_VARIANCE**2
+    correlation = covariance / np.sqrt(np.maximum(variance * warped_variance, floor))
     return np.clip(correlation, 0, 1)[::stride, ::stride] ** 2
+
+
+def local_statistics(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance (H, W) of brightness in [0, 1] around each pixel."""
+    scaled = gray.astype(np.float32) / 255
+    mean, square = (cv2.boxFilter(image, -1, LIKENESS_WINDOW) for image in (scaled, scaled**2))
+    return mean, square - mean**2
 
 
 def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
@@ -189,7 +196,7 @@ def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: in
         np.arange(shape[1], dtype=np.float32) / stride,
         np.arange(shape[0], dtype=np.float32) / stride,
     )
-    return cv2.remap(grid_flow, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sample(grid_flow, column, row)
 
 
 def pixel_maps(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -197,13 +204,15 @@ def pixel_maps(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     return np.meshgrid(np.arange(shape[1], dtype=np.float32), np.arange(shape[0], dtype=np.float32))
 
 
-def warp(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """Return image(p + flow(p)); positions outside the image take the nearest border pixel."""
+def sample(image: np.ndarray, column: np.ndarray, row: np.ndarray, method=cv2.INTER_LINEAR):
+    """Return the image at these positions; those outside take the nearest border pixel."""
+    return cv2.remap(image, column, row, method, borderMode=cv2.BORDER_REPLICATE)
+
+
+def warp(image: np.ndarray, flow: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Return image(p + flow(p))."""
     column, row = pixel_maps(flow.shape[:2])
-    return cv2.remap(
-        image, column + flow[..., 0], row + flow[..., 1], cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
+    return sample(image, column + flow[..., 0], row + flow[..., 1], method)
 
 
 def residual_flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -235,8 +244,60 @@ def reverse_flow(source: np.ndarray, target: np.ndarray, forward: np.ndarray) ->
     return composed_flow(target, source, inverse)
 
 
+def measured_on_grid(
+    source: np.ndarray,  # (H, W) uint8
+    target: np.ndarray,  # (H, W) uint8
+    forward: np.ndarray,  # (H, W, 2) px, flow source to target
+    backward: np.ndarray,  # (H, W, 2) px, flow target to source
+    texture: np.ndarray,  # (h, w) in [0, 1)
+    config: ClassicalFlowConfig,
+) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
+    """Return where each grid cell is in the target, as exactly as the images say, and how sure."""
+    stride, warped = config.stride, warp(target, forward, cv2.INTER_CUBIC)
+    remainder = lucas_kanade(source, same_exposure(source, warped, stride), stride)
+    alike = likeness(source, warped, stride)
+    return grid_matches(forward, remainder, backward, alike * texture, config)
+
+
+def same_exposure(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
+    """Return the warped image (H, W) uint8 with the brightness and contrast of the source.
+
+    Both are medians over small windows, so that what moves or is covered has no say.
+    """
+    (mean, variance), (warped_mean, warped_variance) = (
+        [of_pixels[::stride, ::stride] for of_pixels in local_statistics(image)]
+        for image in (source, warped)
+    )
+    textured = np.minimum(variance, warped_variance) > LEAST_VARIANCE
+    if not textured.any():
+        return warped
+    contrast = np.sqrt(np.median(variance[textured] / warped_variance[textured]))
+    brightness = np.median((mean - contrast * warped_mean)[textured])
+    return cv2.addWeighted(warped, contrast, warped, 0, 255 * brightness)
+
+
+def lucas_kanade(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
+    """Return the displacement (h, w, 2) [px] of each grid cell that the warp has left over.
+
+    The flow of DIS is a blend of patches that overlap, off by some hundredths of a pixel in the
+    same direction over large parts of an image, which turns the camera. A least-squares match of
+    one window per cell has errors of its own, which average out.
+    """
+    cells = np.mgrid[: source.shape[0] : stride, : source.shape[1] : stride][::-1]
+    points = cells.reshape(2, -1).T[:, None].astype(np.float32)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        source, warped, points, points.copy(), winSize=LK_WINDOW, maxLevel=0,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.003),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    remainder = (moved - points).reshape(*cells.shape[1:], 2)
+    usable = (found.reshape(cells.shape[1:]) == 1) & (np.abs(remainder).max(-1) < MAX_REMAINDER)
+    return remainder * usable[..., None]
+
+
 def grid_matches(
     forward: np.ndarray,  # (H, W, 2) px, flow source to target
+    remainder: np.ndarray,  # (h, w, 2) px, what it has left over at the grid cells
     backward: np.ndarray,  # (H, W, 2) px, flow target to source
     texture: np.ndarray,  # (h, w) in [0, 1)
     config: ClassicalFlowConfig,
@@ -245,12 +306,11 @@ def grid_matches(
     height, width = forward.shape[:2]
     stride = config.stride
     column, row = (m[::stride, ::stride] for m in pixel_maps((height, width)))
-    flow = forward[::stride, ::stride]
-    target_u, target_v = column + flow[..., 0], row + flow[..., 1]
-    returned = cv2.remap(
-        backward, target_u, target_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    squared_error = ((flow + returned) ** 2).sum(-1)
+    moved_u, moved_v = column + remainder[..., 0], row + remainder[..., 1]
+    flow = sample(forward, moved_u, moved_v)
+    target_u, target_v = moved_u + flow[..., 0], moved_v + flow[..., 1]
+    returned = sample(backward, target_u, target_v)
+    squared_error = ((remainder + flow + returned) ** 2).sum(-1)
     agreement = np.exp(-0.5 * squared_error / config.consistency_scale**2)
     inside = (target_u >= 0) & (target_u <= width - 1) & (target_v >= 0) & (target_v <= height - 1)
     return np.stack([target_u, target_v], -1), agreement * texture * inside

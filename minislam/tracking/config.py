@@ -86,7 +86,7 @@ class TrackingConfig:
     loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
     loop_suppression: int = parameter(10, "no second loop so near to another [keyframes], official")
     max_loop_residual: float = parameter(3.0, "a loop that stays worse than this is undone [px]")
-    final_rounds: int = parameter(3, "rounds of the final global BA")
+    final_rounds: int = parameter(2, "rounds of the final global BA, paper supplement")
     final_iterations: int = parameter(4, "Gauss-Newton steps per round of the final global BA")
     final_edges: int = parameter(6, "further links per keyframe in the final global BA")
     final_distance: float = parameter(45.0, "largest flow distance of such a link [px]")

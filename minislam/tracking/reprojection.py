@@ -113,13 +113,17 @@ def reproject_with_jacobians(
     # Invalid points get zero weight from the caller; one keeps their numbers finite.
     inverse_z = torch.where(valid, z, torch.ones_like(z)).reciprocal()
     ax, ay, e = x * inverse_z, y * inverse_z, disparities * inverse_z
-    zero = torch.zeros_like(ax)
-    row_u = torch.stack([e, zero, -e * ax, -ax * ay, 1 + ax * ax, -ay], 1)
-    row_v = torch.stack([zero, e, -e * ay, -1 - ay * ay, ax * ay, ax], 1)
-    J_target = torch.stack([camera.fx * row_u, camera.fy * row_v], 2)
+    fx, fy, zero = camera.fx, camera.fy, torch.zeros_like(ax)
+    rows = [
+        fx * e, zero,
+        zero, fy * e,
+        fx * (-e * ax), fy * (-e * ay),
+        fx * (-ax * ay), fy * (-1 - ay * ay),
+        fx * (1 + ax * ax), fy * (ax * ay),
+        fx * -ay, fy * ax,
+    ]  # fmt: skip
+    J_target = torch.stack(rows, 1).unflatten(1, (6, 2))
     tx, ty, tz = T_target_source[:, :3, 3, None].unbind(1)
-    J_disparity = torch.stack(
-        [camera.fx * (tx - tz * ax) * inverse_z, camera.fy * (ty - tz * ay) * inverse_z], 1
-    )
-    positions = torch.stack([camera.fx * ax + camera.cx, camera.fy * ay + camera.cy], 1)
+    J_disparity = torch.stack([fx * (tx - tz * ax) * inverse_z, fy * (ty - tz * ay) * inverse_z], 1)
+    positions = torch.stack([fx * ax + camera.cx, fy * ay + camera.cy], 1)
     return Linearisation(positions, valid, J_target, J_disparity)

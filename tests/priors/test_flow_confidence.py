@@ -22,6 +22,8 @@ from tests.priors.patterns import (
     view,
 )
 
+NOTHING_LEFT = np.zeros((HEIGHT // 8, WIDTH // 8, 2), np.float32)
+
 # Confidence
 
 
@@ -36,16 +38,18 @@ def test_what_leaves_the_image_has_no_confidence():
 
 def test_the_border_of_the_image_counts_as_inside():
     texture = np.full((HEIGHT // 8, WIDTH // 8), 0.9)
-    targets, confidence = grid_matches(constant(0, 0), constant(0, 0), texture, CONFIG)
+    targets, confidence = grid_matches(
+        constant(0, 0), NOTHING_LEFT, constant(0, 0), texture, CONFIG
+    )
     assert targets[0, 0].tolist() == [0, 0] and (confidence == 0.9).all()
-    _, left = grid_matches(constant(-0.5, 0), constant(0.5, 0), texture, CONFIG)
+    _, left = grid_matches(constant(-0.5, 0), NOTHING_LEFT, constant(0.5, 0), texture, CONFIG)
     assert (left[:, 0] == 0).all() and (left[:, 1:] == 0.9).all()
 
 
 def test_disagreement_costs_confidence_by_its_formula():
     texture = np.ones((HEIGHT // 8, WIDTH // 8))
     backward = constant(-2.0, 0.6)  # off by 0.6 px, the consistency scale
-    _, confidence = grid_matches(constant(2.0, 0.0), backward, texture, CONFIG)
+    _, confidence = grid_matches(constant(2.0, 0.0), NOTHING_LEFT, backward, texture, CONFIG)
     np.testing.assert_allclose(confidence[1:-1, 1:-1], np.exp(-0.5), rtol=1e-5)
 
 
