@@ -13,7 +13,7 @@ from minislam.parameters import parameter
 from minislam.priors.choice import NetworksConfig
 from minislam.priors.depth import SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeaturesConfig
-from minislam.priors.flow import ClassicalFlowConfig
+from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.tracking.config import TrackingConfig
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 

@@ -16,7 +16,8 @@ from minislam.priors.depth import (
 )
 from minislam.priors.features import ClassicalFeatures, ClassicalFeaturesConfig
 from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
-from minislam.priors.flow import ClassicalFlow, ClassicalFlowConfig
+from minislam.priors.flow import ClassicalFlow
+from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.priors.networks.depth_anything import DepthAnythingConfig, load_depth_anything
 from minislam.priors.networks.dinov2 import load_dino_features

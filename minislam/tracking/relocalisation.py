@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 
 from minislam.geometry.distortion import camera_matrix
 from minislam.geometry.se3 import make_transform, so3_exp
-from minislam.priors.flow import grayscale
+from minislam.priors.dense_flow import grayscale
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 

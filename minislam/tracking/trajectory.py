@@ -9,6 +9,7 @@ from minislam.geometry import se3_interpolate
 from minislam.records import Sequence
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, motion_only_adjust
+from minislam.tracking.initialisation import start_pose
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.tracker import Tracker
 
@@ -76,6 +77,22 @@ def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: 
         free_disparities=torch.zeros(count + 1, dtype=torch.bool),
         robust=backend.robust and backend.robust.widened(ROBUST_NARROWING),
     )
+    if count == 1:
+        # Nothing holds it from the other side, so it could follow a mover as a keyframe could.
+        trust = keyframes.trust[around[0]]
+        starts = [start, _continued(backend, around[0], timestamp)]
+        poses[-1], _ = start_pose(
+            grid, matches, disparities[0], trust, known[0], starts, backend.robust
+        )
     state = BundleState(poses, torch.cat([disparities, empty[:1]]))
     state, _ = motion_only_adjust(problem, state, ITERATIONS)
     return state.T_camera_world[-1]
+
+
+def _continued(backend: BackEnd, keyframe: int, timestamp: float) -> Tensor:
+    """Return the pose (4, 4) to which the motion up to a keyframe would have led by now."""
+    before, last = max(keyframe - 1, 0), keyframe
+    poses, frames = backend.keyframes.T_camera_world, backend.keyframes.frames
+    elapsed = frames[last].timestamp - frames[before].timestamp
+    share = (timestamp - frames[before].timestamp) / elapsed if elapsed > 0 else 1.0
+    return se3_interpolate(poses[before], poses[last], share)

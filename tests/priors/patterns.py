@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.priors.flow import ClassicalFlow, ClassicalFlowConfig
+from minislam.priors.flow import ClassicalFlow
+from minislam.priors.grid_flow import ClassicalFlowConfig
 
 HEIGHT, WIDTH = 96, 128
 SIZE = (HEIGHT, WIDTH)

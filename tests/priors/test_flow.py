@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
+from minislam.priors import dense_flow
 from minislam.priors import flow as flow_module
-from minislam.priors.flow import (
-    FlowChain,
+from minislam.priors.dense_flow import (
     composed_flow,
     dense_from_grid,
     grayscale,
@@ -16,6 +16,7 @@ from minislam.priors.flow import (
     reverse_flow,
     warp,
 )
+from minislam.priors.flow import FlowChain
 from tests.priors.patterns import (
     CONFIG,
     GRID,
@@ -79,7 +80,7 @@ def test_a_prediction_is_composed_with_what_is_left(monkeypatch: pytest.MonkeyPa
     # start(p) = A p + a and a given remainder r(p) = B p + b: the flow is r(p) + start(p + r(p)).
     start = affine([[0.02, -0.05], [0.04, 0.03]], [7.0, -3.0])
     remainder = affine([[-0.01, 0.02], [0.03, 0.01]], [-2.0, 1.5])
-    monkeypatch.setattr(flow_module, "residual_flow", lambda source, target: remainder)
+    monkeypatch.setattr(dense_flow, "residual_flow", lambda source, target: remainder)
     blank = np.zeros(SIZE, np.uint8)
     actual = composed_flow(blank, blank, start)
     A, a = np.array([[0.02, -0.05], [0.04, 0.03]]), np.array([7.0, -3.0])
@@ -98,7 +99,7 @@ def test_the_target_is_warped_by_the_prediction_before_the_search(monkeypatch: p
         seen.append((source, target))
         return np.zeros((*SIZE, 2), np.float32)
 
-    monkeypatch.setattr(flow_module, "residual_flow", standing_still)
+    monkeypatch.setattr(dense_flow, "residual_flow", standing_still)
     source, target = (grayscale(shifted(d, 0, SIZE)) for d in (0.0, 12.0))
     actual = composed_flow(source, target, constant(12, 0))
     # A perfect prediction leaves the two images alike, and the flow is the prediction.
@@ -145,7 +146,7 @@ def test_grid_targets_become_a_dense_flow():
 def test_the_reverse_flow_is_the_inverse(monkeypatch: pytest.MonkeyPatch):
     # With nothing left to find, what remains is the inversion of the forward field itself.
     monkeypatch.setattr(
-        flow_module, "residual_flow", lambda *images: np.zeros((*SIZE, 2), np.float32)
+        dense_flow, "residual_flow", lambda *images: np.zeros((*SIZE, 2), np.float32)
     )
     M, m = np.array([[0.03, -0.06], [0.05, 0.02]]), np.array([4.0, -3.0])
     blank = np.zeros(SIZE, np.uint8)

@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.priors.flow import (
-    as_matches,
-    grayscale,
-    grid_matches,
-    texture_confidence,
-)
+from minislam.priors.dense_flow import grayscale
+from minislam.priors.grid_flow import as_matches, grid_matches, texture_confidence
 from tests.priors.patterns import (
     CONFIG,
     HEIGHT,

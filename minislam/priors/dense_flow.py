@@ -1,0 +1,74 @@
+"""Dense optical flow (OpenCV's DIS) and what is done with it: warp, compose, invert.
+
+Dense inverse search finds small displacements well and large ones badly. So the target image is
+first warped by a displacement that is expected, DIS finds what is left, and the two are composed
+("warp-compose").
+"""
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+
+def grayscale(image: Tensor) -> np.ndarray:
+    """Return the 8-bit luminance (H, W) of an image (H, W, 3) in [0, 1]."""
+    rgb = (image.numpy() * 255 + 0.5).astype(np.uint8)
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+
+
+def pixel_maps(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the column and row of every pixel, each (H, W) float32."""
+    return np.meshgrid(np.arange(shape[1], dtype=np.float32), np.arange(shape[0], dtype=np.float32))
+
+
+def sample(
+    image: np.ndarray, column: np.ndarray, row: np.ndarray, method: int = cv2.INTER_LINEAR
+) -> np.ndarray:
+    """Return the image at these positions; those outside take the nearest border pixel."""
+    return cv2.remap(image, column, row, method, borderMode=cv2.BORDER_REPLICATE)
+
+
+def warp(image: np.ndarray, flow: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Return image(p + flow(p))."""
+    column, row = pixel_maps(flow.shape[:2])
+    return sample(image, column + flow[..., 0], row + flow[..., 1], method)
+
+
+def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
+    """Return the dense flow (H, W, 2) that interpolates grid target positions (h, w, 2) [px]."""
+    cells = np.mgrid[: grid_targets.shape[0], : grid_targets.shape[1]].astype(np.float32)
+    grid_flow = grid_targets - stride * np.stack([cells[1], cells[0]], -1)
+    column, row = np.meshgrid(
+        np.arange(shape[1], dtype=np.float32) / stride,
+        np.arange(shape[0], dtype=np.float32) / stride,
+    )
+    return sample(grid_flow, column, row)
+
+
+def residual_flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the DIS flow (H, W, 2) with source(p) = target(p + flow(p)), found from zero."""
+    # One object per call: DIS keeps its buffers inside, so objects cannot be shared by threads.
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return dis.calc(source, target, None)
+
+
+def composed_flow(source: np.ndarray, target: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the flow from source to target (H, W, 2), started from `start` by warp-compose.
+
+    With W(p) = target(p + start(p)) and source(p) = W(p + r(p)), the target position of p is
+    p + r(p) + start(p + r(p)).
+    """
+    remainder = residual_flow(source, warp(target, start))
+    return remainder + warp(start, remainder)
+
+
+def reverse_flow(source: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Return the flow from target to source (H, W, 2), started at the inverse of `forward`.
+
+    The inverse is a fixed point: b(q) = -forward(q + b(q)); three rounds bring a smooth field
+    well inside what DIS corrects by itself.
+    """
+    inverse = -forward
+    for _ in range(3):
+        inverse = -warp(forward, inverse)
+    return composed_flow(target, source, inverse)
