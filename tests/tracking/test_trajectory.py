@@ -8,17 +8,18 @@ from helpers import random_transforms
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_interpolate, se3_inverse, se3_log
+from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.status import TrackedFrame, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
-from tests.tracking.wall import FRAMES, back_end, true_poses, wall_frame
+from tests.tracking.wall import FRAMES, GRID, TrueFlow, back_end, true_poses, wall_frame
 
 KEYFRAMES = [0, 3, 5, 8]
 LOST = 6
 
 
-def posed(progress=None) -> dict[int, Tensor]:
+def posed(progress=None, flow: TrueFlow | None = None) -> dict[int, Tensor]:
     """Return the poses of twelve frames, four of which are keyframes and one of which is lost."""
-    backend = back_end(KEYFRAMES)
+    backend = back_end(KEYFRAMES, flow=flow)
     tracked = [
         TrackedFrame(
             number, 0.1 * number, TrackingStatus.LOST if number == LOST else TrackingStatus.OK, 1.0
@@ -59,6 +60,24 @@ def test_it_is_the_flow_that_says_so():
     truth = true_poses()
     guess = se3_interpolate(truth[5], truth[8], 2 / 3)
     assert se3_log(guess @ se3_inverse(truth[7])).norm() > 1e-2
+
+
+class FlowWithFollower(TrueFlow):
+    """True flow, but a quarter of the image goes along with the camera and stands still in it."""
+
+    def match(self, sources: list[int], targets: list[int], predicted: Tensor) -> FlowMatches:
+        matches = super().match(sources, targets, predicted)
+        width = GRID.shape[1] // 4
+        matches.targets[:, :, :width] = GRID.pixels.view(*GRID.shape, 2)[:, :width]
+        matches.confidences[:, :, :width] = 1.0
+        return matches
+
+
+def test_beyond_the_last_keyframe_nobody_takes_the_pose_along():
+    poses, truth = posed(flow=FlowWithFollower()), true_poses()
+    for number in range(KEYFRAMES[-1] + 1, FRAMES):
+        error = se3_log(poses[number] @ se3_inverse(truth[number])).norm()
+        assert error < 0.03, (number, float(error))  # 0.22 from the keyframe alone
 
 
 def test_keyframes_keep_their_poses_to_the_bit():
