@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 import minislam
+from minislam.allocator import keep_freed_memory
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
 from minislam.errors import InputError, MinislamError
@@ -88,6 +89,7 @@ def run_sequence(
 
     With `resume`, an interrupted run goes on from the checkpoint in its folder.
     """
+    keep_freed_memory()
     torch.set_num_threads(config.threads)
     checkpoints = Checkpoints(folder, sequence, config, choice)
     slam = Slam(sequence, config, priors, report, checkpoints.keep)

@@ -10,6 +10,8 @@ from torch import Tensor
 
 # Below this angle the Taylor series is exact to float64 round-off and the closed form is not.
 _SMALL_ANGLE = 0.02  # radian
+# Newton's method for the nearest rotation squares the error: three steps make 1 % vanish.
+_ORTHONORMALISING_STEPS = 3
 
 
 def hat(vectors: Tensor) -> Tensor:
@@ -121,7 +123,10 @@ def se3_normalised(transforms: Tensor) -> Tensor:
     Every product leaves a rotation off by one rounding error. That is harmless until transposes
     stand for inverses in products of products, where the error grows with every further one.
     """
-    rotation = rotation_from_quaternion(quaternion_from_rotation(transforms[..., :3, :3]))
+    rotation = transforms[..., :3, :3]
+    eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+    for _ in range(_ORTHONORMALISING_STEPS):
+        rotation = rotation @ (1.5 * eye - 0.5 * rotation.transpose(-1, -2) @ rotation)
     return make_transform(rotation, transforms[..., :3, 3])
 
 

@@ -285,13 +285,15 @@ def _damped_step(
     if not torch.isfinite(xi).all():
         return None
 
+    poses = state.T_camera_world.clone()
+    moved_poses = se3_exp(xi.reshape(-1, 6)) @ poses[problem.free_poses]
+    poses[problem.free_poses] = se3_normalised(moved_poses)
+    if not problem.free_disparities.any():
+        return BundleState(poses, state.disparities)
     step = equations.disparity_gradient.clone()
     for source, rows, E in equations.source_blocks:
         step[source] -= xi[rows].to(E.dtype) @ E
     disparities = state.disparities + inverse_C * step
     clamped = disparities.clamp_min(MIN_DISPARITY)
     moved = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
-    poses = state.T_camera_world.clone()
-    moved_poses = se3_exp(xi.reshape(-1, 6)) @ poses[problem.free_poses]
-    poses[problem.free_poses] = se3_normalised(moved_poses)
     return BundleState(poses, moved)
