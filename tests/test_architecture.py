@@ -33,7 +33,7 @@ ALLOWED = {
     "checks": [*FOUNDATION, *ALGORITHMS, "evaluation"],
 }
 # ... but these, which put the system together.
-TOP = ["steps", "slam", "resume", "run", "cli", "cli_eval", "__main__"]
+TOP = ["allocator", "steps", "slam", "resume", "run", "cli", "cli_eval", "__main__"]
 RUN_TIME_LIBRARIES = {"numpy", "scipy", "torch", "matplotlib", "cv2"}
 
 
