@@ -7,6 +7,7 @@ from helpers import generator
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
+from minislam.tracking import bundle_adjustment
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.reprojection import relative_transforms, reproject
 
@@ -23,6 +24,11 @@ class KnownProblem:
 
     problem: BundleProblem
     truth: BundleState
+
+
+def normal_equations(problem: BundleProblem, state: BundleState):
+    linearised = bundle_adjustment._linearised(problem, state)
+    return bundle_adjustment._normal_equations(problem, state, linearised)
 
 
 def normal(seed: int, *shape: int) -> Tensor:

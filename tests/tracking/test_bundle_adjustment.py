@@ -11,6 +11,7 @@ from tracking.scene import (
     known_problem,
     noisy,
     normal,
+    normal_equations,
     perturbed,
     two_fixed_poses,
     uniform,
@@ -31,11 +32,6 @@ from minislam.tracking.robust import RobustKernel
 
 # Plain least squares, Cauchy, Geman-McClure.
 ROBUST = [None, RobustKernel(1.5, 1), RobustKernel(1.5)]
-
-
-def normal_equations(problem: BundleProblem, state: BundleState):
-    linearised = bundle_adjustment._linearised(problem, state)
-    return bundle_adjustment._normal_equations(problem, state, linearised)
 
 
 def one_step(problem: BundleProblem, state: BundleState, damping: float, absolute: float):

@@ -17,6 +17,7 @@ import torch
 from helpers import assert_gradients_close
 from torch import Tensor
 from tracking import golden
+from tracking.scene import normal_equations
 
 from minislam.geometry import se3_adjoint
 from minislam.tracking import bundle_adjustment
@@ -27,11 +28,6 @@ from minislam.tracking.bundle_adjustment import (
     residuals,
 )
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
-
-
-def normal_equations(problem: BundleProblem, state: BundleState):
-    linearised = bundle_adjustment._linearised(problem, state)
-    return bundle_adjustment._normal_equations(problem, state, linearised)
 
 
 def damped_diagonal(problem: BundleProblem, diagonal: Tensor) -> Tensor:
