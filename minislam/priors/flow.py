@@ -4,6 +4,7 @@ Every flow starts from an expected one: what geometry predicts, or the last fram
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache
 from typing import ClassVar
 
@@ -20,11 +21,28 @@ from minislam.priors.grid_flow import (
     texture_confidence,
 )
 from minislam.priors.interfaces import FlowMatches
-from minislam.stateful import Stateful
+from minislam.stateful import FrameOf, Stateful, Tree, built, saved
+
+Edge = tuple[int, int]  # keyframe index of source and target
+
+
+@dataclass(frozen=True)
+class MeasuredEdge:
+    """What was measured along an edge, and from which start."""
+
+    source: int  # keyframe index
+    target: int  # keyframe index
+    start: np.ndarray  # (h, w, 2) px
+    targets: np.ndarray  # (h, w, 2) px
+    confidence: np.ndarray  # (h, w) in [0, 1)
 
 
 class ClassicalFlow(Stateful):
-    """DIS flow between registered keyframes, started from a predicted reprojection."""
+    """DIS flow between registered keyframes, started from a predicted reprojection.
+
+    It takes half the time of tracking, and from the same start it finds the same again: edges
+    are remembered, and measured again only if their start has moved.
+    """
 
     def __init__(self, config: ClassicalFlowConfig | None = None) -> None:
         # DIS splits the image in one stripe per OpenCV thread and does not propagate matches
@@ -34,6 +52,16 @@ class ClassicalFlow(Stateful):
         self.stride = self.config.stride
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[int, np.ndarray] = {}
+        self._measured: dict[Edge, MeasuredEdge] = {}
+
+    def saved_state(self) -> Tree:
+        """Return what was measured; the images are given again."""
+        return {"measured": saved(list(self._measured.values()))}
+
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state."""
+        measured = built(list[MeasuredEdge], state["measured"], frame_of)
+        self._measured = {(edge.source, edge.target): edge for edge in measured}
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
@@ -44,6 +72,8 @@ class ClassicalFlow(Stateful):
     def remove_frame(self, keyframe_index: int) -> None:
         """Forget a keyframe."""
         del self._images[keyframe_index], self._textures[keyframe_index]
+        for edge in [edge for edge in self._measured if keyframe_index in edge]:
+            del self._measured[edge]
 
     def match(
         self,
@@ -53,26 +83,43 @@ class ClassicalFlow(Stateful):
     ) -> FlowMatches:
         """Match every grid cell of each source in its target; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
-        predictions = predicted_targets.numpy().astype(np.float32)
-        pool = _threads(self.config.workers)
-        flow_of = dict(zip(edges, pool.map(self._edge_flow, edges, predictions), strict=True))
+        starts = dict(zip(edges, predicted_targets.numpy().astype(np.float32), strict=True))
+        moved = {edge for edge, start in starts.items() if self._has_moved(edge, start)}
+        # Either direction is the check of the other: both are measured anew, or none.
+        self._measure({(i, j): starts[i, j] for i, j in edges if {(i, j), (j, i)} & moved})
+        measured = [self._measured[edge] for edge in edges]
+        return as_matches(
+            [edge.targets for edge in measured],
+            [edge.confidence for edge in measured],
+            [self._textures[source] for source in edges_source],
+            predicted_targets.dtype,
+        )
 
-        def measure(edge: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def _has_moved(self, edge: Edge, start: np.ndarray) -> bool:
+        if edge not in self._measured:
+            return True
+        distance = np.median(np.linalg.norm(start - self._measured[edge].start, axis=-1))
+        return bool(distance >= self.config.start_tolerance)
+
+    def _measure(self, starts: dict[Edge, np.ndarray]) -> None:
+        pool = _threads(self.config.workers)
+        flows = pool.map(self._edge_flow, starts, starts.values())
+        flow_of = dict(zip(starts, flows, strict=True))
+
+        def measure(edge: Edge) -> MeasuredEdge:
             source, target = edge
             forward, backward = flow_of[edge], flow_of.get((target, source))
             if backward is None:
                 backward = reverse_flow(self._images[source], self._images[target], forward)
             images, texture = (self._images[source], self._images[target]), self._textures[source]
-            return measured_on_grid(*images, forward, backward, texture, self.config)
+            on_grid = measured_on_grid(*images, forward, backward, texture, self.config)
+            return MeasuredEdge(source, target, starts[edge], *on_grid)
 
-        measured = list(pool.map(measure, edges))
-        dtype = predicted_targets.dtype
-        textures = [self._textures[source] for source in edges_source]
-        return as_matches([m[0] for m in measured], [m[1] for m in measured], textures, dtype)
+        self._measured.update(zip(starts, pool.map(measure, starts), strict=True))
 
-    def _edge_flow(self, edge: tuple[int, int], predicted: np.ndarray) -> np.ndarray:
+    def _edge_flow(self, edge: Edge, start: np.ndarray) -> np.ndarray:
         source, target = self._images[edge[0]], self._images[edge[1]]
-        return composed_flow(source, target, dense_from_grid(predicted, source.shape, self.stride))
+        return composed_flow(source, target, dense_from_grid(start, source.shape, self.stride))
 
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""

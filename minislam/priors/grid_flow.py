@@ -31,7 +31,21 @@ class ClassicalFlowConfig:
     texture_scale: float = parameter(
         2e-4, "smaller eigenvalue of the structure tensor that halves confidence [1/px^2]"
     )
+    start_tolerance: float = parameter(
+        0.25, "an edge is measured again if its start has moved by this (median) [px]; 0: always"
+    )
     workers: int = parameter(2, "threads that compute flows side by side; no effect on the result")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Brightness in [0, 1] in the window around each grid cell (h, w), of two images alike."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+    warped_mean: np.ndarray
+    warped_variance: np.ndarray
+    covariance: np.ndarray  # of the two
 
 
 def measured_on_grid(
@@ -44,25 +58,42 @@ def measured_on_grid(
 ) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
     """Return where each grid cell is in the target, as exactly as the images say, and how sure."""
     stride, warped = config.stride, warp(target, forward, cv2.INTER_CUBIC)
-    remainder = lucas_kanade(source, same_exposure(source, warped, stride), stride)
-    alike = likeness(source, warped, stride)
-    return grid_matches(forward, remainder, backward, alike * texture, config)
+    windows = windows_of(source, warped, stride)
+    remainder = lucas_kanade(source, same_exposure(warped, windows), stride)
+    return grid_matches(forward, remainder, backward, likeness(windows) * texture, config)
 
 
-def same_exposure(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
+def windows_of(source: np.ndarray, warped: np.ndarray, stride: int) -> Windows:
+    """Return what is seen around each grid cell in two images (H, W) uint8."""
+
+    def at_cells(image: np.ndarray) -> np.ndarray:
+        return image[::stride, ::stride]
+
+    mean, warped_mean = (
+        at_cells(cv2.boxFilter(image, cv2.CV_32F, LIKENESS_WINDOW)) / 255
+        for image in (source, warped)
+    )
+    square, warped_square, product = (
+        at_cells(cv2.boxFilter(cv2.multiply(*images, dtype=cv2.CV_32F), -1, LIKENESS_WINDOW))
+        / 255**2
+        for images in ((source, source), (warped, warped), (source, warped))
+    )
+    return Windows(
+        mean, square - mean**2, warped_mean, warped_square - warped_mean**2,
+        product - mean * warped_mean,
+    )  # fmt: skip
+
+
+def same_exposure(warped: np.ndarray, windows: Windows) -> np.ndarray:
     """Return the warped image (H, W) uint8 with the brightness and contrast of the source.
 
     Both are medians over small windows, so that what moves or is covered has no say.
     """
-    (mean, variance), (warped_mean, warped_variance) = (
-        [of_pixels[::stride, ::stride] for of_pixels in local_statistics(image)]
-        for image in (source, warped)
-    )
-    textured = np.minimum(variance, warped_variance) > LEAST_VARIANCE
+    textured = np.minimum(windows.variance, windows.warped_variance) > LEAST_VARIANCE
     if not textured.any():
         return warped
-    contrast = np.sqrt(np.median(variance[textured] / warped_variance[textured]))
-    brightness = np.median((mean - contrast * warped_mean)[textured])
+    contrast = np.sqrt(np.median(windows.variance[textured] / windows.warped_variance[textured]))
+    brightness = np.median((windows.mean - contrast * windows.warped_mean)[textured])
     return cv2.addWeighted(warped, contrast, warped, 0, 255 * brightness)
 
 
@@ -122,25 +153,14 @@ def texture_confidence(gray: np.ndarray, config: ClassicalFlowConfig) -> np.ndar
     return smaller / (smaller + config.texture_scale)
 
 
-def likeness(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
+def likeness(windows: Windows) -> np.ndarray:
     """Return how alike a source and its warped target look around each cell (h, w), in [0, 1].
 
     It is the squared normalised cross-correlation, blind to exposure. Forward and backward flow
     agree with each other on a black target and, here and there, on any other: this asks the images.
     """
-    (mean, variance), (warped_mean, warped_variance) = map(local_statistics, (source, warped))
-    product = source.astype(np.float32) * warped.astype(np.float32) / 255**2
-    covariance = cv2.boxFilter(product, -1, LIKENESS_WINDOW) - mean * warped_mean
-    floor = LEAST_VARIANCE**2
-    correlation = covariance / np.sqrt(np.maximum(variance * warped_variance, floor))
-    return np.clip(correlation, 0, 1)[::stride, ::stride] ** 2
-
-
-def local_statistics(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variance (H, W) of brightness in [0, 1] around each pixel."""
-    scaled = gray.astype(np.float32) / 255
-    mean, square = (cv2.boxFilter(image, -1, LIKENESS_WINDOW) for image in (scaled, scaled**2))
-    return mean, square - mean**2
+    squared_scale = np.maximum(windows.variance * windows.warped_variance, LEAST_VARIANCE**2)
+    return np.clip(windows.covariance / np.sqrt(squared_scale), 0, 1) ** 2
 
 
 def as_matches(

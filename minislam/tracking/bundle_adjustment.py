@@ -154,19 +154,27 @@ def _linearised(problem: BundleProblem, state: BundleState) -> _Linearised:
     return _Linearised(cost, residual, weight, reprojection, transforms)
 
 
-def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
-    """Return Eq. (5) in px^2, with the robust loss if there is one."""
+def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) float64 px^2
+    """Return what each edge contributes to Eq. (5), the robust loss included."""
+    at = _linearised(problem, state)
+    return _edge_costs(problem, at.residual, at.reprojection.valid)
+
+
+def _edge_costs(problem: BundleProblem, residual: Tensor, valid: Tensor) -> Tensor:
     # Points behind the target would leave the sum, and the cheapest camera would look away from
     # all of them: each counts as a miss by the width of the image.
     residual = torch.where(valid[:, None], residual, float(problem.camera.width))
-    weight = problem.weights
     if problem.robust is None:
-        flow_cost = (weight * residual.square()).sum(dtype=torch.float64)
-    else:
-        loss = problem.robust.loss(residual.square().sum(1))
-        flow_cost = (weight.mean(1) * loss).sum(dtype=torch.float64)
+        return (problem.weights * residual.square()).sum((1, 2), dtype=torch.float64)
+    loss = problem.robust.loss(residual.square().sum(1))
+    return (problem.weights.mean(1) * loss).sum(1, dtype=torch.float64)
+
+
+def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
+    """Return Eq. (5) in px^2, with the robust loss if there is one."""
     difference = state.disparities - problem.prior_disparities
-    return float(flow_cost + (problem.prior_weights * difference.square()).sum(dtype=torch.float64))
+    prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
+    return float(_edge_costs(problem, residual, valid).sum() + prior_cost)
 
 
 def _normal_equations(

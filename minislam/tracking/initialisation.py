@@ -8,7 +8,6 @@ residuals: several hypotheses are carried through the same bundle adjustment and
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import product
 
 import cv2
 import numpy as np
@@ -23,6 +22,7 @@ from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleState,
     bundle_adjust,
+    edge_costs,
     motion_only_adjust,
 )
 from minislam.tracking.frame_graph import splat_disparities
@@ -60,36 +60,38 @@ def start_pose(
     T_source_world: Tensor,  # (4, 4)
     starts: list[Tensor],  # candidates (4, 4) for T_target_world
     robust: RobustKernel | None,
-) -> tuple[Tensor, float]:
-    """Return T_target_world (4, 4) that explains the flow best, and its cost [px^2].
+) -> Tensor:
+    """Return T_target_world (4, 4) that explains the flow best.
 
     Gauss-Newton on six unknowns from several starts, each with the robust weight narrowed from
     wide, from less wide and not at all; the cheapest end is kept. From far only a wide weight
     finds the way, but while it is wide, a near mover with long residuals pulls the pose to itself,
-    and what a narrow weight then finds there costs more than the truth.
+    and what a narrow weight then finds there costs more than the truth. All of them are solved
+    side by side: as poses of one problem that share nothing but the source.
     """
-    problem = BundleProblem(
-        camera=grid.camera,
-        rays=grid.rays,
-        edges_source=torch.tensor([0]),
-        edges_target=torch.tensor([1]),
-        targets=matches.targets.flatten(1, 2).mT,
-        weights=matches.confidences.flatten(1, 2).mT * trust,
-        prior_disparities=torch.zeros(2, len(grid.rays)),
-        prior_weights=torch.zeros(2, len(grid.rays)),
-        free_poses=torch.tensor([False, True]),
-        free_disparities=torch.tensor([False, False]),
-    )
-    widenings = ROBUST_WIDENING if robust else (1.0,)
-    ends = []
-    for start, first in product(starts, range(len(widenings))):
-        state = BundleState(torch.stack([T_source_world, start]), disparities.expand(2, -1))
-        for widening in widenings[first:]:
-            problem = replace(problem, robust=robust and robust.widened(widening))
-            state, report = motion_only_adjust(problem, state, POSE_ITERATIONS)
-        ends.append((report.cost_after, state.T_camera_world[1]))
-    cost, pose = min(ends, key=lambda end: end[0])
-    return pose, cost
+    candidates: list[Tensor] = []
+    for widening in ROBUST_WIDENING if robust else (1.0,):
+        candidates += starts
+        count = len(candidates)
+        empty = torch.zeros(count + 1, len(grid.rays))
+        problem = BundleProblem(
+            camera=grid.camera,
+            rays=grid.rays,
+            edges_source=torch.zeros(count, dtype=torch.long),
+            edges_target=torch.arange(1, count + 1),
+            targets=matches.targets.flatten(1, 2).mT.expand(count, -1, -1),
+            weights=(matches.confidences.flatten(1, 2).mT * trust).expand(count, -1, -1),
+            prior_disparities=empty,
+            prior_weights=empty,
+            free_poses=torch.arange(count + 1) > 0,
+            free_disparities=torch.zeros(count + 1, dtype=torch.bool),
+            robust=robust and robust.widened(widening),
+        )
+        poses = torch.stack([T_source_world, *candidates])
+        state = BundleState(poses, disparities.expand(count + 1, -1))
+        state, _ = motion_only_adjust(problem, state, POSE_ITERATIONS)
+        candidates = list(state.T_camera_world[1:])
+    return candidates[int(edge_costs(problem, state).argmin())]
 
 
 def carry_disparities(
@@ -185,7 +187,7 @@ def chain_state(
         starts = [last]
         if index > 0:
             starts.append(se3_interpolate(poses[-2], last, 2.0))
-        pose, _ = start_pose(grid, matches, depths, trust[-1], last, starts, robust)
+        pose = start_pose(grid, matches, depths, trust[-1], last, starts, robust)
         motion = pose @ se3_inverse(last)
         if memory_scale is not None:
             trust[-1] = updated_trust(grid, matches, depths, motion, trust[-1], memory_scale)

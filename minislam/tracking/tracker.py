@@ -181,7 +181,7 @@ class Tracker(Stateful):
                 before = self.keyframes.T_camera_world[-2]
                 starts.append(se3_interpolate(before, last, 2.0))
             trust = self.keyframes.trust[-1]
-            pose, _ = start_pose(
+            pose = start_pose(
                 self.grid, matches, disparities, trust, last, starts, self.backend.robust
             )
             carried = carry_disparities(self.grid, pose @ se3_inverse(last), disparities)

@@ -81,7 +81,7 @@ def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: 
         # Nothing holds it from the other side, so it could follow a mover as a keyframe could.
         trust = keyframes.trust[around[0]]
         starts = [start, _continued(backend, around[0], timestamp)]
-        poses[-1], _ = start_pose(
+        poses[-1] = start_pose(
             grid, matches, disparities[0], trust, known[0], starts, backend.robust
         )
     state = BundleState(poses, torch.cat([disparities, empty[:1]]))

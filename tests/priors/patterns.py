@@ -48,7 +48,7 @@ def shifted(du: float, dv: float, size: tuple[int, int]) -> Tensor:
     return view(np.eye(2), np.array([-du, -dv]), size)
 
 
-def flow_of(images: list[Tensor], **settings: int) -> ClassicalFlow:
+def flow_of(images: list[Tensor], **settings: float) -> ClassicalFlow:
     flow = ClassicalFlow(replace(CONFIG, **settings))
     for index, image in enumerate(images):
         flow.add_frame(index, image)

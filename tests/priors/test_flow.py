@@ -174,10 +174,10 @@ def test_a_backward_edge_that_is_matched_as_well_is_used(monkeypatch: pytest.Mon
         return reverse(*arguments)
 
     monkeypatch.setattr(flow_module, "reverse_flow", counted)
-    flow = flow_of([shifted(d, 0, SIZE) for d in (0, 2, 4)])
-    both = flow.match([0, 1], [1, 0], still(2))
+    images = [shifted(d, 0, SIZE) for d in (0, 2, 4)]
+    both = flow_of(images).match([0, 1], [1, 0], still(2))
     assert not calls
-    alone = flow.match([0, 2], [1, 1], still(2))
+    alone = flow_of(images).match([0, 2], [1, 1], still(2))
     assert len(calls) == 2
     assert torch.equal(both.targets[0], alone.targets[0])
     assert (both.confidences[0] - alone.confidences[0]).abs().mean() < 0.05

@@ -5,12 +5,17 @@ import pytest
 
 from minislam.priors import grid_flow
 from minislam.priors.dense_flow import grayscale
-from minislam.priors.grid_flow import lucas_kanade, measured_on_grid, same_exposure
+from minislam.priors.grid_flow import lucas_kanade, measured_on_grid, same_exposure, windows_of
 from tests.priors.patterns import CONFIG, HEIGHT, SIZE, WIDTH, constant, shifted, view
 
 STRIDE = CONFIG.stride
 INNER_CELLS = (slice(2, -2), slice(2, -2))
 SURE = np.ones((HEIGHT // STRIDE, WIDTH // STRIDE), np.float32)
+
+
+def brought_to(source: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the other image with the exposure of the source."""
+    return same_exposure(other, windows_of(source, other, STRIDE))
 
 
 @pytest.mark.parametrize("shift", [(0.3, -0.2), (-0.6, 0.4), (0.0, 0.0)])
@@ -54,7 +59,7 @@ def test_a_flow_that_is_off_everywhere_by_the_same_is_set_right():
 def test_another_exposure_is_taken_back(contrast: float, brightness: float):
     bright = shifted(0, 0, SIZE) * 0.5 + 0.25
     other = (contrast * bright + brightness).clamp(0, 1)
-    back = same_exposure(grayscale(bright), grayscale(other), STRIDE)
+    back = brought_to(grayscale(bright), grayscale(other))
     assert np.abs(back.astype(int) - grayscale(bright)).max() <= 3
     found = lucas_kanade(grayscale(bright), back, STRIDE)
     assert np.abs(found).max() < 0.15 and np.median(np.abs(found)) < 0.03
@@ -64,14 +69,14 @@ def test_what_is_covered_has_no_say_in_the_exposure():
     source = grayscale(shifted(0, 0, SIZE))
     covered = source.copy()
     covered[:, : WIDTH // 3] = grayscale(0.4 * shifted(40, 9, SIZE))[:, : WIDTH // 3]
-    back = same_exposure(source, covered, STRIDE)
+    back = brought_to(source, covered)
     assert np.abs(back[:, WIDTH // 2 :].astype(int) - source[:, WIDTH // 2 :]).max() <= 2
 
 
 def test_an_exposure_that_nothing_tells_is_left_alone():
     blank, source = np.full(SIZE, 90, np.uint8), grayscale(shifted(0, 0, SIZE))
-    assert same_exposure(source, blank, STRIDE) is blank
-    assert same_exposure(blank, source, STRIDE) is source
+    assert brought_to(source, blank) is blank
+    assert brought_to(blank, source) is source
 
 
 # Degenerate input

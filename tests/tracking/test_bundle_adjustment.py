@@ -24,6 +24,7 @@ from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleState,
     bundle_adjust,
+    edge_costs,
     motion_only_adjust,
     residuals,
 )
@@ -91,6 +92,18 @@ def test_robust_weights_recover_from_thirty_percent_outliers():
     plain_error = (misled.T_camera_world - known.truth.T_camera_world).abs().max()
     assert error < 2e-3
     assert error < 0.02 * plain_error
+
+
+def test_edge_costs_by_hand():
+    known = known_problem(2)
+    targets = known.problem.targets + torch.tensor([3.0, 4.0])[:, None]
+    weights = 0.5 * torch.ones_like(targets)
+    plain = replace(known.problem, targets=targets, weights=weights)
+    robust = replace(plain, robust=RobustKernel(2.5))
+    # |r|^2 = 25 px^2 in every cell; Geman-McClure: c^2 r^2 / (r^2 + c^2) = 6.25 * 25 / 31.25 = 5.
+    both = torch.ones(2, dtype=torch.float64) * CELLS * 0.5
+    torch.testing.assert_close(edge_costs(plain, known.truth), 25 * both)
+    torch.testing.assert_close(edge_costs(robust, known.truth), 5 * both)
 
 
 def test_cauchy_weights_by_hand():
@@ -165,6 +178,21 @@ def test_the_gradient_is_that_of_the_cost(robust):
     predicted = equations.pose_gradient @ xi.reshape(-1)
     predicted = -2 * (predicted + (equations.disparity_gradient * added).sum())
     assert slope == pytest.approx(float(predicted), rel=1e-6)
+
+
+@pytest.mark.parametrize("robust", ROBUST)
+def test_the_cost_is_that_of_the_edges_and_of_the_prior(robust):
+    known = with_prior(known_problem(), weight=3.0)
+    problem, state = replace(noisy(known, 1.0), robust=robust), perturbed(known, 0.02)
+    costs = edge_costs(problem, state)
+    assert costs.shape == (len(problem.edges_source),)
+    prior = (problem.prior_weights * (state.disparities - problem.prior_disparities) ** 2).sum()
+    _, report = bundle_adjust(problem, state, iterations=0)
+    assert report.cost_before == pytest.approx(float(costs.sum() + prior), rel=1e-12)
+    weights = problem.weights.clone()
+    weights[3] = 0
+    without = edge_costs(replace(problem, weights=weights), state)
+    torch.testing.assert_close(without, costs * (torch.arange(len(costs)) != 3))
 
 
 def test_a_weight_of_zero_removes_a_cell_exactly():
