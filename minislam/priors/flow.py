@@ -113,7 +113,8 @@ class ClassicalFlow(Stateful):
                 backward = reverse_flow(self._images[source], self._images[target], forward)
             images, texture = (self._images[source], self._images[target]), self._textures[source]
             on_grid = measured_on_grid(*images, forward, backward, texture, self.config)
-            return MeasuredEdge(source, target, starts[edge], *on_grid)
+            # A copy: a view would keep the starts of all edges of this call.
+            return MeasuredEdge(source, target, starts[edge].copy(), *on_grid)
 
         self._measured.update(zip(starts, pool.map(measure, starts), strict=True))
 
