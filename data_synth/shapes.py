@@ -21,11 +21,14 @@ class Shape(Protocol):
     """What the ray-caster needs to know about a solid."""
 
     @property
-    def half_extents(self) -> Array: ...  # (3,) of the bounding box [m]
+    def half_extents(self) -> Array:
+        """Half the sides of the bounding box (3,) [m]."""
 
-    def intersect(self, origin: Array, directions: Array) -> Array: ...  # (3,), (3, N) -> (N,)
+    def intersect(self, origin: Array, directions: Array) -> Array:
+        """Return the parameters (N,) at which rays (3,), (3, N) meet it, infinity on a miss."""
 
-    def normals(self, points: Array) -> Array: ...  # (3, N) -> (3, N), unit, outwards
+    def normals(self, points: Array) -> Array:
+        """Return the unit normals (3, N), outwards, at points (3, N) on its surface."""
 
 
 def _slab(origin: Array, directions: Array, half: Array) -> tuple[Array, Array]:

@@ -39,7 +39,7 @@ class ClassicalFlowConfig:
 
 @dataclass(frozen=True)
 class Windows:
-    """Brightness in [0, 1] in the window around each grid cell (h, w), of two images alike."""
+    """Brightness in [0, 1] around each grid cell (h, w), of a source and of its warped target."""
 
     mean: np.ndarray
     variance: np.ndarray

@@ -3,7 +3,7 @@
     python tests/benchmarks/bench_ablations.py prior|loop [NAME:SEED ...]
 
 Tracking alone, at 320x240 with the simulated depth prior. The ATE of the keyframes in cm, before
-and after the final adjustment. About 15 s a column, three minutes where a loop of 400 frames is
+and after the final adjustment. About 20 s a column, some minutes where a loop of 400 frames is
 walked.
 """
 
