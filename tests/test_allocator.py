@@ -9,15 +9,17 @@ import pytest
 
 from minislam.allocator import keep_freed_memory
 
-# Pages that the system has to clear while 8 MB are asked for and freed, over and over.
+# Pages that the system has to clear while 36 MB are asked for and freed, over and over. Blocks of
+# less than 4 MB: for larger ones numpy asks for huge pages, of which there may or may not be some.
 COUNT_FAULTS = """
 import resource
 import numpy as np
 from minislam.allocator import keep_freed_memory
 {call}
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(200):
-    np.ones(1_000_000)
+for _ in range(20):
+    blocks = [np.ones(375_000) for _ in range(12)]
+    del blocks
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
