@@ -2,6 +2,6 @@
 
 import sys
 
-from minislam.cli import main
+from minislam.cli.main import main
 
 sys.exit(main())

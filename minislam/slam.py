@@ -23,8 +23,8 @@ from minislam.geometry import se3_inverse
 from minislam.mapping import Mapper
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
-from minislam.stateful import Stateful
-from minislam.steps import Report, Steps, silent
+from minislam.state.stateful import Stateful
+from minislam.state.steps import Report, Steps, silent
 from minislam.tracking.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker

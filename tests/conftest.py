@@ -18,7 +18,6 @@ def pytest_configure(config) -> None:
     # Notebook kernels start in notebooks/, so a bare clone needs an absolute path to the package.
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     sys.path.insert(0, str(ROOT))
-    sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from minislam.cli import main
+from minislam.cli.main import main
 from minislam.config import from_json, preset, with_settings
 from minislam.data import InputOptions, RunFolder, open_sequence
 from minislam.evaluation import absolute_trajectory_error

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from minislam.data.benchmarks import bonn_camera_trajectory, is_bonn, known_camera
 from minislam.data.calibration import Calibration
 from minislam.data.files import data_rows, finite_numbers, read_text
 from minislam.data.folder import calibration_beside, folder_name, stamps_of_names
 from minislam.data.images import list_images, read_color
+from minislam.data.known_cameras import bonn_camera_trajectory, is_bonn, known_camera
 from minislam.data.recording import Recording
 from minislam.data.sources import FileImages
 from minislam.data.trajectory import read_trajectory

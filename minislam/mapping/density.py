@@ -10,7 +10,7 @@ from minislam.geometry import Camera
 from minislam.geometry.se3 import rotation_from_quaternion
 from minislam.mapping.config import DensityConfig
 from minislam.splatting import GaussianMap, MapOptimizer
-from minislam.stateful import Stateful
+from minislam.state.stateful import Stateful
 
 _CHILDREN = 2  # of a Gaussian that is split, 3DGS
 

@@ -25,7 +25,7 @@ from minislam.mapping.views import MappedKeyframe, keyframe_misfit, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
 from minislam.splatting import GaussianMap, MapOptimizer, Rendering, render
-from minislam.stateful import Stateful
+from minislam.state.stateful import Stateful
 from minislam.uncertainty import (
     UncertaintyConfig,
     UncertaintyMLP,

@@ -10,7 +10,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.records import Keyframe
 from minislam.splatting import Rendering
-from minislam.stateful import FrameOf, Tree
+from minislam.state.stateful import FrameOf, Tree
 from minislam.uncertainty import Misfit, UncertaintyConfig, beta_of_mask, measure_misfit
 
 _OPAQUE = 0.5  # opacity from which on a surface is seen rather than a gap

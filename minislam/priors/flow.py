@@ -21,7 +21,7 @@ from minislam.priors.grid_flow import (
     texture_confidence,
 )
 from minislam.priors.interfaces import FlowMatches
-from minislam.stateful import FrameOf, Stateful, Tree, built, saved
+from minislam.state.stateful import FrameOf, Stateful, Tree, built, saved
 
 Edge = tuple[int, int]  # keyframe index of source and target
 

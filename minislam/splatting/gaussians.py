@@ -9,7 +9,7 @@ from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.parameters import parameter
-from minislam.stateful import FrameOf, Stateful, Tree
+from minislam.state.stateful import FrameOf, Stateful, Tree
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
-from minislam.stateful import Stateful
+from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleReport,

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowMatches
-from minislam.stateful import FrameOf, Stateful, Tree
+from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.reprojection import (
     lengths,
     relative_transforms,

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from minislam.records import Frame
-from minislam.stateful import Stateful
+from minislam.state.stateful import Stateful
 
 
 class KeyframeStore(Stateful):

@@ -16,7 +16,7 @@ from minislam.priors.interfaces import (
     FlowMatches,
 )
 from minislam.records import Frame
-from minislam.stateful import FrameOf, Stateful, Tree
+from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import mask_priors

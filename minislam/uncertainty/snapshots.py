@@ -5,7 +5,7 @@ from typing import ClassVar
 from torch import Tensor
 from torch.func import functional_call
 
-from minislam.stateful import Stateful
+from minislam.state.stateful import Stateful
 from minislam.uncertainty.mlp import UncertaintyMLP
 
 _MOST = 32  # copies kept; a copy for DINOv2 features takes 115 kB

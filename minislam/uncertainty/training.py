@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from minislam.stateful import FrameOf, Stateful, Tree, saved
+from minislam.state.stateful import FrameOf, Stateful, Tree, saved
 from minislam.uncertainty.config import UncertaintyConfig
-from minislam.uncertainty.grid import resample
 from minislam.uncertainty.losses import (
     cell_loss,
     depth_loss,
@@ -16,6 +15,7 @@ from minislam.uncertainty.losses import (
     variance_regulariser,
 )
 from minislam.uncertainty.mlp import UncertaintyMLP
+from minislam.uncertainty.resampling import resample
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """What parts of the tracker are worth: the disparity prior with its mask, and closing loops.
 
-    python tests/benchmarks/bench_ablations.py prior|loop [NAME:SEED ...]
+    python -m tests.benchmarks.bench_ablations prior|loop [NAME:SEED ...]
 
 Tracking alone, at 320x240 with the simulated depth prior. The ATE of the keyframes in cm, before
 and after the final adjustment. About 20 s a column, some minutes where a loop of 400 frames is
@@ -10,10 +10,10 @@ walked.
 import argparse
 
 import torch
-from bench_movers import SEED, SEQUENCES, errors
 
 from minislam.data import open_sequence
 from minislam.tracking.config import TrackingConfig
+from tests.benchmarks.bench_movers import SEED, SEQUENCES, errors
 
 COLUMNS = {
     # Rows (i) to (iv) of the paper's supplement, Tab. "Ablation Study on Disparity Regularization".

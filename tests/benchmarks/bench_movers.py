@@ -1,6 +1,6 @@
 """Follow the camera through moving things, with one safeguard after the other.
 
-    python tests/benchmarks/bench_movers.py [NAME:SEED ...]
+    python -m tests.benchmarks.bench_movers [NAME:SEED ...]
 
 Tracking alone, 100 frames at 320x240 with the simulated depth prior. The ATE of the keyframes in
 cm, before and after the final adjustment: by least squares, with the robust weight, with the
@@ -18,7 +18,7 @@ from minislam.evaluation import absolute_trajectory_error
 from minislam.geometry import se3_inverse
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence, Trajectory
-from minislam.run import choose_priors
+from minislam.runs.run import choose_priors
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.tracker import Tracker
 

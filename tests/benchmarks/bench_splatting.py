@@ -1,6 +1,6 @@
 """Time the renderer, forward and backward, and compare it with plain autograd renderers.
 
-    python tests/benchmarks/bench_splatting.py [--threads 1] [--repeats 15] [--plot timings.png]
+    python -m tests.benchmarks.bench_splatting [--threads 1] [--repeats 15] [--plot timings.png]
 
 All contestants take turns in one process, so that a busy machine slows them all alike: the
 ratios mean more than the milliseconds. The dense reference runs only on a small scene.
@@ -15,13 +15,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from room import room_camera, room_scene
-from tile_autograd import render_tiles_with_autograd
 from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.splatting import GaussianMap, render, render_reference
+from tests.benchmarks.room import room_camera, room_scene
+from tests.benchmarks.tile_autograd import render_tiles_with_autograd
 
 SIZES = ((160, 120, 5_000), (320, 240, 20_000), (640, 480, 50_000))  # width, height, Gaussians
 COMPARED = (320, 240, 20_000)
@@ -91,7 +91,7 @@ def compare(size: tuple[int, int, int], other: Callable, repeats: int) -> tuple[
 
 def peak_memory_mb() -> float:
     """Return by how much rendering raises the peak memory at the largest size [MB]."""
-    command = [sys.executable, __file__, "--memory-only"]
+    command = [sys.executable, "-m", "tests.benchmarks.bench_splatting", "--memory-only"]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 

@@ -1,6 +1,6 @@
 """Time the hot paths of tracking on one thread: the bundle adjustment and the flow.
 
-    python tests/benchmarks/bench_tracking.py
+    python -m tests.benchmarks.bench_tracking
 
 Times are processor time, medians; the ratio to the dense normal equations is what a busy machine
 does not change.

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import picture, save
 
 from minislam.data.folder import folder_name, read_image_folder
 from minislam.errors import InputError
+from tests.recordings import picture, save
 
 # Known answers
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import picture, save
 
 from minislam.data.images import (
     encode_png,
@@ -16,6 +15,7 @@ from minislam.data.images import (
     read_mask,
 )
 from minislam.errors import InputError
+from tests.recordings import picture, save
 
 # Known answers
 

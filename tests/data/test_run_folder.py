@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import random_transforms
-from recordings import picture, save
 
 from minislam.data.images import read_color
 from minislam.data.ply import GaussianArrays
 from minislam.data.run_folder import RunFolder
 from minislam.errors import InputError
 from minislam.records import Trajectory
+from tests.helpers import random_transforms
+from tests.recordings import picture, save
 
 
 def fill(run: RunFolder) -> None:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import picture, save, tum_folder, video
 
 from minislam.data import InputOptions, open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from tests.recordings import picture, save, tum_folder, video
 
 # Known answers
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import random_transforms
 
 from minislam.data.trajectory import (
     format_trajectory,
@@ -16,6 +15,7 @@ from minislam.data.trajectory import (
 )
 from minislam.errors import InputError
 from minislam.records import Trajectory
+from tests.helpers import random_transforms
 
 
 def random_trajectory(count: int, seed: int = 0) -> Trajectory:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import picture, save, tum_folder
 
 from minislam.data.tum import is_tum_folder, parse_image_list, read_tum_folder
 from minislam.errors import InputError
+from tests.recordings import picture, save, tum_folder
 
 # Known answers
 

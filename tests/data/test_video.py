@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import picture, save, video
 
 from minislam.data.folder import read_video
 from minislam.data.sources import VideoImages
 from minislam.errors import InputError
+from tests.recordings import picture, save, video
 
 # Known answers
 

@@ -1,7 +1,6 @@
 """Held-out poses are carried into the world of the map."""
 
 import numpy as np
-from helpers import random_transforms
 
 from minislam.evaluation.novel_views import (
     align_novel_views,
@@ -10,6 +9,7 @@ from minislam.evaluation.novel_views import (
 )
 from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
+from tests.helpers import random_transforms
 
 # Identities
 

@@ -5,7 +5,6 @@ import importlib
 
 import numpy as np
 import pytest
-from helpers import random_transforms
 
 from minislam.errors import InputError
 from minislam.evaluation.trajectory import (
@@ -19,6 +18,7 @@ from minislam.evaluation.trajectory import (
 )
 from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
+from tests.helpers import random_transforms
 
 
 def spiral(count: int, seed: int = 0) -> Trajectory:

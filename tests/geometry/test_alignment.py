@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers import random_transforms
 
 from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity, identity_similarity, umeyama
+from tests.helpers import random_transforms
 
 
 def random_points(count: int, seed: int) -> np.ndarray:

@@ -1,11 +1,11 @@
 """Random maps and cameras for the splatting tests, in float64, ordinary and hostile."""
 
 import torch
-from helpers import generator
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
 from minislam.splatting import GaussianMap
+from tests.helpers import generator
 
 KINDS = ("ordinary", "off_screen", "behind", "huge", "needles", "capped", "faint", "crowded")
 

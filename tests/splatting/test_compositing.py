@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from helpers import assert_gradients_close, generator, numerical_gradient
 from torch import Tensor
 
 from minislam.splatting.compositing import (
@@ -17,6 +16,7 @@ from minislam.splatting.compositing import (
 )
 from minislam.splatting.rendering import MIN_ALPHA
 from minislam.splatting.tiles import PIXELS
+from tests.helpers import assert_gradients_close, generator, numerical_gradient
 
 TILES = 2
 

@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from helpers import assert_gradients_close, generator, numerical_gradient
-from splatting.scenes import random_map
 
 from minislam.geometry.se3 import rotation_from_quaternion
 from minislam.splatting.covariance import (
@@ -13,6 +11,8 @@ from minislam.splatting.covariance import (
     rotations_vjp,
 )
 from minislam.splatting.reference import covariances
+from tests.helpers import assert_gradients_close, generator, numerical_gradient
+from tests.splatting.scenes import random_map
 
 
 def normal(seed: int, *shape: int) -> torch.Tensor:

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from helpers import generator
 
 from minislam.geometry import Camera
 from minislam.splatting.ellipses import project_gaussians
+from tests.helpers import generator
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

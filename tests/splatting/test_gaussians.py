@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from splatting.scenes import one_gaussian, random_map
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, render
+from tests.splatting.scenes import one_gaussian, random_map
 
 
 def descend(optimizer: MapOptimizer, seed: int = 0) -> None:

@@ -4,8 +4,6 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from helpers import assert_gradients_close, generator, numerical_gradient
-from splatting.scenes import random_camera, random_map, random_pose
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
@@ -23,6 +21,8 @@ from minislam.splatting.projection import (
 )
 from minislam.splatting.reference import covariances, project_covariances
 from minislam.splatting.rendering import LOW_PASS_VARIANCE, tangent_limits
+from tests.helpers import assert_gradients_close, generator, numerical_gradient
+from tests.splatting.scenes import random_camera, random_map, random_pose
 
 REGIMES = {"normal": 2.5, "close": 0.1, "far": 200.0}  # mean distance in world units
 

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from helpers import assert_gradients_close, generator, numerical_gradient
-from splatting.scenes import KINDS, one_gaussian, random_camera, random_map, random_pose
 from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.splatting import GaussianMap, Rendering, render, render_reference
+from tests.helpers import assert_gradients_close, generator, numerical_gradient
+from tests.splatting.scenes import KINDS, one_gaussian, random_camera, random_map, random_pose
 
 SCENES_PER_KIND = 25  # times eight kinds: 200 scenes
 

@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from splatting.scenes import one_gaussian, random_camera, random_map, random_pose
 
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.geometry.se3 import quaternion_from_rotation, rotation_from_quaternion
 from minislam.splatting import GaussianMap, render, render_reference
 from minislam.splatting.rendering import LOW_PASS_VARIANCE, NEAR_DEPTH
+from tests.splatting.scenes import one_gaussian, random_camera, random_map, random_pose
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
 CAMERA = Camera(60.0, 60.0, 12.0, 9.0, 27, 21)

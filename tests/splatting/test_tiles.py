@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from splatting.scenes import KINDS, random_camera, random_map, random_pose
 
 from minislam.splatting.ellipses import project_gaussians
 from minislam.splatting.reference import gaussian_alphas
 from minislam.splatting.tiles import TILE, TileLists, build_tile_lists, tile_grid
+from tests.splatting.scenes import KINDS, random_camera, random_map, random_pose
 
 
 def lists_and_truth(kind: str, seed: int) -> tuple[TileLists, torch.Tensor, int]:

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, replace
 
 import torch
-from helpers import generator
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
 from minislam.tracking import bundle_adjustment
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.reprojection import relative_transforms, reproject
+from tests.helpers import generator
 
 STRIDE = 8
 CAMERA = Camera(fx=60.0, fy=66.0, cx=33.0, cy=19.0, width=80, height=56)

@@ -4,19 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tracking.scene import (
-    CELLS,
-    assert_same_bits,
-    distance,
-    known_problem,
-    noisy,
-    normal,
-    normal_equations,
-    perturbed,
-    two_fixed_poses,
-    uniform,
-    with_prior,
-)
 
 from minislam.geometry import se3_exp
 from minislam.tracking import bundle_adjustment
@@ -30,6 +17,19 @@ from minislam.tracking.bundle_adjustment import (
 )
 from minislam.tracking.reference import dense_normal_equations, dense_step
 from minislam.tracking.robust import RobustKernel
+from tests.tracking.scene import (
+    CELLS,
+    assert_same_bits,
+    distance,
+    known_problem,
+    noisy,
+    normal,
+    normal_equations,
+    perturbed,
+    two_fixed_poses,
+    uniform,
+    with_prior,
+)
 
 # Plain least squares, Cauchy, Geman-McClure.
 ROBUST = [None, RobustKernel(1.5, 1), RobustKernel(1.5)]

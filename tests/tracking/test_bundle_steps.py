@@ -6,15 +6,6 @@ from itertools import pairwise
 import pytest
 import torch
 from torch import Tensor
-from tracking.scene import (
-    assert_same_bits,
-    distance,
-    known_problem,
-    noisy,
-    perturbed,
-    two_fixed_poses,
-    with_prior,
-)
 
 from minislam.geometry import se3_exp
 from minislam.tracking import bundle_adjustment
@@ -26,6 +17,15 @@ from minislam.tracking.bundle_adjustment import (
     residuals,
 )
 from minislam.tracking.robust import RobustKernel
+from tests.tracking.scene import (
+    assert_same_bits,
+    distance,
+    known_problem,
+    noisy,
+    perturbed,
+    two_fixed_poses,
+    with_prior,
+)
 
 # Steps that are not taken
 

@@ -5,8 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from tracking.scene import CAMERA, STRIDE, uniform
-from tracking.wall import back_end
 
 from minislam.geometry import Camera, se3_exp
 from minislam.tracking.config import TrackingConfig
@@ -20,6 +18,8 @@ from minislam.tracking.disparity_prior import (
     sample_features,
 )
 from minislam.tracking.grid import Grid
+from tests.tracking.scene import CAMERA, STRIDE, uniform
+from tests.tracking.wall import back_end
 
 CONFIG = TrackingConfig(prior_mask=True)
 EPSILON, GAMMA = 0.02, 0.9  # paper

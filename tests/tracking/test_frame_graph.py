@@ -2,10 +2,7 @@
 
 import pytest
 import torch
-from helpers import random_transforms
 from torch import Tensor
-from tracking import golden
-from tracking.scene import CAMERA, PIXELS, RAYS, STRIDE, poses_on_an_arc, uniform
 
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking import frame_graph
@@ -19,6 +16,9 @@ from minislam.tracking.frame_graph import (
     splat_disparities,
 )
 from minislam.tracking.grid import Grid
+from tests.helpers import random_transforms
+from tests.tracking import golden
+from tests.tracking.scene import CAMERA, PIXELS, RAYS, STRIDE, poses_on_an_arc, uniform
 
 GRID = Grid.of(CAMERA, STRIDE)
 

@@ -14,10 +14,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import assert_gradients_close
 from torch import Tensor
-from tracking import golden
-from tracking.scene import normal_equations
 
 from minislam.geometry import se3_adjoint
 from minislam.tracking import bundle_adjustment
@@ -28,6 +25,9 @@ from minislam.tracking.bundle_adjustment import (
     residuals,
 )
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
+from tests.helpers import assert_gradients_close
+from tests.tracking import golden
+from tests.tracking.scene import normal_equations
 
 
 def damped_diagonal(problem: BundleProblem, diagonal: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
 """The grid of cells: its pixels, its rays, and sampling between cells."""
 
 import torch
-from tracking.scene import CAMERA, STRIDE, uniform
 
 from minislam.tracking.grid import Grid
+from tests.tracking.scene import CAMERA, STRIDE, uniform
 
 GRID = Grid.of(CAMERA, STRIDE)
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from tracking.scene import CAMERA, STRIDE, known_problem, normal, perturbed, uniform
 
 from minislam.geometry import se3_exp, se3_inverse
 from minislam.priors.interfaces import FlowMatches
@@ -23,6 +22,7 @@ from minislam.tracking.initialisation import (
 )
 from minislam.tracking.reprojection import reproject
 from minislam.tracking.robust import RobustKernel
+from tests.tracking.scene import CAMERA, STRIDE, known_problem, normal, perturbed, uniform
 
 GRID = Grid.of(CAMERA, STRIDE)
 CELLS = len(GRID.rays)

@@ -1,10 +1,10 @@
 """The keyframe store: rows that belong together."""
 
 import torch
-from tracking.scene import normal, poses_on_an_arc, uniform
 
 from minislam.records import Frame
 from minislam.tracking.keyframes import KeyframeStore
+from tests.tracking.scene import normal, poses_on_an_arc, uniform
 
 CELLS = 12
 

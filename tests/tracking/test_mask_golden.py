@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from helpers import random_transforms
 from torch import Tensor
-from tracking.golden import transforms_of
-from tracking.scene import STRIDE
 
 from minislam.geometry import Camera
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import DepthView, depth_consistency, prior_mask
 from minislam.tracking.grid import Grid
+from tests.helpers import random_transforms
+from tests.tracking.golden import transforms_of
+from tests.tracking.scene import STRIDE
 
 CONFIG = TrackingConfig(prior_mask=True)
 EPSILON, GAMMA = 0.02, 0.9  # paper

@@ -2,9 +2,7 @@
 
 import pytest
 import torch
-from helpers import assert_gradients_close, generator, numerical_jacobian
 from torch import Tensor
-from tracking.scene import CAMERA, PIXELS, RAYS, normal, poses_on_an_arc, uniform
 
 from minislam.geometry import se3_adjoint, se3_exp, se3_inverse, transform_points
 from minislam.tracking.reprojection import (
@@ -14,6 +12,8 @@ from minislam.tracking.reprojection import (
     reproject_with_jacobians,
     scaled_points,
 )
+from tests.helpers import assert_gradients_close, generator, numerical_jacobian
+from tests.tracking.scene import CAMERA, PIXELS, RAYS, normal, poses_on_an_arc, uniform
 
 CHOSEN = slice(3, 60, 8)  # cells all over the image; every cell would only take longer
 REGIMES = {

@@ -4,13 +4,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import random_transforms
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_interpolate, se3_inverse, se3_log
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.status import TrackedFrame, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
+from tests.helpers import random_transforms
 from tests.tracking.wall import FRAMES, GRID, TrueFlow, back_end, true_poses, wall_frame
 
 KEYFRAMES = [0, 3, 5, 8]

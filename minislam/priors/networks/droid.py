@@ -28,7 +28,7 @@ from minislam.priors.networks.droid_network import (
     update,
 )
 from minislam.priors.networks.vit import normalise
-from minislam.stateful import FrameOf, Stateful, Tree, saved
+from minislam.state.stateful import FrameOf, Stateful, Tree, saved
 
 _SMALLEST_GRID = 2 ** (LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
 

@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import minislam
-from minislam.cli_doctor import add_doctor_parser
-from minislam.cli_eval import add_eval_parser
-from minislam.cli_options import (
+from minislam.cli.doctor import add_doctor_parser
+from minislam.cli.evaluate import add_eval_parser
+from minislam.cli.options import (
     add_flow,
     add_input,
     add_lpips,
@@ -29,8 +29,8 @@ from minislam.cli_options import (
     resumed_settings,
     settings,
 )
-from minislam.cli_priors import add_priors_parser
-from minislam.cli_progress import ProgressLine, StopRequest
+from minislam.cli.priors import add_priors_parser
+from minislam.cli.progress import ProgressLine, StopRequest
 from minislam.errors import InputError, MinislamError
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def _run_until(
     stop: StopRequest, args: argparse.Namespace, options: InputOptions, output: str | None
 ) -> int:
     from minislam.data import RunFolder, open_sequence
-    from minislam.run import choose_priors, run_sequence
+    from minislam.runs.run import choose_priors, run_sequence
 
     if args.resume and output is None:
         raise InputError(

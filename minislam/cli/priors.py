@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minislam.cli_options import add_input, add_priors, input_options, prior_choice, settings
-from minislam.cli_progress import ProgressLine, StopRequest
+from minislam.cli.options import add_input, add_priors, input_options, prior_choice, settings
+from minislam.cli.progress import ProgressLine, StopRequest
 from minislam.errors import InputError
 
 if TYPE_CHECKING:

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers import random_transforms
-from recordings import tum_folder
 
-from minislam.data.benchmarks import bonn_camera_trajectory, known_camera
+from minislam.data.known_cameras import bonn_camera_trajectory, known_camera
 from minislam.data.tum import read_tum_folder
 from minislam.records import Trajectory
+from tests.helpers import random_transforms
+from tests.recordings import tum_folder
 
 # Known answers
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from minislam.records import Frame
-from minislam.stateful import Stateful, built, saved
+from minislam.state.stateful import Stateful, built, saved
 
 
 class Mood(Enum):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from minislam.cli import main
+from minislam.cli.main import main
 from tests.checkpoint_files import lpips_files, tiny_fit3d, write_all
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.cli import main
+from minislam.cli.main import main
 from minislam.data import RunFolder
 from minislam.priors.networks.dinov2 import DinoFeatures
 from minislam.priors.networks.metric3d import Metric3DDepth

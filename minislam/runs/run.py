@@ -16,16 +16,16 @@ from minislam.data import GaussianArrays, RunFolder
 from minislam.errors import InputError, MinislamError
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.lpips import Lpips
-from minislam.evaluation.run import MAX_DIFFERENCE, MappedView, measure_run
+from minislam.evaluation.metrics import MAX_DIFFERENCE, MappedView, measure_run
 from minislam.geometry import se3_inverse
 from minislam.mapping.views import surface_depth
 from minislam.priors.choice import FILES, PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
-from minislam.resume import Checkpoints
+from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
-from minislam.steps import Report, silent
-from minislam.uncertainty.grid import resample
+from minislam.state.steps import Report, silent
+from minislam.uncertainty.resampling import resample
 from minislam.viz import (
     ate_over_time,
     beta_to_rgb,

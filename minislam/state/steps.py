@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import ClassVar
 
-from minislam.stateful import Stateful
+from minislam.state.stateful import Stateful
 
 Report = Callable[[str, int, int], None]  # stage, done, of all; KeyboardInterrupt stops the run
 

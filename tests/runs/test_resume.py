@@ -10,14 +10,14 @@ from types import SimpleNamespace
 import pytest
 
 import minislam
-from minislam import resume
-from minislam.cli import main
-from minislam.cli_progress import ProgressLine
+from minislam.cli.main import main
+from minislam.cli.progress import ProgressLine
 from minislam.config import preset, with_settings
 from minislam.data import InputOptions, RunFolder, open_sequence
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
+from minislam.runs import resume
 
 FRAMES = 16
 INPUT = ["--stride", "3", "--max-frames", str(FRAMES), "--size", "96x72"]

@@ -1,6 +1,6 @@
 import torch
 
-from minislam.uncertainty.grid import resample
+from minislam.uncertainty.resampling import resample
 
 
 def test_resampling_keeps_a_constant_and_hits_cell_centres():

@@ -123,7 +123,7 @@ def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
 def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
     """Return the measure whose files were given, if it can be taken at this size of images."""
     from minislam.errors import InputError
-    from minislam.run import load_lpips
+    from minislam.runs.run import load_lpips
 
     trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
     if trunk is None and heads is None:

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import random_transforms
 
-from minislam.cli_eval import add_eval_parser, run_eval
+from minislam.cli.evaluate import add_eval_parser, run_eval
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
+from tests.helpers import random_transforms
 
 
 @pytest.fixture
@@ -94,9 +94,9 @@ def test_contradicting_flags_and_strange_clocks(files):
 def test_help_does_not_wait_for_torch():
     program = (
         "import argparse, sys\n"
-        "from minislam.cli_eval import add_eval_parser\n"
+        "from minislam.cli.evaluate import add_eval_parser\n"
         "add_eval_parser(argparse.ArgumentParser().add_subparsers())\n"
         "assert not {'torch', 'numpy', 'matplotlib'} & set(sys.modules)\n"
     )
-    root = str(Path(__file__).parents[1])
+    root = str(Path(__file__).parents[2])
     subprocess.run([sys.executable, "-c", program], check=True, cwd=root)

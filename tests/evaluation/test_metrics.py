@@ -4,12 +4,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from helpers import random_transforms
 
-from minislam.evaluation.run import CENTIMETRES, MIN_MASK, MappedView, measure_run
+from minislam.evaluation.metrics import CENTIMETRES, MIN_MASK, MappedView, measure_run
 from minislam.evaluation.trajectory import straight_line_error
 from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
+from tests.helpers import random_transforms
 
 HEIGHT, WIDTH = 24, 32
 NAMES = [

@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import picture, save, tum_folder, video
 
 import minislam
-from minislam.cli import main
-from minislam.cli_progress import ProgressLine, StopRequest
+from minislam.cli.main import main
+from minislam.cli.progress import ProgressLine, StopRequest
+from tests.recordings import picture, save, tum_folder, video
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (20, 27, 3)).astype(np.uint8)
 # What a failed run may leave.
@@ -70,7 +70,7 @@ def test_help_names_every_setting_with_its_meaning_and_default(capsys):
 @pytest.mark.parametrize("command", [[], ["eval"], ["doctor"]])
 def test_help_answers_without_torch(command: list[str]):
     program = (
-        "import sys\nfrom minislam.cli import main\n"
+        "import sys\nfrom minislam.cli.main import main\n"
         f"try: main({[*command, '--help']!r})\n"
         "except SystemExit: print('torch' in sys.modules, 'numpy' in sys.modules)"
     )
