@@ -1,0 +1,45 @@
+"""`tests/` mirrors `minislam/`: the tests of minislam/ROOM/MODULE.py are in tests/ROOM/test_MODULE*.py."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+TESTS = sorted((ROOT / "tests").glob("*/**/test_*.py"))
+MODULES = sorted(p for p in (ROOT / "minislam").glob("*/**/*.py") if p.stem != "__init__")
+
+# Modules that hold no logic of their own, or whose every line runs in the tests of another one.
+TESTED_ELSEWHERE: dict[str, str] = {}
+
+
+def place(path: Path) -> str:
+    """Return "splatting/tiles" for minislam/splatting/tiles.py."""
+    return path.relative_to(ROOT / "minislam").with_suffix("").as_posix()
+
+
+def modules_of(test: Path) -> list[str]:
+    """Return the modules that a test file may belong to by its name, the longest name first."""
+    room = test.relative_to(ROOT / "tests").parent
+    words = test.stem.removeprefix("test_").split("_")
+    names = ["_".join(words[:count]) for count in range(len(words), 0, -1)]
+    tops = [ROOT / "minislam", ROOT]  # data_synth stands beside the package
+    return [n for n in names for top in tops if (top / room / f"{n}.py").exists()]
+
+
+@pytest.mark.parametrize("test", TESTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_test_file_is_named_after_a_module(test: Path):
+    room = test.relative_to(ROOT / "tests").parent
+    is_of_the_room = test.stem == f"test_{room.name}"
+    assert is_of_the_room or modules_of(test), (
+        f"expected {test.name} to begin with the name of a module of {room}, found none"
+    )
+
+
+@pytest.mark.parametrize("module", MODULES, ids=place)
+def test_every_module_has_a_test_file(module: Path):
+    if place(module) in TESTED_ELSEWHERE:
+        assert (ROOT / "tests" / TESTED_ELSEWHERE[place(module)]).exists()
+        return
+    folder = ROOT / "tests" / Path(place(module)).parent
+    owners = [modules_of(test)[:1] for test in folder.glob(f"test_{module.stem}*.py")]
+    assert [module.stem] in owners, f"expected tests/{place(module)} as test_{module.stem}.py"
