@@ -170,7 +170,7 @@ def se3_left_jacobian(xi: Tensor) -> Tensor:
     """Return J (..., 6, 6), with exp(xi + d) = exp(J d) exp(xi) to first order in d.
 
     J = [[V, Q], [0, V]] for xi = (rho, phi); Q collects the coupling of rho and phi (Barfoot,
-    State Estimation for Robotics, Eq. 7.86). Near zero angle the series sum ad^n / (n+1)! is used.
+    State Estimation for Robotics, (7.86)). Near zero angle the series sum ad^n / (n+1)! is used.
     """
     rho, phi = xi[..., :3], xi[..., 3:]
     angle = _safe_norm(phi)[..., None, None]

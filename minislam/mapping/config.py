@@ -102,7 +102,7 @@ class MappingConfig:
     color_share: float = parameter(
         0.8, "alpha: lambda_5 = alpha / 2, lambda_6 = (1 - alpha) / 2; official 0.5 or 0.8"
     )
-    lambda_ssim: float = parameter(0.2, "share of SSIM in L_color (Eq. 7), official")
+    lambda_ssim: float = parameter(0.2, "share of SSIM in L_color, Eq. (7), official")
     lambda_isotropic: float = parameter(10.0, "lambda_7: weight of L_iso [1 per m], official")
     metric_median: float = parameter(
         2.0, "median depth of a scene in which the official metres hold [m], our assumption"

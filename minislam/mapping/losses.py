@@ -22,7 +22,7 @@ SOLID = 0.9
 class RenderLoss:
     """L_render and its parts."""
 
-    total: Tensor  # () Eq. 6
+    total: Tensor  # () Eq. (6)
     color: Tensor  # () weighted mean of L_color
     depth: Tensor  # () weighted mean of L_depth, in metres as `MappingConfig` means them
     isotropic: Tensor  # () L_iso, likewise
@@ -90,7 +90,7 @@ def color_loss(
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
     lambda_ssim: float,  # share of SSIM in [0, 1]
 ) -> Tensor:  # (H, W)
-    """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. 7."""
+    """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. (7)."""
     absolute = (rendered - image).abs().mean(-1)
     loss = (1 - lambda_ssim) * absolute
     if lambda_ssim > 0:
@@ -106,7 +106,7 @@ def weighted_depth_loss(
     far_limit: float,  # world units
     floater_margin: float,  # world units
 ) -> Tensor:  # (H, W) world units
-    """Return the weighted |D^ - D~| (Eq. 3); floaters count even where beta is large.
+    """Return the weighted |D^ - D~| of Eq. (3); floaters count even where beta is large.
 
     A mover hides the static scene, so it is always NEARER than the scene. Where the map has a
     surface far in front of the reference, it is the map that is wrong, whatever beta says. A hole
@@ -133,7 +133,7 @@ def render_loss(
     median_depth: float,  # world units, of the scene
     config: MappingConfig,
 ) -> RenderLoss:
-    """Return (lambda_5 L_color + lambda_6 L_depth) / beta^2 + lambda_7 L_iso. Eq. 6.
+    """Return (lambda_5 L_color + lambda_6 L_depth) / beta^2 + lambda_7 L_iso. Eq. (6).
 
     Means run over all pixels. The factor 1/2 of lambda_5 and lambda_6 is that of the weight.
     """

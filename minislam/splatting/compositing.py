@@ -1,4 +1,4 @@
-"""Eq. (1) and (2) on blocks of pixels: what the Gaussians of a tile show, front to back.
+"""Eqs. (1) and (2) on blocks of pixels: what the Gaussians of a tile show, front to back.
 
 A group of B tiles with P pixels each and K slots per tile is one dense block. With the features
 f = (red, green, blue, z) of slot k, per pixel

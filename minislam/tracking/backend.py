@@ -1,4 +1,4 @@
-"""The back-end: keyframes, the graph between them, and their adjustment (Eq. 5)."""
+"""The back-end: keyframes, the graph between them, and their adjustment, Eq. (5)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

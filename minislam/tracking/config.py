@@ -57,17 +57,17 @@ class TrackingConfig:
     lambda_disparity_prior: float = parameter(
         0.0005,
         "lambda_4: disparity prior, times fx^2, so that it weighs a disparity error by the pixels "
-        "that a unit baseline would turn it into [-], Eq. 5",
+        "that a unit baseline would turn it into [-], Eq. (5)",
     )
     prior_mask: bool = parameter(
         True,
-        "mask M: no disparity prior where other views contradict it, Eq. 8; off: an ablation",
+        "mask M: no disparity prior where other views contradict it, Eq. (8); off: an ablation",
     )
     mask_max_depth_error: float = parameter(
-        0.02, "epsilon: relative difference of depths that still agree [-], Eq. 8"
+        0.02, "epsilon: relative difference of depths that still agree [-], Eq. (8)"
     )
     mask_min_similarity: float = parameter(
-        0.9, "gamma: cosine of features that show the same thing [-], Eq. 8"
+        0.9, "gamma: cosine of features that show the same thing [-], Eq. (8)"
     )
     mask_min_corresponding: int = parameter(
         2, "views that must see a cell to judge it: more than one, paper supplement"

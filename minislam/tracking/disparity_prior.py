@@ -58,7 +58,7 @@ def mask_priors(
 def prior_mask(
     grid: Grid, view: DepthView, others: list[DepthView], config: TrackingConfig
 ) -> Tensor:  # (N,) bool
-    """Return M: False where enough views have a word on a cell and too few agree with it. Eq. (8)
+    """Return M: False where enough views have a word on a cell and too few agree with it. Eq. (8).
 
     A cell of which nothing is known against it keeps its prior.
     """

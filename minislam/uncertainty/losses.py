@@ -92,7 +92,7 @@ def modified_ssim_loss(
     """Return L'_SSIM = gain (1 - l)(1 - c)(1 - s) per pixel, faded where nothing is rendered.
 
     The product is far steeper than 1 - SSIM: near 0 on small misfits, large on another object.
-    First numerator of Eq. 4.
+    First numerator of Eq. (4).
     """
     luminance, contrast, structure = ssim_components(image, rendered)
     product = (1 - luminance) * (1 - contrast) * (1 - structure)
@@ -104,7 +104,7 @@ def depth_loss(
     reference_depth: Tensor,  # (H, W) world units, 0 where unknown
     far_limit: float,  # world units; beyond it the reference says nothing
 ) -> Tensor:  # (H, W) world units
-    """Return |D^ - D~| per pixel, 0 where the reference depth is unknown or far. Eq. 3."""
+    """Return |D^ - D~| per pixel, 0 where the reference depth is unknown or far. Eq. (3)."""
     known = (reference_depth > 0) & (reference_depth < far_limit)
     return torch.where(known, (rendered_depth - reference_depth).abs(), 0)
 
@@ -134,7 +134,7 @@ def variance_regulariser(
     features: Tensor,  # (n, C)
     config: UncertaintyConfig,
 ) -> Tensor:  # ()
-    """Return L_reg_V, the mean variance of beta among cells whose features are alike (Eq. 4).
+    """Return L_reg_V, the mean variance of beta among cells whose features are alike. Eq. (4).
 
     Each cell is compared with its most similar cells, itself included, of cosine > 0.75.
     """
@@ -160,7 +160,7 @@ def cell_loss(
     opacity: Tensor,  # (h', w') in [0, 1]
     config: UncertaintyConfig,
 ) -> Tensor:  # (h', w')
-    """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell (Eq. 4).
+    """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell. Eq. (4).
 
     With lambda_3 = 0.5 and misfit L it is smallest at beta = 2 sqrt(L). Cells that the map does
     not cover yet give 0: a hole is not a moving object.

@@ -1,4 +1,4 @@
-"""Train the MLP on what the map fails to explain: one step of L_uncer (Eq. 4)."""
+"""Train the MLP on what the map fails to explain: one step of L_uncer, Eq. (4)."""
 
 from dataclasses import dataclass
 
@@ -57,7 +57,7 @@ def uncertainty_loss(
     sample_features: Tensor,  # (n, C) of the same cells
     config: UncertaintyConfig,
 ) -> Tensor:  # ()
-    """Return L_uncer: the mean cell loss plus lambda_2 L_reg_V. Eq. 4."""
+    """Return L_uncer: the mean cell loss plus lambda_2 L_reg_V. Eq. (4)."""
     numerator = misfit.ssim + config.lambda_depth * misfit.depth
     cells = cell_loss(beta_raw, numerator, misfit.opacity, config)
     regulariser = variance_regulariser(sample_beta_raw, sample_features, config)

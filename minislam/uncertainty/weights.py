@@ -1,7 +1,7 @@
 """The only place where beta becomes a weight.
 
-The paper weights residuals by 1 / beta^2 (Eq. 5 and 6). The official code, which we follow here,
-stretches beta first and caps or cuts the weight:
+The paper weights residuals by 1 / beta^2, Eqs. (5) and (6). The official code, which we follow
+here, stretches beta first and caps or cuts the weight:
 
     beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
     tracking: w capped at 1,        mapping: w below 0.1 set to 0.
@@ -34,7 +34,7 @@ DATA_RATE = 1 + schlick_bias(TRAIN_FRACTION, SCHLICK_SLOPE)  # 1.6316
 
 
 def clipped_beta(beta_raw: Tensor) -> Tensor:
-    """Return max(beta_raw, 0.1) + 0.001, the beta of the loss (Eq. 4); shape and gradient kept."""
+    """Return max(beta_raw, 0.1) + 0.001, the beta of Eq. (4); shape and gradient kept."""
     return beta_raw.clamp_min(BETA_FLOOR) + BETA_OFFSET
 
 
@@ -54,7 +54,7 @@ def mapping_weight(
     beta_raw: Tensor,  # (h', w') output of the MLP
     camera: Camera,
 ) -> Tensor:  # (H, W) 0 or >= 0.1, at most 48.4
-    """Return the weight of each pixel in L_render (Eq. 6): 0.5 / beta_adj^2, cut at 0.1."""
+    """Return the weight of each pixel in L_render, Eq. (6): 0.5 / beta_adj^2, cut at 0.1."""
     weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2
     return torch.where(weight < MAPPING_CUT, torch.zeros_like(weight), weight)
 
@@ -64,6 +64,6 @@ def tracking_weight(
     camera: Camera,
     stride: int,  # px between grid cells of the tracker
 ) -> Tensor:  # (ceil(H / stride), ceil(W / stride)) in (0, 1]
-    """Return the weight of each tracker cell (Eq. 5), sampled at pixels (stride i, stride j)."""
+    """Return the weight of each tracker cell in Eq. (5), sampled at pixels (stride i, stride j)."""
     weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera)[::stride, ::stride] ** 2
     return weight.clamp_max(TRACKING_CAP)

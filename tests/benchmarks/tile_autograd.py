@@ -1,7 +1,7 @@
 """A plain renderer for comparison: a Python loop over 16-px tiles, differentiated by autograd.
 
 It is what a careful first implementation looks like: the per-Gaussian steps of the reference
-twin, bounding boxes to find the Gaussians of a tile, Eq. (1) and (2) in torch per tile.
+twin, bounding boxes to find the Gaussians of a tile, Eqs. (1) and (2) in torch per tile.
 """
 
 import torch

@@ -1,4 +1,4 @@
-"""Eq. (1) and (2) on blocks of pixels, against plain formulas and autograd."""
+"""Eqs. (1) and (2) on blocks of pixels, against plain formulas and autograd."""
 
 import pytest
 import torch

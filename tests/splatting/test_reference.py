@@ -1,4 +1,4 @@
-"""Known answers of Eq. (1) and (2), asked of the readable twin and of the fast renderer alike."""
+"""Known answers of Eqs. (1) and (2), asked of the readable twin and of the fast renderer alike."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Metric3D v2: the metric depth of the paper (D~ in Eq. (3), (4) and the disparity prior of (5)).
+"""Metric3D v2: the metric depth of the paper (D~ in Eq. (3), Eq. (4) and Eq. (5)).
 
 An image alone does not tell a near small thing from a far large one: the focal length decides.
 So the network is trained as if every image came from one "canonical" camera of 1000 px, and its
