@@ -21,6 +21,7 @@ from minislam.config import SlamConfig
 from minislam.errors import InputError, MinislamError, TrackingLost
 from minislam.geometry import se3_inverse
 from minislam.mapping import Mapper
+from minislam.priors.high_resolution import HighResolutionFeatures
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
@@ -30,7 +31,6 @@ from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty import (
-    HighResolutionFeatures,
     MlpSnapshots,
     beta_of_mask,
     tracking_weight,
@@ -67,7 +67,9 @@ class Slam(Stateful):
         self.sequence, self.config = sequence, config
         self.steps = Steps(report, lambda at_all_events: keep(self, at_all_events))
         self.focal_length: FocalLengthFit | None = None  # which one the flow wants, at the end
-        self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
+        self._features = priors.features
+        if config.uncertainty.grid_factor > 1:
+            self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
         self.mapper = Mapper(
             sequence.camera,
             config.mapping,

@@ -84,7 +84,7 @@ def _kinds(
     from minislam.config import as_json
     from minislam.priors.choice import choose_depth, choose_features
     from minislam.priors.files import DEPTH, FEATURES
-    from minislam.uncertainty import HighResolutionFeatures
+    from minislam.priors.high_resolution import HighResolutionFeatures
 
     # Whatever the result depends on: files of another command must not be taken for ours.
     tree = as_json(config)
@@ -95,7 +95,8 @@ def _kinds(
         features = choose_features(choice, sequence.camera, config.features)
         factor = config.uncertainty.grid_factor
         origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
-        kinds[FEATURES] = (origin, HighResolutionFeatures(features, factor))
+        fine = features if factor == 1 else HighResolutionFeatures(features, factor)
+        kinds[FEATURES] = (origin, fine)
     if choice.depth != "none":
         depth = choose_depth(choice, sequence, config.seed, config.simulated_depth, config.networks)
         origin = f"{choice.depth} {choice.depth_weights}; {conditions}"

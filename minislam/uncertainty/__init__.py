@@ -1,14 +1,12 @@
 """Uncertainty (Sec. 3.2): an MLP learns, while the map grows, which image patches move."""
 
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
-from minislam.uncertainty.high_resolution import HighResolutionFeatures
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.snapshots import MlpSnapshots
 from minislam.uncertainty.training import Misfit, UncertaintyTrainer, measure_misfit
 from minislam.uncertainty.weights import beta_of_mask, mapping_weight, tracking_weight
 
 __all__ = [
-    "HighResolutionFeatures",
     "Misfit",
     "MlpSnapshots",
     "UncertaintyConfig",

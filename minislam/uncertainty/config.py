@@ -67,6 +67,11 @@ class UncertaintyConfig:
         return self.enabled and not self.given_masks
 
     def __post_init__(self) -> None:
+        if self.grid_factor < 1:
+            raise InputError(
+                f"expected a grid at least as fine as the extractor's, found a factor of "
+                f"{self.grid_factor}; set uncertainty.grid_factor to 1 or 2"
+            )
         if self.median_size < 1 or self.median_size % 2 == 0:
             raise InputError(
                 f"expected an odd median window of at least 1 cell, found {self.median_size}; "

@@ -167,3 +167,5 @@ def test_an_even_median_window_is_refused_in_one_sentence():
         UncertaintyConfig(median_size=4)
     with pytest.raises(InputError, match="dropout share"):
         UncertaintyConfig(dropout=1.0)
+    with pytest.raises(InputError, match="at least as fine"):
+        UncertaintyConfig(grid_factor=0)

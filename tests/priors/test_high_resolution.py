@@ -4,11 +4,9 @@ import pytest
 import torch
 from torch.nn import functional
 
-from minislam.errors import InputError
 from minislam.priors.features import ClassicalFeatures
+from minislam.priors.high_resolution import HighResolutionFeatures, shift_image
 from minislam.records import Frame
-from minislam.uncertainty import HighResolutionFeatures
-from minislam.uncertainty.high_resolution import shift_image
 from tests.helpers import generator
 
 PATCH = 8  # px
@@ -57,24 +55,8 @@ def test_an_image_is_shifted_by_whole_and_by_half_pixels():
 # Identities
 
 
-def test_a_factor_of_one_is_the_extractor_itself():
-    image = torch.rand(35, 42, 3, generator=generator(0))
-    extractor = ClassicalFeatures()
-    plain = HighResolutionFeatures(extractor, 1)
-    assert torch.equal(plain(frame(image)), extractor(frame(image)))
-    assert (plain.dimension, plain.stride) == (extractor.dimension, extractor.stride)
-
-
 def test_an_odd_factor_keeps_the_coarse_features_among_the_fine_ones():
     image = torch.rand(35, 42, 3, generator=generator(1))
     extractor = ClassicalFeatures()
     fine = HighResolutionFeatures(extractor, 3)(frame(image))
     torch.testing.assert_close(fine[1::3, 1::3], extractor(frame(image)), rtol=0, atol=1e-3)
-
-
-# Errors
-
-
-def test_a_coarser_grid_is_refused_in_one_sentence():
-    with pytest.raises(InputError, match="at least as fine"):
-        HighResolutionFeatures(PatchMean(), 0)
