@@ -1,4 +1,8 @@
-"""Similarity of two images: PSNR and SSIM. LPIPS is in lpips.py."""
+"""Similarity of two images: PSNR and SSIM. LPIPS is in lpips.py.
+
+SSIM is written here in numpy on purpose and shares nothing with minislam/images.py: a mistake
+there would be optimised as a loss, and the metric must not repeat it.
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike

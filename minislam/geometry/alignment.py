@@ -6,7 +6,7 @@ import numpy as np
 
 from minislam.errors import InputError
 
-# Of the singular values of the covariance, those below this share of the largest are round-off.
+# Singular values of the covariance below this fraction of the largest are round-off.
 _RANK_TOLERANCE = 1e-12
 
 
@@ -28,11 +28,6 @@ class Similarity:
         moved[..., :3, :3] = self.rotation @ moved[..., :3, :3]
         moved[..., :3, 3] = self.transform_points(moved[..., :3, 3])
         return moved
-
-    def inverse(self) -> "Similarity":
-        """Return the similarity that undoes this one."""
-        rotation = self.rotation.T
-        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
 
 def identity_similarity() -> Similarity:

@@ -1,11 +1,14 @@
-"""The pinhole camera: projection, back-projection, their Jacobians, and resizing."""
+"""The pinhole camera: projection, its Jacobians, back-projection, resizing."""
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from minislam.errors import InputError
+
+REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that thresholds in pixels belong to
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,34 @@ class Camera:
         rows = [self.fx / z, zero, -self.fx * x / z**2, zero, self.fy / z, -self.fy * y / z**2]
         return torch.stack(rows, -1).reshape(*points_camera.shape[:-1], 2, 3)
 
+    def twist_jacobian(
+        self,
+        ray_x: Tensor,  # (..., N) x / z of points in the camera frame
+        ray_y: Tensor,  # (..., N) y / z
+        inverse_depth: Tensor,  # (..., N) 1 / z
+    ) -> Tensor:  # (..., 6, 2, N) px per unit of the twist
+        """Return d(u, v)/d(rho, phi) of points when the pose moves by exp((rho, phi)) on the left.
+
+        To first order a point p moves by rho + phi x p, so the Jacobian is that of the projection
+        times [I | -hat(p)]. With p = (a, b, 1) / e, where e = 1/z, its rows are
+
+            du:  fx (e, 0, -e a,   -a b,     1 + a^2, -b)
+            dv:  fy (0, e, -e b,   -1 - b^2,  a b,     a).
+
+        Points at infinity have e = 0, and only a rotation moves them.
+        """
+        a, b, e = ray_x, ray_y, inverse_depth
+        fx, fy, zero = self.fx, self.fy, torch.zeros_like(ray_x)
+        columns = [
+            fx * e, zero,
+            zero, fy * e,
+            fx * (-e * a), fy * (-e * b),
+            fx * (-a * b), fy * (-1 - b * b),
+            fx * (1 + a * a), fy * (a * b),
+            fx * -b, fy * a,
+        ]  # fmt: skip
+        return torch.stack(columns, -2).unflatten(-2, (6, 2))
+
     def rays(self, pixels: Tensor) -> Tensor:
         """Return the rays (..., 3) of pixels (..., 2), scaled to z = 1."""
         x = (pixels[..., 0] - self.cx) / self.fx
@@ -62,14 +93,6 @@ class Camera:
     def backproject(self, pixels: Tensor, depth: Tensor) -> Tensor:
         """Return the points (..., 3) in the camera frame of pixels (..., 2) at z-depths (...)."""
         return self.rays(pixels) * depth[..., None]
-
-    def backproject_jacobian(self, pixels: Tensor, depth: Tensor) -> Tensor:
-        """Return d(x, y, z)/d(u, v, depth) (..., 3, 3) at pixels (..., 2) and depths (...)."""
-        jacobian = pixels.new_zeros(*pixels.shape[:-1], 3, 3)
-        jacobian[..., 0, 0] = depth / self.fx
-        jacobian[..., 1, 1] = depth / self.fy
-        jacobian[..., :, 2] = self.rays(pixels)
-        return jacobian
 
     def pixel_grid(
         self,
@@ -92,8 +115,15 @@ class Camera:
         """Return the camera of the window of `width` x `height` that starts at (left, top)."""
         return Camera(self.fx, self.fy, self.cx - left, self.cy - top, width, height)
 
-    def contains(self, pixels: Tensor, margin: float = 0.0) -> Tensor:
-        """Tell which pixels (..., 2) lie on the image, at least `margin` px inside its centres."""
+    def contains(self, pixels: Tensor) -> Tensor:
+        """Tell which positions (..., 2) lie between the centres of the outermost pixels."""
         u, v = pixels.unbind(-1)
-        inside_u = (u >= margin) & (u <= self.width - 1 - margin)
-        return inside_u & (v >= margin) & (v <= self.height - 1 - margin)
+        return (u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1)
+
+
+def pixel_scale(camera: Camera) -> float:
+    """Return how many pixels stand for one pixel of a 320x240 image.
+
+    Thresholds in pixels are given for that size and are multiplied by this factor.
+    """
+    return math.hypot(camera.width, camera.height) / REFERENCE_DIAGONAL

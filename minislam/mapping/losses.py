@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from minislam.images import SSIM_C1, SSIM_C2, SSIM_SIGMA, gaussian_blur, local_moments
 from minislam.mapping.config import MappingConfig
 from minislam.splatting import GaussianMap, Rendering
-from minislam.uncertainty.losses import SSIM_C1, SSIM_C2, depth_loss, gaussian_blur
+from minislam.uncertainty.losses import depth_loss
 
 SSIM_WINDOW = 11  # px, the usual window of SSIM, as in 3DGS
-SSIM_SIGMA = 1.5  # px
 # Summed RGB. Darker pixels are the empty border that undistortion leaves, official.
 BLACK = 0.01
 # A rendering less opaque than this is a hole with ragged edges and no surface; as in L_uncer.
@@ -42,8 +42,7 @@ class _SsimLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rendered: Tensor, image: Tensor) -> Tensor:
         x, y = (picture.permute(2, 0, 1).contiguous() for picture in (rendered, image))
-        moments = gaussian_blur(torch.stack([x, x * x, x * y, y, y * y]), SSIM_WINDOW, SSIM_SIGMA)
-        ssim, slopes = ssim_of_moments(*moments)
+        ssim, slopes = ssim_of_moments(*local_moments(x, y, SSIM_WINDOW))
         ctx.save_for_backward(x, y, slopes)
         return 1 - ssim.mean(0)
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp, se3_inverse, se3_log
+from minislam.geometry.camera import pixel_scale
 from minislam.mapping.config import PoseRefinementConfig
 from minislam.splatting import GaussianMap, Rendering, render
 
@@ -18,7 +19,6 @@ from minislam.splatting import GaussianMap, Rendering, render
 _FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 1e-3, 10.0, 0.3
 # Where the rendering is less opaque its depth says little about how the picture would move.
 _SOLID = 0.9
-REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that `farthest` belongs to
 
 
 def refine_pose(
@@ -56,7 +56,7 @@ def _most_alike_pose(
     """
     pose = candidate = start
     lowest, damping = math.inf, _FIRST_DAMPING
-    farthest = config.farthest * math.hypot(camera.width, camera.height) / REFERENCE_DIAGONAL
+    farthest = config.farthest * pixel_scale(camera)
     for steps_done in range(config.iterations + 1):
         twist = torch.zeros(6, dtype=gaussians.means.dtype, device=image.device, requires_grad=True)
         rendering = render(gaussians, camera, candidate, background, twist=twist)
@@ -109,8 +109,9 @@ def curvature(
 ) -> Tensor:  # (6, 6) float64
     """Return the Gauss-Newton matrix of the loss: the mean of w J^T J / |I^ - I|.
 
-    A twist moves the point seen at a pixel by A px per unit. The picture there changes by what
-    slides in: with the slope g = (dI^/du, dI^/dv) of a channel, J = -g^T A. All channels share A,
+    A twist moves the point seen at a pixel by A px per unit: `Camera.twist_jacobian`. The picture
+    at the pixel changes by what slides in: with the slope g = (dI^/du, dI^/dv) of a channel,
+    J = -g^T A. All channels share A,
 
         sum_c w J_c^T J_c / |r_c| = A^T G A,        G = sum_c w g_c g_c^T / |r_c|   (2x2).
     """
@@ -121,27 +122,13 @@ def curvature(
     weighted_u, weighted_v = factor * slope_u, factor * slope_v
     uu, vv = (weighted_u * slope_u).sum(-1), (weighted_v * slope_v).sum(-1)
     uv = (weighted_u * slope_v).sum(-1)
-    u, v = pixel_motion(torch.where(solid, rendering.depth / rendering.opacity, 1), camera)
-    bend = u.flatten(1) @ (uu * u + uv * v).flatten(1).T
-    bend += v.flatten(1) @ (uv * u + vv * v).flatten(1).T
+    depth = torch.where(solid, rendering.depth / rendering.opacity, 1)
+    pixels = camera.pixel_grid(dtype=depth.dtype, device=depth.device)
+    x, y, _ = camera.rays(pixels.reshape(-1, 2)).unbind(-1)
+    u, v = camera.twist_jacobian(x, y, 1 / depth.reshape(-1)).unbind(1)  # (6, H W) each
+    uu, uv, vv = uu.reshape(-1), uv.reshape(-1), vv.reshape(-1)
+    bend = u @ (uu * u + uv * v).T + v @ (uv * u + vv * v).T
     return bend.double()
-
-
-def pixel_motion(
-    depth: Tensor,  # (H, W) z in world units
-    camera: Camera,
-) -> tuple[Tensor, Tensor]:  # (6, H, W), (6, H, W)
-    """Return du / d(rho, phi) and dv / d(rho, phi) of what each pixel shows: the A above.
-
-    A twist moves the point p by rho + phi x p. With its ray (x, y, 1) and e = 1/z, they are
-
-        fx (e, 0, -e x, -x y, 1 + x^2, -y),        fy (0, e, -e y, -1 - y^2, x y, x).
-    """
-    x, y, _ = camera.rays(camera.pixel_grid(dtype=depth.dtype, device=depth.device)).unbind(-1)
-    e, zero = 1 / depth, torch.zeros_like(depth)
-    u = torch.stack([e, zero, -e * x, -x * y, 1 + x * x, -y]).mul_(camera.fx)
-    v = torch.stack([zero, e, -e * y, -1 - y * y, x * y, x]).mul_(camera.fy)
-    return u, v
 
 
 def image_slope(image: Tensor) -> Tensor:  # (H, W, 3) -> (2, H, W, 3)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
+from minislam.geometry.camera import pixel_scale
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
 from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import (
@@ -31,7 +32,6 @@ from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
 from minislam.tracking.robust import RobustKernel
 
-REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that the thresholds in px belong to
 # A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
 # correct would look like outliers. So the weight is wide at first. [-]
 FIRST_WIDENING = 8.0
@@ -52,7 +52,7 @@ class BackEnd(Stateful):
         self.keyframes = KeyframeStore(len(self.grid.rays))
         self.graph = FrameGraph()
         self.reports: list[BundleReport] = []
-        self.pixel_scale = (camera.width**2 + camera.height**2) ** 0.5 / REFERENCE_DIAGONAL
+        self.pixel_scale = pixel_scale(camera)
         self.flow = flow
         self._first_moved = 0
 

@@ -100,30 +100,19 @@ def reproject_with_jacobians(
 ) -> Linearisation:
     """Return the reprojection with its derivatives (notebook 05 derives them).
 
-    A left step (rho, phi) of the target moves X by d rho + phi x X; with a = X / X_z and
-    e = d / X_z the rows of J_target are
-
-        fx (e, 0, -e a_x,  -a_x a_y,  1 + a_x^2,  -a_y)
-        fy (0, e, -e a_y,  -1 - a_y^2,  a_x a_y,   a_x),
-
-    and X moves by t when d grows by one.
+    A step of the target's pose moves the point in the target frame, whose ray is X / X_z and
+    whose inverse depth is d / X_z: J_target is `Camera.twist_jacobian` there. A larger d moves X
+    along t.
     """
     x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
     valid = z >= MIN_DEPTH_RATIO
     # Invalid points get zero weight from the caller; one keeps their numbers finite.
     inverse_z = torch.where(valid, z, torch.ones_like(z)).reciprocal()
-    ax, ay, e = x * inverse_z, y * inverse_z, disparities * inverse_z
-    fx, fy, zero = camera.fx, camera.fy, torch.zeros_like(ax)
-    rows = [
-        fx * e, zero,
-        zero, fy * e,
-        fx * (-e * ax), fy * (-e * ay),
-        fx * (-ax * ay), fy * (-1 - ay * ay),
-        fx * (1 + ax * ax), fy * (ax * ay),
-        fx * -ay, fy * ax,
-    ]  # fmt: skip
-    J_target = torch.stack(rows, 1).unflatten(1, (6, 2))
+    ray_x, ray_y = x * inverse_z, y * inverse_z
+    J_target = camera.twist_jacobian(ray_x, ray_y, disparities * inverse_z)
     tx, ty, tz = T_target_source[:, :3, 3, None].unbind(1)
-    J_disparity = torch.stack([fx * (tx - tz * ax) * inverse_z, fy * (ty - tz * ay) * inverse_z], 1)
-    positions = torch.stack([fx * ax + camera.cx, fy * ay + camera.cy], 1)
+    J_u = camera.fx * (tx - tz * ray_x) * inverse_z
+    J_v = camera.fy * (ty - tz * ray_y) * inverse_z
+    positions = torch.stack([camera.fx * ray_x + camera.cx, camera.fy * ray_y + camera.cy], 1)
+    J_disparity = torch.stack([J_u, J_v], 1)
     return Linearisation(positions, valid, J_target, J_disparity)

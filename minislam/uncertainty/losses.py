@@ -3,58 +3,17 @@
 Everything that comes from the renderer is a constant here: L_uncer never moves a Gaussian.
 """
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from minislam.images import SSIM_C1, SSIM_C2, local_moments
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.weights import clipped_beta
 
 SSIM_WINDOW = 7  # px, official; NeRF On-the-go uses a 5x5 box
-SSIM_SIGMA = 1.5  # px
-SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # stabilise l and c on flat patches of images in [0, 1]
 SSIM_C3 = SSIM_C2 / 2  # the usual choice, with which l c s is the classic SSIM
 STRUCTURE_CAP = 0.98  # of c and s: one perfect factor must not hide the two others
-STRIP = 32  # px blurred by one matrix product: wider ones multiply more zeros (measured)
-
-
-def gaussian_blur(
-    images: Tensor,  # (..., H, W)
-    size: int,  # px, odd
-    sigma: float,  # px
-) -> Tensor:  # (..., H, W)
-    """Blur by a normalised Gaussian window, zero beyond the border: B_rows @ image @ B_columns.
-
-    As products with strips of the banded matrices it is far faster on a CPU than as a
-    convolution of a few channels, and three times as fast as with the whole matrices.
-    """
-    height, width = images.shape[-2:]
-    kind = size, sigma, images.dtype, images.device
-    wide = torch.cat([images[..., seen] @ B for seen, B in _blur_strips(width, *kind)], -1)
-    return torch.cat([B.T @ wide[..., seen, :] for seen, B in _blur_strips(height, *kind)], -2)
-
-
-@lru_cache(maxsize=16)
-def _blur_strips(
-    length: int, size: int, sigma: float, dtype: torch.dtype, device: torch.device
-) -> list[tuple[slice, Tensor]]:
-    """Return the matrix that blurs a row of pixels, made once, as strips of its columns.
-
-    Each strip comes with the pixels that it sees; the rows of all others would be zero.
-    """
-    position = torch.arange(length, dtype=dtype, device=device)
-    reach = size // 2
-    window = torch.arange(size, dtype=dtype, device=device) - reach
-    total = torch.exp(-0.5 * (window / sigma) ** 2).sum()
-    strips = []
-    for first in range(0, length, STRIP):
-        seen = slice(max(first - reach, 0), first + STRIP + reach)
-        distance = (position[seen, None] - position[None, first : first + STRIP]).abs()
-        blur = torch.exp(-0.5 * (distance / sigma) ** 2) * (distance <= reach) / total
-        strips.append((seen, blur))
-    return strips
 
 
 def ssim_components(
@@ -67,8 +26,7 @@ def ssim_components(
     s = (d12 + C3) / (d1 d2 + C3), with local means m, deviations d and covariance d12.
     """
     first, second = image.permute(2, 0, 1), rendered.permute(2, 0, 1)
-    stack = torch.stack([first, second, first * first, second * second, first * second])
-    m1, m2, m11, m22, m12 = gaussian_blur(stack, SSIM_WINDOW, SSIM_SIGMA)
+    m1, m11, m12, m2, m22 = local_moments(first, second, SSIM_WINDOW)
 
     # E[x^2] - E[x]^2 can come out negative, and |d12| larger than d1 d2, by round-off.
     smallest = torch.finfo(image.dtype).eps

@@ -83,10 +83,8 @@ def test_points_in_a_plane_have_one_answer():
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=1e-12)
 
 
-def test_inverse_undoes_and_poses_move_with_their_centres():
-    similarity, points = random_similarity(7, 3.0), random_points(5, 7)
-    back = similarity.inverse().transform_points(similarity.transform_points(points))
-    np.testing.assert_allclose(back, points, atol=1e-12)
+def test_poses_move_with_their_centres():
+    similarity = random_similarity(7, 3.0)
     poses = random_transforms(5, "normal", 8).numpy()
     moved = similarity.transform_poses(poses)
     centres = similarity.transform_points(poses[:, :3, 3])

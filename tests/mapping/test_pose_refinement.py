@@ -10,7 +10,6 @@ from minislam.mapping import Mapper, MappingConfig, PoseRefinementConfig
 from minislam.mapping.pose_refinement import (
     curvature,
     image_slope,
-    pixel_motion,
     refine_pose,
     rerendering_loss,
 )
@@ -197,21 +196,6 @@ def test_slope_of_a_ramp():
     slope = image_slope(ramp)
     expected = torch.tensor([2.0, -3.0])[:, None, None, None].expand(2, 3, 4, 3)
     torch.testing.assert_close(slope[:, 1:-1, 1:-1], expected)
-
-
-def test_pixel_motion_agrees_with_moved_points():
-    camera = Camera(30.0, 33.0, 12.0, 14.0, 32, 24)
-    depth = 1 + torch.rand(24, 32, generator=generator(3), dtype=torch.float64)
-    points = camera.backproject(camera.pixel_grid(dtype=torch.float64), depth)
-    found = torch.stack(pixel_motion(depth, camera), 1)
-    for axis in range(6):
-        xi = torch.zeros(6, dtype=torch.float64)
-        xi[axis] = 1e-6
-        ahead, behind = (
-            camera.project(points @ T[:3, :3].T + T[:3, 3]) for T in (se3_exp(xi), se3_exp(-xi))
-        )
-        expected = (ahead - behind).permute(2, 0, 1) / 2e-6
-        torch.testing.assert_close(found[axis], expected, rtol=1e-6, atol=1e-6)
 
 
 # Degenerate input

@@ -1,0 +1,56 @@
+"""Local statistics of images: Gaussian blur, and the constants and moments of SSIM."""
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+SSIM_SIGMA = 1.5  # px, standard deviation of the window (Wang et al. 2004)
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # keep flat patches of images in [0, 1] from 0/0 (the same)
+_STRIP = 32  # px blurred by one matrix product: wider ones multiply more zeros (measured)
+
+
+def local_moments(
+    x: Tensor,  # (C, H, W)
+    y: Tensor,  # (C, H, W)
+    size: int,  # px, side of the window, odd
+) -> Tensor:  # (5, C, H, W)
+    """Return the local means of x, x^2, x y, y and y^2 under the window of SSIM."""
+    return gaussian_blur(torch.stack([x, x * x, x * y, y, y * y]), size, SSIM_SIGMA)
+
+
+def gaussian_blur(
+    images: Tensor,  # (..., H, W)
+    size: int,  # px, side of the window, odd
+    sigma: float,  # px
+) -> Tensor:  # (..., H, W)
+    """Blur by a normalised Gaussian window, zero beyond the border: B_rows @ image @ B_columns.
+
+    On a CPU, products with strips of the banded matrices are far faster than a convolution of a
+    few channels, and three times as fast as products with the whole matrices.
+    """
+    height, width = images.shape[-2:]
+    kind = size, sigma, images.dtype, images.device
+    wide = torch.cat([images[..., seen] @ B for seen, B in _blur_strips(width, *kind)], -1)
+    return torch.cat([B.T @ wide[..., seen, :] for seen, B in _blur_strips(height, *kind)], -2)
+
+
+@lru_cache(maxsize=16)
+def _blur_strips(
+    length: int, size: int, sigma: float, dtype: torch.dtype, device: torch.device
+) -> list[tuple[slice, Tensor]]:
+    """Return the banded matrix that blurs a row of `length` pixels, as strips of its columns.
+
+    Each strip comes with the range of pixels that it reads, because its other rows are zero.
+    """
+    position = torch.arange(length, dtype=dtype, device=device)
+    reach = size // 2
+    window = torch.arange(size, dtype=dtype, device=device) - reach
+    total = torch.exp(-0.5 * (window / sigma) ** 2).sum()
+    strips = []
+    for first in range(0, length, _STRIP):
+        seen = slice(max(first - reach, 0), first + _STRIP + reach)
+        distance = (position[seen, None] - position[None, first : first + _STRIP]).abs()
+        blur = torch.exp(-0.5 * (distance / sigma) ** 2) * (distance <= reach) / total
+        strips.append((seen, blur))
+    return strips

@@ -1,0 +1,51 @@
+"""Gaussian windows and local moments, against scipy and plain formulas."""
+
+import pytest
+import torch
+from scipy import ndimage
+
+from minislam.images import SSIM_SIGMA, gaussian_blur, local_moments
+from tests.helpers import generator
+
+
+def random_images(seed: int, *shape: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+# Known answers
+
+
+@pytest.mark.parametrize(("height", "width"), [(37, 70), (5, 3), (1, 1)])
+def test_blur_agrees_with_scipy(height: int, width: int):
+    image = random_images(0, height, width)  # 70 px are three strips; 3 px are less than a window
+    expected = ndimage.gaussian_filter(image.numpy(), 1.5, mode="constant", radius=3)
+    torch.testing.assert_close(gaussian_blur(image, 7, 1.5), torch.from_numpy(expected))
+
+
+def test_a_single_pixel_becomes_the_window():
+    image = torch.zeros(9, 9, dtype=torch.float64)
+    image[4, 4] = 1
+    blurred = gaussian_blur(image, 3, 1.0)
+    side = 0.6065306597126334  # exp(-1/2)
+    centre = 1 / (1 + 2 * side)
+    assert float(blurred[4, 4]) == pytest.approx(centre**2)
+    assert float(blurred[4, 5]) == pytest.approx(side * centre**2)
+    assert float(blurred.sum()) == pytest.approx(1)
+    assert blurred[4, 6] == 0  # the window has 3 px
+
+
+# Identities
+
+
+def test_moments_are_the_blurred_powers():
+    x, y = random_images(1, 3, 20, 24), random_images(2, 3, 20, 24)
+    moments = local_moments(x, y, 11)
+    for found, powers in zip(moments, (x, x * x, x * y, y, y * y), strict=True):
+        torch.testing.assert_close(found, gaussian_blur(powers, 11, SSIM_SIGMA))
+
+
+def test_blur_is_its_own_transpose():
+    # The backward of the SSIM loss relies on it: <B x, y> = <x, B y>.
+    x, y = random_images(3, 37, 70), random_images(4, 37, 70)
+    forward, backward = (gaussian_blur(x, 11, 1.5) * y).sum(), (x * gaussian_blur(y, 11, 1.5)).sum()
+    torch.testing.assert_close(forward, backward)
