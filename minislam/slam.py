@@ -11,7 +11,6 @@ learnt of each cell, and `_move_map` carries the map along when an adjustment mo
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -51,10 +50,12 @@ class Priors:
 class Slam(Stateful):
     """Monocular SLAM in a scene with moving things. Its parts can be read at any time."""
 
-    STATE: ClassVar = {
-        "tracker": Tracker, "mapper": Mapper, "snapshots": MlpSnapshots, "steps": Steps,
-        "focal_length": FocalLengthFit | None, "_poses": dict[int, Tensor],
-    }  # fmt: skip
+    tracker: Tracker
+    mapper: Mapper
+    snapshots: MlpSnapshots  # by frame index
+    steps: Steps
+    focal_length: FocalLengthFit | None = None  # which one the flow wants, at the end
+    _poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
         self,
@@ -66,7 +67,6 @@ class Slam(Stateful):
     ) -> None:
         self.sequence, self.config = sequence, config
         self.steps = Steps(report, lambda at_all_events: keep(self, at_all_events))
-        self.focal_length: FocalLengthFit | None = None  # which one the flow wants, at the end
         self._features = priors.features
         if config.uncertainty.grid_factor > 1:
             self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
@@ -77,7 +77,7 @@ class Slam(Stateful):
             priors.features.dimension,
             config.seed,
         )
-        self.snapshots = MlpSnapshots(self.mapper.mlp)  # by frame index
+        self.snapshots = MlpSnapshots(self.mapper.mlp)
         tracking = config.tracking
         if config.uncertainty.given_masks:  # they stand on no map, so they need no depth prior
             tracking = replace(tracking, beta_without_prior=True)
@@ -90,7 +90,7 @@ class Slam(Stateful):
             self._static_weight,
         )
         self._stride = priors.flow.stride
-        self._poses: dict[int, Tensor] = {}  # T_camera_world of every frame, once known
+        self._poses = {}
 
     def run(self) -> None:
         """Process the sequence to the final map, from its start or from a restored state."""

@@ -17,13 +17,13 @@ from minislam.data.files import atomic_file, read_bytes
 from minislam.errors import InputError
 
 _TREE = "tree.json"  # the array that holds the text
-_ARRAY, _TENSOR = "@array", "@tensor"  # keys of what stands in the text for either
+_ARRAY, _TENSOR = "@array", "@tensor"  # keys in the text that refer to an array or a tensor
 
 
 def write_checkpoint(path: Path | str, tree: Any) -> None:
     """Write dictionaries and lists of tensors, arrays, numbers, text and None, atomically.
 
-    A tensor that occurs twice is stored once, and is one tensor again when it is read.
+    A tensor that occurs twice is stored once, and reading gives one tensor for both places.
     """
     arrays: dict[str, np.ndarray] = {}
     names: dict[int, str] = {}  # by identity of the tensor or array
@@ -79,7 +79,7 @@ def read_checkpoint(path: Path | str) -> Any:
 
 
 def _once(tensor: Tensor) -> Tensor:
-    """Return the part of an expanded tensor that lies in memory."""
+    """Return an expanded tensor without its repeated rows, which memory holds only once."""
     for dimension, stride in enumerate(tensor.stride()):
         if stride == 0 and tensor.shape[dimension] > 1:
             tensor = tensor.narrow(dimension, 0, 1)
@@ -87,7 +87,7 @@ def _once(tensor: Tensor) -> Tensor:
 
 
 def _strided(array: np.ndarray, shape: list[int], strides: list[int], device: str) -> Tensor:
-    """Return the tensor as it lay in memory: sums add up in that order, so its bytes matter."""
+    """Restore the strides: they fix the order of summation and thereby the last bits of sums."""
     stored = torch.from_numpy(array)
     tensor = torch.empty_strided(stored.shape, strides, dtype=stored.dtype, device=device)
     return tensor.copy_(stored).expand(shape)

@@ -1,7 +1,6 @@
 """Clone, split and prune Gaussians: put them where the images ask for detail."""
 
 from dataclasses import fields
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,7 +20,8 @@ class ScreenGradients(Stateful):
     In half images instead of pixels, so that the threshold holds for every image size.
     """
 
-    STATE: ClassVar = {"total": Tensor, "views": Tensor}
+    total: Tensor  # (N,) sum of the lengths
+    views: Tensor  # (N,) number of views
 
     def __init__(self, count: int) -> None:
         self.total = torch.zeros(count)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -39,12 +38,17 @@ Progress = Callable[[int, int], None]  # called with the iterations done and the
 class Mapper(Stateful):
     """Grow and optimise the map of the static scene, and train the MLP on what does not fit."""
 
-    STATE: ClassVar = {
-        "keyframes": list[MappedKeyframe], "window": list[int], "median_depth": float,
-        "background": Tensor, "history": MappingHistory, "_trainer": UncertaintyTrainer,
-        "_generator": torch.Generator, "_optimizer": MapOptimizer, "_gradients": ScreenGradients,
-        "_iteration": int, "_frozen_until": int,
-    }  # fmt: skip
+    keyframes: list[MappedKeyframe]
+    window: list[int]  # positions in `keyframes`, newest first
+    median_depth: float = 1.0  # world units; set by the first keyframes, then fixed
+    background: Tensor  # RGB of what no keyframe sees
+    history: MappingHistory
+    _trainer: UncertaintyTrainer
+    _generator: torch.Generator
+    _optimizer: MapOptimizer
+    _gradients: ScreenGradients
+    _iteration: int = 0
+    _frozen_until: int = 0  # iteration from which on the MLP learns again
 
     def __init__(
         self,
@@ -58,17 +62,14 @@ class Mapper(Stateful):
         self.camera = camera
         self.config = config
         self.uncertainty = uncertainty
-        self.keyframes: list[MappedKeyframe] = []
-        self.window: list[int] = []  # positions in `keyframes`, newest first
-        self.median_depth = 1.0  # world units; set by the first keyframes, then fixed
-        self.background = torch.zeros(3, device=device)  # RGB of what no keyframe sees
+        self.keyframes = []
+        self.window = []
+        self.background = torch.zeros(3, device=device)
         self.history = MappingHistory()
         self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed, device)
         self._generator = torch.Generator().manual_seed(seed + 1)
         self._optimizer = MapOptimizer(GaussianMap.empty(device=device), config.rates)
         self._gradients = ScreenGradients(0)
-        self._iteration = 0
-        self._frozen_until = 0
         scale = config.image_scale
         self._online_camera = camera.resized(
             max(1, round(scale * camera.width)), max(1, round(scale * camera.height))

@@ -57,7 +57,7 @@ class MappedKeyframe:
         return {name: value for name, value in vars(self).items() if name not in made_again}
 
     @classmethod
-    def restored(cls, state: Tree, frame_of: FrameOf) -> "MappedKeyframe":
+    def from_state(cls, state: Tree, frame_of: FrameOf) -> "MappedKeyframe":
         """Return the keyframe of a saved state, its image read again."""
         return cls(**state, image=frame_of(state["frame_index"]).image)
 

@@ -6,7 +6,6 @@ Every flow starts from an expected one: what geometry predicts, or the last fram
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -21,7 +20,7 @@ from minislam.priors.grid_flow import (
     texture_confidence,
 )
 from minislam.priors.interfaces import FlowMatches
-from minislam.state.stateful import FrameOf, Stateful, Tree, built, saved
+from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
@@ -56,11 +55,11 @@ class ClassicalFlow(Stateful):
 
     def saved_state(self) -> Tree:
         """Return what was measured; the images are given again."""
-        return {"measured": saved(list(self._measured.values()))}
+        return {"measured": to_tree(list(self._measured.values()))}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
-        measured = built(list[MeasuredEdge], state["measured"], frame_of)
+        measured = from_tree(list[MeasuredEdge], state["measured"], frame_of)
         self._measured = {(edge.source, edge.target): edge for edge in measured}
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
@@ -137,14 +136,17 @@ class FlowChain(Stateful):
     changed: the next frame gives a new one, and a bad frame can be passed over.
     """
 
-    STATE: ClassVar = dict.fromkeys(("_reference", "_newest", "_flow", "_increment"), np.ndarray)
+    _reference: np.ndarray  # (H, W) uint8
+    _newest: np.ndarray  # (H, W) uint8
+    _flow: np.ndarray  # (H, W, 2) px, reference to newest
+    _increment: np.ndarray  # (H, W, 2) px, how much of it the last frame added
 
     def __init__(
         self,
-        reference: np.ndarray,  # (H, W) uint8
-        newest: np.ndarray,  # (H, W) uint8
-        flow: np.ndarray,  # (H, W, 2) px, reference to newest
-        increment: np.ndarray,  # (H, W, 2) px, how much of it the last frame added
+        reference: np.ndarray,
+        newest: np.ndarray,
+        flow: np.ndarray,
+        increment: np.ndarray,
         config: ClassicalFlowConfig,
     ) -> None:
         self._reference, self._newest = reference, newest

@@ -1,7 +1,6 @@
 """The map: one row per Gaussian in six tensors, and the Adam that lives and dies with the rows."""
 
 from dataclasses import dataclass, fields
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -124,12 +123,11 @@ class MapOptimizer(Stateful):
     step of a late row would be (1 - beta1) / sqrt(1 - beta2) = 3.2 times too long.
     """
 
-    STATE: ClassVar = {
-        "gaussians": GaussianMap,
-        "_first": dict[str, Tensor],
-        "_second": dict[str, Tensor],
-        "_steps": Tensor,
-    }
+    gaussians: GaussianMap
+    _first: dict[str, Tensor]  # first moments, by parameter
+    _second: dict[str, Tensor]  # second moments, by parameter
+    _steps: Tensor  # (N,)
+
     BETAS = (0.9, 0.999)  # decay of the first and second moment, Adam's defaults
     EPSILON = 1e-15  # floor of the denominator: 3DGS, gradients per pixel mean are tiny
 
@@ -152,7 +150,7 @@ class MapOptimizer(Stateful):
         parameters = self.gaussians.parameters
         self._first = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
         self._second = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
-        self._steps = torch.zeros_like(parameters["opacity_logits"].detach())  # (N,)
+        self._steps = torch.zeros_like(parameters["opacity_logits"].detach())
 
     @torch.no_grad()
     def step(self) -> None:

@@ -1,14 +1,20 @@
-"""What a run needs to go on later: the state of its parts, as a tree of plain values.
+"""The state of a run as a tree of plain values, from which another process can go on.
 
-A class with state names the attributes that make it up. What follows from the settings and the
-sequence alone (cameras, images, caches) is not among them: it is made again.
+The state of a `Stateful` class is what its body annotates:
+
+    class Mapper(Stateful):
+        window: list[int]  # saved and restored
+        _optimizer: MapOptimizer  # a Stateful part: saved and restored by itself
+
+Attributes that only `__init__` sets are not saved. They follow from the settings and the sequence:
+cameras, callbacks, caches.
 """
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from types import NoneType, UnionType
-from typing import Any, ClassVar, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import torch
 
@@ -20,28 +26,29 @@ FrameOf = Callable[[int], Frame]  # reads a frame again, by its frame_index
 
 
 class Stateful:
-    """A thing that can tell its state, and take it up again where another process left off."""
-
-    STATE: ClassVar[dict[str, Any]] = {}  # attribute -> its type, which says how to build it again
+    """An object whose state can be saved, and restored in another process."""
 
     def saved_state(self) -> Tree:
-        """Return the state. Tensors are those in use: write them before anything moves on."""
-        return {name: saved(getattr(self, name)) for name in self.STATE}
+        """Return the state. Its tensors are those in use: write them before the next step."""
+        return {name: to_tree(getattr(self, name)) for name in get_type_hints(type(self))}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state; nothing of the present one is left."""
-        for name, kind in self.STATE.items():
+        """Replace the present state by a saved one.
+
+        Stateful parts and random generators stay the same objects, since others may hold them.
+        """
+        for name, kind in get_type_hints(type(self)).items():
             present = getattr(self, name)
             if isinstance(present, Stateful):
                 present.restore_state(state[name], frame_of)
             elif isinstance(present, torch.Generator):
                 present.set_state(state[name])
             else:
-                setattr(self, name, built(kind, state[name], frame_of))
+                setattr(self, name, from_tree(kind, state[name], frame_of))
 
 
-def saved(value: Any) -> Tree:
-    """Return a value as a tree; of a frame only its index, of records only their fields."""
+def to_tree(value: Any) -> Tree:
+    """Return a value as a tree; a frame becomes its index, a record its fields."""
     if hasattr(value, "saved_state"):
         return value.saved_state()
     if isinstance(value, Frame):
@@ -51,33 +58,35 @@ def saved(value: Any) -> Tree:
     if isinstance(value, Enum):
         return value.value
     if is_dataclass(value):
-        return {field.name: saved(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: to_tree(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, dict):
-        return {str(key): saved(item) for key, item in value.items()}
+        return {str(key): to_tree(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [saved(item) for item in value]
+        return [to_tree(item) for item in value]
     return value
 
 
-def built(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
+def from_tree(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
     """Return the value of a type, like `list[Frame] | None`, from its tree."""
     if tree is None:
         return None
-    origin, inside = get_origin(kind), get_args(kind)
+    origin, arguments = get_origin(kind), get_args(kind)
     if origin is UnionType:
-        kind = next(part for part in inside if part is not NoneType)
-        return built(kind, tree, frame_of)
+        kind = next(part for part in arguments if part is not NoneType)
+        return from_tree(kind, tree, frame_of)
     if origin is list:
-        return [built(inside[0], item, frame_of) for item in tree]
+        return [from_tree(arguments[0], item, frame_of) for item in tree]
     if origin is tuple:
-        return tuple(built(part, item, frame_of) for part, item in zip(inside, tree, strict=True))
+        parts = zip(arguments, tree, strict=True)
+        return tuple(from_tree(part, item, frame_of) for part, item in parts)
     if origin is dict:
-        return {inside[0](key): built(inside[1], item, frame_of) for key, item in tree.items()}
+        of_key, of_value = arguments
+        return {of_key(key): from_tree(of_value, item, frame_of) for key, item in tree.items()}
     if kind is Frame:
         return frame_of(tree)
-    if hasattr(kind, "restored"):  # it makes itself
-        return kind.restored(tree, frame_of)
+    if hasattr(kind, "from_state"):
+        return kind.from_state(tree, frame_of)
     if is_dataclass(kind):
         hints = get_type_hints(kind)
-        return kind(**{name: built(hints[name], tree[name], frame_of) for name in hints})
+        return kind(**{name: from_tree(hints[name], tree[name], frame_of) for name in hints})
     return kind(tree) if issubclass(kind, Enum) else tree

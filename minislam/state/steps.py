@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import ClassVar
 
 from minislam.state.stateful import Stateful
 
@@ -17,13 +16,14 @@ def silent(stage: str, done: int, of_all: int) -> None:
 class Steps(Stateful):
     """Counts steps and seconds per stage."""
 
-    STATE: ClassVar = {"seconds": dict[str, float], "_done": dict[str, int]}
+    seconds: dict[str, float]  # spent per stage
+    _done: dict[str, int]  # steps per stage
 
     def __init__(self, report: Report, keep: Callable[[bool], None]) -> None:
-        self.seconds: dict[str, float] = {}  # spent per stage
+        self.seconds = {}
         self.keep = keep  # a checkpoint, where nothing is half done; True: at all events
         self._report = report
-        self._done: dict[str, int] = {}  # steps per stage
+        self._done = {}
         self._stage: str | None = None  # that the time since the last lap is counted for
         self._since = 0.0
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -41,20 +40,20 @@ HORIZON = 3  # windows of keyframes among which a new one looks for proximity li
 class BackEnd(Stateful):
     """Holds what tracking has estimated, and makes it consistent."""
 
-    STATE: ClassVar = {
-        "keyframes": KeyframeStore, "graph": FrameGraph, "flow": FlowEstimator,
-        "reports": list[BundleReport], "_first_moved": int,
-    }  # fmt: skip
+    keyframes: KeyframeStore
+    graph: FrameGraph
+    flow: FlowEstimator
+    reports: list[BundleReport]
+    _first_moved: int = 0
 
     def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
         self.config = config
         self.grid = Grid.of(camera, flow.stride)
         self.keyframes = KeyframeStore(len(self.grid.rays))
         self.graph = FrameGraph()
-        self.reports: list[BundleReport] = []
+        self.reports = []
         self.pixel_scale = pixel_scale(camera)
         self.flow = flow
-        self._first_moved = 0
 
     @property
     def robust(self) -> RobustKernel | None:

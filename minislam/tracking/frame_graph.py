@@ -1,6 +1,6 @@
 """The frame graph: which keyframes are compared, and what the flow between them measured."""
 
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -22,23 +22,17 @@ KEPT_SHARE = 0.8
 FAR = 1000.0  # px, the distance of such a pair
 
 
+@dataclass
 class FrameGraph(Stateful):
     """Directed edges (source, target) between keyframes, each with its flow measurement."""
 
-    STATE: ClassVar = {
-        "edges_source": list[int],
-        "edges_target": list[int],
-        "targets": list[Tensor],
-        "confidences": list[Tensor],
-        "matched_shares": list[float],
-    }
+    edges_source: list[int] = field(default_factory=list)
+    edges_target: list[int] = field(default_factory=list)
+    targets: list[Tensor] = field(default_factory=list)  # per edge (2, N) px
+    confidences: list[Tensor] = field(default_factory=list)  # per edge (2, N) in [0, 1]
+    matched_shares: list[float] = field(default_factory=list)  # per edge, in [0, 1]
 
-    def __init__(self) -> None:
-        self.edges_source: list[int] = []
-        self.edges_target: list[int] = []
-        self.targets: list[Tensor] = []  # per edge (2, N) px
-        self.confidences: list[Tensor] = []  # per edge (2, N) in [0, 1]
-        self.matched_shares: list[float] = []  # per edge, in [0, 1]
+    def __post_init__(self) -> None:
         self._position: dict[tuple[int, int], int] = {}
 
     def __len__(self) -> int:

@@ -1,7 +1,5 @@
 """The tracker's memory: one row per keyframe, growing as long as the sequence does."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
@@ -12,28 +10,26 @@ from minislam.state.stateful import Stateful
 class KeyframeStore(Stateful):
     """Everything the tracker knows of its keyframes."""
 
-    STATE: ClassVar = {
-        "frames": list[Frame],
-        "features": list[Tensor],  # a network's take long to make again
-        "metric_depths": list[Tensor | None],
-        "T_camera_world": Tensor,
-        "disparities": Tensor,
-        "prior_disparities": Tensor,
-        "prior_masks": Tensor,
-        "static_weights": Tensor,
-        "motion_trust": Tensor,
-    }
+    frames: list[Frame]
+    features: list[Tensor]  # (h', w', C); saved, because a network takes long to compute them
+    metric_depths: list[Tensor | None]  # (H, W) D~, 0 where unknown
+    T_camera_world: Tensor  # (K, 4, 4)
+    disparities: Tensor  # (K, N) 1/world unit
+    prior_disparities: Tensor  # (K, N) 1/D~, 0 where unknown
+    prior_masks: Tensor  # (K, N) M; False: prior off
+    static_weights: Tensor  # (K, N) what beta leaves of a cell's weight
+    motion_trust: Tensor  # (K, N) how well a cell has followed the camera
 
     def __init__(self, cells: int) -> None:
-        self.frames: list[Frame] = []
-        self.features: list[Tensor] = []  # (h', w', C)
-        self.metric_depths: list[Tensor | None] = []  # (H, W) D~, 0 where unknown
-        self.T_camera_world = torch.zeros(0, 4, 4, dtype=torch.float64)  # (K, 4, 4)
-        self.disparities = torch.zeros(0, cells)  # (K, N) 1/world unit
-        self.prior_disparities = torch.zeros(0, cells)  # (K, N) 1/D~, 0 where unknown
-        self.prior_masks = torch.zeros(0, cells, dtype=torch.bool)  # (K, N) M; False: prior off
-        self.static_weights = torch.zeros(0, cells)  # (K, N) what beta leaves of a cell's weight
-        self.motion_trust = torch.zeros(0, cells)  # (K, N) how well a cell has followed the camera
+        self.frames = []
+        self.features = []
+        self.metric_depths = []
+        self.T_camera_world = torch.zeros(0, 4, 4, dtype=torch.float64)
+        self.disparities = torch.zeros(0, cells)
+        self.prior_disparities = torch.zeros(0, cells)
+        self.prior_masks = torch.zeros(0, cells, dtype=torch.bool)
+        self.static_weights = torch.zeros(0, cells)
+        self.motion_trust = torch.zeros(0, cells)
 
     def __len__(self) -> int:
         return len(self.frames)

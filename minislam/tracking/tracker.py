@@ -1,7 +1,6 @@
 """The tracker: follows the camera, keeps keyframes, and has them adjusted (paper Sec. 3.3)."""
 
 from collections.abc import Callable
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -38,18 +37,16 @@ from minislam.tracking.status import TrackedFrame, TrackingStatus
 class Tracker(Stateful):
     """Turns frames into keyframes with poses and disparities."""
 
-    STATE: ClassVar = {
-        "backend": BackEnd,
-        "tracked": list[TrackedFrame],
-        "health": list[KeyframeHealth],
-        "initialised": bool,
-        "_chain": FlowChain,
-        "_passed_over": tuple[Frame, FlowMatches] | None,
-        "_steps": list[FlowMatches | None],
-        "_lost_in_a_row": int,
-        "_culled_in_a_row": int,
-        "_last_global": int,
-    }
+    backend: BackEnd
+    tracked: list[TrackedFrame]
+    health: list[KeyframeHealth]  # of every keyframe, when it came
+    initialised: bool = False
+    _chain: FlowChain | None = None
+    _passed_over: tuple[Frame, FlowMatches] | None = None  # newest frame, no keyframe
+    _steps: list[FlowMatches | None]  # keyframe k to k + 1, None across a loss
+    _lost_in_a_row: int = 0
+    _culled_in_a_row: int = 0
+    _last_global: int = 0  # keyframes at the last online global BA
 
     def __init__(
         self,
@@ -64,25 +61,20 @@ class Tracker(Stateful):
         self.backend = BackEnd(camera, config, flow)
         self.keyframes = self.backend.keyframes
         self.grid = self.backend.grid
-        self.tracked: list[TrackedFrame] = []
-        self.health: list[KeyframeHealth] = []  # of every keyframe, when it came
-        self.initialised = False
+        self.tracked = []
+        self.health = []
         self._features, self._depth_prior = features, depth_prior
         self._predict_static_weight = predict_static_weight
-        self._chain: FlowChain | None = None
-        self._passed_over: tuple[Frame, FlowMatches] | None = None  # newest frame, no keyframe
-        self._steps: list[FlowMatches | None] = []  # keyframe k to k + 1, None across a loss
+        self._steps = []
         memory_scale = config.motion_memory * self.backend.pixel_scale
         self._motion = MotionMemory(self.grid, self.keyframes, memory_scale)
         self._relocaliser = Relocaliser(self.grid, self.keyframes, self.backend.pixel_scale)
-        self._lost_in_a_row = 0
-        self._culled_in_a_row = 0
-        self._last_global = 0  # keyframes at the last online global BA
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state; the flow looks at the keyframes' images again."""
         if state["_chain"] is not None:
-            self._chain = self.backend.flow.start_chain(frame_of(0).image)  # any: to be filled
+            # The flow estimator makes a chain of its own class; the state replaces its content.
+            self._chain = self.backend.flow.start_chain(frame_of(0).image)
         super().restore_state(state, frame_of)
         for index, frame in enumerate(self.keyframes.frames):
             self.backend.flow.add_frame(index, frame.image)

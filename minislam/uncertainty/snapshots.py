@@ -1,7 +1,5 @@
 """The MLP as it was at earlier moments: how the system found out what moves."""
 
-from typing import ClassVar
-
 from torch import Tensor
 from torch.func import functional_call
 
@@ -14,12 +12,13 @@ _MOST = 32  # copies kept; a copy for DINOv2 features takes 115 kB
 class MlpSnapshots(Stateful):
     """Copies of the weights of an MLP, at most 32, spread evenly over the run."""
 
-    STATE: ClassVar = {"_weights": dict[int, dict[str, Tensor]], "_spacing": int, "_calls": int}
+    _weights: dict[int, dict[str, Tensor]]  # by moment, in order
+    _spacing: int = 1  # calls of `record` per copy
+    _calls: int = 0
 
     def __init__(self, mlp: UncertaintyMLP | None = None) -> None:
-        self._weights: dict[int, dict[str, Tensor]] = {}  # by moment, in order
+        self._weights = {}
         self._mlp = mlp
-        self._spacing, self._calls = 1, 0
 
     @property
     def moments(self) -> list[int]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from minislam.state.stateful import FrameOf, Stateful, Tree, saved
+from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import (
     cell_loss,
@@ -85,7 +85,7 @@ class UncertaintyTrainer(Stateful):
 
     def saved_state(self) -> Tree:
         """Return the state: weights, Adam's moments and the random source."""
-        return saved(
+        return to_tree(
             {
                 "mlp": self.mlp.state_dict(),
                 "adam": self.optimizer.state_dict()["state"],

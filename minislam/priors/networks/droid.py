@@ -6,7 +6,6 @@ so a later answer builds on the earlier ones while the geometry between them imp
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,7 +27,7 @@ from minislam.priors.networks.droid_network import (
     update,
 )
 from minislam.priors.networks.vit import normalise
-from minislam.state.stateful import FrameOf, Stateful, Tree, saved
+from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 
 _SMALLEST_GRID = 2 ** (LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
 
@@ -84,7 +83,7 @@ class DroidFlow(Stateful):
 
     def saved_state(self) -> Tree:
         """Return the state: of the edges. The frames are encoded again."""
-        return {"edges": [[*edge, saved(state)] for edge, state in self._edges.items()]}
+        return {"edges": [[*edge, to_tree(state)] for edge, state in self._edges.items()]}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
@@ -185,7 +184,9 @@ class DroidFlow(Stateful):
 class DroidChain(Stateful):
     """The flow from one reference frame to the newest; a `FlowChain` that never changes."""
 
-    STATE: ClassVar = {"_reference": EncodedFrame, "_newest": EncodedFrame, "_target": Tensor}
+    _reference: EncodedFrame
+    _newest: EncodedFrame
+    _target: Tensor | None  # (1, h, w, 2) cells, None: nothing has moved yet
 
     def __init__(
         self,
@@ -196,7 +197,7 @@ class DroidChain(Stateful):
     ) -> None:
         self._flow, self._reference = flow, reference
         self._newest = newest or reference
-        self._target = target  # (1, h, w, 2) cells, None: nothing has moved yet
+        self._target = target
 
     @torch.no_grad()
     def advanced(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
