@@ -70,10 +70,9 @@ class Mapper(Stateful):
         self._generator = torch.Generator().manual_seed(seed + 1)
         self._optimizer = MapOptimizer(GaussianMap.empty(device=device), config.rates)
         self._gradients = ScreenGradients(0)
-        scale = config.image_scale
-        self._online_camera = camera.resized(
-            max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
-        )
+        sides = (camera.width, camera.height)
+        online = [max(1, round(config.image_scale * side)) for side in sides]
+        self._online_camera = camera.resized(*online)
 
     @property
     def gaussians(self) -> GaussianMap:
