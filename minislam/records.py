@@ -30,7 +30,7 @@ class Keyframe:
     features: Tensor  # (h', w', C) float32, one vector per patch of the feature grid
     depth: Tensor  # (H, W) float32 world units, 0 where unknown: the mapper's reference D~
     T_camera_world: Tensor  # (4, 4) float64
-    moving_mask: Tensor | None = None  # (H, W) bool, True on movers, if it is given (ablation)
+    moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class GroundTruth(Protocol):
     trajectory: Trajectory | None  # in the benchmark's own world and at its own timestamps
 
     def moving_mask(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) bool, True where a mover is seen."""
+        """Return (H, W) bool, True where a dynamic object is seen."""
 
     def static_image(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W, 3) float32: the same view without the movers and their shadows."""
+        """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
 
     def depth(self, frame_index: int) -> np.ndarray | None:
         """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
@@ -79,3 +79,6 @@ class Sequence(Protocol):
 
     def frame(self, frame_index: int) -> Frame:
         """Return one frame again."""
+
+    def sensor_depth(self, frame_index: int) -> np.ndarray | None:
+        """Return the depth sensor's z-depth (H, W) [m], 0 where unknown; None without a sensor."""

@@ -1,4 +1,4 @@
-"""Files in and out: sequences to read, trajectories, maps and run folders to write."""
+"""Read sequences; read and write trajectories, maps and run folders."""
 
 from minislam.data.files import atomic_write
 from minislam.data.options import InputOptions

@@ -1,4 +1,4 @@
-"""Intrinsics: from a file, from a known benchmark, or guessed and said so."""
+"""Camera intrinsics: read from a file, known from a benchmark, or guessed with a warning."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,7 +9,7 @@ from minislam.geometry import BrownDistortion, Camera
 
 # Focal length over the longer image side when nothing is known. Phone and consumer cameras film
 # with 0.75 to 0.95 (a 26-30 mm equivalent lens, a little cropped by stabilisation); 0.85 is in the
-# middle and means a field of view of 61 degrees.
+# middle and gives a field of view of 61 degrees.
 GUESSED_FOCAL_RATIO = 0.85
 
 # Two aspect ratios closer than this belong to the same picture, resized and rounded to pixels.
@@ -50,7 +50,7 @@ class Calibration:
 
 
 def guessed_calibration(width: int, height: int) -> Calibration:
-    """Return a guess for images whose camera is unknown: see GUESSED_FOCAL_RATIO."""
+    """Guess the intrinsics of an unknown camera from its image size: see GUESSED_FOCAL_RATIO."""
     focal = GUESSED_FOCAL_RATIO * max(width, height)
     return Calibration(focal, focal, (width - 1) / 2, (height - 1) / 2, origin="guessed intrinsics")
 
@@ -68,18 +68,18 @@ def parse_calibration(text: str, name: str) -> Calibration:
             "expected 4, 6 or 11 numbers, fx fy cx cy [width height [k1 k2 p1 p2 k3]], found "
             f"{len(fields)} in {name}; add or remove numbers"
         )
-    numbers = finite_numbers(fields, name)
+    fx, fy, cx, cy, *rest = finite_numbers(fields, name)
     size = None
-    if len(numbers) >= 6:
-        size = (int(numbers[4]), int(numbers[5]))
-        if size != (numbers[4], numbers[5]) or min(size) < 1:
+    if rest:
+        size = (int(rest[0]), int(rest[1]))
+        if size != (rest[0], rest[1]) or min(size) < 1:
             raise InputError(
                 f"expected width and height as positive whole numbers, found {fields[4]} and "
                 f"{fields[5]} in {name}; correct them"
             )
-    if min(numbers[:2]) <= 0:
+    if min(fx, fy) <= 0:
         raise InputError(
             f"expected positive focal lengths, found fx={fields[0]} fy={fields[1]} in {name}; "
             "give them in pixels"
         )
-    return Calibration(*numbers[:4], size, BrownDistortion(*numbers[6:]), name)
+    return Calibration(fx, fy, cx, cy, size, BrownDistortion(*rest[2:]), name)

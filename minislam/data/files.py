@@ -1,4 +1,4 @@
-"""Files: whole or not at all when written, one sentence when they cannot be read."""
+"""Write files atomically; read them, or say in one sentence why they cannot be read."""
 
 import json
 import math
@@ -19,7 +19,7 @@ def atomic_write(path: Path | str, content: bytes) -> None:
 
 @contextmanager
 def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
-    """Open a file to write, as a whole or not at all.
+    """Open a file to be written as a whole or not at all.
 
     The bytes go to a temporary file in the same folder (os.replace is atomic only within one
     file system), reach the disk (fsync), and then take the final name.

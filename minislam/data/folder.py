@@ -42,7 +42,8 @@ def read_video(path: Path, limit: int | None) -> Recording:
     images = VideoImages(path, limit)
     if len(images) == 0:
         raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")
-    warnings, rate = [], images.frame_rate
+    warnings = []
+    rate = images.frame_rate
     if not (math.isfinite(rate) and rate > 0):
         rate = ASSUMED_FRAME_RATE
         warnings.append(f"the frame rate of {path.name} is unknown: {rate:g} per second assumed")
@@ -58,9 +59,9 @@ def read_video(path: Path, limit: int | None) -> Recording:
 
 
 def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
-    """Return timestamps (N,) of images, and in words where they come from.
+    """Return the timestamps (N,) of images, and a note that says where they come from.
 
-    A name that is a number is the timestamp; if any is not, the images are counted instead.
+    Names that are all numbers are the timestamps; otherwise the images are counted.
     """
     names = [path.stem for path in paths]
     if not all(re.fullmatch(r"\d+(\.\d+)?", name, re.ASCII) for name in names):
@@ -91,7 +92,7 @@ def folder_name(path: Path) -> str:
 
 
 def _hint(folder: Path) -> str:
-    """Say what else could be meant: often the video or the data set is one level deeper."""
+    """Say what the user may have meant: often the video or data set lies one level deeper."""
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     videos = [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]
     if videos:

@@ -1,4 +1,4 @@
-"""Image files: decoding whatever cameras write, and encoding PNG."""
+"""Decode the image files that cameras write, and encode PNG."""
 
 import re
 from pathlib import Path
@@ -80,7 +80,7 @@ def _decode(path: Path, mode: int) -> np.ndarray:
 
 
 def _is_complete(content: bytes) -> bool:
-    """Tell whether the closing marker is there: some decoders fill a cut image with grey."""
+    """Tell whether the end marker is there; without it some decoders fill the rest with grey."""
     if content.startswith(_PNG_SIGNATURE):
         return b"IEND" in content
     if content.startswith(_JPEG_SIGNATURE):

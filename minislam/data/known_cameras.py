@@ -1,4 +1,4 @@
-"""What is published about well-known benchmarks and not written in their folders."""
+"""Cameras and pose conventions of known benchmarks, which their folders do not state."""
 
 import re
 
@@ -42,7 +42,7 @@ _BONN_NAME = re.compile(r"(?<![a-z])rgbd_bonn(?![a-z])", re.IGNORECASE)
 
 
 def known_camera(text: str) -> Calibration | None:
-    """Return the intrinsics of the camera that a name or note speaks of: freiburg1, fr3, bonn."""
+    """Return the intrinsics of the camera that a text names: freiburg1, fr3, rgbd_bonn."""
     tum = _TUM_NAME.search(text)
     if tum is None and not is_bonn(text):
         return None

@@ -18,6 +18,11 @@ _SH_C0 = 0.28209479177387814  # Y_00 = 1 / (2 sqrt(pi)): colour = 0.5 + Y_00 * f
 # exp(20) world units is larger than any scene, exp(-20) smaller than any surface; values beyond
 # are mistakes (scales that were not logarithms), and some viewers hang on them.
 MAX_LOG_SCALE = 20.0
+# In the order of the original implementation; other files may hold f_rest_0, ... as well.
+PROPERTIES = (
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+    "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+)  # fmt: skip
 _MAX_HEADER = 65536  # byte
 
 
@@ -35,9 +40,9 @@ class GaussianArrays:
         return len(self.means)
 
 
-def write_ply(path: Path | str, gaussians: GaussianArrays, sh_degree: int = 0) -> None:
-    """Write a Gaussian map. `sh_degree` 3 pads with zeros for viewers that insist on it."""
-    atomic_write(path, encode_ply(gaussians, sh_degree))
+def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
+    """Write a Gaussian map."""
+    atomic_write(path, encode_ply(gaussians))
 
 
 def read_ply(path: Path | str) -> GaussianArrays:
@@ -45,38 +50,22 @@ def read_ply(path: Path | str) -> GaussianArrays:
     return decode_ply(read_bytes(path), str(path))
 
 
-def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
+def encode_ply(gaussians: GaussianArrays) -> bytes:
     """Return the bytes of a PLY file of a Gaussian map."""
-    if sh_degree not in (0, 1, 2, 3):
-        raise InputError(f"expected an SH degree from 0 to 3, found {sh_degree}; choose 0 or 3")
     _validate(gaussians, "the map")
-    names = property_names(sh_degree)
-    count = len(gaussians)
-    table = np.zeros((count, len(names)), dtype="<f4")
-    columns = {name: column for column, name in enumerate(names)}
-
-    def fill(first: str, values: np.ndarray) -> None:
-        values = values if values.ndim == 2 else values[:, None]
-        table[:, columns[first] : columns[first] + values.shape[1]] = values
-
-    fill("x", gaussians.means)
-    # Viewers clamp colours outside [0, 1] in different ways, so it is done here.
-    fill("f_dc_0", (np.clip(gaussians.colors, 0, 1) - 0.5) / _SH_C0)
-    fill("opacity", gaussians.opacity_logits)
-    fill("scale_0", gaussians.log_scales)
-    fill("rot_0", _normalised(gaussians.quats_wxyz))
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property float {name}" for name in names] + ["end_header"]
+    columns = [
+        gaussians.means,
+        np.zeros_like(gaussians.means),  # normals, which no viewer reads
+        # Viewers clamp colours outside [0, 1] in different ways, so it is done here.
+        (np.clip(gaussians.colors, 0, 1) - 0.5) / _SH_C0,
+        gaussians.opacity_logits[:, None],
+        gaussians.log_scales,
+        _normalised(gaussians.quats_wxyz),
+    ]
+    table = np.concatenate([column.astype("<f4") for column in columns], axis=1)
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    lines += [f"property float {name}" for name in PROPERTIES] + ["end_header"]
     return ("\n".join(lines) + "\n").encode("ascii") + table.tobytes()
-
-
-def property_names(sh_degree: int) -> list[str]:
-    """Return the names of the properties in the order of the original implementation."""
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{number}" for number in range(rest)]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    return names
 
 
 def decode_ply(content: bytes, name: str) -> GaussianArrays:
@@ -120,7 +109,7 @@ def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
     fields = [line.split() for line in lines[3:]]
     plain = all(len(field) == 3 and field[:2] == ["property", "float"] for field in fields)
     names = [field[2] for field in fields] if plain else []
-    missing = sorted(set(property_names(0)) - {"nx", "ny", "nz"} - set(names))
+    missing = sorted(set(PROPERTIES) - {"nx", "ny", "nz"} - set(names))
     counted = len(element) == 3 and element[:2] == ["element", "vertex"] and element[2].isdecimal()
     if missing or not counted or len(set(names)) != len(names):
         raise InputError(
@@ -133,14 +122,7 @@ def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
 
 def _validate(gaussians: GaussianArrays, name: str) -> None:
     """Refuse values that would hang or blind a viewer."""
-    arrays = {
-        "means": gaussians.means,
-        "log_scales": gaussians.log_scales,
-        "quats_wxyz": gaussians.quats_wxyz,
-        "opacity_logits": gaussians.opacity_logits,
-        "colors": gaussians.colors,
-    }
-    for what, values in arrays.items():
+    for what, values in vars(gaussians).items():
         bad = int((~np.isfinite(values)).sum())
         if bad:
             raise InputError(

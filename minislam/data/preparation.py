@@ -1,4 +1,4 @@
-"""From the raw image to the working image: undistort, cut to what was seen, resize, crop."""
+"""From the raw image to the working image: undistort, cut unseen borders, resize, crop."""
 
 import cv2
 import numpy as np
@@ -31,13 +31,14 @@ class ImagePreparation:
                 f"expected images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px, found "
                 f"{raw_camera.width}x{raw_camera.height}; use larger images"
             )
-        self._maps, self._window = None, (0, 0, *self.raw_size)
+        self._maps: tuple[np.ndarray, np.ndarray] | None = None
+        self._window = (0, 0, *self.raw_size)
         if np.any(distortion.coefficients):
             self._maps = distortion.undistortion_maps(raw_camera)
             self._window = seen_window(*self._maps, self.raw_size)
         seen_size = self._window[2:]
         size = size or working_size(*seen_size, pixels)
-        # The smallest enlargement that covers the wanted size; what stands over is cropped.
+        # The smallest scale at which the image covers the wanted size; the rest is cropped.
         scale = max(size[0] / seen_size[0], size[1] / seen_size[1])
         self._resized = (
             max(round(scale * seen_size[0]), size[0]),
@@ -113,20 +114,22 @@ def seen_window(
 ) -> tuple[int, int, int, int]:  # left, top, width, height px
     """Return a window of the undistorted image without pixels that no camera saw.
 
-    Left in, they would be a black frame that stands still while the camera moves. The side with
-    the largest share of such pixels loses one row or column until none is left.
+    Such pixels would be a black frame that stands still while the camera moves. The side with
+    the largest fraction of such pixels loses one row or column until none is left.
     """
     width, height = raw_size
     unseen = (map_x < 0) | (map_x > width - 1) | (map_y < 0) | (map_y > height - 1)
     left, top, right, bottom = 0, 0, width, height
     while right - left >= MINIMUM_SIDE and bottom - top >= MINIMUM_SIDE:
         inside = unseen[top:bottom, left:right]
-        shares = [inside[:, 0], inside[0], inside[:, -1], inside[-1]]
-        worst = int(np.argmax([share.mean() for share in shares]))
-        if not shares[worst].any():
+        sides = [inside[:, 0], inside[0], inside[:, -1], inside[-1]]
+        worst = int(np.argmax([side.mean() for side in sides]))
+        if not sides[worst].any():
             return left, top, right - left, bottom - top
-        left, top = left + (worst == 0), top + (worst == 1)
-        right, bottom = right - (worst == 2), bottom - (worst == 3)
+        left += worst == 0
+        top += worst == 1
+        right -= worst == 2
+        bottom -= worst == 3
     raise InputError(
         "expected a lens distortion that leaves part of the image visible, but nothing would be "
         "left; check the order k1 k2 p1 p2 k3 and the signs"

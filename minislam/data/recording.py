@@ -1,11 +1,14 @@
-"""What a reader found, before any frame is chosen or resized."""
+"""What lies in a recording, before any frame is chosen or resized, and the truth beside it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from minislam.data.calibration import Calibration
+from minislam.data.images import read_color, read_mask
+from minislam.data.preparation import ImagePreparation
 from minislam.data.sources import ImageSource
 from minislam.records import Trajectory
 
@@ -24,25 +27,54 @@ class Recording:
     calibration: Calibration | None = None  # None: unknown
     trajectory: Trajectory | None = None  # ground truth
     depth_paths: list[Path | None] = field(default_factory=list)
-    mask_paths: list[Path | None] = field(default_factory=list)
-    static_paths: list[Path | None] = field(default_factory=list)
+    mask_paths: list[Path | None] = field(default_factory=list)  # True on dynamic objects
+    static_paths: list[Path | None] = field(default_factory=list)  # without dynamic objects
     novel_views: list[tuple[np.ndarray, Path]] = field(default_factory=list)  # (T_world_camera, .)
     notes: list[str] = field(default_factory=list)  # more for the description
     warnings: list[str] = field(default_factory=list)
-
-    def depth_path(self, index: int) -> Path | None:
-        """Return the depth image that belongs to a colour image."""
-        return self.depth_paths[index] if self.depth_paths else None
-
-    def mask_path(self, index: int) -> Path | None:
-        """Return the mask of the movers in an image."""
-        return self.mask_paths[index] if self.mask_paths else None
-
-    def static_path(self, index: int) -> Path | None:
-        """Return the same view without movers."""
-        return self.static_paths[index] if self.static_paths else None
 
     def has_truth(self) -> bool:
         """Tell whether there is anything to compare with; sensor depth alone is an input."""
         views = [*self.mask_paths, *self.static_paths, *self.novel_views]
         return self.trajectory is not None or any(view is not None for view in views)
+
+
+def path_of(paths: list[Path | None], index: int) -> Path | None:
+    """Return the file that belongs to an image; see `Recording` for the lists."""
+    return paths[index] if paths else None
+
+
+class RecordedTruth:
+    """What a benchmark knows and the system must not see: a `minislam.records.GroundTruth`."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        prepare: ImagePreparation,
+        source_index: Callable[[int], int],  # of a frame: its position in the recording
+        sensor_depth: Callable[[int], np.ndarray | None],  # of a frame
+    ) -> None:
+        self.trajectory = recording.trajectory
+        self._recording = recording
+        self._prepare = prepare
+        self._source_index = source_index
+        self._sensor_depth = sensor_depth
+
+    def moving_mask(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) bool, True where a dynamic object is seen."""
+        path = path_of(self._recording.mask_paths, self._source_index(frame_index))
+        return None if path is None else self._prepare.nearest(read_mask(path), str(path))
+
+    def static_image(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
+        path = path_of(self._recording.static_paths, self._source_index(frame_index))
+        return None if path is None else self._prepare.color(read_color(path), str(path))
+
+    def depth(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
+        return self._sensor_depth(frame_index)
+
+    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
+        views = self._recording.novel_views
+        return [(pose, self._prepare.color(read_color(path), str(path))) for pose, path in views]

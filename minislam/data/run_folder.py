@@ -96,9 +96,9 @@ class RunFolder:
         rows = [f"{index} {stamp:.6f} {reason}\n" for index, stamp, reason in lost]
         write_text(self.path / LOST_FRAMES, "# frame_index timestamp reason\n" + "".join(rows))
 
-    def write_map(self, gaussians: GaussianArrays, sh_degree: int = 0) -> None:
+    def write_map(self, gaussians: GaussianArrays) -> None:
         """Write the Gaussian map for 3D viewers."""
-        write_ply(self.path / MAP, gaussians, sh_degree)
+        write_ply(self.path / MAP, gaussians)
 
     def write_mlp(self, state: dict[str, Tensor]) -> None:
         """Write the weights of the uncertainty MLP."""

@@ -1,4 +1,4 @@
-"""Open whatever the user names: a folder, a video, or a synthetic sequence."""
+"""Open a folder, a video, or a synthetic sequence by its name."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -12,8 +12,7 @@ from minislam.data.folder import read_image_folder, read_video
 from minislam.data.images import read_depth
 from minislam.data.options import InputOptions
 from minislam.data.preparation import ImagePreparation
-from minislam.data.recording import Recording
-from minislam.data.truth import RecordedTruth
+from minislam.data.recording import RecordedTruth, Recording, path_of
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.records import Frame
@@ -28,7 +27,7 @@ def open_sequence(
 ) -> "RecordedSequence":
     """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED]`.
 
-    What a folder is, is decided by what lies in it, not by its name.
+    A folder is recognised by its content, not by its name.
     """
     options = options or InputOptions()
     if source.startswith("synth:"):
@@ -52,7 +51,8 @@ class RecordedSequence:
     """The chosen frames of a recording at the working size: a `minislam.records.Sequence`."""
 
     def __init__(self, recording: Recording, options: InputOptions) -> None:
-        self._recording, self._depth_scale = recording, options.depth_scale
+        self._recording = recording
+        self._depth_scale = options.depth_scale
         chosen = range(options.start, len(recording.images), options.stride)
         self._chosen = chosen[: options.max_frames]
         if len(self._chosen) == 0:
@@ -106,7 +106,7 @@ class RecordedSequence:
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        path = self._recording.depth_path(self.source_index(frame_index))
+        path = path_of(self._recording.depth_paths, self.source_index(frame_index))
         if path is None:
             return None
         return self._prepare.nearest(read_depth(path, self._depth_scale), str(path))
@@ -117,8 +117,7 @@ def _calibration(
 ) -> tuple[Calibration, bool]:
     """Return the calibration, and whether its focal length is a guess.
 
-    What the user says on the command line wins over files, files over known names, names over
-    the guess.
+    The options come before files, files before known cameras, known cameras before the guess.
     """
     found = read_calibration(Path(options.calibration)) if options.calibration else None
     found = found or recording.calibration

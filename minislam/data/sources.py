@@ -1,4 +1,4 @@
-"""Where raw images come from: files in a folder, or a video."""
+"""Sources of raw images: files in a folder, or a video."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from minislam.data.images import read_color
 from minislam.errors import InputError
 
-# Assumed when neither the file names nor the container say how fast the frames follow each other.
+# Assumed when neither the file names nor the container state the frame rate.
 ASSUMED_FRAME_RATE = 30.0  # frames per second
 
 
@@ -46,15 +46,17 @@ class FileImages:
 
 
 class VideoImages:
-    """Images that are frames of a video. The rotation noted by phones is applied by OpenCV.
+    """Images that are frames of a video. OpenCV applies the rotation that phones note in it.
 
-    The frame count in a container is an estimate, and seeking is inexact for many codecs. So the
-    frames are counted by decoding them once, and going back means to decode from the start again.
+    The frame count in a container is an estimate, and seeking is inexact for many codecs.
+    Therefore the frames are counted by reading through the file once, and reading an earlier
+    frame starts again at the beginning.
     """
 
     def __init__(self, path: Path, limit: int | None = None) -> None:
         self.path = path
-        self._capture, self._next = _open_capture(path), 0
+        self._capture = _open_capture(path)
+        self._next = 0  # the frame that the capture returns next
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
         self._count = 0
         while (limit is None or self._count < limit) and self._capture.grab():
@@ -85,11 +87,12 @@ class VideoImages:
 
     def _rewind(self) -> None:
         self._capture.release()
-        self._capture, self._next = _open_capture(self.path), 0
+        self._capture = _open_capture(self.path)
+        self._next = 0
 
 
 def _open_capture(path: Path) -> cv2.VideoCapture:
-    """Open a video by its content; other back ends would take a name for a camera or a pattern."""
+    """Open a video with FFmpeg; other back ends may take the name for a camera or a pattern."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise InputError(

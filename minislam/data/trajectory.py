@@ -27,7 +27,7 @@ def parse_trajectory(text: str, name: str) -> Trajectory:
 
     Of rows with the same timestamp the first is kept: published ground truth has such rows.
     """
-    rows = []
+    rows: list[list[float]] = []
     for number, row in data_rows(text):
         where = f"line {number} of {name}"
         fields = row.split()

@@ -1,4 +1,4 @@
-"""TUM RGB-D folders, and the truth that a synthetic sequence adds to one."""
+"""TUM RGB-D folders, and the ground truth that synthetic sequences add to them."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ _DEPTH_MAX_DIFFERENCE = 0.02  # second between a colour and its depth image, as 
 
 
 def is_tum_folder(folder: Path) -> bool:
-    """Tell by content: an image list rgb.txt, or rgb/ whose file names are times in seconds."""
+    """Tell by the content: a list rgb.txt, or rgb/ with file names that are times in seconds."""
     if (folder / "rgb.txt").is_file():
         return True
     images = list_images(folder / "rgb") if (folder / "rgb").is_dir() else []
@@ -99,9 +99,9 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
 
 
 def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
-    """Look for freiburg1, rgbd_bonn ... in the folder's name, its notes and its lists' heads.
+    """Return the known camera that the folder's name, README or lists name (freiburg1, ...).
 
-    Images of another shape than the benchmark's were filmed by another camera.
+    Images of another aspect ratio than the benchmark's come from another camera: None.
     """
     notes = [folder.resolve().name]
     lists = [folder / "rgb.txt", folder / "groundtruth.txt"]

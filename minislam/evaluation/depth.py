@@ -1,4 +1,4 @@
-"""How far the surface of the map is from the true one."""
+"""Error of the depth that the map renders."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +10,7 @@ def depth_l1(
     depth: ArrayLike,  # (H, W) world units of the map, 0 where unknown
     reference: ArrayLike,  # (H, W) world units of the truth, 0 where unknown
     scale: float,  # units of the truth per unit of the map, from a Sim(3) of the trajectories
-    moving: ArrayLike | None = None,  # (H, W) bool, True where a mover hides the static scene
+    moving: ArrayLike | None = None,  # (H, W) bool, True where a dynamic object hides the scene
 ) -> float | None:  # units of the truth
     """Return the mean |scale D^ - D| over static pixels known to both; None if there is none.
 
@@ -18,14 +18,13 @@ def depth_l1(
     trajectory is an error.
     """
     depth, reference = np.asarray(depth, np.float64), np.asarray(reference, np.float64)
-    known = (depth > 0) & (reference > 0) if depth.shape == reference.shape else None
-    if known is None or (moving is not None and np.shape(moving) != depth.shape):
+    hidden = np.zeros(depth.shape, bool) if moving is None else np.asarray(moving, bool)
+    if not depth.shape == reference.shape == hidden.shape:
         raise InputError(
             f"expected depths and mask of one size, found {depth.shape}, {reference.shape} and "
-            f"{np.shape(moving)}; render at the size of the reference"
+            f"{hidden.shape}; render at the size of the reference"
         )
-    if moving is not None:
-        known &= ~np.asarray(moving, dtype=bool)
+    known = (depth > 0) & (reference > 0) & ~hidden
     if not known.any():
         return None
     return float(np.abs(scale * depth - reference)[known].mean())

@@ -1,13 +1,13 @@
-"""LPIPS, a learned distance of two images (Zhang et al. 2018): smaller means more alike.
+"""LPIPS, a learned distance of two images (Zhang et al. 2018): smaller means more similar.
 
 Both images go through a classifier's convolutions (the "trunk", AlexNet or VGG-16). At five depths
-their feature vectors are compared pixel by pixel, and trained weights (the "heads") say how much
-each channel's difference matters to a human eye:
+their feature vectors are compared pixel by pixel. Trained weights (the "heads") say how much the
+difference in each channel matters to a human eye:
 
     distance = sum over depths l of  mean over pixels of  sum_c w_lc (f_lc(a) - f_lc(b))^2
 
-with every feature vector f scaled to unit length. Trunk and heads are files the user gives: those
-of torchvision, and those of the authors' repository (weights/v0.1). SLAM papers use AlexNet.
+with every feature vector f scaled to unit length. The user gives the files: the trunk from
+torchvision, the heads from the authors' repository (weights/v0.1). SLAM papers use AlexNet.
 """
 
 from collections.abc import Mapping
@@ -140,29 +140,32 @@ def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:
     """Return the layout of a trunk that is complete, by the shapes of its convolutions."""
     first = trunk["features.0.weight"] if "features.0.weight" in trunk else None
     for layout in (_ALEXNET, _VGG16):
-        if first is not None and first.shape[-1] == layout.first_kernel:
-            _require_convolutions(trunk, layout)
-            return layout
+        if first is None or first.shape[-1] != layout.first_kernel:
+            continue
+        for name, shape in _expected_channels(layout).items():
+            found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
+            if found != shape:
+                raise InputError(
+                    f"expected {name} of {layout.name} to have {shape} channels, found "
+                    f"{found}; give torchvision's file of this network, whole"
+                )
+        return layout
     raise InputError(
         "expected the convolutions of AlexNet or VGG-16 for LPIPS, found another network; give "
         "alexnet-owt-*.pth or vgg16-*.pth of torchvision"
     )
 
 
-def _require_convolutions(trunk: Mapping[str, Tensor], layout: _Trunk) -> None:
+def _expected_channels(layout: _Trunk) -> dict[str, tuple[int, ...]]:
+    """Return the channels (out, in) of every weight and (out,) of every bias of a trunk."""
+    expected: dict[str, tuple[int, ...]] = {}
     channels = 3
     for stage in layout.stages:
         for number in stage.convs:
-            expected = {"weight": (stage.channels, channels), "bias": (stage.channels,)}
+            expected[f"features.{number}.weight"] = (stage.channels, channels)
+            expected[f"features.{number}.bias"] = (stage.channels,)
             channels = stage.channels
-            for part, shape in expected.items():
-                name = f"features.{number}.{part}"
-                found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
-                if found != shape:
-                    raise InputError(
-                        f"expected {name} of {layout.name} to have {shape} channels, found "
-                        f"{found}; give torchvision's file of this network, whole"
-                    )
+    return expected
 
 
 def recognise_heads(heads: Mapping[str, Tensor]) -> str:

@@ -1,4 +1,4 @@
-"""All figures of one run against the truth, as the paper evaluates (Sec. 4)."""
+"""All measures of one run against the ground truth, as in the paper (Sec. 4)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,24 +8,20 @@ import numpy as np
 from minislam.errors import InputError
 from minislam.evaluation.depth import depth_l1
 from minislam.evaluation.images import psnr, ssim
-from minislam.evaluation.novel_views import (
-    align_novel_views,
-    oriented_truth_to_estimate,
-    truth_to_estimate,
-)
+from minislam.evaluation.novel_views import oriented_truth_to_estimate, truth_to_estimate
 from minislam.evaluation.separability import auroc
 from minislam.evaluation.trajectory import absolute_trajectory_error, straight_line_error
 from minislam.records import GroundTruth, Trajectory
 
 MAX_DIFFERENCE = 0.02  # second between a frame and its true pose; TUM stamps differ by 0.005
 ImageDistance = Callable[[np.ndarray, np.ndarray], float]  # rendered, true (H, W, 3) RGB
-MIN_MASK = 20  # px of a mover below which a view says nothing about ghosts
+MIN_MASK = 20  # px of dynamic objects below which a view says nothing about ghosts
 CENTIMETRES = 100.0  # per world unit of the truth, which is metric
 
 
 @dataclass(frozen=True)
 class MappedView:
-    """A keyframe as the run left it."""
+    """A keyframe at the end of a run."""
 
     frame_index: int
     T_world_camera: np.ndarray  # (4, 4) estimated
@@ -39,7 +35,7 @@ def measure_run(
     keyframe_trajectory: Trajectory,
     views: list[MappedView],
     render: Callable[[np.ndarray], np.ndarray],  # T_world_camera (4, 4) -> RGB (H, W, 3)
-    lpips: ImageDistance | None = None,  # needs weights; without it its two figures are left out
+    lpips: ImageDistance | None = None,  # needs weights; without it two metrics are left out
 ) -> dict[str, float | None]:
     """Return the metrics by name, units in the names; None for what cannot be known."""
     metrics: dict[str, float | None] = dict.fromkeys(
@@ -58,8 +54,8 @@ def measure_run(
         metrics["ate_keyframes_cm"] = _ate_cm(keyframe_trajectory, truth.trajectory)
         metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(truth.trajectory)
         if metrics["ate_all_cm"] is not None:
-            metrics |= _novel_views(truth, trajectory, render, lpips)
-            metrics["depth_l1_cm"] = _depth_l1_cm(truth, trajectory, views)
+            metrics |= _novel_views(truth, truth.trajectory, trajectory, render, lpips)
+            metrics["depth_l1_cm"] = _depth_l1_cm(truth, truth.trajectory, trajectory, views)
     metrics |= _input_views(truth, views, render, lpips)
     metrics["beta_auroc"] = _beta_auroc(truth, views)
     return metrics
@@ -75,24 +71,25 @@ def _ate_cm(estimate: Trajectory, truth: Trajectory) -> float | None:
 
 def _novel_views(
     truth: GroundTruth,
+    true_trajectory: Trajectory,
     trajectory: Trajectory,
     render: Callable[[np.ndarray], np.ndarray],
     lpips: ImageDistance | None,
 ) -> dict[str, float | None]:
     """Compare held-out static views with renderings from their Sim(3)-aligned poses.
 
-    The alignment by camera centres is the paper's; `psnr_novel_oriented_db` aligns by the
-    cameras' orientations too, and so says more of the map and less of the alignment.
+    The paper aligns by camera centres. `psnr_novel_oriented_db` aligns by the orientations too,
+    so that errors of the alignment count less and errors of the map count more.
     """
     views = truth.novel_views()
     if not views:
         return {}
-    similarity = truth_to_estimate(trajectory, truth.trajectory, MAX_DIFFERENCE)
-    oriented = oriented_truth_to_estimate(trajectory, truth.trajectory, MAX_DIFFERENCE)
-    pairs = [(render(align_novel_views(pose, similarity)), image) for pose, image in views]
+    similarity = truth_to_estimate(trajectory, true_trajectory, MAX_DIFFERENCE)
+    oriented = oriented_truth_to_estimate(trajectory, true_trajectory, MAX_DIFFERENCE)
+    pairs = [(render(similarity.transform_poses(pose)), image) for pose, image in views]
     metrics = {
         "psnr_novel_oriented_db": _mean(
-            [psnr(render(align_novel_views(pose, oriented)), image) for pose, image in views]
+            [psnr(render(oriented.transform_poses(pose)), image) for pose, image in views]
         ),
         "psnr_novel_db": _mean([psnr(rendered, image) for rendered, image in pairs]),
         "ssim_novel": _mean([ssim(rendered, image) for rendered, image in pairs]),
@@ -108,11 +105,13 @@ def _input_views(
     render: Callable[[np.ndarray], np.ndarray],
     lpips: ImageDistance | None,
 ) -> dict[str, float | None]:
-    """Compare renderings from the keyframes with the same views of the empty scene.
+    """Compare renderings from the keyframes with the same views of the static scene.
 
-    `psnr_masked_db` looks only where a mover stood: a ghost of it would show there.
+    `psnr_masked_db` counts only pixels that a dynamic object covered: its ghost would be there.
     """
-    whole, masked, distances = [], [], []
+    whole: list[float] = []
+    masked: list[float] = []
+    distances: list[float] = []
     for view in views:
         static = truth.static_image(view.frame_index)
         if static is None:
@@ -129,10 +128,10 @@ def _input_views(
 
 
 def _depth_l1_cm(
-    truth: GroundTruth, trajectory: Trajectory, views: list[MappedView]
+    truth: GroundTruth, true_trajectory: Trajectory, trajectory: Trajectory, views: list[MappedView]
 ) -> float | None:
-    """Compare the depth of the map in the keyframes with the truth, without the movers."""
-    aligned = absolute_trajectory_error(trajectory, truth.trajectory, max_difference=MAX_DIFFERENCE)
+    """Compare the map's depth in the keyframes with the truth where the scene is static."""
+    aligned = absolute_trajectory_error(trajectory, true_trajectory, max_difference=MAX_DIFFERENCE)
     errors = []
     for view in views:
         reference = truth.depth(view.frame_index)
@@ -146,7 +145,7 @@ def _depth_l1_cm(
 
 
 def _beta_auroc(truth: GroundTruth, views: list[MappedView]) -> float | None:
-    """Return how well beta separates movers from the rest, all keyframes taken together."""
+    """Return how well beta separates moving from static pixels, over all keyframes together."""
     scores, masks = [], []
     for view in views:
         mask = truth.moving_mask(view.frame_index)

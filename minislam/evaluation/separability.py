@@ -1,4 +1,4 @@
-"""How well the uncertainty tells movers from the static scene."""
+"""How well the uncertainty separates dynamic objects from the static scene."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,7 +9,7 @@ from minislam.errors import InputError
 
 def auroc(
     scores: ArrayLike,  # any shape, for instance beta; larger means "moving"
-    mask: ArrayLike,  # the same shape, True where a mover is
+    mask: ArrayLike,  # the same shape, True on dynamic objects
 ) -> float:  # 1: perfect, 0.5: chance, 0: inverted
     """Return the area under the ROC curve, from ranks (Mann and Whitney's U).
 
@@ -22,7 +22,7 @@ def auroc(
     if scores.shape != mask.shape or positives == 0 or negatives == 0:
         raise InputError(
             f"expected one score per pixel and pixels of both kinds, found {scores.size} scores, "
-            f"{positives} moving and {negatives} static pixels; choose frames with movers"
+            f"{positives} moving and {negatives} static pixels; choose frames with dynamic objects"
         )
     if not np.isfinite(scores).all():
         raise InputError("expected finite scores, found NaN or infinity; check the uncertainty")

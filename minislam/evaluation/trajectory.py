@@ -14,7 +14,7 @@ DEFAULT_MAX_DIFFERENCE = 0.01  # second
 
 
 class Alignment(Enum):
-    """What may be fitted before the comparison. A monocular estimate has no scale of its own."""
+    """What is fitted before the comparison. A monocular estimate needs a scale, so Sim(3)."""
 
     NONE = "no alignment"
     SCALE = "scale correction only"
@@ -57,9 +57,9 @@ def relative_pose_error(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the motions between poses `step` apart (RPE).
 
-    With motions Q = truth_i^-1 truth_(i+step) and P likewise of the estimate, the error is
-    E = Q^-1 P. Returned are |translation of E| and the angle of E [rad], one per motion; the
-    motions follow each other without overlap. Align the scale first where it is unknown.
+    With the motions Q = truth_i^-1 truth_(i+step), and P likewise of the estimate, the error is
+    E = Q^-1 P. Returned are |translation of E| and the angle of E [rad], one per motion. The
+    motions do not overlap. Where the scale is unknown, align it first.
     """
     if step < 1:
         raise InputError(f"expected a step of at least 1 pose, found {step}; choose a larger one")
@@ -82,10 +82,10 @@ def relative_pose_error(
 
 
 def straight_line_error(truth: Trajectory) -> float:
-    """Return the ATE (rmse) of the best straight line walked at constant speed.
+    """Return the ATE (rmse) of the straight line at constant speed that fits the truth best.
 
-    An estimate that is not clearly better than this has not followed the camera at all: the
-    line is fitted to the truth itself, by least squares in position over time.
+    An estimate that is not clearly better has not followed the camera: this line needs no
+    images. It is fitted to the true positions over time by least squares.
     """
     time = truth.timestamps - truth.timestamps.mean()
     design = np.stack([np.ones_like(time), time], axis=1)
@@ -161,11 +161,6 @@ def statistics(errors: np.ndarray) -> dict[str, float]:
 def centres(trajectory: Trajectory) -> np.ndarray:
     """Return the camera centres (N, 3) in the world."""
     return trajectory.T_world_camera[:, :3, 3]
-
-
-def path_length(trajectory: Trajectory) -> float:
-    """Return the length of the way the camera went, in world units."""
-    return float(np.linalg.norm(np.diff(centres(trajectory), axis=0), axis=1).sum())
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -10,8 +10,14 @@ from minislam.viz.figures import (
     trajectory_plot,
 )
 from minislam.viz.report import build_report
-from minislam.viz.style import beta_to_rgb, depth_to_rgb, figure_png, new_figure, show_image
-from minislam.viz.window import show_figure
+from minislam.viz.style import (
+    beta_to_rgb,
+    depth_to_rgb,
+    figure_png,
+    new_figure,
+    show_figure,
+    show_image,
+)
 
 __all__ = [
     "ate_over_time",

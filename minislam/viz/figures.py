@@ -20,7 +20,7 @@ from minislam.viz.style import (
     show_image,
 )
 
-_AVERAGED = 30  # iterations
+_AVERAGED = 30  # iterations in the running mean of a loss
 
 
 def keyframe_strip(
@@ -48,7 +48,7 @@ def keyframe_strip(
 def trajectory_plot(
     estimate: Trajectory, truth: Trajectory | None = None, unit: str = "world units"
 ) -> Figure:
-    """Draw camera centres in the planes x-z and x-y; align the estimate before."""
+    """Draw camera centres in the planes x-z and x-y; the estimate must be aligned already."""
     figure = new_figure(WIDE)
     for axes, second in zip(figure.subplots(1, 2), (2, 1), strict=True):
         _draw_path(axes, estimate, truth, second, unit)
@@ -74,10 +74,10 @@ def ate_over_time(
 
 
 def loss_curves(history: Mapping[str, Series[float]]) -> Figure:
-    """Draw losses per iteration: those that stay positive on a logarithmic scale at the left.
+    """Draw losses per iteration: on a logarithmic scale if always positive, else on a linear one.
 
-    Each iteration looks at another keyframe, so the values jump; the thick line is their mean
-    over the last iterations. NaN, where nothing was trained, is left out.
+    The values jump because each iteration renders another keyframe; the thick line is their
+    running mean. NaN marks iterations without training and is left out.
     """
     curves = {name: np.asarray(values, dtype=np.float64) for name, values in history.items()}
     logarithmic = {n: v for n, v in curves.items() if np.all(v[np.isfinite(v)] > 0)}
@@ -100,7 +100,7 @@ def loss_curves(history: Mapping[str, Series[float]]) -> Figure:
 
 
 def _running_mean(values: np.ndarray) -> np.ndarray:
-    """Return the mean of each value and those before it, at most so many as are averaged."""
+    """Return the mean of each value and up to _AVERAGED - 1 values before it."""
     total = np.concatenate([[0.0], np.cumsum(values)])
     end = np.arange(1, len(values) + 1)
     start = np.maximum(0, end - _AVERAGED)
@@ -120,10 +120,10 @@ def map_growth(gaussians: Series[int]) -> Figure:
 
 def online_uncertainty(
     image: np.ndarray,  # (H, W, 3) RGB in [0, 1] of one frame
-    betas: Mapping[str, np.ndarray],  # what the MLP had learnt by then -> (h, w) beta of the frame
+    betas: Mapping[str, np.ndarray],  # caption of an earlier MLP -> its beta (h, w)
     title: str = "",
 ) -> Figure:
-    """Draw how beta of one frame changed while the MLP learnt, all in the same colours."""
+    """Draw beta of one frame as predicted by the MLP at several times, in the same colours."""
     figure = new_figure((WIDE[0], STRIP[1]))
     axes = figure.subplots(1, 1 + len(betas))
     show_image(axes[0], image, "input")

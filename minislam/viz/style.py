@@ -1,6 +1,7 @@
 """One look for all figures: sizes, colours, and bytes that do not change from run to run."""
 
 import io
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -8,17 +9,19 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-WIDE, SQUARE, STRIP = (9.0, 3.0), (4.0, 4.0), (9.0, 2.0)  # inch
+from minislam.errors import InputError
 
-TRUTH_STYLE = {"color": "black", "linestyle": "--", "linewidth": 1.2, "zorder": 3}  # on top
-ESTIMATE_STYLE = {"color": "tab:blue", "linestyle": "-", "linewidth": 1.4}
-DYNAMIC_COLOR = "tab:orange"
-DEPTH_COLORMAP, BETA_COLORMAP, ERROR_COLORMAP = "viridis", "magma", "RdBu_r"
+WIDE, STRIP = (9.0, 3.0), (9.0, 2.0)  # inch
 
+# The truth is drawn on top of the estimate.
+TRUTH_STYLE: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.2, "zorder": 3}
+ESTIMATE_STYLE: dict[str, Any] = {"color": "tab:blue", "linestyle": "-", "linewidth": 1.4}
+
+_DEPTH_COLORMAP, _BETA_COLORMAP = "viridis", "magma"
 _DPI = 100  # dots per inch
 _UNKNOWN_RGB = (0.25, 0.25, 0.25)  # where there is no depth
-_QUANTILES = (0.02, 0.98)  # a few wild values must not take the whole colour range
-# A range at least this wide keeps the noise of a frame without movers from filling all colours.
+_QUANTILES = (0.02, 0.98)  # a few outliers must not take the whole colour range
+# A range at least this wide keeps the noise of a static frame from filling all colours.
 _LEAST_BETA_RATIO = 4.0
 
 
@@ -34,6 +37,25 @@ def figure_png(figure: Figure, dpi: float = _DPI) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def show_figure(figure: Figure) -> None:
+    """Open a window with a figure and wait until it is closed."""
+    from matplotlib import pyplot  # only here: pyplot looks for a screen when it is imported
+    from matplotlib.backends import backend_registry
+    from matplotlib.backends.registry import BackendFilter
+
+    backend = pyplot.get_backend().lower()
+    if backend not in backend_registry.list_builtin(BackendFilter.INTERACTIVE):
+        raise InputError(
+            "expected a display to plot on, found none; write the plot to a file with "
+            "--save_plot FILE"
+        )
+    window = pyplot.figure(figsize=figure.get_size_inches(), dpi=figure.dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    window.figimage(canvas.buffer_rgba())
+    pyplot.show()
 
 
 def show_image(
@@ -58,7 +80,7 @@ def depth_to_rgb(
     depth = np.asarray(depth, dtype=np.float64)
     known = np.isfinite(depth) & (depth > 0)
     low, high = limits or (np.quantile(depth[known], _QUANTILES) if known.any() else (0.0, 1.0))
-    colored = _mapped(np.where(known, depth, low), low, high, DEPTH_COLORMAP)
+    colored = _mapped(np.where(known, depth, low), low, high, _DEPTH_COLORMAP)
     colored[~known] = _UNKNOWN_RGB
     return colored
 
@@ -70,11 +92,11 @@ def beta_to_rgb(
     """Colour an uncertainty map: magma over log beta, dark is certain."""
     beta = np.asarray(beta, dtype=np.float64)
     low, high = limits or beta_limits(beta)
-    return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), BETA_COLORMAP)
+    return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), _BETA_COLORMAP)
 
 
 def beta_limits(beta: np.ndarray) -> tuple[float, float]:
-    """Return the beta that is darkest and the one that is brightest, for maps of any shape."""
+    """Return the beta drawn darkest and the beta drawn brightest, for maps of any shape."""
     low, high = np.quantile(np.asarray(beta, dtype=np.float64), _QUANTILES)
     low = max(float(low), float(np.finfo(np.float64).tiny))
     return low, max(float(high), _LEAST_BETA_RATIO * low)

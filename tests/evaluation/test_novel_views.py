@@ -1,12 +1,8 @@
-"""Held-out poses are carried into the world of the map."""
+"""Held-out poses follow the similarity into the world of the map."""
 
 import numpy as np
 
-from minislam.evaluation.novel_views import (
-    align_novel_views,
-    oriented_truth_to_estimate,
-    truth_to_estimate,
-)
+from minislam.evaluation.novel_views import oriented_truth_to_estimate, truth_to_estimate
 from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
@@ -22,10 +18,10 @@ def test_views_follow_the_similarity_between_the_worlds():
     estimate = Trajectory(
         np.arange(15.0), Similarity(s, R, t).transform_poses(truth.T_world_camera)
     )
-    novel = align_novel_views(poses[15:], truth_to_estimate(estimate, truth))
+    novel = truth_to_estimate(estimate, truth).transform_poses(poses[15:])
     np.testing.assert_allclose(novel[:, :3, :3], R @ poses[15:, :3, :3], atol=1e-12)
     np.testing.assert_allclose(novel[:, :3, 3], s * poses[15:, :3, 3] @ R.T + t, atol=1e-12)
-    one = align_novel_views(poses[15], truth_to_estimate(estimate, truth))
+    one = truth_to_estimate(estimate, truth).transform_poses(poses[15])
     np.testing.assert_array_equal(one, novel[0])
 
 
@@ -40,7 +36,7 @@ def test_a_point_seen_by_both_keeps_its_pixel():
         p_camera = (p_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         return p_camera / np.linalg.norm(p_camera)
 
-    moved = align_novel_views(pose, similarity)
+    moved = similarity.transform_poses(pose)
     np.testing.assert_allclose(
         ray(moved, similarity.transform_points(point)), ray(pose, point), atol=1e-12
     )

@@ -11,7 +11,6 @@ from minislam.evaluation.trajectory import (
     Alignment,
     absolute_trajectory_error,
     associate,
-    path_length,
     relative_pose_error,
     statistics,
     straight_line_error,
@@ -106,12 +105,6 @@ def test_a_straight_walk_is_explained_by_the_line_and_a_circle_is_not():
     circle.T_world_camera[:, :2, 3] = np.stack([np.cos(time), np.sin(time)], axis=1)
     # The line through a full circle explains of x nothing and of sin t the share 6 / pi^2.
     assert straight_line_error(circle) == pytest.approx(np.sqrt(1 - 3 / np.pi**2), abs=1e-4)
-
-
-def test_path_length_of_a_square():
-    square = np.tile(np.eye(4), (5, 1, 1))
-    square[:, :2, 3] = [[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]
-    assert path_length(Trajectory(np.arange(5.0), square)) == 8
 
 
 # Identities

@@ -9,7 +9,7 @@ import torch
 
 from data_synth import SyntheticSequence, generate
 from minislam.errors import TrackingLost
-from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error, path_length
+from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error, centres
 from minislam.geometry import Camera, se3_inverse
 from minislam.priors.depth import NoDepth, SensorDepth
 from minislam.priors.features import ClassicalFeatures
@@ -78,6 +78,10 @@ def finished(with_depth: bool) -> Tracker:
     tracker = new_tracker(with_depth)
     run(tracker, frames())
     return tracker
+
+
+def path_length(trajectory: Trajectory) -> float:
+    return float(np.linalg.norm(np.diff(centres(trajectory), axis=0), axis=1).sum())
 
 
 @pytest.mark.parametrize("with_depth", [True, False])
