@@ -210,7 +210,7 @@ def draw_table(rng: np.random.Generator, main: Colour, accent: Colour) -> TableS
 def table(
     T_world_table: Array, skin: TableSkin, size: tuple[float, float, float], curtain: float
 ) -> list[Part]:
-    """Return a table with panels that hang down by a share `curtain` of its height."""
+    """Return a table with panels that hang down by `curtain` times its height."""
     length, width, height = size
     parts = [_attached(T_world_table, Box((length, width, 0.05)), (0, 0, height), skin.top)]
     for x in (-0.46, 0.46):

@@ -1,7 +1,7 @@
 """Where things are at a time: routes through waypoints, and the hand-held camera."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -33,9 +33,9 @@ class Route:
         self._position = PchipInterpolator(table[:, 0], table[:, 1:])
         self._velocity = self._position.derivative()
         self._facing = np.array([np.cos(facing), np.sin(facing)])
-        phases = np.linspace(0, 1, PATH_SAMPLES)
-        steps = np.linalg.norm(np.diff(self._position(phases), axis=0), axis=1)
-        self._phases, self._walked = phases, np.concatenate([[0.0], np.cumsum(steps)])
+        self._phases = np.linspace(0, 1, PATH_SAMPLES)
+        steps = np.linalg.norm(np.diff(self._position(self._phases), axis=0), axis=1)
+        self._walked = np.concatenate([[0.0], np.cumsum(steps)])
 
     def position(self, phase: float) -> Array:
         """Return the place (x, y) [m]."""
@@ -55,7 +55,7 @@ class Route:
     def pace(self, phase: float) -> float:
         """Return how fully the legs swing: 0 at rest, 1 in a walk."""
         walking_speed = 1.2  # m per clip
-        return float(min(1.0, np.linalg.norm(self._velocity(phase)) / walking_speed))
+        return min(1.0, float(np.linalg.norm(self._velocity(phase))) / walking_speed)
 
 
 def curve(*points: tuple[float, float]) -> Callable[[float], float]:
@@ -75,7 +75,7 @@ class HandheldPath:
     phases: Array  # (3,) [rad]
     target: Array  # (3,) [m]
     target_reach: Array  # (3,) [m]
-    follow: float  # share of its own way by which the camera shifts its target; < 0 turns more
+    follow: float  # part of its own way by which the camera shifts its target; < 0 turns more
     tremble: Array  # (6, 4): amplitude [m, rad], frequency [Hz], phase [rad], second phase [rad]
 
     def __call__(self, time: float) -> Array:
@@ -151,16 +151,17 @@ def handheld_path(rng: np.random.Generator, centre: Array, target: Array) -> Han
     phases = np.array([rng.uniform(-0.5, 0.5), rng.uniform(0, 6.28), rng.uniform(0, 6.28)])
     tremble = _draw_tremble(rng)
     wanted = rng.uniform(4.2, 4.8)
-    arguments = {
-        "centre": np.asarray(centre) + rng.uniform(-0.1, 0.1, 3),
-        "cycles": cycles,
-        "phases": phases,
-        "target": np.asarray(target) + rng.uniform(-0.12, 0.12, 3),
-        "target_reach": np.array([0.22, 0.0, 0.1]) * rng.uniform(0.6, 1.2, 3),
-        "follow": -rng.uniform(0.12, 0.22),
-        "tremble": tremble,
-    }
+    path = HandheldPath(
+        centre=np.asarray(centre) + rng.uniform(-0.1, 0.1, 3),
+        reach=reach,
+        cycles=cycles,
+        phases=phases,
+        target=np.asarray(target) + rng.uniform(-0.12, 0.12, 3),
+        target_reach=np.array([0.22, 0.0, 0.1]) * rng.uniform(0.6, 1.2, 3),
+        follow=-rng.uniform(0.12, 0.22),
+        tremble=tremble,
+    )
     # The length is nearly proportional to the reach: a few corrections meet it.
     for _ in range(4):
-        reach = reach * wanted / path_length(HandheldPath(reach=reach, **arguments))
-    return HandheldPath(reach=reach, **arguments)
+        path = replace(path, reach=path.reach * wanted / path_length(path))
+    return path

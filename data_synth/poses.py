@@ -7,6 +7,7 @@ The centre of the first pixel is (0, 0).
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
@@ -57,7 +58,7 @@ def rotation_about_z(angle: float) -> Array:
     return Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
 
 
-def upright(position: Array, yaw: float = 0.0) -> Array:
+def upright(position: ArrayLike, yaw: float = 0.0) -> Array:
     """Return T_world_body of a thing standing upright, turned by yaw [rad]."""
     return rigid(rotation_about_z(yaw), np.asarray(position, float))
 

@@ -18,8 +18,8 @@ from .shapes import Part
 SUPERSAMPLE = 2  # rays per pixel side
 FOOTPRINT = 0.6  # px, texture filter width: the spacing of the rays plus a little
 NEAR = 0.05  # m, parts that reach behind this plane are not culled by their outline
-AMBIENT, DIRECT = 0.45, 0.57  # shares of light from everywhere and from the lamp
-SHADOW_DEPTH = 0.8  # share of the lamp's light that a mover takes away
+AMBIENT, DIRECT = 0.45, 0.57  # light from everywhere and light from the lamp
+SHADOW_DEPTH = 0.8  # part of the lamp's light that a mover takes away
 SHADOW_MARGIN = 1e-3  # part of the way to the lamp, against a surface shading itself
 BLUR_SIGMA = 0.5  # px, the lens
 NOTHING = -1  # the index of a ray that met no part
@@ -67,7 +67,7 @@ def camera_rays(
     intrinsics: Intrinsics,
     T_world_camera: Array,  # (4, 4)
     supersample: int = 1,
-    dtype: type = np.float64,
+    dtype: type[np.floating] = np.float64,
 ) -> RayGrid:
     """Return the rays through the pixel centres, or through a finer grid inside each pixel."""
     columns = (np.arange(intrinsics.width * supersample) + 0.5) / supersample - 0.5
@@ -75,10 +75,10 @@ def camera_rays(
     across = ((columns - intrinsics.cx) / intrinsics.fx)[None, :]
     down = ((rows - intrinsics.cy) / intrinsics.fy)[:, None]
     R = T_world_camera[:3, :3]
-    directions = np.empty((3, len(rows), len(columns)), dtype)
+    directions: Array = np.empty((3, len(rows), len(columns)), dtype)
     for axis in range(3):
         directions[axis] = R[axis, 0] * across + R[axis, 1] * down + R[axis, 2]
-    origin = T_world_camera[:3, 3].astype(dtype)
+    origin: Array = T_world_camera[:3, 3].astype(dtype)
     inverse = np.linalg.inv(T_world_camera)
     return RayGrid(origin, directions, inverse, intrinsics, supersample)
 

@@ -56,7 +56,7 @@ class _Builder:
         *walls, floor = shell.textures
         floor = _shadowed(floor, upright([0.0, 0.0, 0.0]), lamp, self.parts)
         rugs = [
-            replace(rug, textures=(_shadowed(*rug.textures, rug.T_world_part, lamp, self.parts),))
+            replace(rug, textures=(_shadowed(rug.textures[0], rug.T_world_part, lamp, self.parts),))
             for rug in self.rugs
         ]
         return (replace(shell, textures=(*walls, floor)), *rugs, *self.parts)
@@ -151,7 +151,7 @@ def _shell(
     else:
         east_west = surfaces.wallpaper(rng, short_wall, palette)
         north = surfaces.wallpaper(rng, long_wall, palette)
-        # The south wall is behind the camera: it shares the paper of the north wall.
+        # The south wall is behind the camera: it has the paper of the north wall.
         walls = [east_west, east_west, north, north]
         ground = surfaces.planks(rng, (LENGTH, WIDTH), floor)
     ceiling = surfaces.planks(rng, (1.5, 1.5), colour(0.1, 0.05, 0.85), width=0.3)
@@ -183,13 +183,13 @@ def living_room(rng: np.random.Generator, low_texture: bool = False) -> Room:
     build.clutter(build.block(sideboard, (1.45, NORTH - 0.35)), sideboard, 6)
     sofa = colour(hue + 0.3, 0.35, 0.5)
     fabric = surfaces.cloth(rng, sofa, tuple(np.array(sofa) * 1.35), "plaid")
-    for size, place in _SOFA:
-        build.add(Box(size), upright(np.array(place)), fabric)
+    for cushion, place in _SOFA:
+        build.add(Box(cushion), upright(place), fabric)
     low_table = (0.9, 0.5, 0.36)
     build.clutter(build.block(low_table, (0.25, 1.0)), low_table, 4)
     build.rug((2.2, 1.5), (0.2, 0.9), 0.1)
-    for size, at in (((0.42, 0.42, 0.46), (-1.15, 0.35)), ((0.5, 0.4, 0.62), (1.85, 0.75))):
-        build.clutter(build.block(size, at), size, 2)
+    for stool, at in (((0.42, 0.42, 0.46), (-1.15, 0.35)), ((0.5, 0.4, 0.62), (1.85, 0.75))):
+        build.clutter(build.block(stool, at), stool, 2)
     tower = build.block((0.45, 0.4, 0.5), (2.45, 1.55))
     build.add(Box((0.34, 0.3, 0.4)), tower @ upright([0.02, 0, 0.45], 0.3), build.cover())
     build.plant((-2.55, 1.35), 1.25)

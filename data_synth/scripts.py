@@ -2,7 +2,7 @@
 
 A way is a list of marks (phase, across, away): when in the clip (0 to 1), where across the view of
 the camera at that time (-1 and 1 are its edges), and how many metres away. Numbers such as hand
-positions are choreography, found by looking at the result; tests hold the shares of the image.
+positions are choreography, found by looking at the result; tests hold how much they cover.
 """
 
 import numpy as np
@@ -221,9 +221,9 @@ def anymal2_movers(cast: Cast) -> list[Mover]:
 
 def wandering_movers(cast: Cast) -> list[Mover]:
     """Return a person who stands in view, then walks towards the camera."""
-    phase, *place = cast.on_floor(0.6, 0.35, 1.9)
+    phase, x, y = cast.on_floor(0.6, 0.35, 1.9)
     leaving = [cast.on_floor(*mark) for mark in ((0.78, 0.0, 1.35), (1, -0.3, 1.15))]
-    route = Route([(0, *place), (phase, *place), *leaving], TOWARDS_CAMERA)
+    route = Route([(0, x, y), (phase, x, y), *leaving], TOWARDS_CAMERA)
     return [Mover(cast.walker(route)[0], moves_from=phase)]
 
 

@@ -76,7 +76,7 @@ def books(rng: np.random.Generator, size: Size, palette: Sequence[Colour]) -> Te
         while column < columns - 2:
             width = rng.uniform(0.022, 0.055) / TEXEL
             height = shelf * rng.uniform(0.62, 0.88)
-            tone = np.array(palette[rng.integers(len(palette))]) * rng.uniform(0.6, 1.2)
+            tone = np.array(palette[int(rng.integers(len(palette)))]) * rng.uniform(0.6, 1.2)
             top = bottom - 3 - height
             _fill(image, column, top, width, height, tuple(tone))
             label = top + height * rng.uniform(0.15, 0.6)
@@ -88,7 +88,7 @@ def books(rng: np.random.Generator, size: Size, palette: Sequence[Colour]) -> Te
 
 def poster(rng: np.random.Generator, size: Size, palette: Sequence[Colour]) -> Texture:
     """Paint a framed picture: bold figures above lines of unreadable print."""
-    image = canvas(size, FINE_TEXEL, palette[rng.integers(len(palette))])
+    image = canvas(size, FINE_TEXEL, palette[int(rng.integers(len(palette)))])
     rows, columns = image.shape[:2]
     scatter_patches(rng, image, FINE_TEXEL, palette, int(160 * size[0] * size[1]), (0.01, 0.16))
     line = 0.03 / FINE_TEXEL
@@ -115,10 +115,10 @@ def rug(rng: np.random.Generator, size: Size, palette: Sequence[Colour]) -> Text
     reach = 0.45 * step * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
     for row in np.arange(0.3 / TEXEL, rows - 0.25 / TEXEL, step):
         for column in np.arange(0.3 / TEXEL, columns - 0.25 / TEXEL, step):
-            tone = np.array(palette[rng.integers(len(palette))]) * 255
+            yarn = np.array(palette[int(rng.integers(len(palette)))]) * 255
             for scale in (1.0, 0.45):
                 outline = np.round((column, row) + scale * reach).astype(np.int32)
-                cv2.fillPoly(image, [outline], (tone * scale).tolist(), lineType=cv2.LINE_AA)
+                cv2.fillPoly(image, [outline], (yarn * scale).tolist(), lineType=cv2.LINE_AA)
     return finish(rng, image, TEXEL, contrast=0.06)
 
 

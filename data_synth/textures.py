@@ -48,10 +48,10 @@ class Texture:
         rows, columns = image.shape[:2]
         count = len(across)
         padded = -(-count // REMAP_COLUMNS) * REMAP_COLUMNS
-        grid = np.zeros((2, padded), np.float32)
-        grid[0, :count] = across / texel + (columns / 2 - 0.5)
-        grid[1, :count] = rows / 2 - 0.5 - up / texel
-        grid = grid.reshape(2, -1, REMAP_COLUMNS)
+        flat = np.zeros((2, padded), np.float32)
+        flat[0, :count] = across / texel + (columns / 2 - 0.5)
+        flat[1, :count] = rows / 2 - 0.5 - up / texel
+        grid = flat.reshape(2, -1, REMAP_COLUMNS)
         wrap = cv2.BORDER_WRAP
         found = cv2.remap(image, grid[0], grid[1], cv2.INTER_LINEAR, borderMode=wrap)
         return found.reshape(-1, 3)[:count]
@@ -134,13 +134,15 @@ def scatter_patches(
 ) -> None:
     """Paint discs and polygons of all sizes, the large ones first."""
     rows, columns = image.shape[:2]
-    radii = np.exp(rng.uniform(*np.log(extent), count))
+    smallest, largest = np.log(extent)
+    radii = np.exp(rng.uniform(smallest, largest, count))
     for radius in np.sort(radii)[::-1] / texel:
         centre = rng.uniform((0, 0), (columns, rows))
         corners = int(rng.integers(3, 9))
-        angles = np.sort(rng.uniform(0, 2 * np.pi, corners)) if corners < 7 else None
-        angles = np.linspace(0, 2 * np.pi, 24) if angles is None else angles
+        angles = np.linspace(0, 2 * np.pi, 24)
+        if corners < 7:
+            angles = np.sort(rng.uniform(0, 2 * np.pi, corners))
         outline = centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        shade = np.array(palette[rng.integers(len(palette))]) * rng.uniform(0.75, 1.2)
+        shade = np.array(palette[int(rng.integers(len(palette)))]) * rng.uniform(0.75, 1.2)
         fill = np.clip(shade * 255, 0, 255).tolist()
         cv2.fillPoly(image, [np.round(outline).astype(np.int32)], fill, lineType=cv2.LINE_AA)
