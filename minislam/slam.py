@@ -261,7 +261,7 @@ class Slam(Stateful):
     def lost_frames(self) -> list[tuple[int, float, str]]:
         """Return frame index, timestamp and reason of every frame without a pose."""
         return [
-            (t.frame_index, t.timestamp, f"{t.status.value}, matched share {t.matched_share:.3f}")
+            (t.frame_index, t.timestamp, f"{t.status.value}, matched ratio {t.matched_ratio:.3f}")
             for t in self.tracker.tracked
             if not t.status.is_followed
         ]

@@ -72,12 +72,10 @@ def _self_test() -> float:
     smooth = torch.nn.functional.interpolate(coarse, scale_factor=8, mode="bicubic")
     image = smooth[0].permute(1, 2, 0).clamp(0, 1)
     _, matches = ClassicalFlow().start_chain(image[:240, :320]).advanced(image[4:244, 8:328])
-    rows, columns = matches.targets.shape[1:3]
-    start = torch.stack(
-        torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), -1
-    )
-    flow = matches.targets[0] - 8 * start
-    middle = flow[8:-8, 8:-8].reshape(-1, 2).median(0).values
+    rows, columns = 240 // 8, 320 // 8
+    v, u = torch.meshgrid(8 * torch.arange(rows), 8 * torch.arange(columns), indexing="ij")
+    flow = matches.targets[0].reshape(2, rows, columns) - torch.stack([u, v])
+    middle = flow[:, 8:-8, 8:-8].flatten(1).median(1).values
     return float((middle - torch.tensor([-8.0, -4.0])).norm())
 
 

@@ -31,7 +31,7 @@ class MeasuredEdge:
 
     source: int  # keyframe index
     target: int  # keyframe index
-    start: np.ndarray  # (h, w, 2) px
+    start: np.ndarray  # (2, N) px
     targets: np.ndarray  # (h, w, 2) px
     confidence: np.ndarray  # (h, w) in [0, 1)
 
@@ -78,7 +78,7 @@ class ClassicalFlow(Stateful):
         self,
         edges_source: list[int],  # (E,) keyframe index
         edges_target: list[int],  # (E,) keyframe index
-        predicted_targets: Tensor,  # (E, h, w, 2) px
+        predicted_targets: Tensor,  # (E, 2, N) px
     ) -> FlowMatches:
         """Match every grid cell of each source in its target; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
@@ -97,7 +97,7 @@ class ClassicalFlow(Stateful):
     def _has_moved(self, edge: Edge, start: np.ndarray) -> bool:
         if edge not in self._measured:
             return True
-        distance = np.median(np.linalg.norm(start - self._measured[edge].start, axis=-1))
+        distance = np.median(np.linalg.norm(start - self._measured[edge].start, axis=0))
         return bool(distance >= self.config.start_tolerance)
 
     def _measure(self, starts: dict[Edge, np.ndarray]) -> None:
@@ -119,7 +119,8 @@ class ClassicalFlow(Stateful):
 
     def _edge_flow(self, edge: Edge, start: np.ndarray) -> np.ndarray:
         source, target = self._images[edge[0]], self._images[edge[1]]
-        return composed_flow(source, target, dense_from_grid(start, source.shape, self.stride))
+        on_grid = np.ascontiguousarray(start.T).reshape(*self._textures[edge[0]].shape, 2)
+        return composed_flow(source, target, dense_from_grid(on_grid, source.shape, self.stride))
 
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""

@@ -170,8 +170,8 @@ def as_matches(
     dtype: torch.dtype,
 ) -> FlowMatches:
     """Bundle the measurements of single edges."""
-    matched = torch.from_numpy(np.stack(targets)).to(dtype)
+    matched = torch.from_numpy(np.stack(targets)).to(dtype).flatten(1, 2).mT.contiguous()
     confidence = torch.from_numpy(np.stack(confidences)).to(dtype)
     possible = torch.from_numpy(np.stack(textures)).to(dtype).sum((1, 2))
-    shares = confidence.sum((1, 2)) / possible.clamp_min(1e-6)
-    return FlowMatches(matched, confidence[..., None].expand(matched.shape), shares)
+    ratios = confidence.sum((1, 2)) / possible.clamp_min(1e-6)
+    return FlowMatches(matched, confidence.flatten(1)[:, None].repeat(1, 2, 1), ratios)

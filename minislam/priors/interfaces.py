@@ -17,14 +17,9 @@ from minislam.records import Frame
 class FlowMatches:
     """Where the grid cells of source frames are seen in target frames."""
 
-    targets: Tensor  # (E, h, w, 2) px, the matched position of each cell
-    confidences: Tensor  # (E, h, w, 2) in [0, 1], for u and for v; 0 where there is no match
-    matched_shares: Tensor  # (E,) in [0, 1], how much of what could be matched was matched
-
-    def edge(self, position: int) -> "FlowMatches":
-        """Return the matches of one edge (E = 1)."""
-        only = slice(position, position + 1)
-        return FlowMatches(self.targets[only], self.confidences[only], self.matched_shares[only])
+    targets: Tensor  # (E, 2, N) px, the matched position of each cell, N = h w, row by row
+    confidences: Tensor  # (E, 2, N) in [0, 1], for u and for v; 0 where there is no match
+    matched_ratios: Tensor  # (E,) in [0, 1], how much of what could be matched was matched
 
 
 class FlowChain(Protocol):
@@ -55,7 +50,7 @@ class FlowEstimator(Protocol):
         self,
         edges_source: list[int],  # (E,) keyframe index
         edges_target: list[int],  # (E,) keyframe index
-        predicted_targets: Tensor,  # (E, h, w, 2) px, present reprojection of every cell
+        predicted_targets: Tensor,  # (E, 2, N) px, present reprojection of every cell
     ) -> FlowMatches:
         """Match every cell of each source frame in the target frame of its edge."""
 

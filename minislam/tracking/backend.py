@@ -106,7 +106,7 @@ class BackEnd(Stateful):
         """Return the flow distance of a pose (4, 4) from the newest keyframe."""
         pair = torch.stack([self.keyframes.T_camera_world[-1], T_camera_world])
         disparities = self.keyframes.disparities[-1:].expand(2, -1)
-        grid, share = self.grid, self.config.rotation_share
+        grid, share = self.grid, self.config.rotation_weight
         there = flow_distances(pair, disparities, grid.rays, grid.pixels, grid.camera, share)
         return float(there[0, 1])
 
@@ -150,9 +150,9 @@ class BackEnd(Stateful):
         if not edges:
             return []
         matches = self._flow_from_geometry(edges)
-        share = dict(zip(edges, matches.matched_shares.tolist(), strict=True))
-        least = self.config.min_link_share
-        return [(i, j) for i, j in edges if min(share[i, j], share[j, i]) >= least]
+        ratio = dict(zip(edges, matches.matched_ratios.tolist(), strict=True))
+        least = self.config.min_link_ratio
+        return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= least]
 
     def adjust_so_far(self) -> None:
         """Adjust all keyframes together while the sequence goes on (online global BA).
@@ -199,7 +199,6 @@ class BackEnd(Stateful):
         # Points near the camera plane project to anywhere; a flow started there finds nothing.
         size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
         predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
-        predicted = predicted.mT.reshape(len(edges), *self.grid.shape, 2)
         return self.flow.match(sources, targets, predicted)
 
     def adjust(
@@ -294,7 +293,7 @@ class BackEnd(Stateful):
 
     def distances(self, start: int = 0, rows: range | None = None) -> Tensor:  # (K', K') px
         """Return the flow distances between the keyframes from `start` on, of some rows or all."""
-        state, grid, share = self.state, self.grid, self.config.rotation_share
+        state, grid, share = self.state, self.grid, self.config.rotation_weight
         poses, disparities = state.T_camera_world[start:], state.disparities[start:]
         return flow_distances(poses, disparities, grid.rays, grid.pixels, grid.camera, share, rows)
 

@@ -16,7 +16,7 @@ class TrackingConfig:
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement"
     )
-    cull_share: float = parameter(
+    cull_fraction: float = parameter(
         0.3,
         "a keyframe nearer to the last than this part of the flow that made it is culled [-]; "
         "official code: 3 of 24 px",
@@ -32,7 +32,7 @@ class TrackingConfig:
     neighbourhood: int = parameter(5, "every keyframe is linked with so many predecessors")
     proximity_edges: int = parameter(2, "further links of a new keyframe, nearest by flow distance")
     proximity_distance: float = parameter(120.0, "largest flow distance of a proximity link [px]")
-    min_link_share: float = parameter(
+    min_link_ratio: float = parameter(
         0.1, "a link beyond the neighbourhood needs this much of its flow confirmed [-]"
     )
     rounds: int = parameter(2, "rounds of flow and BA per keyframe")
@@ -91,13 +91,14 @@ class TrackingConfig:
     final_edges: int = parameter(6, "further links per keyframe in the final global BA")
     final_distance: float = parameter(45.0, "largest flow distance of such a link [px]")
     final_prior: bool = parameter(False, "keep the disparity prior in the final BA (an ablation)")
-    rotation_share: float = parameter(
-        0.75, "beta of the flow distance: share of the full motion, the rest without rotation [-]"
+    rotation_weight: float = parameter(
+        0.75,
+        "beta of the flow distance: weight of the full motion, the rest is without rotation [-]",
     )
-    keyframe_share: float = parameter(
+    keyframe_matched_ratio: float = parameter(
         0.2, "less of the last keyframe matched than this makes a new one [-]"
     )
-    min_matched_share: float = parameter(
+    min_matched_ratio: float = parameter(
         0.1, "a frame in which less of the last keyframe is matched is lost [-]"
     )
     max_disparity_error: float = parameter(

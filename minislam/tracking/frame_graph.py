@@ -18,7 +18,7 @@ from minislam.tracking.reprojection import (
 # A pair whose cells mostly leave the view has no meaningful distance. [-]; DROID-SLAM: 0.75.
 MIN_VISIBLE_SHARE = 0.5
 # A new measurement must confirm at least this part of what the old one did. [-]
-KEPT_SHARE = 0.8
+KEPT_FRACTION = 0.8
 FAR = 1000.0  # px, the distance of such a pair
 
 
@@ -30,7 +30,7 @@ class FrameGraph(Stateful):
     edges_target: list[int] = field(default_factory=list)
     targets: list[Tensor] = field(default_factory=list)  # per edge (2, N) px
     confidences: list[Tensor] = field(default_factory=list)  # per edge (2, N) in [0, 1]
-    matched_shares: list[float] = field(default_factory=list)  # per edge, in [0, 1]
+    matched_ratios: list[float] = field(default_factory=list)  # per edge, in [0, 1]
 
     def __post_init__(self) -> None:
         self._position: dict[tuple[int, int], int] = {}
@@ -53,28 +53,30 @@ class FrameGraph(Stateful):
         started from wrong geometry finds nothing, and would take with it what could repair that
         geometry.
         """
-        targets = matches.targets.flatten(1, 2).mT.contiguous()
-        confidences = matches.confidences.flatten(1, 2).mT.contiguous()
-        shares = matches.matched_shares.tolist()
-        for edge, target, confidence, share in zip(
-            edges, targets, confidences, shares, strict=True
-        ):
+        measured = zip(
+            edges,
+            matches.targets,
+            matches.confidences,
+            matches.matched_ratios.tolist(),
+            strict=True,
+        )
+        for edge, target, confidence, ratio in measured:
             position = self._position.setdefault(edge, len(self))
             if position == len(self):
                 self.edges_source.append(edge[0])
                 self.edges_target.append(edge[1])
                 self.targets.append(target)
                 self.confidences.append(confidence)
-                self.matched_shares.append(share)
-            elif share >= KEPT_SHARE * self.matched_shares[position]:
+                self.matched_ratios.append(ratio)
+            elif ratio >= KEPT_FRACTION * self.matched_ratios[position]:
                 self.targets[position], self.confidences[position] = target, confidence
-                self.matched_shares[position] = share
+                self.matched_ratios[position] = ratio
 
     def remove_newest(self, count: int) -> None:
         """Forget the `count` edges that were added last."""
         for _ in range(count):
             del self._position[self.edges_source.pop(), self.edges_target.pop()]
-            for column in (self.targets, self.confidences, self.matched_shares):
+            for column in (self.targets, self.confidences, self.matched_ratios):
                 column.pop()
 
     def edges(self) -> list[tuple[int, int]]:

@@ -17,7 +17,7 @@ class KeyframeHealth:
 
     keyframe_index: int
     frame_index: int
-    matched_share: float  # of its cells, in the best of its links [-]
+    matched_ratio: float  # of its cells, in the best of its links [-]
     mean_weight: float  # over cells and links, robust weight included [-]
     median_residual: float  # px, of the cells that are trusted
     parallax: float  # px, the most that translation contributes to the flow of a link
@@ -37,7 +37,7 @@ def health_of(backend: BackEnd, keyframe: int) -> KeyframeHealth:
     return KeyframeHealth(
         keyframe,
         frame_index,
-        matched_share=max(backend.graph.matched_shares[p] for p in links),
+        matched_ratio=max(backend.graph.matched_ratios[p] for p in links),
         mean_weight=float(weight.mean()),
         median_residual=float(length[trusted].median()) if bool(trusted.any()) else 0.0,
         parallax=float(parallax.max()),

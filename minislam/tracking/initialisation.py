@@ -42,14 +42,11 @@ DISPARITY_SPREAD = 20.0  # largest ratio of a triangulated disparity to the medi
 
 def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> FlowMatches:
     """Return the matches a -> c from matches a -> b and b -> c (E = 1 each)."""
-    middle = first.targets.reshape(1, -1, 2)
-    flow = second.targets.reshape(1, -1, 2) - grid.pixels
-    confidence = second.confidences.reshape(1, -1, 2)
-    targets = middle + grid.sample(flow, middle)
-    confidences = first.confidences.reshape(1, -1, 2) * grid.sample(confidence, middle)
-    shares = first.matched_shares * second.matched_shares
-    shape = first.targets.shape
-    return FlowMatches(targets.reshape(shape), confidences.reshape(shape), shares)
+    middle = first.targets.mT
+    flow = second.targets.mT - grid.pixels
+    targets = first.targets + grid.sample(flow, middle).mT
+    confidences = first.confidences * grid.sample(second.confidences.mT, middle).mT
+    return FlowMatches(targets, confidences, first.matched_ratios * second.matched_ratios)
 
 
 def start_pose(
@@ -79,8 +76,8 @@ def start_pose(
             rays=grid.rays,
             edges_source=torch.zeros(count, dtype=torch.long),
             edges_target=torch.arange(1, count + 1),
-            targets=matches.targets.flatten(1, 2).mT.expand(count, -1, -1),
-            weights=(matches.confidences.flatten(1, 2).mT * trust).expand(count, -1, -1),
+            targets=matches.targets.expand(count, -1, -1),
+            weights=(matches.confidences * trust).expand(count, -1, -1),
             prior_disparities=empty,
             prior_weights=empty,
             free_poses=torch.arange(count + 1) > 0,

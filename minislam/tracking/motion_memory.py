@@ -66,7 +66,7 @@ def updated_trust(
     """Return the trust in the source cells after one more step of the camera."""
     motion = T_target_source[None].to(disparities.dtype)
     positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
-    squared = (positions[0].mT - matches.targets.reshape(-1, 2)).square().sum(1)
+    squared = (positions[0] - matches.targets[0]).square().sum(0)
     agreement = (1 + squared / scale**2) ** -2
     rate = torch.where(agreement < trust, LOSS_RATE, RECOVERY_RATE)
     return torch.where(valid[0] & _has_say(matches), trust.lerp(agreement, rate), trust)
@@ -77,7 +77,7 @@ def inherited_trust(grid: Grid, matches: FlowMatches, trust: Tensor) -> Tensor: 
 
     Where several meet, the least trusted one counts; where none arrives, the nearest that does.
     """
-    cells = (matches.targets.reshape(-1, 2) / grid.stride).round().long()
+    cells = (matches.targets[0].mT / grid.stride).round().long()
     height, width = grid.shape
     inside = (cells >= 0).all(1) & (cells[:, 0] < width) & (cells[:, 1] < height)
     arrives = inside & _has_say(matches)
@@ -92,4 +92,4 @@ def inherited_trust(grid: Grid, matches: FlowMatches, trust: Tensor) -> Tensor: 
 
 
 def _has_say(matches: FlowMatches) -> Tensor:  # (N,) bool
-    return matches.confidences.reshape(-1, 2).mean(1) > MIN_CONFIDENCE
+    return matches.confidences[0].mean(0) > MIN_CONFIDENCE

@@ -25,4 +25,4 @@ class TrackedFrame:
     frame_index: int
     timestamp: float  # second
     status: TrackingStatus
-    matched_share: float  # of the last keyframe, [-]
+    matched_ratio: float  # of the last keyframe, [-]

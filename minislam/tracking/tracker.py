@@ -31,6 +31,7 @@ from minislam.tracking.initialisation import (
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.motion_memory import MotionMemory
 from minislam.tracking.relocalisation import Place, Relocaliser
+from minislam.tracking.reprojection import lengths
 from minislam.tracking.status import TrackedFrame, TrackingStatus
 
 
@@ -96,17 +97,17 @@ class Tracker(Stateful):
             # a keyframe after all and go on from there.
             added = self._insert(*self._passed_over, may_cull=False)
             chain, matches = self._chain.advanced(frame.image)
-        share = float(matches.matched_shares)
+        ratio = float(matches.matched_ratios)
         if not self._is_followed(matches):
-            return self._find_again(frame, share) or added
+            return self._find_again(frame, ratio) or added
         self._chain = chain
-        self._log(frame, TrackingStatus.OK, share)
+        self._log(frame, TrackingStatus.OK, ratio)
         self._passed_over = (frame, matches)
         if not self._is_keyframe(frame, matches):
             return added
         return self._insert(frame, matches) or added
 
-    def _find_again(self, frame: Frame, share: float) -> bool:
+    def _find_again(self, frame: Frame, ratio: float) -> bool:
         """Look for a lost camera among all keyframes; return whether there is a new keyframe.
 
         The chain stays where the view was last seen, so that it can be taken up again there.
@@ -118,7 +119,7 @@ class Tracker(Stateful):
             if place is not None and self._resume(frame, place, features):
                 return True
         recently = self._lost_in_a_row <= self.config.recently_lost_frames
-        self._log(frame, TrackingStatus.RECENTLY_LOST if recently else TrackingStatus.LOST, share)
+        self._log(frame, TrackingStatus.RECENTLY_LOST if recently else TrackingStatus.LOST, ratio)
         return False
 
     def _resume(self, frame: Frame, place: Place, features: Tensor) -> bool:
@@ -143,15 +144,15 @@ class Tracker(Stateful):
         return keyframe_index > 0 and self._steps[keyframe_index - 1] is None
 
     def _is_followed(self, matches: FlowMatches) -> bool:
-        return float(matches.matched_shares) >= self.config.min_matched_share
+        return float(matches.matched_ratios) >= self.config.min_matched_ratio
 
     def _is_keyframe(self, frame: Frame, matches: FlowMatches) -> bool:
-        lengths = (matches.targets.reshape(-1, 2) - self.grid.pixels).norm(dim=1)
-        confidence = matches.confidences.reshape(-1, 2)[:, 0]
-        mean_flow = float((confidence * lengths).sum() / confidence.sum())
+        length = lengths(matches.targets - self.grid.pixels.T)[0]
+        confidence = matches.confidences[0, 0]
+        mean_flow = float((confidence * length).sum() / confidence.sum())
         if mean_flow > self.backend.keyframe_flow:
             return True
-        if float(matches.matched_shares) < self.config.keyframe_share:
+        if float(matches.matched_ratios) < self.config.keyframe_matched_ratio:
             return True
         # Without a depth prior the first keyframes need parallax more than they need each other.
         may_force = self.initialised or self.keyframes.has_prior
@@ -193,7 +194,7 @@ class Tracker(Stateful):
     def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
         """Tell whether a keyframe would stand where the last one stands (at most 2 in a row)."""
         elapsed = frame.frame_index - self.keyframes.frames[-1].frame_index
-        least = self.config.cull_share * self.backend.keyframe_flow
+        least = self.config.cull_fraction * self.backend.keyframe_flow
         may_cull = self._culled_in_a_row < self.config.max_culled_in_a_row
         is_forced = elapsed >= self.config.keyframe_interval
         if may_cull and not is_forced and self.backend.distance_to_newest(pose) < least:
@@ -228,11 +229,11 @@ class Tracker(Stateful):
         if self.initialised:
             self.update_static_weights(first=index)
 
-    def _log(self, frame: Frame, status: TrackingStatus, share: float) -> None:
+    def _log(self, frame: Frame, status: TrackingStatus, ratio: float) -> None:
         if status is TrackingStatus.OK:
             self._lost_in_a_row = 0
             status = status if self.initialised else TrackingStatus.INITIALISING
-        self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, share))
+        self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
 
     # The stages ---------------------------------------------------------------------------------
 

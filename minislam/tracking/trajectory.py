@@ -58,9 +58,7 @@ def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: 
     transforms = relative_transforms(poses, sources, targets).float()
     predicted, _ = reproject(transforms, disparities, grid.rays, grid.camera)
     backend.flow.add_frame(newest, image)
-    matches = backend.flow.match(
-        around, [newest] * count, predicted.mT.reshape(count, *grid.shape, 2)
-    )
+    matches = backend.flow.match(around, [newest] * count, predicted)
     backend.flow.remove_frame(newest)
 
     empty = torch.zeros(count + 1, len(grid.rays))
@@ -69,8 +67,8 @@ def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: 
         rays=grid.rays,
         edges_source=sources,
         edges_target=targets,
-        targets=matches.targets.flatten(1, 2).mT,
-        weights=matches.confidences.flatten(1, 2).mT * keyframes.trust[around, None],
+        targets=matches.targets,
+        weights=matches.confidences * keyframes.trust[around, None],
         prior_disparities=empty,
         prior_weights=empty,
         free_poses=torch.arange(count + 1) == count,

@@ -104,7 +104,7 @@ def bench_flow() -> None:
     flow = ClassicalFlow(ClassicalFlowConfig(start_tolerance=0))  # nothing is remembered
     for index in (0, 4):
         flow.add_frame(index, images[index])
-    still = CAMERA.pixel_grid(STRIDE)[None]
+    still = CAMERA.pixel_grid(STRIDE).flatten(0, 1).T[None]
     edge = milliseconds(lambda: flow.match([0], [4], still))
     chain = flow.start_chain(images[0])
     step = milliseconds(lambda: chain.advanced(images[1]))

@@ -55,8 +55,14 @@ def flow_of(images: list[Tensor], **settings: float) -> ClassicalFlow:
     return flow
 
 
-def still(edges: int = 1) -> Tensor:
-    return GRID.expand(edges, *GRID.shape).clone()
+def still(edges: int = 1) -> Tensor:  # (E, 2, N)
+    """Return the start of a flow that expects nothing to move."""
+    return GRID.flatten(0, 1).T.expand(edges, 2, -1).clone()
+
+
+def on_grid(values: Tensor, shape: torch.Size = GRID.shape) -> Tensor:  # (E, 2, N) -> (E, h, w, 2)
+    """Return what holds for the cells of E edges in the order of an image."""
+    return values.mT.reshape(-1, *shape[:2], 2)
 
 
 def constant(du: float, dv: float) -> np.ndarray:

@@ -26,6 +26,7 @@ from tests.priors.patterns import (
     WIDTH,
     constant,
     flow_of,
+    on_grid,
     shifted,
     still,
     view,
@@ -46,8 +47,8 @@ def test_a_shift_is_found(shift: tuple[float, float]):
     flow = flow_of([shifted(0, 0, SIZE), shifted(*shift, SIZE)])
     matches = flow.match([0, 1], [1, 0], still(2))
     for edge, sign in ((0, 1), (1, -1)):
-        error = (matches.targets[edge] - GRID - sign * torch.tensor(shift)).norm(dim=-1)
-        sure = matches.confidences[edge, ..., 0] > 0.5
+        error = (on_grid(matches.targets)[edge] - GRID - sign * torch.tensor(shift)).norm(dim=-1)
+        sure = on_grid(matches.confidences)[edge, ..., 0] > 0.5
         assert sure.float().mean() > 0.6
         assert error[sure].median() < 0.1 and error[sure].max() < 1.0
 
@@ -59,8 +60,8 @@ def test_a_rotation_about_the_image_centre_is_found():
     turned = view(R.T, centre - R.T @ centre, SIZE)
     matches = flow_of([shifted(0, 0, SIZE), turned]).match([0], [1], still())
     expected = (GRID.numpy() - centre) @ R.T + centre
-    error = np.linalg.norm(matches.targets[0].numpy() - expected, axis=-1)
-    sure = matches.confidences[0, ..., 0].numpy() > 0.5
+    error = np.linalg.norm(on_grid(matches.targets)[0].numpy() - expected, axis=-1)
+    sure = on_grid(matches.confidences)[0, ..., 0].numpy() > 0.5
     assert sure.mean() > 0.6 and np.median(error[sure]) < 0.15
 
 
@@ -68,12 +69,12 @@ def test_a_long_shift_needs_the_prediction():
     shift = torch.tensor([46.0, -10.0])
     flow = flow_of([shifted(0, 0, SIZE), shifted(*shift.tolist(), SIZE)])
     lost = flow.match([0], [1], still())
-    found = flow.match([0], [1], still() + shift + torch.tensor([5.0, 4.0]))
+    found = flow.match([0], [1], still() + (shift + torch.tensor([5.0, 4.0]))[:, None])
     stays = GRID[..., 0] + 46 < WIDTH - 8
     stays &= GRID[..., 1] > 18
-    errors = [(m.targets[0] - GRID - shift).norm(dim=-1)[stays] for m in (lost, found)]
+    errors = [(on_grid(m.targets)[0] - GRID - shift).norm(dim=-1)[stays] for m in (lost, found)]
     assert errors[0].median() > 5 > 0.1 > errors[1].median()
-    assert found.confidences[0, ..., 0][stays].median() > 0.6
+    assert on_grid(found.confidences)[0, ..., 0][stays].median() > 0.6
 
 
 def test_a_prediction_is_composed_with_what_is_left(monkeypatch: pytest.MonkeyPatch):
@@ -191,13 +192,13 @@ def test_the_number_of_workers_changes_nothing(other: int):
     many = flow_of(images, workers=other).match(sources, targets, still(6))
     assert torch.equal(one.targets, many.targets)
     assert torch.equal(one.confidences, many.confidences)
-    assert torch.equal(one.matched_shares, many.matched_shares)
+    assert torch.equal(one.matched_ratios, many.matched_ratios)
 
 
 def test_matches_follow_the_order_of_the_edges():
     flow = flow_of([shifted(3 * d, 0, SIZE) for d in range(3)])
     matches = flow.match([0, 2, 0], [1, 1, 2], still(3))
-    typical = (matches.targets - GRID)[..., 0].flatten(1).median(1).values
+    typical = (on_grid(matches.targets) - GRID)[..., 0].flatten(1).median(1).values
     torch.testing.assert_close(typical, torch.tensor([3.0, -3.0, 6.0]), rtol=0, atol=0.1)
 
 
@@ -210,9 +211,9 @@ def test_a_chain_follows_a_displacement_that_is_too_long_for_one_search():
         chain, matches = chain.advanced(shifted(8.0 * frame, -3.0 * frame, SIZE))
     shift = torch.tensor([48.0, -18.0])
     stays = (GRID[..., 0] + 48 < WIDTH - 8) & (GRID[..., 1] - 18 > 8)
-    error = (matches.targets[0] - GRID - shift).norm(dim=-1)[stays]
+    error = (on_grid(matches.targets)[0] - GRID - shift).norm(dim=-1)[stays]
     assert error.median() < 0.1
-    assert matches.confidences[0, ..., 0][stays].median() > 0.6
+    assert on_grid(matches.confidences)[0, ..., 0][stays].median() > 0.6
     single = composed_flow(
         grayscale(shifted(0, 0, SIZE)), grayscale(shifted(48, -18, SIZE)), constant(0, 0)
     )
@@ -231,8 +232,8 @@ def test_a_chain_is_not_changed_by_its_next_frame():
 def test_a_restarted_chain_measures_from_the_newest_frame():
     chain, _ = flow_of([]).start_chain(shifted(0, 0, SIZE)).advanced(shifted(9, 0, SIZE))
     _, matches = chain.restarted().advanced(shifted(15, 2, SIZE))
-    sure = matches.confidences[0, ..., 0] > 0.5
-    error = (matches.targets[0] - GRID - torch.tensor([6.0, 2.0])).norm(dim=-1)
+    sure = on_grid(matches.confidences)[0, ..., 0] > 0.5
+    error = (on_grid(matches.targets)[0] - GRID - torch.tensor([6.0, 2.0])).norm(dim=-1)
     assert sure.float().mean() > 0.6 and error[sure].median() < 0.1
 
 
@@ -242,7 +243,7 @@ def test_a_chain_expects_the_motion_to_go_on():
     for place in (10, 30, 60):
         chain, matches = chain.advanced(shifted(place, 0, SIZE))
     stays = GRID[..., 0] + 60 < WIDTH - 8
-    error = (matches.targets[0] - GRID - torch.tensor([60.0, 0.0])).norm(dim=-1)[stays]
+    error = (on_grid(matches.targets)[0] - GRID - torch.tensor([60.0, 0.0])).norm(dim=-1)[stays]
     assert error.median() < 0.1
 
 
@@ -251,7 +252,7 @@ def test_a_chain_takes_up_a_motion_that_stops():
     for place in (12, 24, 24):
         chain, matches = chain.advanced(shifted(place, 0, SIZE))
     stays = GRID[..., 0] + 24 < WIDTH - 8
-    error = (matches.targets[0] - GRID - torch.tensor([24.0, 0.0])).norm(dim=-1)[stays]
+    error = (on_grid(matches.targets)[0] - GRID - torch.tensor([24.0, 0.0])).norm(dim=-1)[stays]
     assert error.median() < 0.1
 
 
@@ -264,7 +265,7 @@ def test_a_wrong_expectation_that_looks_less_different_is_not_followed():
     assert (second[:, :1] - first).abs().mean() < (second - first).abs().mean()
     chain = FlowChain(grayscale(first), grayscale(first), constant(0, 0), into_the_grey, CONFIG)
     _, matches = chain.advanced(second)
-    error = (matches.targets[0] - GRID - torch.tensor([6.0, 0.0])).norm(dim=-1)
+    error = (on_grid(matches.targets)[0] - GRID - torch.tensor([6.0, 0.0])).norm(dim=-1)
     assert error.median() < 0.1
 
 
@@ -275,10 +276,10 @@ def test_a_size_that_is_no_multiple_of_the_stride():
     size = (61, 83)
     flow = flow_of([shifted(0, 0, size), shifted(2, 1, size)])
     grid = Camera(80, 80, 41, 30, 83, 61).pixel_grid(CONFIG.stride)
-    matches = flow.match([0], [1], grid[None])
-    assert matches.targets.shape == (1, 8, 11, 2) == matches.confidences.shape
-    sure = matches.confidences[0, ..., 0] > 0.5
-    error = (matches.targets[0] - grid - torch.tensor([2.0, 1.0])).norm(dim=-1)
+    matches = flow.match([0], [1], grid.flatten(0, 1).T[None])
+    assert matches.targets.shape == (1, 2, 8 * 11) == matches.confidences.shape
+    sure = on_grid(matches.confidences, grid.shape)[0, ..., 0] > 0.5
+    error = (on_grid(matches.targets, grid.shape)[0] - grid - torch.tensor([2.0, 1.0])).norm(dim=-1)
     assert error[sure].median() < 0.1
 
 
@@ -310,5 +311,5 @@ def test_a_forgotten_keyframe_cannot_be_matched():
     with pytest.raises(KeyError):
         flow.match([0], [1], still())
     flow.add_frame(1, shifted(2, 0, SIZE))
-    moved = (flow.match([0], [1], still()).targets[0] - GRID)[..., 0].median()
+    moved = (flow.match([0], [1], still()).targets - still())[:, 0].median()
     assert float(moved) == pytest.approx(2, abs=0.1)

@@ -13,6 +13,7 @@ from tests.priors.patterns import (
     WIDTH,
     constant,
     flow_of,
+    on_grid,
     shifted,
     still,
     view,
@@ -25,11 +26,11 @@ NOTHING_LEFT = np.zeros((HEIGHT // 8, WIDTH // 8, 2), np.float32)
 
 def test_what_leaves_the_image_has_no_confidence():
     flow = flow_of([shifted(0, 0, SIZE), shifted(30, 0, SIZE)])
-    matches = flow.match([0], [1], still() + torch.tensor([30.0, 0.0]))
-    outside = matches.targets[0, ..., 0] > WIDTH - 1
+    matches = flow.match([0], [1], still() + torch.tensor([[30.0], [0.0]]))
+    outside = on_grid(matches.targets)[0, ..., 0] > WIDTH - 1
     assert outside[:, -3:].all()
-    assert (matches.confidences[0][outside] == 0).all()
-    assert matches.confidences[0, :, :9].mean() > 0.5
+    assert (on_grid(matches.confidences)[0][outside] == 0).all()
+    assert on_grid(matches.confidences)[0, :, :9].mean() > 0.5
 
 
 def test_the_border_of_the_image_counts_as_inside():
@@ -66,19 +67,19 @@ def test_half_a_bare_wall_leaves_the_other_half():
     for image in images:
         image[:, :64] = 0.5
     matches = flow_of(images).match([0], [1], still())
-    confidence = matches.confidences[0, ..., 0]
+    confidence = on_grid(matches.confidences)[0, ..., 0]
     assert confidence[:, :7].max() < 1e-3 and confidence[:, 10:14].mean() > 0.5
 
 
-def test_matched_share_is_relative_to_what_texture_allows():
+def test_matched_ratio_is_relative_to_what_texture_allows():
     texture = np.array([[0.5, 0.9], [0.0, 0.6]])
     confidence = 0.5 * texture
     targets = np.zeros((2, 2, 2))
     matches = as_matches(
         [targets, targets], [confidence, texture], [texture, texture], torch.float64
     )
-    torch.testing.assert_close(matches.matched_shares, torch.tensor([0.5, 1.0]).double())
-    assert torch.equal(matches.confidences[..., 0], matches.confidences[..., 1])
+    torch.testing.assert_close(matches.matched_ratios, torch.tensor([0.5, 1.0]).double())
+    assert torch.equal(matches.confidences[:, 0], matches.confidences[:, 1])
 
 
 # Degenerate input
@@ -88,29 +89,29 @@ def test_black_images_match_nothing():
     black, seen = torch.zeros(*SIZE, 3), shifted(0, 0, SIZE)
     matches = flow_of([black, seen, black]).match([0, 0], [1, 2], still(2))
     assert torch.isfinite(matches.targets).all()
-    assert (matches.confidences == 0).all() and (matches.matched_shares == 0).all()
+    assert (matches.confidences == 0).all() and (matches.matched_ratios == 0).all()
     _, of_chain = flow_of([]).start_chain(black).advanced(black)
-    assert float(of_chain.matched_shares) == 0
+    assert float(of_chain.matched_ratios) == 0
 
 
 def test_unrelated_images_share_little():
     other = view(np.eye(2), np.array([5000.0, 3000.0]), SIZE)
     matches = flow_of([shifted(0, 0, SIZE), other]).match([0, 0], [0, 1], still(2))
-    assert matches.matched_shares[1] < 0.15 < 0.9 < matches.matched_shares[0]
+    assert matches.matched_ratios[1] < 0.15 < 0.9 < matches.matched_ratios[0]
 
 
 @pytest.mark.parametrize("brightness", [0.0, 0.5, 1.0])
 def test_a_view_that_goes_blank_is_not_matched(brightness: float):
     blank, seen = torch.full((*SIZE, 3), brightness), shifted(0, 0, SIZE)
-    assert flow_of([seen, blank]).match([0], [1], still()).matched_shares[0] < 0.01
+    assert flow_of([seen, blank]).match([0], [1], still()).matched_ratios[0] < 0.01
     _, of_chain = flow_of([]).start_chain(seen).advanced(blank)
-    assert float(of_chain.matched_shares) < 0.01
+    assert float(of_chain.matched_ratios) < 0.01
 
 
 def test_exposure_does_not_matter():
     darker = 0.2 + 0.5 * shifted(3, 0, SIZE)
     plain, dimmed = (
-        flow_of([shifted(0, 0, SIZE), image]).match([0], [1], still()).matched_shares[0]
+        flow_of([shifted(0, 0, SIZE), image]).match([0], [1], still()).matched_ratios[0]
         for image in (shifted(3, 0, SIZE), darker)
     )
     assert dimmed > 0.9 * plain

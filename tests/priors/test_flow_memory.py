@@ -11,7 +11,7 @@ from tests.priors.patterns import CONFIG, SIZE, flow_of, shifted, still
 
 def aside(tolerances: float) -> Tensor:
     """Return two starts that lie to the right by so many tolerances."""
-    return still(2) + torch.tensor([tolerances * CONFIG.start_tolerance, 0])
+    return still(2) + torch.tensor([[tolerances * CONFIG.start_tolerance], [0]])
 
 
 def counting(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -34,7 +34,7 @@ def test_an_edge_is_measured_again_only_if_its_start_has_moved(monkeypatch: pyte
     assert len(calls) == 2
     assert torch.equal(first.targets, again.targets.flip(0))
     assert torch.equal(first.confidences, again.confidences.flip(0))
-    assert torch.equal(first.matched_shares, again.matched_shares.flip(0))
+    assert torch.equal(first.matched_ratios, again.matched_ratios.flip(0))
     one_moved = torch.stack([still()[0], aside(1.01)[1]])
     flow.match([0, 1], [1, 0], one_moved)
     assert len(calls) == 4  # the other direction with it: each is the check of the other
@@ -73,5 +73,5 @@ def test_a_forgotten_keyframe_takes_its_edges_along():
     flow.remove_frame(1)
     flow.add_frame(1, shifted(5, 0, SIZE))
     after = flow.match([0], [1], still())
-    moved = (after.targets - before.targets)[..., 0].median()
+    moved = (after.targets - before.targets)[:, 0].median()
     assert float(moved) == pytest.approx(2, abs=0.1)

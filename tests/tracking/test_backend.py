@@ -87,9 +87,7 @@ def test_a_new_keyframe_is_linked_and_adjusted_without_knowing_where_it_is():
     fresh = back_end(list(range(4)))
     fresh.match([edge for edge in everything if 3 not in edge])
     move(fresh, 3)
-    steps = [
-        fresh.flow.match([k], [k + 1], GRID.pixels.reshape(1, *GRID.shape, 2)) for k in range(3)
-    ]
+    steps = [fresh.flow.match([k], [k + 1], GRID.pixels.T[None]) for k in range(3)]
     fresh.adjust_newest(steps)
     assert {(0, 3), (1, 3), (2, 3), (3, 2)} <= set(fresh.graph.edges())
     first, last = fresh.keyframes.T_camera_world[0], fresh.keyframes.T_camera_world[3]
@@ -131,8 +129,8 @@ def test_the_state_is_that_of_the_keyframes():
 
 
 def test_a_new_link_needs_both_directions():
-    flow = TrueFlow(shares={(0, 3): 0.9, (3, 0): 0.05, (1, 3): 0.5, (3, 1): 0.4})
-    backend = back_end([0, 1, 2, 3], TrackingConfig(min_link_share=0.1), flow)
+    flow = TrueFlow(ratios={(0, 3): 0.9, (3, 0): 0.05, (1, 3): 0.5, (3, 1): 0.4})
+    backend = back_end([0, 1, 2, 3], TrackingConfig(min_link_ratio=0.1), flow)
     asked = [(0, 3), (3, 0), (1, 3), (3, 1)]
     assert backend.confirmed(asked) == [(1, 3), (3, 1)]
     assert backend.confirmed([]) == [] and len(backend.graph) == 0

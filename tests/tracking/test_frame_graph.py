@@ -23,9 +23,9 @@ from tests.tracking.scene import CAMERA, PIXELS, RAYS, STRIDE, poses_on_an_arc, 
 GRID = Grid.of(CAMERA, STRIDE)
 
 
-def matches_of(value: float, edges: int, share: float = 1.0) -> FlowMatches:
-    targets = torch.full((edges, *GRID.shape, 2), value)
-    return FlowMatches(targets, torch.ones_like(targets), torch.full((edges,), share))
+def matches_of(value: float, edges: int, ratio: float = 1.0) -> FlowMatches:
+    targets = torch.full((edges, 2, len(RAYS)), value)
+    return FlowMatches(targets, torch.ones_like(targets), torch.full((edges,), ratio))
 
 
 def distances_on_a_line(count: int) -> Tensor:
@@ -49,12 +49,12 @@ def test_recording_an_edge_again_replaces_its_matches():
 
 def test_an_edge_keeps_what_it_has_against_clearly_less():
     graph = FrameGraph()
-    graph.record([(0, 1)], matches_of(1.0, 1, share=0.5))
-    graph.record([(0, 1)], matches_of(2.0, 1, share=0.39))
+    graph.record([(0, 1)], matches_of(1.0, 1, ratio=0.5))
+    graph.record([(0, 1)], matches_of(2.0, 1, ratio=0.39))
     assert float(graph.targets[0][0, 0]) == 1.0  # 0.39 < 0.8 * 0.5
-    graph.record([(0, 1)], matches_of(3.0, 1, share=0.41))
+    graph.record([(0, 1)], matches_of(3.0, 1, ratio=0.41))
     assert float(graph.targets[0][0, 0]) == 3.0
-    graph.record([(0, 1)], matches_of(4.0, 1, share=0.35))
+    graph.record([(0, 1)], matches_of(4.0, 1, ratio=0.35))
     assert float(graph.targets[0][0, 0]) == 4.0 and len(graph) == 1  # 0.35 > 0.8 * 0.41
 
 
@@ -70,7 +70,7 @@ def test_what_a_keyframe_measured_is_that_of_its_own_edges():
 
 def test_recorded_targets_keep_the_order_of_cells():
     graph = FrameGraph()
-    targets = GRID.pixels.reshape(1, *GRID.shape, 2)
+    targets = GRID.pixels.T[None]
     graph.record([(0, 1)], FlowMatches(targets, torch.ones_like(targets), torch.ones(1)))
     assert torch.equal(graph.targets[0], GRID.pixels.T)
 

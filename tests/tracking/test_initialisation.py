@@ -30,11 +30,8 @@ CELLS = len(GRID.rays)
 
 def matches_to(targets: Tensor, confidence: Tensor | float = 1.0) -> FlowMatches:
     """Return the matches (E = 1) with these targets (N, 2)."""
-    shape = (1, *GRID.shape, 2)
-    confidences = (torch.ones(CELLS) * confidence)[:, None].expand(CELLS, 2)
-    return FlowMatches(
-        targets.float().reshape(shape), confidences.reshape(shape), torch.tensor([0.8])
-    )
+    confidences = (torch.ones(CELLS) * confidence).expand(1, 2, CELLS)
+    return FlowMatches(targets.float().T[None], confidences, torch.tensor([0.8]))
 
 
 def seen_matches(T_target_source: Tensor, disparities: Tensor) -> FlowMatches:
@@ -47,7 +44,7 @@ def seen_matches(T_target_source: Tensor, disparities: Tensor) -> FlowMatches:
 
 def flat(matches: FlowMatches) -> tuple[Tensor, Tensor]:
     """Return targets [px] and confidences, each (N, 2)."""
-    return matches.targets.reshape(CELLS, 2), matches.confidences.reshape(CELLS, 2)
+    return matches.targets[0].T, matches.confidences[0].T
 
 
 def triangulated(T_target_source: Tensor, matches: FlowMatches) -> Tensor:
@@ -92,7 +89,7 @@ def test_triangulation_recovers_a_room_up_to_scale():
 def test_triangulation_gives_doubtful_cells_the_median():
     truth, transform = room_disparities(), sideways()
     matches = seen_matches(transform, truth)
-    targets, confidence = matches.targets.reshape(CELLS, 2).clone(), torch.ones(CELLS)
+    targets, confidence = matches.targets[0].T.clone(), torch.ones(CELLS)
     confidence[3] = 0.2
     targets[5] = 2 * GRID.pixels[5] - targets[5]  # the wrong way: a point behind both cameras
     targets[7] += 40 * (targets[7] - GRID.pixels[7])  # forty times too near
@@ -116,7 +113,7 @@ def test_the_essential_matrix_gives_the_room_without_a_pose():
 
 def test_the_essential_matrix_survives_outliers_and_repeats_itself():
     truth = room_disparities()
-    targets = seen_matches(sideways(0.5), truth).targets.reshape(CELLS, 2)
+    targets = seen_matches(sideways(0.5), truth).targets[0].T
     is_outlier = (uniform(3, CELLS, 1) < 0.2).expand(CELLS, 2)
     spoilt = torch.where(is_outlier, targets + 15 * normal(4, CELLS, 2).float(), targets)
     first = essential_disparities(GRID, *flat(matches_to(spoilt)))
@@ -135,11 +132,11 @@ def test_composed_matches_by_hand():
     u, v = GRID.pixels.T
     inside = u + 8 <= 72
     expected = torch.stack([u + 8 + 0.1 * (u + 8), v - 2], 1)
-    targets = composed.targets.reshape(CELLS, 2)
+    targets = composed.targets[0].T
     torch.testing.assert_close(targets[inside], expected[inside], rtol=1e-5, atol=1e-4)
-    confidences = composed.confidences.reshape(CELLS, 2)[inside, 0]
+    confidences = composed.confidences[0].T[inside, 0]
     torch.testing.assert_close(confidences, ((u + 8) / 72)[inside], rtol=1e-5, atol=1e-5)
-    assert float(composed.matched_shares) == pytest.approx(0.64)
+    assert float(composed.matched_ratios) == pytest.approx(0.64)
 
 
 def test_composed_matches_are_the_matches_of_the_composed_motion():
@@ -147,11 +144,13 @@ def test_composed_matches_are_the_matches_of_the_composed_motion():
     disparities = torch.full((CELLS,), 0.5)
     a, b = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
     a[:3, 3], b[:3, 3] = torch.tensor([-0.1, 0.1, 0.0]), torch.tensor([-0.05, 0.1, 0.2])
-    composed = compose_matches(
-        seen_matches(a, disparities), seen_matches(b, disparities), GRID
-    ).targets.reshape(CELLS, 2)
-    expected = seen_matches(b @ a, disparities).targets.reshape(CELLS, 2)
-    middle = seen_matches(a, disparities).targets.reshape(CELLS, 2)
+    composed = (
+        compose_matches(seen_matches(a, disparities), seen_matches(b, disparities), GRID)
+        .targets[0]
+        .T
+    )
+    expected = seen_matches(b @ a, disparities).targets[0].T
+    middle = seen_matches(a, disparities).targets[0].T
     inside = ((middle >= 0) & (middle <= torch.tensor([72.0, 48.0]))).all(1)
     assert inside.sum() > 40
     torch.testing.assert_close(composed[inside], expected[inside], rtol=0, atol=1e-3)
@@ -169,7 +168,7 @@ def test_a_pose_is_found_from_matches_and_disparities(robust: RobustKernel | Non
 
 def test_a_pose_ignores_what_is_not_trusted():
     truth, disparities, identity = sideways(), room_disparities(), torch.eye(4).double()
-    targets = seen_matches(truth, disparities).targets.reshape(CELLS, 2).clone()
+    targets = seen_matches(truth, disparities).targets[0].T.clone()
     targets[:30] += torch.tensor([9.0, 5.0])  # a mover that fills 3 of 7 rows
     trust = (torch.arange(CELLS) >= 30).float()
     found = start_pose(GRID, matches_to(targets), disparities, trust, identity, [identity], None)
@@ -284,7 +283,7 @@ def test_the_best_hypothesis_is_the_one_that_explains_the_matches():
     truth, disparities = sideways(), room_disparities()
     forward, backward = seen_matches(truth, disparities), room_disparities(5)
     returned = seen_matches(se3_inverse(truth), backward)
-    targets = torch.cat([forward.targets, returned.targets]).flatten(1, 2).mT
+    targets = torch.cat([forward.targets, returned.targets])
     problem = BundleProblem(
         camera=CAMERA,
         rays=GRID.rays,

@@ -29,7 +29,7 @@ class FlowThatNeverFits(TrueFlow):
         for edge, (source, target) in enumerate(zip(sources, targets, strict=True)):
             if abs(source - target) >= CONFIG.loop_min_gap:
                 moved[edge] += 40.0 * torch.rand(moved[edge].shape, generator=seeded())
-        return FlowMatches(moved, matches.confidences, matches.matched_shares)
+        return FlowMatches(moved, matches.confidences, matches.matched_ratios)
 
 
 def seeded() -> torch.Generator:
@@ -102,7 +102,7 @@ def test_health_at_the_truth():
     backend = back_end([0, 1, 2])
     backend.match(neighbourhood_edges(0, 3, 2))
     health = health_of(backend, 2)
-    assert health.keyframe_index == 2 and health.matched_share == 1
+    assert health.keyframe_index == 2 and health.matched_ratio == 1
     assert health.median_residual < 1e-3 and health.parallax > 3
 
 
@@ -119,7 +119,7 @@ def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
 
 def test_a_keyframe_without_links_is_reported_as_such():
     health = health_of(back_end([0, 1]), 1)
-    assert health.matched_share == 0 and health.parallax == 0
+    assert health.matched_ratio == 0 and health.parallax == 0
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.05])

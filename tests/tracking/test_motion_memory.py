@@ -20,7 +20,7 @@ def matches_of(shift: torch.Tensor, confidence: float = 1.0) -> FlowMatches:
     """Return what a camera that moved by MOTION sees, each cell off by `shift` (N, 2) px."""
     rays, pose = GRID.rays.float(), MOTION[None].float()
     positions, _ = reproject(pose, DISPARITIES[None], rays, CAMERA)
-    targets = (positions[0].mT + shift).reshape(1, *GRID.shape, 2)
+    targets = (positions[0].mT + shift).T[None]
     return FlowMatches(targets, torch.full_like(targets, confidence), torch.ones(1))
 
 
@@ -61,8 +61,7 @@ def test_trust_moves_with_the_flow():
     height, width = GRID.shape
     trust = torch.ones(height, width)
     trust[2:4, 1:3] = 0.1
-    grid_pixels = GRID.pixels.float().reshape(1, height, width, 2)
-    right = grid_pixels + torch.tensor([2.0 * STRIDE, 0.0])
+    right = GRID.pixels.float().T[None] + torch.tensor([[2.0 * STRIDE], [0.0]])
     matches = FlowMatches(right, torch.ones_like(right), torch.ones(1))
     carried = inherited_trust(GRID, matches, trust.reshape(-1)).reshape(height, width)
     expected = torch.ones(height, width)
@@ -72,7 +71,7 @@ def test_trust_moves_with_the_flow():
 
 
 def test_where_two_cells_meet_the_less_trusted_one_counts():
-    everything_to_one = torch.zeros(1, *GRID.shape, 2)
-    matches = FlowMatches(everything_to_one, torch.ones(1, *GRID.shape, 2), torch.ones(1))
+    everything_to_one = torch.zeros(1, 2, CELLS)
+    matches = FlowMatches(everything_to_one, torch.ones(1, 2, CELLS), torch.ones(1))
     carried = inherited_trust(GRID, matches, torch.linspace(0.2, 1, CELLS))
     torch.testing.assert_close(carried, torch.full((CELLS,), 0.2))

@@ -67,9 +67,9 @@ class FlowWithFollower(TrueFlow):
 
     def match(self, sources: list[int], targets: list[int], predicted: Tensor) -> FlowMatches:
         matches = super().match(sources, targets, predicted)
-        width = GRID.shape[1] // 4
-        matches.targets[:, :, :width] = GRID.pixels.view(*GRID.shape, 2)[:, :width]
-        matches.confidences[:, :, :width] = 1.0
+        is_mover = GRID.pixels[:, 0] < GRID.stride * (GRID.shape[1] // 4)
+        matches.targets[..., is_mover] = GRID.pixels[is_mover].T
+        matches.confidences[..., is_mover] = 1.0
         return matches
 
 

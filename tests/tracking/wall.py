@@ -42,9 +42,9 @@ class TrueFlow:
 
     stride = STRIDE
 
-    def __init__(self, shares: dict[tuple[int, int], float] | None = None) -> None:
+    def __init__(self, ratios: dict[tuple[int, int], float] | None = None) -> None:
         self.numbers: dict[int, int] = {}  # of the frame that a keyframe is
-        self.shares = shares or {}  # of edges that are not matched as a whole
+        self.ratios = ratios or {}  # of edges that are not matched as a whole
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         self.numbers[keyframe_index] = int(image[0, 0, 0])
@@ -53,7 +53,7 @@ class TrueFlow:
         del self.numbers[keyframe_index]
 
     def match(self, sources: list[int], targets: list[int], predicted: Tensor) -> FlowMatches:
-        assert predicted.shape == (len(sources), *GRID.shape, 2), predicted.shape
+        assert predicted.shape == (len(sources), 2, len(GRID.rays)), predicted.shape
         poses = true_poses()
         source = [self.numbers[index] for index in sources]
         target = [self.numbers[index] for index in targets]
@@ -61,13 +61,9 @@ class TrueFlow:
         transforms = relative_transforms(poses, source, target)
         positions, valid = reproject(transforms, disparities, GRID.rays.double(), CAMERA)
         seen = valid & CAMERA.contains(positions.mT)
-        confidences = seen[..., None].expand(-1, -1, 2).reshape(len(source), *GRID.shape, 2)
-        shares = [self.shares.get(edge, 1.0) for edge in zip(sources, targets, strict=True)]
-        return FlowMatches(
-            positions.mT.reshape(confidences.shape).float(),
-            confidences.float(),
-            torch.tensor(shares),
-        )
+        confidences = seen[:, None].repeat(1, 2, 1).float()
+        ratios = [self.ratios.get(edge, 1.0) for edge in zip(sources, targets, strict=True)]
+        return FlowMatches(positions.float(), confidences, torch.tensor(ratios))
 
     def start_chain(self, image: Tensor) -> FlowChain:
         raise NotImplementedError

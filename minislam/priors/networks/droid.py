@@ -94,11 +94,13 @@ class DroidFlow(Stateful):
         self,
         edges_source: list[int],  # (E,) keyframe index
         edges_target: list[int],  # (E,) keyframe index
-        predicted_targets: Tensor,  # (E, h, w, 2) px
+        predicted_targets: Tensor,  # (E, 2, N) px
     ) -> FlowMatches:
         """Match every grid cell of each source in its target; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
+        height, width = self._frames[edges_source[0]].features.shape[2:]
         expected = predicted_targets.to(self.weights.device, torch.float32) / STRIDE
+        expected = expected.mT.reshape(-1, height, width, 2)
         states: dict[tuple[int, int], _EdgeState] = {}
         confidences = []
         for start in range(0, len(edges), self.config.edges_per_batch):
@@ -173,8 +175,9 @@ class DroidFlow(Stateful):
         size = targets.new_tensor([targets.shape[2] - 1, targets.shape[1] - 1])
         inside = ((targets >= 0) & (targets <= size)).all(-1)
         matched = inside & (confidences.mean(-1) >= self.config.matched_confidence)
-        shares = matched.float().mean((1, 2))
-        return FlowMatches(*(x.to(like) for x in (STRIDE * targets, confidences, shares)))
+        ratios = matched.float().mean((1, 2))
+        targets, confidences = (x.flatten(1, 2).mT.contiguous() for x in (targets, confidences))
+        return FlowMatches(*(x.to(like) for x in (STRIDE * targets, confidences, ratios)))
 
     def start_chain(self, image: Tensor) -> "DroidChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""

@@ -49,9 +49,9 @@ def flow_with_frames(**settings: int) -> DroidFlow:
 
 
 def still(edges: int = 1) -> torch.Tensor:
-    """Return predicted targets (E, h, w, 2) [px] of a camera that does not move."""
+    """Return predicted targets (E, 2, N) [px] of a camera that does not move."""
     grid = Camera(50, 50, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT).pixel_grid(DroidFlow.stride)
-    return grid.expand(edges, *grid.shape).clone()
+    return grid.flatten(0, 1).T.expand(edges, 2, -1).clone()
 
 
 # Known answers
@@ -72,14 +72,15 @@ def test_matches_are_the_networks_answer_in_pixels():
         expected,
         expected,
     )
-    torch.testing.assert_close(matches.targets, 8 * (expected + answer.revision))
-    torch.testing.assert_close(matches.confidences, answer.confidence)
+    targets = 8 * (expected + answer.revision)
+    torch.testing.assert_close(matches.targets, targets.flatten(1, 2).mT)
+    torch.testing.assert_close(matches.confidences, answer.confidence.flatten(1, 2).mT)
 
 
 def test_the_grid_is_that_of_the_camera():
     matches = flow_with_frames(updates=1).match([0, 2], [1, 0], still(2))
-    assert matches.targets.shape == still(2).shape == (2, 9, 12, 2)
-    assert matches.matched_shares.shape == (2,)
+    assert matches.targets.shape == still(2).shape == (2, 2, 9 * 12)
+    assert matches.matched_ratios.shape == (2,)
     assert ((matches.confidences > 0) & (matches.confidences < 1)).all()
 
 
@@ -88,7 +89,7 @@ def test_cells_that_leave_the_image_or_are_unsure_are_not_matched():
     targets = torch.tensor([[[[0.0, 0], [1, 1]], [[-0.1, 0], [1, 0]]]])
     confidences = torch.tensor([[[[0.9, 0.9], [0.9, 0.9]], [[0.9, 0.9], [0.4, 0.5]]]])
     matches = flow.as_matches(targets, confidences, targets)
-    assert matches.matched_shares.tolist() == [0.5]
+    assert matches.matched_ratios.tolist() == [0.5]
 
 
 # Identities
@@ -127,7 +128,7 @@ def test_a_chain_never_changes_and_restarts_at_its_newest_image():
     once, matches = start.advanced(image(1))
     again, repeated = start.advanced(image(1))
     assert torch.equal(matches.targets, repeated.targets)
-    assert matches.targets.shape == (1, 9, 12, 2)
+    assert matches.targets.shape == (1, 2, 9 * 12)
     _, carried = once.advanced(image(2))
     _, direct = start.advanced(image(2))
     assert not torch.equal(carried.targets, direct.targets)  # it starts where the last one ended
@@ -157,7 +158,7 @@ def test_matches_are_ordinary_tensors_of_the_callers_kind():
     matches = flow_with_frames(updates=1).match([0], [1], still().double())
     assert not matches.targets.requires_grad
     assert matches.targets.dtype == torch.float64
-    (matches.targets * torch.ones(2, dtype=torch.float64, requires_grad=True)).sum().backward()
+    (matches.targets * torch.ones(2, 1, dtype=torch.float64, requires_grad=True)).sum().backward()
 
 
 def test_a_checkpoint_of_a_parallel_training_is_checked_and_runs(tmp_path: Path):
@@ -212,10 +213,10 @@ def test_textureless_images_give_finite_matches(value: float):
     flow = DroidFlow(weights())
     flow.add_frame(0, torch.full((64, 64, 3), value))
     flow.add_frame(1, torch.full((64, 64, 3), value))
-    predicted = 1e6 * torch.ones(1, 8, 8, 2)  # far outside
+    predicted = 1e6 * torch.ones(1, 2, 8 * 8)  # far outside
     matches = flow.match([0], [1], predicted)
     assert torch.isfinite(matches.targets).all() and torch.isfinite(matches.confidences).all()
-    assert matches.matched_shares.tolist() == [0.0]
+    assert matches.matched_ratios.tolist() == [0.0]
 
 
 # Errors
