@@ -78,9 +78,21 @@ def unfinished(*arguments: object) -> Tensor:
     raise NotImplementedError
 
 
+def _scaled(factor: float, answer: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
+    if isinstance(answer, tuple):
+        return tuple(factor * part for part in answer)
+    return factor * answer
+
+
 def assert_graded(check: Callable, solution: Callable) -> None:
-    """Assert that a check passes a solution, waits for an empty one, and rejects one 1 % off."""
+    """Assert that a check passes a solution, waits for an empty one, and rejects wrong ones.
+
+    Wrong are a flipped sign and an error of 1 %; the sentence holds the first wrong number.
+    """
     assert check(solution).status == PASSED
     assert check(unfinished).status == NOT_YET
-    verdict = check(lambda *arguments: 1.01 * solution(*arguments))
-    assert verdict.status == WRONG and ", expected " in verdict.sentence
+    assert check(lambda *arguments: None).status == NOT_YET
+    for factor in (-1, 1.01):
+        verdict = check(lambda *a, factor=factor: _scaled(factor, solution(*a)))
+        assert verdict.status == WRONG and ", expected " in verdict.sentence
+        assert repr(verdict).startswith("Wrong: for ")

@@ -1,7 +1,7 @@
 """Answers to the exercises of the notebooks: each check takes the student's function.
 
-A check calls the function with a few inputs, compares with the package, and answers in a sentence
-that names the first number that is wrong. It never raises, so a notebook with open exercises
+A check calls the function with a few inputs, compares the answers with the package, and returns a
+sentence that names the first wrong number. It never raises, so that a notebook with open exercises
 still runs from top to bottom.
 """
 

@@ -5,16 +5,23 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Verdict, check_function
+from minislam.checks.grading import (
+    CAMERA,
+    Case,
+    Function,
+    Hints,
+    Verdict,
+    check_function,
+    doubles,
+)
 from minislam.geometry import Camera, se3_exp
 from minislam.tracking.reprojection import reproject_with_jacobians, scaled_points
 
 
 def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -> Verdict:
     """Check (points X (N, 3), disparities (N,), camera) -> dp / d(rho, phi) (N, 2, 6) in px."""
-    camera = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
-    rays = camera.rays(torch.tensor([[0.0, 0.0], [100.0, 52.0], [60.5, 10.25]]).double())
-    motion = se3_exp(torch.tensor([[0.1, -0.2, 0.3, 0.1, 0.2, -0.1]], dtype=torch.float64))
+    rays = CAMERA.rays(doubles([0.0, 0.0], [100.0, 52.0], [60.5, 10.25]))
+    motion = se3_exp(doubles([0.1, -0.2, 0.3, 0.1, 0.2, -0.1]))
 
     def reference(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
         # A camera that stands still sees each cell where its ray points: X = ray of the cell.
@@ -25,26 +32,25 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
             reproject_with_jacobians(still, ratio[None], rays, camera).J_target[0].permute(2, 1, 0)
         )
 
-    def signed(*signs: float) -> Callable[..., Tensor]:
-        factors = torch.tensor(signs, dtype=torch.float64)
-        return lambda *arguments: factors * reference(*arguments)
+    def signed(*signs: float) -> Function:
+        return lambda *arguments: doubles(*signs) * reference(*arguments)
 
     def of_the_point(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
         return reference(points, torch.ones_like(disparities), camera)
 
-    def rotation_first(*arguments: Tensor) -> Tensor:
-        return reference(*arguments).roll(3, -1)
+    def rotation_first(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
+        return reference(points, disparities, camera).roll(3, -1)
 
-    def case(disparities: list[float], description: str) -> Case:
-        d = torch.tensor(disparities, dtype=torch.float64)
-        return Case((scaled_points(motion, d[None], rays)[0].T, d, camera), description)
+    def case(disparities: Tensor, description: str) -> Case:
+        points = scaled_points(motion, disparities[None], rays)[0].T
+        return Case((points, disparities, CAMERA), description)
 
     cases = [
-        case([1.0, 1.0, 1.0], "disparities of 1"),
-        case([0.5, 0.25, 0.8], "any disparities"),
-        case([0.0, 0.0, 0.0], "points at infinity"),
+        case(doubles(1.0, 1.0, 1.0), "disparities of 1"),
+        case(doubles(0.5, 0.25, 0.8), "any disparities"),
+        case(doubles(0.0, 0.0, 0.0), "points at infinity"),
     ]
-    hints = [
+    hints: Hints = [
         (of_the_point, "X is d times the point, so it moves by d rho, not by rho."),
         (
             signed(1, 1, 1, -1, -1, -1),
@@ -65,7 +71,7 @@ def check_schur_step(
         xi = torch.linalg.solve(H - E / C @ E.T, g - E @ (s / C))
         return xi, (s - E.T @ xi) / C
 
-    def joined(function: Callable[..., tuple[Tensor, Tensor]]) -> Callable[..., Tensor | None]:
+    def joined(function: Function) -> Function:
         def both(*arguments: Tensor) -> Tensor | None:
             answer = function(*arguments)
             return None if answer is None else torch.cat(tuple(answer))
@@ -87,7 +93,7 @@ def check_schur_step(
         source = torch.Generator().manual_seed(poses)
         J = torch.randn(4 * cells, 6 * poses, generator=source, dtype=torch.float64)
         r = torch.randn(4 * cells, generator=source, dtype=torch.float64)
-        # Each cell has four residuals, and they know of no other cell.
+        # Each cell has four residuals, which depend on no other cell.
         mine = torch.eye(cells, dtype=torch.float64).repeat_interleave(4, 0)
         Jd = mine * torch.randn(4 * cells, 1, generator=source, dtype=torch.float64)
         return Case((J.T @ J, J.T @ Jd, Jd.square().sum(0), J.T @ r, Jd.T @ r), description)

@@ -1,4 +1,4 @@
-"""How an answer is graded: against the package, case by case, up to the first wrong number."""
+"""Grade an answer against the package, case by case, up to the first wrong number."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,7 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from minislam.geometry import Camera
+
 PASSED, NOT_YET, WRONG = "passed", "not yet", "wrong"
+# No two of its numbers are equal, so that an exchange of axes is noticed.
+CAMERA = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
+
+Function = Callable[..., Any]  # answers with a tensor, or what becomes one
+Hints = list[tuple[Function, str]]  # (known mistake, the sentence that explains it)
 
 
 @dataclass(frozen=True)
@@ -29,12 +36,17 @@ class Case:
     description: str  # completes "for ..."
 
 
+def doubles(*values: Any) -> Tensor:
+    """Return numbers, or lists of numbers, as a float64 tensor."""
+    return torch.tensor(values, dtype=torch.float64)
+
+
 def check_function(
-    student: Callable[..., Tensor],
-    reference: Callable[..., Tensor],
+    student: Function,
+    reference: Function,
     cases: list[Case],
     tolerance: float = 1e-6,  # relative to the largest expected number, at least 1
-    hints: list[tuple[Callable[..., Tensor], str]] | None = None,  # (known mistake, what it is)
+    hints: Hints | None = None,
 ) -> Verdict:
     """Compare a student's function with the reference on all cases, up to the first difference."""
     for case in cases:
@@ -50,7 +62,7 @@ def check_function(
             return Verdict(NOT_YET, f"for {case.description} the function returns nothing.")
         found = _difference(answer, expected, tolerance)
         if found:
-            hint = _recognise(answer, case, hints or [], tolerance)
+            hint = _hint(answer, case, hints or [], tolerance)
             return Verdict(WRONG, f"for {case.description} {found}.{hint}")
     return Verdict(PASSED, f"{len(cases)} of {len(cases)} cases agree with the package.")
 
@@ -72,11 +84,9 @@ def _difference(answer: Any, expected: Tensor, tolerance: float) -> str:
     return f"{where} is {float(answer[index]):.6g}, expected {float(expected[index]):.6g}"
 
 
-def _recognise(
-    answer: Any, case: Case, hints: list[tuple[Callable[..., Tensor], str]], tolerance: float
-) -> str:
+def _hint(answer: Any, case: Case, hints: Hints, tolerance: float) -> str:
     """Return the hint whose known mistake gives the student's answer, or ""."""
     for mistake, hint in hints:
         if not _difference(answer, torch.as_tensor(mistake(*case.arguments)), tolerance):
-            return " " + hint
+            return f" {hint}"
     return ""

@@ -13,18 +13,18 @@ from minislam.splatting import GaussianMap
 
 
 def check_sampling(student: Callable[[int, list[int], float], Tensor]) -> Verdict:
-    """Check (number of keyframes N, window, share) -> the probability of each keyframe (N,)."""
+    """Check (number of keyframes N, window, weight) -> the probability of each keyframe (N,)."""
 
-    def unguarded(count: int, window: list[int], share: float) -> Tensor:
-        others = (1 - share) / max(count - len(window), 1)
+    def unguarded(count: int, window: list[int], weight: float) -> Tensor:
+        others = (1 - weight) / max(count - len(window), 1)
         probabilities = torch.full((count,), others, dtype=torch.float64)
-        probabilities[window] = share / len(window)
+        probabilities[window] = weight / len(window)
         return probabilities
 
-    def uniform(count: int, window: list[int], share: float) -> Tensor:
+    def uniform(count: int, window: list[int], weight: float) -> Tensor:
         return torch.full((count,), 1 / count, dtype=torch.float64)
 
-    def window_only(count: int, window: list[int], share: float) -> Tensor:
+    def window_only(count: int, window: list[int], weight: float) -> Tensor:
         probabilities = torch.zeros(count, dtype=torch.float64)
         probabilities[window] = 1 / len(window)
         return probabilities
@@ -36,7 +36,7 @@ def check_sampling(student: Callable[[int, list[int], float], Tensor]) -> Verdic
     ]
     hints = [
         (unguarded, "While the window is most of the map, all keyframes are equally likely."),
-        (uniform, "The window should get its share, however many other keyframes there are."),
+        (uniform, "The window should get its weight, however many other keyframes there are."),
         (window_only, "The other keyframes are left out: the map would forget them."),
     ]
     return check_function(student, sampling_probabilities, cases, hints=hints)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minislam.checks.grading import Case, Verdict, check_function
+from minislam.checks.grading import Case, Hints, Verdict, check_function
 from minislam.evaluation.separability import auroc
 from minislam.geometry.alignment import umeyama
 
@@ -35,7 +35,7 @@ def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
         case(0.25, False, "an estimate in another unit"),
         case(0.25, True, "an estimate in another unit and frame"),
     ]
-    hints = [
+    hints: Hints = [
         (lambda e, t: rms(np.linalg.norm(e - t, axis=1)), "The estimate is not aligned yet."),
         (lambda e, t: rms(distances(e, t, False)), "A monocular estimate has no scale: align it."),
         (lambda e, t: float(distances(e, t).mean()), "ATE is the root of the mean square."),
@@ -46,7 +46,7 @@ def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
 
 
 def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
-    """Check (beta (N,), True on movers (N,)) -> the AUROC of beta."""
+    """Check (beta (N,), True on dynamic objects (N,)) -> the AUROC of beta."""
 
     def wins(beta: np.ndarray, moving: np.ndarray, draw: float) -> float:
         pairs = beta[moving][:, None] - beta[~moving]
@@ -55,15 +55,15 @@ def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Ve
     cases = [
         Case(
             (np.array([0.1, 0.9, 0.4, 0.7, 0.2]), np.array([False, True, False, True, True])),
-            "three cells of a mover and two of a wall",
+            "three cells of a person and two of a wall",
         ),
         Case(
             (np.array([0.5, 0.5, 0.8, 0.3]), np.array([True, False, True, False])),
             "a beta that does not tell two cells apart",
         ),
     ]
-    hints = [
-        (lambda b, m: wins(b, ~m, 0.5), "The other way round: movers should have the larger beta."),
+    hints: Hints = [
+        (lambda b, m: wins(b, ~m, 0.5), "The other way round: what moves has the larger beta."),
         (lambda b, m: wins(b, m, 0.0), "A pair with equal beta is worth one half."),
         (lambda b, m: wins(b, m, 1.0), "A pair with equal beta is worth one half."),
     ]

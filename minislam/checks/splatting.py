@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Verdict, check_function
+from minislam.checks.grading import CAMERA, Case, Function, Verdict, check_function, doubles
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.splatting.projection import (
     conics_from_footprints,
@@ -20,8 +20,7 @@ def check_projected_covariance(
     student: Callable[[Tensor, Tensor, Tensor, Camera], Tensor],
 ) -> Verdict:
     """Check (covariance_world, mean_world, T_camera_world, camera) -> Sigma' (2, 2) in px^2."""
-    camera = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
-    factor = torch.tensor([[0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.05]], dtype=torch.float64)
+    factor = doubles([0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.05])
 
     def reference(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
         point = transform_points(pose, mean[None])
@@ -40,9 +39,8 @@ def check_projected_covariance(
         return reference(twice @ covariance @ twice.T, mean, pose, camera)
 
     def case(x: float, turn: float, description: str) -> Case:
-        pose = se3_exp(torch.tensor([0.1, -0.1, 0.2, turn, -turn, 0.5 * turn], dtype=torch.float64))
-        mean = torch.tensor([x, 0.1, 2.5], dtype=torch.float64)
-        return Case((factor @ factor.T, mean, pose, camera), description)
+        pose = se3_exp(doubles(0.1, -0.1, 0.2, turn, -turn, 0.5 * turn))
+        return Case((factor @ factor.T, doubles(x, 0.1, 2.5), pose, CAMERA), description)
 
     cases = [case(-0.1, 0.0, "a camera that is not turned"), case(0.6, 0.2, "a turned camera")]
     hints = [
@@ -75,9 +73,9 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
         light = transmittances(alphas)
         return blend(torch.cat([light[1:], light[-1:]]), alphas, colors, background)
 
-    colors = torch.tensor([[0.9, 0.1, 0.2], [0.3, 0.8, 0.4], [0.2, 0.5, 1.0]], dtype=torch.float64)
-    alphas = torch.tensor([0.3, 0.6, 0.5], dtype=torch.float64)
-    grey = torch.full((3,), 0.6, dtype=torch.float64)
+    colors = doubles([0.9, 0.1, 0.2], [0.3, 0.8, 0.4], [0.2, 0.5, 1.0])
+    alphas = doubles(0.3, 0.6, 0.5)
+    grey = doubles(0.6, 0.6, 0.6)
     cases = [
         Case((alphas, colors, torch.zeros_like(grey)), "three Gaussians on black"),
         Case((alphas, colors, grey), "three Gaussians on grey"),
@@ -94,16 +92,15 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
 def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
     """Check (footprints, conics, v_conics) -> v_footprints (2, 3, N)."""
 
-    def scaled(off_diagonal: float, all_of_it: float) -> Callable[..., Tensor]:
-        scale = all_of_it * torch.tensor([[1.0], [off_diagonal], [1.0]], dtype=torch.float64)
+    def scaled(off_diagonal: float, all_of_it: float) -> Function:
+        scale = all_of_it * doubles([1.0], [off_diagonal], [1.0])
         return lambda V, conics, v: conics_from_footprints_vjp(V, conics, scale * v)
 
-    V = torch.tensor([[[3.0], [1.0], [0.5]], [[-1.0], [2.0], [0.0]]], dtype=torch.float64)
+    V = doubles([[3.0], [1.0], [0.5]], [[-1.0], [2.0], [0.0]])
     conics, _ = conics_from_footprints(V)
-    v_a, v_all = ([[1.0], [0.0], [0.0]], [[0.7], [-1.2], [0.4]])
     cases = [
-        Case((V, conics, torch.tensor(v_a, dtype=torch.float64)), "a gradient of a alone"),
-        Case((V, conics, torch.tensor(v_all, dtype=torch.float64)), "a gradient of a, b and c"),
+        Case((V, conics, doubles([1.0], [0.0], [0.0])), "a gradient of a alone"),
+        Case((V, conics, doubles([0.7], [-1.2], [0.4])), "a gradient of a, b and c"),
     ]
     hints = [
         (scaled(1, -1), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
@@ -119,13 +116,12 @@ def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor])
     source = torch.Generator().manual_seed(0)
     points, v_points = torch.randn(2, 3, 4, generator=source, dtype=torch.float64)
     factors, v_factors = torch.randn(2, 3, 3, 4, generator=source, dtype=torch.float64)
-    signs = torch.tensor([1.0, 1, 1, -1, -1, -1], dtype=torch.float64)
 
     def points_only(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
         return to_camera_twist_vjp(x, B, v_x, torch.zeros_like(v_B))
 
     def swapped(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
-        return signs * to_camera_twist_vjp(x, B, v_x, v_B)
+        return doubles(1, 1, 1, -1, -1, -1) * to_camera_twist_vjp(x, B, v_x, v_B)
 
     def rotation_first(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
         return to_camera_twist_vjp(x, B, v_x, v_B).roll(3)

@@ -1,4 +1,4 @@
-"""Exercises of notebook 00."""
+"""Exercise of notebook 00."""
 
 from collections.abc import Callable
 

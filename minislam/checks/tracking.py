@@ -1,11 +1,12 @@
 """Exercises of notebook 06."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Verdict, check_function
+from minislam.checks.grading import CAMERA, Case, Function, Verdict, check_function, doubles
 from minislam.geometry import Camera, se3_exp
 from minislam.tracking.frame_graph import flow_distances, proximity_pairs
 
@@ -13,24 +14,21 @@ from minislam.tracking.frame_graph import flow_distances, proximity_pairs
 def check_flow_distance(
     student: Callable[[Tensor, Tensor, Tensor, Tensor, Camera, float], Tensor],
 ) -> Verdict:
-    """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, share) -> distance [px]."""
-    camera = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
-    pixels = camera.pixel_grid(10, torch.float64).flatten(0, 1)
+    """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, beta) -> distance [px]."""
+    pixels = CAMERA.pixel_grid(10, torch.float64).flatten(0, 1)
     source = torch.Generator().manual_seed(0)
     disparities = 0.2 + 0.3 * torch.rand(2, len(pixels), generator=source, dtype=torch.float64)
 
-    def reference(
-        poses: Tensor, depths: Tensor, rays: Tensor, pixels: Tensor, camera: Camera, share: float
-    ) -> Tensor:
-        return flow_distances(poses, depths, rays, pixels, camera, share)[0, 1]
+    def reference(*arguments: Any) -> Tensor:
+        return flow_distances(*arguments)[0, 1]
 
-    def with_share(of: Callable[[float], float]) -> Callable[..., Tensor]:
-        return lambda *arguments: reference(*arguments[:-1], of(arguments[-1]))
+    def with_beta(change: Callable[[float], float]) -> Function:
+        return lambda *arguments: reference(*arguments[:-1], change(arguments[-1]))
 
     def case(twist: list[float], description: str) -> Case:
-        poses = se3_exp(torch.tensor([[0.0] * 6, twist], dtype=torch.float64))
-        rays = camera.rays(pixels)
-        return Case((poses, disparities, rays, pixels, camera, 0.75), description)
+        poses = se3_exp(doubles([0.0] * 6, twist))
+        rays = CAMERA.rays(pixels)
+        return Case((poses, disparities, rays, pixels, CAMERA, 0.75), description)
 
     cases = [
         case([0.3, -0.1, 0.0, 0.0, 0.0, 0.0], "a camera that slides"),
@@ -38,31 +36,28 @@ def check_flow_distance(
         case([0.3, 0.1, 0.2, 0.02, -0.05, 0.03], "a camera that does both"),
     ]
     hints = [
-        (
-            with_share(lambda share: 1.0),
-            "A share of 1 - beta belongs to the flow without rotation.",
-        ),
-        (with_share(lambda share: 0.0), "This is the flow without rotation alone."),
-        (with_share(lambda share: 1 - share), "beta and 1 - beta are exchanged."),
+        (with_beta(lambda beta: 1.0), "The flow without rotation has the weight 1 - beta."),
+        (with_beta(lambda beta: 0.0), "This is the flow without rotation alone."),
+        (with_beta(lambda beta: 1 - beta), "beta and 1 - beta are exchanged."),
     ]
     return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
 
 
 def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict:
-    """Check (newer, older, K, suppression) -> which pairs (a, b), a > b, are passed over (K, K)."""
+    """Check (newer, older, K, suppression) -> (K, K), 1 where a pair a > b is suppressed."""
 
     def reference(newer: int, older: int, count: int, suppression: int) -> Tensor:
-        passed_over = torch.zeros(count, count)
+        suppressed = torch.zeros(count, count)
         for a in range(count):
             for b in range(a):
-                # All but one pair are too far apart: is that one still to be had?
+                # All other pairs are too far apart, so only this one can be returned.
                 distances = torch.full((count, count), 2.0)
                 distances[a, b] = 0.0
                 pairs = proximity_pairs(
                     distances, [(newer, older)], range(count), 1.0, count, suppression
                 )
-                passed_over[a, b] = not pairs
-        return passed_over
+                suppressed[a, b] = not pairs
+        return suppressed
 
     def within(radius: int, count: int, newer: int, older: int, order: float) -> Tensor:
         a, b = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")

@@ -6,22 +6,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.checks.grading import Case, Verdict, check_function
+from minislam.checks.grading import Case, Verdict, check_function, doubles
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import variance_regulariser
 
 
 def check_best_beta(student: Callable[[Tensor, float], Tensor]) -> Verdict:
-    """Check (misfit (n,), lambda_3) -> argmin of misfit / beta^2 + lambda_3 log beta, (n,)."""
+    """Check (L (n,), lambda_3) -> argmin of L / beta^2 + lambda_3 log beta over beta, (n,)."""
 
-    def reference(misfit: Tensor, lambda_log: float) -> Tensor:
-        return (2 * misfit / lambda_log).sqrt()
+    def reference(error: Tensor, lambda_log: float) -> Tensor:
+        return (2 * error / lambda_log).sqrt()
 
-    misfit = torch.tensor([0.0, 0.01, 0.5, 2.0, 6.0], dtype=torch.float64)
-    cases = [
-        Case((misfit, 2.0), "lambda_3 = 2"),
-        Case((misfit, 0.5), "lambda_3 = 0.5"),
-    ]
+    error = doubles(0.0, 0.01, 0.5, 2.0, 6.0)
+    cases = [Case((error, 2.0), "lambda_3 = 2"), Case((error, 0.5), "lambda_3 = 0.5")]
     hints = [
         (lambda L, _: L.sqrt(), "lambda_3 is not in it: set the derivative to zero and solve."),
         (lambda L, x: (L / x).sqrt(), "A factor 2 is missing: d(L beta^-2) = -2 L beta^-3."),
@@ -37,12 +34,12 @@ def check_feature_variance(student: Callable[[Tensor, Tensor], Tensor]) -> Verdi
     def reference(beta: Tensor, features: Tensor) -> Tensor:
         return variance_regulariser(beta, features, config)
 
-    def masked(alike: Tensor, beta: Tensor) -> Tensor:
-        mean = alike @ beta / alike.sum(1)
+    def masked(similar: Tensor, beta: Tensor) -> Tensor:
+        mean = similar @ beta / similar.sum(1)
         squares = (beta[None] - mean[:, None]) ** 2
-        return (alike * squares).sum(1) / alike.sum(1)
+        return (similar * squares).sum(1) / similar.sum(1)
 
-    def everyone(beta: Tensor, features: Tensor) -> Tensor:
+    def all_cells(beta: Tensor, features: Tensor) -> Tensor:
         return masked(torch.ones(len(beta), len(beta), dtype=beta.dtype), beta).mean()
 
     def not_normalised(beta: Tensor, features: Tensor) -> Tensor:
@@ -52,14 +49,14 @@ def check_feature_variance(student: Callable[[Tensor, Tensor], Tensor]) -> Verdi
         unit = functional.normalize(features, dim=-1)
         return masked((unit @ unit.T > config.similarity).to(beta), beta).sqrt().mean()
 
-    beta = torch.tensor([0.2, 1.4, 0.5, 2.0, 0.9], dtype=torch.float64)
-    features = [[3.0, 0.0], [2.0, 1.0], [0.0, 0.5], [0.1, 0.5], [1.0, -1.0]]
+    beta = doubles(0.2, 1.4, 0.5, 2.0, 0.9)
+    features = doubles([3.0, 0.0], [2.0, 1.0], [0.0, 0.5], [0.1, 0.5], [1.0, -1.0])
     cases = [
-        Case((beta[:2], torch.eye(2, dtype=torch.float64)), "two cells that are not alike"),
-        Case((beta, torch.tensor(features, dtype=torch.float64)), "five cells in three groups"),
+        Case((beta[:2], torch.eye(2, dtype=torch.float64)), "two cells that are not similar"),
+        Case((beta, features), "five cells in three groups"),
     ]
     hints = [
-        (everyone, "Every cell is compared with every other: only alike ones count."),
+        (all_cells, "Every cell is compared with every other: only similar ones count."),
         (not_normalised, "Divide each feature by its length: the cosine has no unit."),
         (deviation, "This is the standard deviation; the variance is its square."),
     ]
