@@ -7,7 +7,7 @@ from minislam.mapping.config import (
     PoseRefinementConfig,
     paper_mapping,
 )
-from minislam.mapping.history import MappingHistory
+from minislam.mapping.losses import MappingHistory
 from minislam.mapping.mapper import Mapper
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""The constants of mapping."""
+"""The settings of mapping. "official" names the constants of the authors' code."""
 
 from dataclasses import dataclass, field
 
@@ -9,17 +9,11 @@ from minislam.splatting import LearningRates
 
 @dataclass(frozen=True)
 class InsertionConfig:
-    """Where a keyframe adds Gaussians, and how large they start."""
+    """How densely a keyframe adds Gaussians, and how they start."""
 
-    cell: int = parameter(3, "one Gaussian per cell of this side [px of the full image]")
-    footprint: float = parameter(0.6, "first scale, in sides of a cell seen at its depth [1]")
+    cell: int = parameter(3, "one Gaussian per square cell of this side [px of the full image]")
+    footprint: float = parameter(0.6, "first scale over the side of a cell seen at its depth [1]")
     opacity: float = parameter(0.9, "first opacity (0, 1); official 0.5")
-    explained_opacity: float = parameter(
-        0.8, "a pixel rendered less opaque than this is not explained by the map yet [1]"
-    )
-    far_factor: float = parameter(
-        10.0, "nothing is inserted beyond this many median depths [1], as L_depth"
-    )
 
 
 @dataclass(frozen=True)
@@ -28,17 +22,9 @@ class DensityConfig:
 
     interval: int = parameter(100, "iterations between two rounds, official in initialisation")
     gradient: float = parameter(
-        2e-4, "mean screen gradient above which a Gaussian is refined [1 per half image], official"
-    )
-    split_scale: float = parameter(
-        0.02, "larger ones are split, smaller ones cloned [median depths], official 0.06 m"
-    )
-    split_shrink: float = parameter(1.6, "a child is this much smaller than its parent [1], 3DGS")
-    prune_opacity: float = parameter(
-        0.1, "fainter Gaussians are removed [1]; official 0.005 at first and 0.7 online"
-    )
-    prune_scale: float = parameter(
-        0.2, "larger Gaussians are removed [median depths], official 0.6 m"
+        2e-4,
+        "Gaussians of a larger mean screen gradient are cloned or split [1 per half image],"
+        " official",
     )
     max_gaussians: int = parameter(
         0,
@@ -51,22 +37,22 @@ class DensityConfig:
 class PoseRefinementConfig:
     """How the poses between the keyframes are refined by re-rendering, at full image size."""
 
-    enabled: bool = parameter(True, "off: those poses stand on flow alone (fast mode of the paper)")
+    enabled: bool = parameter(True, "off: those poses come from flow alone (paper's fast mode)")
     iterations: int = parameter(
-        5, "steps per frame at most; official 100 of Adam, ours divide by the curvature"
+        5, "most steps per frame; official 100 of Adam, ours divide by the curvature"
     )
     tolerance: float = parameter(
         0.05, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
     )
     farthest: float = parameter(
         1.0,
-        "a pose that moves the picture by more is not believed: matched flow is better than that "
-        "[px of a 320x240 image]",
+        "reject a pose that moves the picture by more, because matched flow is more accurate "
+        "than that [px of a 320x240 image]",
     )
-    share: float = parameter(
+    fraction: float = parameter(
         0.75,
-        "how far to go from the pose that the flow says to the one that the picture says [0, 1]; "
-        "official 1. The two err independently, so that a mean beats both (measured)",
+        "fraction of the way from the pose by flow to the pose by re-rendering [0, 1]; official 1."
+        " Their errors are independent, so a mean is better than either (measured)",
     )
     rounding: float = parameter(
         0.01, "colour difference below which the L1 loss is rounded off [1], one step of noise"
@@ -75,10 +61,9 @@ class PoseRefinementConfig:
 
 @dataclass(frozen=True)
 class MappingConfig:
-    """Budget, window, losses and step lengths. "official" names the authors' code.
+    """Iterations, window, losses and step lengths.
 
-    World units are arbitrary, so the official constants in metres are given in median depths of
-    the first keyframes. `metric_median` says what a metre was when they were chosen.
+    The world has no fixed unit, so lengths are given in median depths of the first keyframes.
     """
 
     image_scale: float = parameter(0.5, "size of the images used online, of the full size (0, 1]")
@@ -88,32 +73,23 @@ class MappingConfig:
         1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode"
     )
     refine_iterations: int = parameter(700, "iterations at the end; official 20000, fast 3000")
-    refine_full_share: float = parameter(
-        0.4, "share of them, the last ones, at full image size [0, 1]; official 1"
+    refine_full_fraction: float = parameter(
+        0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1"
+    )
+    freeze_iterations: int = parameter(
+        5, "iterations without MLP training after a change of density; official 20 of 450"
     )
 
     window_size: int = parameter(10, "most keyframes in the local window, official")
-    window_overlap: float = parameter(0.4, "least share of common Gaussians to stay, official")
-    window_share: float = parameter(0.5, "probability of a keyframe of the window, paper 3.4")
-    visible_contribution: float = parameter(
-        0.5, "a Gaussian of more blending weight in a view is seen there [px]"
+    window_probability: float = parameter(
+        0.5, "probability that an iteration takes a keyframe of the window, paper 3.4"
     )
 
-    color_share: float = parameter(
+    color_weight: float = parameter(
         0.8, "alpha: lambda_5 = alpha / 2, lambda_6 = (1 - alpha) / 2; official 0.5 or 0.8"
     )
-    lambda_ssim: float = parameter(0.2, "share of SSIM in L_color, Eq. (7), official")
+    lambda_ssim: float = parameter(0.2, "weight of SSIM in L_color (Eq. 7), official")
     lambda_isotropic: float = parameter(10.0, "lambda_7: weight of L_iso [1 per m], official")
-    metric_median: float = parameter(
-        2.0, "median depth of a scene in which the official metres hold [m], our assumption"
-    )
-    floater_margin: float = parameter(
-        0.5, "a surface this far in front of the reference is a floater [median depths]"
-    )
-    far_factor: float = parameter(
-        10.0, "no depth loss beyond this many median depths [1], official"
-    )
-
     mean_background: bool = parameter(
         True,
         "what no keyframe sees is rendered in the mean colour of the first ones; off: black,"
@@ -128,18 +104,16 @@ class MappingConfig:
         "last step of the means over the first, log-linear over `rate_iterations`; official 0.01",
     )
     rate_iterations: int = parameter(1500, "iterations of that decay; official 30000")
+    quats_rate: float = parameter(2e-2, "Adam step of the quaternions; official 1e-3")
+    log_scales_rate: float = parameter(2e-2, "Adam step of the log-scales; official 6e-3")
+    opacity_rate: float = parameter(5e-2, "Adam step of the opacity logits, official")
+    colors_rate: float = parameter(5e-3, "Adam step of the colours; official 7.05e-4")
     refine_rate_end: float = parameter(
         0.5, "last step over the first one in the refinement, all parameters; official 1"
     )
-    rates: LearningRates = field(
-        default_factory=lambda: LearningRates(
-            quats_wxyz=2e-2, log_scales=2e-2, opacity_logits=5e-2, colors=5e-3
-        ),
-        metadata={"meaning": "Adam steps of the rest; longer than official: fewer iterations"},
-    )
 
     insertion: InsertionConfig = field(
-        default_factory=InsertionConfig, metadata={"meaning": "where Gaussians are inserted"}
+        default_factory=InsertionConfig, metadata={"meaning": "how Gaussians are inserted"}
     )
     density: DensityConfig = field(
         default_factory=DensityConfig, metadata={"meaning": "cloning, splitting and pruning"}
@@ -147,9 +121,6 @@ class MappingConfig:
     pose_refinement: PoseRefinementConfig = field(
         default_factory=PoseRefinementConfig,
         metadata={"meaning": "photometric refinement of the poses between the keyframes"},
-    )
-    freeze_iterations: int = parameter(
-        5, "iterations without MLP training after a change of density; official 20 of 450"
     )
 
     def __post_init__(self) -> None:
@@ -179,15 +150,15 @@ class MappingConfig:
         decay = self.means_rate_end ** min(1.0, iteration / self.rate_iterations)
         return LearningRates(
             means=factor * decay * self.means_rate * median_depth,
-            quats_wxyz=factor * self.rates.quats_wxyz,
-            log_scales=factor * self.rates.log_scales,
-            opacity_logits=factor * self.rates.opacity_logits,
-            colors=factor * self.rates.colors,
+            quats_wxyz=factor * self.quats_rate,
+            log_scales=factor * self.log_scales_rate,
+            opacity_logits=factor * self.opacity_rate,
+            colors=factor * self.colors_rate,
         )
 
 
 def paper_mapping() -> MappingConfig:
-    """Return the paper's and the official constants, for a GPU and an hour.
+    """Return the paper's and the official constants.
 
     The official learning rate of the means, 9.6e-4 m, is given in median depths of 2 m; the
     official first scale, 0.22 of the distance between neighbours, in cells.
@@ -197,17 +168,19 @@ def paper_mapping() -> MappingConfig:
         init_iterations=1050,
         keyframe_iterations=450,
         refine_iterations=20000,
-        refine_full_share=1.0,
-        refine_rate_end=1.0,
-        color_share=0.5,
+        refine_full_fraction=1.0,
+        freeze_iterations=20,
+        color_weight=0.5,
         mean_background=False,
         means_rate=4.8e-4,
         means_rate_end=0.01,
         rate_iterations=30000,
-        rates=LearningRates(),
+        quats_rate=1e-3,
+        log_scales_rate=6e-3,
+        colors_rate=7.05e-4,
+        refine_rate_end=1.0,
         insertion=InsertionConfig(cell=4, footprint=0.22, opacity=0.5),
         density=DensityConfig(max_gaussians=1_000_000),
         # The official 100 steps of Adam go as far as a few of ours: these are for hard frames.
-        pose_refinement=PoseRefinementConfig(iterations=10, tolerance=0.01, share=1.0),
-        freeze_iterations=20,
+        pose_refinement=PoseRefinementConfig(iterations=10, tolerance=0.01, fraction=1.0),
     )

@@ -1,4 +1,4 @@
-"""Move the map when a bundle adjustment moves its keyframes (Sec. 3.4)."""
+"""Deform the map when bundle adjustment changes its keyframes (Sec. 3.4)."""
 
 import torch
 from torch import Tensor
@@ -29,8 +29,8 @@ def deform_rigidly(
 ) -> GaussianMap:
     """Move each Gaussian with its anchor keyframe: mu <- T mu, q <- q(T) q.
 
-    T = T_world_new_camera @ T_old_camera_world is composed in float64: at float32 a rotation
-    below 1e-4 rad would be lost in the conversion to a quaternion. Scale and opacity stay.
+    T = T_world_new_camera @ T_old_camera_world. It is composed in float64, because in float32 a
+    rotation below 1e-4 rad would be lost in the quaternion. Scale and opacity do not change.
     """
     motion = se3_inverse(T_new_camera_world) @ T_old_camera_world  # (K, 4, 4) world to world
     turn = quaternion_from_rotation(motion[:, :3, :3])
@@ -58,8 +58,8 @@ def rescale_to_depths(
 ) -> GaussianMap:
     """Move Gaussians along the rays of their anchor when its reference depth changes.
 
-    As in Splat-SLAM: s = 1 + (D_new - D_old) / z at the pixel of the Gaussian; z and the scales
-    are multiplied by s. Where a depth is unknown or s would not be positive, nothing changes.
+    As in Splat-SLAM, z and the scales are multiplied by s = 1 + (D_new - D_old) / z, with the
+    depths at the pixel of the Gaussian. Where one is unknown or s is not positive, s is 1.
     """
     means = gaussians.means.detach().double().clone()
     log_scales = gaussians.log_scales.detach().clone()
@@ -82,7 +82,7 @@ def rescale_to_depths(
 
 
 def _depth_factor(points_camera: Tensor, old: Tensor, new: Tensor, camera: Camera) -> Tensor:
-    """Return s (M,) of points (M, 3) in the camera frame; 1 where it cannot be known."""
+    """Return s (M,) of points (M, 3) in the camera frame; 1 where it is unknown."""
     z = points_camera[:, 2]
     in_front = z > 0
     safe = torch.where(in_front[:, None], points_camera, torch.ones_like(points_camera))

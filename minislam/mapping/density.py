@@ -1,4 +1,4 @@
-"""Clone, split and prune Gaussians: put them where the images ask for detail."""
+"""Clone, split and prune Gaussians, so that there are more of them where detail is missing."""
 
 from dataclasses import fields
 
@@ -11,13 +11,17 @@ from minislam.mapping.config import DensityConfig
 from minislam.splatting import GaussianMap, MapOptimizer
 from minislam.state.stateful import Stateful
 
-_CHILDREN = 2  # of a Gaussian that is split, 3DGS
+CHILDREN = 2  # of a Gaussian that is split, 3DGS
+SPLIT_SCALE = 0.02  # median depths: larger ones are split, smaller ones cloned; official 0.06 m
+SPLIT_SHRINK = 1.6  # scale of a parent over that of its children, 3DGS
+PRUNE_OPACITY = 0.1  # fainter ones are removed; official 0.005 at first and 0.7 online
+PRUNE_SCALE = 0.2  # median depths: larger ones are removed, official 0.6 m
 
 
 class ScreenGradients(Stateful):
     """Mean length of dL/d(projected mean) of each Gaussian over the views that saw it.
 
-    In half images instead of pixels, so that the threshold holds for every image size.
+    The unit of length is half an image, so that one threshold holds for every image size.
     """
 
     total: Tensor  # (N,) sum of the lengths
@@ -33,7 +37,7 @@ class ScreenGradients(Stateful):
         radii: Tensor,  # (N,) px, 0 where not seen
         camera: Camera,
     ) -> None:
-        """Count one view."""
+        """Add the gradients of one view."""
         self.total = self.total.to(v_screen)
         self.views = self.views.to(v_screen)
         half_image = v_screen.new_tensor([camera.width / 2, camera.height / 2])
@@ -43,7 +47,7 @@ class ScreenGradients(Stateful):
 
     @property
     def mean(self) -> Tensor:
-        """Return the means (N,); 0 for what no view saw."""
+        """Return the means (N,); 0 for Gaussians that no view saw."""
         return self.total / self.views.clamp_min(1)
 
 
@@ -56,30 +60,30 @@ def densify(
 ) -> int:
     """Clone small and split large Gaussians of large screen gradient; return the rows added.
 
-    A clone starts at its original and the gradients pull the two apart. Two children of a split
-    are drawn from the parent, which disappears. Children keep their parent's anchor.
+    A clone starts as a copy, and later gradients move the two apart. A split replaces the parent
+    by two children at random places inside it. Both keep the anchor keyframe.
     """
     gaussians = optimizer.gaussians.detach()
-    room = config.max_gaussians - len(gaussians)
-    if room <= 0:
+    capacity = config.max_gaussians - len(gaussians)
+    if capacity <= 0:
         return 0
     chosen = gradients > config.gradient
-    if int(chosen.sum()) > room:
-        # The strongest gradients first when there is not room for all.
-        chosen &= gradients >= gradients.topk(room).values[-1]
-    large = gaussians.scales.max(-1).values > config.split_scale * median_depth
+    if int(chosen.sum()) > capacity:
+        # There is no place for all: take those of the largest gradients.
+        chosen &= gradients >= gradients.topk(capacity).values[-1]
+    large = gaussians.scales.max(-1).values > SPLIT_SCALE * median_depth
     clones = gaussians.prune(chosen & ~large)
     parents = gaussians.prune(chosen & large)
-    children = split(parents, config.split_shrink, generator)
+    children = split(parents, generator)
     optimizer.append(clones.concatenate(children))
     added = torch.ones(len(clones) + len(children), dtype=torch.bool, device=chosen.device)
     optimizer.prune(torch.cat([~(chosen & large), added]))
     return len(clones) + len(children) - len(parents)
 
 
-def split(parents: GaussianMap, shrink: float, generator: torch.Generator) -> GaussianMap:
-    """Return two children per parent, drawn from its distribution and `shrink` times smaller."""
-    rows = [getattr(parents, f.name).repeat_interleave(_CHILDREN, 0) for f in fields(parents)]
+def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
+    """Return two children per parent, drawn from its distribution and 1.6 times smaller."""
+    rows = [getattr(parents, f.name).repeat_interleave(CHILDREN, 0) for f in fields(parents)]
     doubled = GaussianMap(*rows)
     normal = torch.randn(doubled.means.shape, generator=generator).to(doubled.means)
     rotations = rotation_from_quaternion(doubled.quats_wxyz)
@@ -87,7 +91,7 @@ def split(parents: GaussianMap, shrink: float, generator: torch.Generator) -> Ga
     return GaussianMap(
         doubled.means + offsets,
         doubled.quats_wxyz,
-        doubled.log_scales - torch.tensor(shrink).log().to(doubled.means),
+        doubled.log_scales - torch.tensor(SPLIT_SHRINK).log().to(doubled.means),
         doubled.opacity_logits,
         doubled.colors,
         doubled.anchor_keyframe,
@@ -97,11 +101,10 @@ def split(parents: GaussianMap, shrink: float, generator: torch.Generator) -> Ga
 def useful_rows(
     gaussians: GaussianMap,
     median_depth: float,  # world units, of the scene
-    config: DensityConfig,
 ) -> Tensor:  # (N,) bool
-    """Tell which Gaussians stay: those neither faint nor huge, and finite."""
-    opaque = gaussians.opacities > config.prune_opacity
-    small = gaussians.scales.max(-1).values < config.prune_scale * median_depth
-    # One bad number would spread over every pixel that the Gaussian touches.
+    """Tell which Gaussians stay: those that are neither faint nor huge, and finite."""
+    opaque = gaussians.opacities > PRUNE_OPACITY
+    small = gaussians.scales.max(-1).values < PRUNE_SCALE * median_depth
+    # One bad number would spread to every pixel that the Gaussian touches.
     finite = gaussians.means.isfinite().all(-1)
     return (opaque & small & finite).detach()

@@ -1,4 +1,4 @@
-"""Insert Gaussians for what a keyframe sees and the map does not explain, and withdraw movers."""
+"""Insert Gaussians for what a keyframe sees and the map does not show, without dynamic objects."""
 
 import math
 
@@ -8,29 +8,55 @@ from torch.nn import functional
 
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.mapping.config import InsertionConfig
+from minislam.mapping.views import MappedKeyframe
 from minislam.splatting import GaussianMap, Rendering
+from minislam.uncertainty.losses import FAR_FACTOR
 
-# A first scale must be positive: its logarithm is stored.
-_SMALLEST_SCALE = 1e-12  # world units
+EXPLAINED_OPACITY = 0.8  # a pixel of the map that is at least so opaque gets no new Gaussian
+_SMALLEST_SCALE = 1e-12  # world units; a scale must be positive, because its logarithm is stored
+
+
+def gaussians_of_keyframe(
+    keyframe: MappedKeyframe,
+    camera: Camera,
+    rendering: Rendering | None,  # the map from this view, None while it is empty
+    weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
+    median_depth: float,  # world units, of the scene
+    config: InsertionConfig,
+    generator: torch.Generator,
+) -> GaussianMap:
+    """Return the Gaussians that a keyframe adds to the map: at most one per cell."""
+    allowed = insertable_pixels(keyframe.depth, FAR_FACTOR * median_depth, weight, rendering)
+    pixels = draw_pixels(keyframe.depth > 0, config.cell, generator)
+    pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
+    return gaussians_at_pixels(
+        pixels,
+        keyframe.image,
+        keyframe.depth,
+        camera,
+        keyframe.T_camera_world,
+        keyframe.keyframe_index,
+        config,
+    )
 
 
 def insertable_pixels(
     depth: Tensor,  # (H, W) world units, 0 where unknown
     far_limit: float,  # world units
-    weight: Tensor,  # (H, W) static weight, 0 on movers
+    weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
     rendering: Rendering | None,  # the map from this view, None while it is empty
-    config: InsertionConfig,
 ) -> Tensor:  # (H, W) bool
     """Tell which pixels may add a Gaussian.
 
-    The reference depth must be known and not too far, the pixel static as far as the MLP knows,
-    and the map transparent there. Where the map shows another surface nothing is added: if the
-    new one is nearer it may be a mover that the MLP does not know yet, and if it is farther the
-    old one is a mover's remainder, which `lies_on_mover` finds, or the blurred edge of an object.
+    The reference depth must be known and not too far, the static weight positive, and the map
+    transparent there. Where the map shows a surface at another depth, nothing is added either. A
+    nearer reference may be a dynamic object that the MLP does not know yet. A farther one means
+    that the map still holds a dynamic object, which `is_on_dynamic_object` finds, or the blurred
+    edge of a static one.
     """
     wanted = (depth > 0) & (depth < far_limit) & (weight > 0)
     if rendering is not None:
-        wanted &= rendering.opacity < config.explained_opacity
+        wanted &= rendering.opacity < EXPLAINED_OPACITY
     return wanted
 
 
@@ -41,15 +67,17 @@ def draw_pixels(
 ) -> Tensor:  # (M, 2) int64, column and row
     """Draw one random known pixel in each cell x cell square of the image that has any.
 
-    A stratified subset: as random as the paper's, without its clumps and holes, and no fewer
-    where the depth is sparse.
+    Unlike the random subset of the paper, such a stratified one has no clumps and no holes, and
+    where the depth is sparse it is no smaller.
     """
     height, width = known.shape
-    lottery = torch.rand(height, width, generator=generator).to(known.device)
-    lottery = torch.where(known, lottery, -1)
-    best, winner = functional.max_pool2d(lottery[None], cell, ceil_mode=True, return_indices=True)
-    winner = winner[best >= 0]
-    return torch.stack([winner % width, winner // width], -1)
+    priority = torch.rand(height, width, generator=generator).to(known.device)
+    priority = torch.where(known, priority, -1)
+    highest, where = functional.max_pool2d(
+        priority[None], cell, ceil_mode=True, return_indices=True
+    )
+    drawn = where[highest >= 0]
+    return torch.stack([drawn % width, drawn // width], -1)
 
 
 def gaussians_at_pixels(
@@ -63,8 +91,8 @@ def gaussians_at_pixels(
 ) -> GaussianMap:
     """Back-project pixels to round Gaussians that just cover their cells.
 
-    The scale follows from the distance between neighbouring pixels of the draw, a cell, seen at
-    the depth of the pixel: no search for neighbours in space is needed.
+    Neighbouring Gaussians are about one cell apart. Its size at the depth of the pixel gives the
+    first scale, so no search for neighbours in space is needed.
     """
     column, row = pixels.unbind(-1)
     z = depth[row, column]
@@ -85,22 +113,22 @@ def gaussians_at_pixels(
     )
 
 
-def lies_on_mover(
+def is_on_dynamic_object(
     means: Tensor,  # (N, 3) world units
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4) float64, of the keyframe they were inserted for
-    weight: Tensor,  # (H, W) static weight of that keyframe, 0 on movers
+    weight: Tensor,  # (H, W) static weight of that keyframe, 0 on dynamic objects
 ) -> Tensor:  # (N,) bool
-    """Tell which Gaussians their own keyframe sees where it now knows a mover.
+    """Tell which Gaussians project to pixels of static weight 0 in their own keyframe.
 
-    They were inserted when the MLP had not learnt it yet. Had it known, `insertable_pixels` would
-    not have let them in, so they leave: they are the mover's surface, seen from where it was.
+    The MLP had not learnt yet that the object there moves when they were inserted; today
+    `insertable_pixels` would refuse them.
     """
     points = transform_points(T_camera_world, means.double())
     in_front = points[:, 2] > 0
-    # Points behind the camera have no pixel; any depth that is not zero will do for them.
+    # A point behind the camera has no pixel; another point takes its place, then it is masked.
     pixels = camera.project(torch.where(in_front[:, None], points, torch.ones_like(points)))
-    # Optimisation may have pushed a Gaussian over the border: the nearest pixel speaks for it.
+    # Optimisation may have moved a Gaussian out of the image: take the nearest pixel.
     column = pixels[:, 0].round().clamp(0, camera.width - 1).long()
     row = pixels[:, 1].round().clamp(0, camera.height - 1).long()
     return in_front & (weight[row, column] == 0)

@@ -1,6 +1,6 @@
 """The terms of L_render, which moves the Gaussians and nothing else (Sec. 3.4)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -9,13 +9,12 @@ from torch.autograd.function import once_differentiable
 from minislam.images import SSIM_C1, SSIM_C2, SSIM_SIGMA, gaussian_blur, local_moments
 from minislam.mapping.config import MappingConfig
 from minislam.splatting import GaussianMap, Rendering
-from minislam.uncertainty.losses import depth_loss
+from minislam.uncertainty.losses import FAR_FACTOR, SURFACE_OPACITY, depth_loss
 
 SSIM_WINDOW = 11  # px, the usual window of SSIM, as in 3DGS
-# Summed RGB. Darker pixels are the empty border that undistortion leaves, official.
-BLACK = 0.01
-# A rendering less opaque than this is a hole with ragged edges and no surface; as in L_uncer.
-SOLID = 0.9
+BLACK = 0.01  # summed RGB; darker pixels are the border that undistortion leaves, official
+METRIC_MEDIAN = 2.0  # m, median depth of a scene for which official metres hold, our assumption
+FLOATER_MARGIN = 0.5  # median depths between a floater and the reference behind it
 
 
 @dataclass(frozen=True)
@@ -24,20 +23,46 @@ class RenderLoss:
 
     total: Tensor  # () Eq. (6)
     color: Tensor  # () weighted mean of L_color
-    depth: Tensor  # () weighted mean of L_depth, in metres as `MappingConfig` means them
-    isotropic: Tensor  # () L_iso, likewise
+    depth: Tensor  # () weighted mean of L_depth [m, see `metre`]
+    isotropic: Tensor  # () L_iso [m]
+
+
+@dataclass
+class MappingHistory:
+    """The losses and the size of the map, one entry per iteration, for plots."""
+
+    render: list[float] = field(default_factory=list)  # L_render
+    color: list[float] = field(default_factory=list)  # weighted L_color
+    depth: list[float] = field(default_factory=list)  # weighted L_depth
+    isotropic: list[float] = field(default_factory=list)  # L_iso
+    uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
+    gaussians: list[int] = field(default_factory=list)  # size of the map
+
+    def add(self, loss: RenderLoss, uncertainty: float, gaussians: int) -> None:
+        """Append one iteration."""
+        self.render.append(float(loss.total.detach()))
+        self.color.append(float(loss.color.detach()))
+        self.depth.append(float(loss.depth.detach()))
+        self.isotropic.append(float(loss.isotropic.detach()))
+        self.uncertainty.append(uncertainty)
+        self.gaussians.append(gaussians)
+
+
+def metre(median_depth: float) -> float:
+    """Return how many world units stand for a metre of the official constants."""
+    return median_depth / METRIC_MEDIAN
 
 
 def ssim_loss(
     rendered: Tensor,  # (H, W, 3)
     image: Tensor,  # (H, W, 3) RGB in [0, 1], constant
 ) -> Tensor:  # (H, W) in [0, 2]
-    """Return 1 - SSIM per pixel, mean over channels: a map, so that each pixel has its weight."""
+    """Return 1 - SSIM per pixel, mean over channels. A map, so that each pixel can be weighted."""
     return _SsimLoss.apply(rendered, image)
 
 
 class _SsimLoss(torch.autograd.Function):
-    """The loss above and its backward: torch alone would keep several times as many maps."""
+    """The loss above and its backward. Autograd would store several times as many maps."""
 
     @staticmethod
     def forward(ctx, rendered: Tensor, image: Tensor) -> Tensor:
@@ -65,14 +90,14 @@ def ssim_of_moments(
     mean_y: Tensor,  # y
     mean_yy: Tensor,  # and y^2
 ) -> tuple[Tensor, Tensor]:  # (3, H, W), (3, 3, H, W)
-    """Return the SSIM, and its derivatives by the first three means.
+    """Return the SSIM and its derivatives by the first three means.
 
-    It is a quotient, A B / (C D), of
+    The SSIM is A B / (C D) with
 
         A = 2 m_x m_y + C1,            B = 2 (m_xy - m_x m_y) + C2,
         C = m_x^2 + m_y^2 + C1,        D = m_xx - m_x^2 + m_yy - m_y^2 + C2,
 
-    so that dS/dm_xx = -S / D, dS/dm_xy = 2 A / (C D) and
+    so dS/dm_xx = -S / D, dS/dm_xy = 2 A / (C D) and
     dS/dm_x = 2 m_y (B - A) / (C D) - 2 m_x S (1 / C - 1 / D).
     """
     product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
@@ -87,7 +112,7 @@ def ssim_of_moments(
 def color_loss(
     rendered: Tensor,  # (H, W, 3)
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
-    lambda_ssim: float,  # share of SSIM in [0, 1]
+    lambda_ssim: float,  # weight of SSIM in [0, 1]
 ) -> Tensor:  # (H, W)
     """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. (7)."""
     absolute = (rendered - image).abs().mean(-1)
@@ -105,16 +130,16 @@ def weighted_depth_loss(
     far_limit: float,  # world units
     floater_margin: float,  # world units
 ) -> Tensor:  # (H, W) world units
-    """Return the weighted |D^ - D~| of Eq. (3); floaters count even where beta is large.
+    """Return the weighted |D^ - D~|; the loss of floaters is not weighted.
 
-    A mover hides the static scene, so it is always NEARER than the scene. Where the map has a
-    surface far in front of the reference, it is the map that is wrong, whatever beta says. A hole
-    behind a mover is no such surface, though its rendered depth is small too: without the test of
-    opacity the mover's own depth would be painted into it.
+    A floater is a Gaussian surface far in front of the reference depth. Beta does not excuse it: a
+    dynamic object can only make the reference too near, never too far. The test of opacity
+    excludes holes in the map. Their rendered depth is small too, but with this loss the depth of
+    the dynamic object in front of a hole would fill it.
     """
     loss = depth_loss(rendered_depth, reference_depth, far_limit)
     in_front = reference_depth > rendered_depth.detach() + floater_margin
-    floater = in_front & (opacity.detach() > SOLID)
+    floater = in_front & (opacity.detach() > SURFACE_OPACITY)
     return torch.where(floater, loss, weight * loss)
 
 
@@ -134,19 +159,19 @@ def render_loss(
 ) -> RenderLoss:
     """Return (lambda_5 L_color + lambda_6 L_depth) / beta^2 + lambda_7 L_iso. Eq. (6).
 
-    Means run over all pixels. The factor 1/2 of lambda_5 and lambda_6 is that of the weight.
+    Means run over all pixels. The factor 1/2 of lambda_5 and lambda_6 is in the weight.
     """
-    metre = median_depth / config.metric_median
+    unit = metre(median_depth)
     color = (weight * color_loss(rendering.color, image, config.lambda_ssim)).mean()
     depth = weighted_depth_loss(
         rendering.depth,
         rendering.opacity,
         reference_depth,
         weight,
-        config.far_factor * median_depth,
-        config.floater_margin * median_depth,
+        FAR_FACTOR * median_depth,
+        FLOATER_MARGIN * median_depth,
     )
-    depth = depth.mean() / metre
-    isotropic = isotropic_loss(gaussians.scales) / metre
-    total = config.color_share * color + (1 - config.color_share) * depth
+    depth = depth.mean() / unit
+    isotropic = isotropic_loss(gaussians.scales) / unit
+    total = config.color_weight * color + (1 - config.color_weight) * depth
     return RenderLoss(total + config.lambda_isotropic * isotropic, color, depth, isotropic)

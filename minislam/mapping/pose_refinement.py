@@ -1,8 +1,8 @@
 """Refine a pose by re-rendering: move the camera until the map looks like its image (Sec. 3.4).
 
 The paper lets Adam descend along the renderer's pose gradient, 100 renderings per frame. Here the
-same exact gradient is divided by the curvature of the loss, and two or three steps suffice. The
-curvature may be approximate: it says how far to go, the gradient alone says where the end is.
+same gradient is divided by the curvature of the loss, and two or three steps suffice. Only the
+gradient must be exact, because it defines the minimum; the curvature sets the length of a step.
 """
 
 import math
@@ -14,11 +14,11 @@ from minislam.geometry import Camera, se3_exp, se3_inverse, se3_log
 from minislam.geometry.camera import pixel_scale
 from minislam.mapping.config import PoseRefinementConfig
 from minislam.splatting import GaussianMap, Rendering, render
+from minislam.uncertainty.losses import SURFACE_OPACITY
 
-# Levenberg-Marquardt: the share of the curvature's diagonal added at first, and its changes.
+# Levenberg-Marquardt: the first damping, as a fraction of the curvature's diagonal, and its
+# factors after a step that failed and after one that succeeded.
 _FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 1e-3, 10.0, 0.3
-# Where the rendering is less opaque its depth says little about how the picture would move.
-_SOLID = 0.9
 
 
 def refine_pose(
@@ -26,20 +26,20 @@ def refine_pose(
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4) float64, to start from
     image: Tensor,  # (H, W, 3) RGB in [0, 1], what the camera saw
-    weight: Tensor,  # (H, W) static weight, 0 on movers
+    weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
     background: Tensor,  # (3,) RGB
     config: PoseRefinementConfig,
 ) -> Tensor:  # (4, 4) float64
-    """Move a pose towards the one from which the map resembles the image most.
+    """Move a pose a fraction of the way to the one of least rendering error.
 
-    The start is a measurement too: `config.share` says how far to go from one to the other.
+    The pose by flow is a measurement too, so the mean of both is better than either.
     """
     start = T_camera_world.double()
-    best = _most_alike_pose(gaussians, camera, start, image, weight, background, config)
-    return se3_exp(config.share * se3_log(best @ se3_inverse(start))) @ start
+    best = _optimise_pose(gaussians, camera, start, image, weight, background, config)
+    return se3_exp(config.fraction * se3_log(best @ se3_inverse(start))) @ start
 
 
-def _most_alike_pose(
+def _optimise_pose(
     gaussians: GaussianMap,
     camera: Camera,
     start: Tensor,  # (4, 4) float64
@@ -48,11 +48,11 @@ def _most_alike_pose(
     background: Tensor,  # (3,)
     config: PoseRefinementConfig,
 ) -> Tensor:  # (4, 4) float64
-    """Return the pose near the start from which the map resembles the image most.
+    """Return the pose near the start from which the rendering error is smallest.
 
-    A pose that would move the picture by more than `config.farthest` is not believed: then the
-    start is returned. A step that does not lower the loss is taken back and repeated shorter, so
-    the result is never worse than the start, as far as the loss can tell.
+    A pose that moves the picture by more than `config.farthest` is rejected, and the start is
+    returned. A step that does not lower the loss is undone and repeated with more damping, so the
+    loss of the result is never larger than that of the start.
     """
     pose = candidate = start
     lowest, damping = math.inf, _FIRST_DAMPING
@@ -115,7 +115,7 @@ def curvature(
 
         sum_c w J_c^T J_c / |r_c| = A^T G A,        G = sum_c w g_c g_c^T / |r_c|   (2x2).
     """
-    solid = rendering.opacity > _SOLID
+    solid = rendering.opacity > SURFACE_OPACITY
     absolute = ((rendering.color - image).square() + rounding**2).sqrt()
     factor = (weight * rendering.opacity * solid)[..., None] / absolute / absolute.numel()
     slope_u, slope_v = image_slope(rendering.color)

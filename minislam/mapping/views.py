@@ -1,4 +1,4 @@
-"""Keyframes as the mapper stores them: one pose, and images at several sizes."""
+"""Keyframes as the mapper stores them: one pose, and the image at several sizes."""
 
 from dataclasses import dataclass, field
 
@@ -11,9 +11,14 @@ from minislam.geometry import Camera
 from minislam.records import Keyframe
 from minislam.splatting import Rendering
 from minislam.state.stateful import FrameOf, Tree
-from minislam.uncertainty import Misfit, UncertaintyConfig, beta_of_mask, measure_misfit
+from minislam.uncertainty import (
+    RenderingError,
+    UncertaintyConfig,
+    beta_of_mask,
+    rendering_error,
+)
 
-_OPAQUE = 0.5  # opacity from which on a surface is seen rather than a gap
+_OPAQUE = 0.5  # a less opaque pixel shows a gap rather than a surface
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class View:
 
 @dataclass
 class MappedKeyframe:
-    """A keyframe in the map. The pose and the reference depth change when tracking says so."""
+    """A keyframe in the map. Bundle adjustment changes its pose and its reference depth."""
 
     keyframe_index: int
     frame_index: int
@@ -40,7 +45,7 @@ class MappedKeyframe:
 
     @classmethod
     def from_record(cls, keyframe: Keyframe) -> "MappedKeyframe":
-        """Take over what the tracker handed out."""
+        """Return the keyframe for a record of the tracker."""
         return cls(
             keyframe.keyframe_index,
             keyframe.frame_index,
@@ -62,7 +67,7 @@ class MappedKeyframe:
         return cls(**state, image=frame_of(state["frame_index"]).image)
 
     def view(self, camera: Camera) -> View:
-        """Return the keyframe at the size of `camera`, made once."""
+        """Return the keyframe at the size of `camera`; it is computed once and stored."""
         size = (camera.height, camera.width)
         if size not in self._views:
             image = shrink_image(self.image, *size)
@@ -87,53 +92,55 @@ def median_depth(keyframes: list[Keyframe]) -> float:  # world units
 
 
 @torch.no_grad()
-def keyframe_misfit(
+def keyframe_rendering_error(
     keyframe: MappedKeyframe,
     rendering: Rendering,  # of any size
     camera: Camera,  # of the size at which they are compared
     depth_unit: float,  # world units that count as 1 in L_depth
     config: UncertaintyConfig,
-) -> Misfit:
-    """Compare a rendering with its keyframe, at a size that is always the same.
+) -> RenderingError:
+    """Compare a rendering with its keyframe at the size of `camera`.
 
-    The windows of the SSIM are in pixels: at another size, beta would mean something else.
+    It must be one size throughout a run: the windows of the SSIM are in pixels, so the error of
+    the same rendering, and with it beta, is different at another size.
     """
     size = (camera.height, camera.width)
     view = keyframe.view(camera)
     depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
     depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
-    return measure_misfit(
+    return rendering_error(
         view.image,
         view.depth,
         shrink_image(rendering.color, *size),
         depth,
         opacity,
-        keyframe.features.shape[:2],
+        (keyframe.features.shape[0], keyframe.features.shape[1]),
         depth_unit,
         config,
     )
 
 
 def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
-    """Return the mean z of what is seen [world units], 0 where the map is mostly transparent."""
+    """Return the depth of the visible surface [world units], 0 where the map is transparent."""
     depth = rendering.depth / rendering.opacity.clamp_min(_OPAQUE)
     return torch.where(rendering.opacity > _OPAQUE, depth, 0)
 
 
 def shrink_image(image: Tensor, height: int, width: int) -> Tensor:
-    """Return the image (height, width, 3) of the means over the pixels that each new one covers."""
+    """Return the image (height, width, 3) whose pixels are means over the areas they cover."""
     if image.shape[:2] == (height, width):
         return image
     return _area_mean(image.permute(2, 0, 1), height, width).permute(1, 2, 0).contiguous()
 
 
 def shrink_depth(depth: Tensor, height: int, width: int) -> Tensor:
-    """Return the depth (height, width) of the means over KNOWN pixels, 0 where there is none."""
+    """Return the depth (height, width) of means over the KNOWN pixels, 0 where there are none."""
     if depth.shape == (height, width):
         return depth
     known = (depth > 0).to(depth)
-    total, share = _area_mean(torch.stack([depth * known, known]), height, width)
-    return torch.where(share > 0, total / share.clamp_min(torch.finfo(depth.dtype).eps), 0)
+    total, fraction = _area_mean(torch.stack([depth * known, known]), height, width)
+    smallest = torch.finfo(depth.dtype).eps  # where no pixel is known, 0 / 0 is not taken
+    return torch.where(fraction > 0, total / fraction.clamp_min(smallest), 0)
 
 
 def _area_mean(channels: Tensor, height: int, width: int) -> Tensor:

@@ -1,11 +1,12 @@
-"""The local window of keyframes, and which keyframe is optimised next (Sec. 3.4)."""
+"""The local window of keyframes, and the probability to optimise each keyframe (Sec. 3.4)."""
 
 import torch
 from torch import Tensor
 
 from minislam.geometry import se3_inverse
 
-_PROTECTED = 2  # the newest keyframes of a window, which always stay, MonoGS
+LEAST_OVERLAP = 0.4  # overlap coefficient below which a keyframe leaves the window, official
+PROTECTED = 2  # the newest keyframes of a window, which always stay, MonoGS
 
 
 def overlap_coefficient(
@@ -23,21 +24,20 @@ def update_window(
     seen: dict[int, Tensor],  # (N,) bool per position of `window` and of `new`
     T_camera_world: Tensor,  # (K, 4, 4) of all keyframes
     size: int,  # most keyframes in a window
-    least_overlap: float,  # share in [0, 1]
 ) -> list[int]:
-    """Return the window with the new keyframe first and at most one that lost sight of it less.
+    """Prepend the new keyframe; drop at most one keyframe that no longer overlaps it.
 
-    The oldest keyframe that shares too little with the new one leaves; then, if the window is
-    still too large, the one that is far from the new keyframe and close to others (DSO's rule).
+    That is the oldest one whose overlap with the new keyframe is too small. If the window is
+    still too large, the keyframe far from the new one and close to others leaves (DSO's rule).
     """
     window = [new, *window]
-    strangers = [
+    non_overlapping = [
         position
-        for position in window[_PROTECTED:]
-        if overlap_coefficient(seen[new], seen[position]) <= least_overlap
+        for position in window[PROTECTED:]
+        if overlap_coefficient(seen[new], seen[position]) <= LEAST_OVERLAP
     ]
-    if strangers:
-        window.remove(strangers[-1])
+    if non_overlapping:
+        window.remove(non_overlapping[-1])
     while len(window) > size:
         window.remove(_most_redundant(window, T_camera_world))
     return window
@@ -47,27 +47,27 @@ def _most_redundant(window: list[int], T_camera_world: Tensor) -> int:
     """Return the position whose score sqrt(d_new) * sum_j 1 / d_j is largest."""
     centres = se3_inverse(T_camera_world[window])[:, :3, 3]
     distances = torch.cdist(centres, centres)
-    # Two keyframes at one place must not divide by zero; relative to the size of the window.
+    # The addend keeps two keyframes at one place from a division by zero, at any world scale.
     inverse = 1 / (distances + 1e-6 * (distances.max() + 1e-12))
-    candidates = inverse[_PROTECTED:, _PROTECTED:]
+    candidates = inverse[PROTECTED:, PROTECTED:]
     crowding = candidates.sum(-1) - candidates.diagonal()
-    score = distances[_PROTECTED:, 0].sqrt() * crowding
-    return window[_PROTECTED + int(score.argmax())]
+    score = distances[PROTECTED:, 0].sqrt() * crowding
+    return window[PROTECTED + int(score.argmax())]
 
 
 def sampling_probabilities(
     count: int,  # N keyframes
     window: list[int],  # positions of keyframes
-    share: float,  # probability that the sample comes from the window
+    window_probability: float,  # that the sample comes from the window
 ) -> Tensor:  # (N,) float64, sum 1
-    """Return the probability of each keyframe: half of it for the window, half for the others.
+    """Return the probability of each keyframe: in the paper, 1/2 for the window in total.
 
-    While the window holds more than its share of all keyframes, all are equally likely, which
-    gives the window at least that share. It also covers N = |W|, where no other keyframe exists.
+    While the window holds a larger fraction of all keyframes, all are equally likely, so the
+    window is still drawn at least that often. This includes a window of all keyframes.
     """
-    if len(window) > share * count:
+    if len(window) > window_probability * count:
         return torch.full((count,), 1 / count, dtype=torch.float64)
-    others = (1 - share) / (count - len(window))
+    others = (1 - window_probability) / (count - len(window))
     probabilities = torch.full((count,), others, dtype=torch.float64)
-    probabilities[window] = share / len(window)
+    probabilities[window] = window_probability / len(window)
     return probabilities

@@ -3,18 +3,18 @@
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.snapshots import MlpSnapshots
-from minislam.uncertainty.training import Misfit, UncertaintyTrainer, measure_misfit
+from minislam.uncertainty.training import RenderingError, UncertaintyTrainer, rendering_error
 from minislam.uncertainty.weights import beta_of_mask, mapping_weight, tracking_weight
 
 __all__ = [
-    "Misfit",
     "MlpSnapshots",
+    "RenderingError",
     "UncertaintyConfig",
     "UncertaintyMLP",
     "UncertaintyTrainer",
     "beta_of_mask",
     "mapping_weight",
-    "measure_misfit",
     "paper_uncertainty",
+    "rendering_error",
     "tracking_weight",
 ]

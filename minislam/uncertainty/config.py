@@ -1,4 +1,4 @@
-"""The constants of the uncertainty MLP and of its loss."""
+"""The settings of the uncertainty MLP and of its loss."""
 
 from dataclasses import dataclass
 
@@ -13,16 +13,16 @@ class UncertaintyConfig:
     enabled: bool = parameter(True, "off: every weight is 1 and nothing is trained (ablation a)")
     given_masks: bool = parameter(
         False,
-        "weigh by masks of movers that come with the sequence, train nothing (ablation c)",
+        "take masks of moving objects that come with the sequence, train nothing (ablation c)",
     )
 
     grid_factor: int = parameter(
         1,
-        "beta on a grid so many times as fine, at the square of the cost of features; paper"
+        "the grid of beta is n times as fine, and its features cost n^2 times as much; paper"
         " supplement, high-resolution uncertainty map",
     )
     hidden_units: int = parameter(64, "width of the two hidden layers [units], official")
-    dropout: float = parameter(0.2, "share of hidden units dropped in training [0, 1), official")
+    dropout: float = parameter(0.2, "fraction of hidden units dropped in training [0, 1), official")
     learning_rate: float = parameter(
         2e-3, "Adam step of the MLP [1]; official 4e-4 for some 10^4 iterations, ours run 10^3"
     )
@@ -45,15 +45,9 @@ class UncertaintyConfig:
     median_size: int = parameter(
         3, "window of the median filter [cells], odd; official 5 on a grid twice as fine"
     )
-    opacity_gate: float = parameter(
-        0.9, "cells rendered less opaque than this teach nothing [1], official"
-    )
-    far_factor: float = parameter(
-        10.0, "no depth term beyond this many median depths [1], official"
-    )
 
-    similarity: float = parameter(0.75, "cosine above which features are alike [1], official")
-    neighbours: int = parameter(128, "most alike cells that enter L_reg_V [cells], official")
+    similarity: float = parameter(0.75, "cosine above which features are similar [1], official")
+    neighbours: int = parameter(128, "most similar cells that enter L_reg_V [cells], official")
     variance_samples: int = parameter(
         350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes"
     )
@@ -79,7 +73,7 @@ class UncertaintyConfig:
             )
         if not 0 <= self.dropout < 1:
             raise InputError(
-                f"expected a dropout share in [0, 1), found {self.dropout}; "
+                f"expected a dropout fraction in [0, 1), found {self.dropout}; "
                 "set uncertainty.dropout, 0.2 by default"
             )
 

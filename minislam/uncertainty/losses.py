@@ -14,6 +14,8 @@ from minislam.uncertainty.weights import clipped_beta
 SSIM_WINDOW = 7  # px, official; NeRF On-the-go uses a 5x5 box
 SSIM_C3 = SSIM_C2 / 2  # the usual choice, with which l c s is the classic SSIM
 STRUCTURE_CAP = 0.98  # of c and s: one perfect factor must not hide the two others
+SURFACE_OPACITY = 0.9  # a rendering less opaque than this shows a hole, not a surface, official
+FAR_FACTOR = 10.0  # median depths: a reference depth beyond them is not used, official
 
 
 def ssim_components(
@@ -49,8 +51,8 @@ def modified_ssim_loss(
 ) -> Tensor:  # (H, W) in [0, config.loss_cap]
     """Return L'_SSIM = gain (1 - l)(1 - c)(1 - s) per pixel, faded where nothing is rendered.
 
-    The product is far steeper than 1 - SSIM: near 0 on small misfits, large on another object.
-    First numerator of Eq. (4).
+    The product is far steeper than 1 - SSIM: near 0 for small rendering errors, large where the
+    image shows another object. It is the first numerator of L_uncer.
     """
     luminance, contrast, structure = ssim_components(image, rendered)
     product = (1 - luminance) * (1 - contrast) * (1 - structure)
@@ -60,7 +62,7 @@ def modified_ssim_loss(
 def depth_loss(
     rendered_depth: Tensor,  # (H, W) world units
     reference_depth: Tensor,  # (H, W) world units, 0 where unknown
-    far_limit: float,  # world units; beyond it the reference says nothing
+    far_limit: float,  # world units; a reference beyond it is not used
 ) -> Tensor:  # (H, W) world units
     """Return |D^ - D~| per pixel, 0 where the reference depth is unknown or far. Eq. (3)."""
     known = (reference_depth > 0) & (reference_depth < far_limit)
@@ -73,7 +75,7 @@ def median_filter(
 ) -> Tensor:  # (h, w)
     """Return the median over size x size windows, mirrored at the border.
 
-    It removes thin lines of misfit: an edge rendered half a pixel off is not a moving object.
+    It removes thin lines of error: an edge rendered half a pixel off is not a dynamic object.
     """
     margin = min(size // 2, values.shape[0] - 1, values.shape[1] - 1)
     size = 2 * margin + 1
@@ -83,46 +85,46 @@ def median_filter(
 
 
 def log_regulariser(beta: Tensor) -> Tensor:
-    """Return L_reg_U = log beta: without it, beta -> infinity would explain everything away."""
+    """Return L_reg_U = log beta; without it an infinite beta would be the minimum of L_uncer."""
     return beta.log()
 
 
 def variance_regulariser(
-    beta_raw: Tensor,  # (n,) unclipped, so that cells under the floor feel it too
+    beta_raw: Tensor,  # (n,) unclipped, so that cells under the floor get a gradient too
     features: Tensor,  # (n, C)
     config: UncertaintyConfig,
 ) -> Tensor:  # ()
-    """Return L_reg_V, the mean variance of beta among cells whose features are alike. Eq. (4).
+    """Return L_reg_V, the mean variance of beta among cells of similar features.
 
-    Each cell is compared with its most similar cells, itself included, of cosine > 0.75.
+    Each cell is compared with its most similar cells of cosine > 0.75, itself included.
     """
     unit = functional.normalize(features.detach(), dim=-1)
     cosine = unit @ unit.T
-    # A cell is always alike to itself, even when its feature vector is zero.
+    # A cell is always similar to itself, even when its feature vector is zero.
     cosine.fill_diagonal_(1)
-    alike = cosine > config.similarity
-    crowded = alike.sum(-1) > config.neighbours
+    similar = cosine > config.similarity
+    crowded = similar.sum(-1) > config.neighbours
     if crowded.any():
-        most_alike = cosine[crowded].topk(config.neighbours, dim=-1).values
-        alike[crowded] &= cosine[crowded] >= most_alike[:, -1:]
-    alike = alike.to(beta_raw)
-    number = alike.sum(-1)
-    mean = alike @ beta_raw / number
-    variance = (alike * (beta_raw - mean[:, None]) ** 2).sum(-1) / number
+        most_similar = cosine[crowded].topk(config.neighbours, dim=-1).values
+        similar[crowded] &= cosine[crowded] >= most_similar[:, -1:]
+    similar = similar.to(beta_raw)
+    number = similar.sum(-1)
+    mean = similar @ beta_raw / number
+    variance = (similar * (beta_raw - mean[:, None]) ** 2).sum(-1) / number
     return variance.mean()
 
 
 def cell_loss(
     beta_raw: Tensor,  # (h', w') with gradient to the MLP
-    misfit: Tensor,  # (h', w') L'_SSIM + lambda_1 L_depth, constant
+    error: Tensor,  # (h', w') L'_SSIM + lambda_1 L_depth, constant
     opacity: Tensor,  # (h', w') in [0, 1]
     config: UncertaintyConfig,
 ) -> Tensor:  # (h', w')
-    """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell. Eq. (4).
+    """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell.
 
-    With lambda_3 = 0.5 and misfit L it is smallest at beta = 2 sqrt(L). Cells that the map does
-    not cover yet give 0: a hole is not a moving object.
+    With lambda_3 = 0.5 and rendering error L it is smallest at beta = 2 sqrt(L). Cells that the
+    map does not cover yet give 0, because a hole is not a dynamic object.
     """
     beta = clipped_beta(beta_raw)
-    loss = misfit.detach() / beta**2 + config.lambda_log * log_regulariser(beta)
-    return torch.where(opacity >= config.opacity_gate, loss, 0)
+    loss = error.detach() / beta**2 + config.lambda_log * log_regulariser(beta)
+    return torch.where(opacity >= SURFACE_OPACITY, loss, 0)

@@ -1,4 +1,4 @@
-"""The uncertainty MLP P: one image feature in, one beta out."""
+"""The uncertainty MLP P: it predicts one beta from one image feature."""
 
 import itertools
 import math
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 class UncertaintyMLP(nn.Module):
     """Predict beta = P(F) > 0 from features: C -> 64 -> 64 -> 1, ReLU inside, softplus at the end.
 
-    It starts from scratch in every sequence. Randomness comes only from the given generators.
+    It is trained from scratch in every sequence. All random numbers come from the generators.
     """
 
     def __init__(
@@ -18,7 +18,7 @@ class UncertaintyMLP(nn.Module):
         feature_dimension: int,  # C
         generator: torch.Generator,  # draws the first weights
         hidden_units: int = 64,
-        dropout: float = 0.2,  # share of hidden units, in training only
+        dropout: float = 0.2,  # fraction of the hidden units, in training only
     ) -> None:
         super().__init__()
         sizes = [feature_dimension, hidden_units, hidden_units, 1]
@@ -32,11 +32,6 @@ class UncertaintyMLP(nn.Module):
             bias = torch.rand(fan_out, generator=generator) * 2 - 1
             self.weights.append(nn.Parameter(weight * weight_bound))
             self.biases.append(nn.Parameter(bias * bias_bound))
-
-    @property
-    def feature_dimension(self) -> int:
-        """Return C, the number of channels of the features."""
-        return self.weights[0].shape[1]
 
     def forward(
         self,
@@ -54,7 +49,7 @@ class UncertaintyMLP(nn.Module):
 
     def _dropout_mask(self, hidden: Tensor, generator: torch.Generator) -> Tensor:
         """Return 0 for dropped units and 1 / (1 - p) for the others, so that the mean stays."""
-        # Drawn where the generator lives, so that every device drops the same units.
+        # Drawn on the generator's device, so that every device drops the same units.
         draw = torch.rand(hidden.shape, generator=generator, device=generator.device)
         kept = (draw >= self.dropout).to(hidden)
         return kept / (1 - self.dropout)

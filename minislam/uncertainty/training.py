@@ -1,4 +1,4 @@
-"""Train the MLP on what the map fails to explain: one step of L_uncer, Eq. (4)."""
+"""Train the MLP on the rendering error of the map: L_uncer and its optimiser."""
 
 from dataclasses import dataclass
 
@@ -8,6 +8,7 @@ from torch import Tensor
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import (
+    FAR_FACTOR,
     cell_loss,
     depth_loss,
     median_filter,
@@ -19,8 +20,8 @@ from minislam.uncertainty.resampling import resample
 
 
 @dataclass(frozen=True)
-class Misfit:
-    """How badly the map explains a keyframe, on its feature grid. Constants: no gradient."""
+class RenderingError:
+    """Difference between a keyframe and its rendering on the feature grid, without gradient."""
 
     ssim: Tensor  # (h', w') L'_SSIM after the median filter
     depth: Tensor  # (h', w') L_depth in depth units, capped
@@ -28,7 +29,7 @@ class Misfit:
 
 
 @torch.no_grad()
-def measure_misfit(
+def rendering_error(
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
     reference_depth: Tensor,  # (H, W) world units, 0 where unknown
     rendered_color: Tensor,  # (H, W, 3)
@@ -37,29 +38,29 @@ def measure_misfit(
     grid_shape: tuple[int, int],  # (h', w') cells
     depth_unit: float,  # world units that count as 1 in L_depth
     config: UncertaintyConfig,
-) -> Misfit:
-    """Compare a rendering with its keyframe and bring the misfit to the feature grid."""
+) -> RenderingError:
+    """Compare a rendering with its keyframe and resample the errors to the feature grid."""
     ssim = modified_ssim_loss(image, rendered_color, opacity, config)
     ssim = median_filter(resample(ssim, *grid_shape), config.median_size)
 
     known = reference_depth > 0
     # Without any reference depth there is no median, and every pixel is masked anyway.
     median = float(reference_depth[known].median()) if known.any() else 1.0
-    depth = depth_loss(rendered_depth, reference_depth, config.far_factor * median) / depth_unit
+    depth = depth_loss(rendered_depth, reference_depth, FAR_FACTOR * median) / depth_unit
     depth = resample(depth.clamp_max(config.loss_cap), *grid_shape)
-    return Misfit(ssim, depth, resample(opacity, *grid_shape))
+    return RenderingError(ssim, depth, resample(opacity, *grid_shape))
 
 
 def uncertainty_loss(
     beta_raw: Tensor,  # (h', w') of the view, with gradient to the MLP
-    misfit: Misfit,
+    error: RenderingError,
     sample_beta_raw: Tensor,  # (n,) of cells drawn from the view and its neighbours
     sample_features: Tensor,  # (n, C) of the same cells
     config: UncertaintyConfig,
 ) -> Tensor:  # ()
     """Return L_uncer: the mean cell loss plus lambda_2 L_reg_V. Eq. (4)."""
-    numerator = misfit.ssim + config.lambda_depth * misfit.depth
-    cells = cell_loss(beta_raw, numerator, misfit.opacity, config)
+    numerator = error.ssim + config.lambda_depth * error.depth
+    cells = cell_loss(beta_raw, numerator, error.opacity, config)
     regulariser = variance_regulariser(sample_beta_raw, sample_features, config)
     return cells.mean() + config.lambda_variance * regulariser
 
@@ -72,13 +73,12 @@ class UncertaintyTrainer(Stateful):
         feature_dimension: int,  # C
         config: UncertaintyConfig,
         seed: int,
-        device: torch.device | str = "cpu",
     ) -> None:
         self.config = config
         self.generator = torch.Generator().manual_seed(seed)
         self.mlp = UncertaintyMLP(
             feature_dimension, self.generator, config.hidden_units, config.dropout
-        ).to(device)
+        )
         self.optimizer = torch.optim.Adam(
             self.mlp.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
@@ -94,7 +94,7 @@ class UncertaintyTrainer(Stateful):
         )
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
+        """Go on from a saved state."""
         self.mlp.load_state_dict(state["mlp"])
         moments = {int(number): moment for number, moment in state["adam"].items()}
         self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
@@ -108,7 +108,7 @@ class UncertaintyTrainer(Stateful):
     def step(
         self,
         features: Tensor,  # (h', w', C) of the sampled keyframe
-        misfit: Misfit,
+        error: RenderingError,
         nearby_features: Tensor,  # (n, C) cells of this keyframe and of its neighbours in time
     ) -> float:
         """Take one Adam step on L_uncer and return its value before the step."""
@@ -116,7 +116,7 @@ class UncertaintyTrainer(Stateful):
         sample = nearby_features[drawn[: self.config.variance_samples].to(nearby_features.device)]
         beta_raw = self.mlp(features, self.generator)
         sample_beta_raw = self.mlp(sample, self.generator)
-        loss = uncertainty_loss(beta_raw, misfit, sample_beta_raw, sample, self.config)
+        loss = uncertainty_loss(beta_raw, error, sample_beta_raw, sample, self.config)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()

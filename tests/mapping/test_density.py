@@ -52,7 +52,7 @@ def test_faint_huge_and_broken_gaussians_are_not_useful():
     gaussians = map_of([0.01, 0.01, 5.0, 0.01])
     gaussians.opacity_logits[1] = -5
     gaussians.means[3, 0] = torch.nan
-    assert useful_rows(gaussians, 1.0, CONFIG).tolist() == [True, False, False, False]
+    assert useful_rows(gaussians, 1.0).tolist() == [True, False, False, False]
 
 
 # Identities
@@ -61,7 +61,7 @@ def test_faint_huge_and_broken_gaussians_are_not_useful():
 def test_children_are_spread_like_their_parent():
     parents = map_of([1.0] * 4000)
     parents.means.zero_()
-    children = split(parents, 1.6, generator(1))
+    children = split(parents, generator(1))
     assert children.means.mean(0).abs().max() < 0.05
     torch.testing.assert_close(children.means.std(0), torch.ones(3), rtol=0.05, atol=0)
 
@@ -81,4 +81,4 @@ def test_no_more_than_the_largest_number_of_gaussians():
 def test_an_empty_map_stays_empty():
     optimizer = MapOptimizer(GaussianMap.empty(), LearningRates())
     assert densify(optimizer, torch.zeros(0), 1.0, CONFIG, generator(0)) == 0
-    assert useful_rows(optimizer.gaussians, 1.0, CONFIG).tolist() == []
+    assert useful_rows(optimizer.gaussians, 1.0).tolist() == []

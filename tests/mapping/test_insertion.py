@@ -9,7 +9,7 @@ from minislam.mapping.insertion import (
     draw_pixels,
     gaussians_at_pixels,
     insertable_pixels,
-    lies_on_mover,
+    is_on_dynamic_object,
 )
 from minislam.splatting import Rendering
 from tests.helpers import generator
@@ -30,9 +30,9 @@ def test_a_pixel_is_inserted_only_if_known_near_static_and_unexplained():
     depth = torch.tensor([[2.0, 50.0, 0.0, 2.0, 2.0, 2.0]])
     weight = torch.tensor([[1.0, 1.0, 1.0, 0.0, 1.0, 1.0]])
     opacity = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.95, 0.5]])
-    allowed = insertable_pixels(depth, 20.0, weight, rendering_with(depth, opacity), CONFIG)
+    allowed = insertable_pixels(depth, 20.0, weight, rendering_with(depth, opacity))
     assert allowed.tolist() == [[True, False, False, False, False, True]]
-    assert insertable_pixels(depth, 20.0, weight, None, CONFIG).sum() == 3
+    assert insertable_pixels(depth, 20.0, weight, None).sum() == 3
 
 
 def test_new_gaussians_project_to_their_pixels_with_the_size_of_a_cell():
@@ -89,7 +89,7 @@ def test_a_gaussian_on_a_mover_of_its_own_keyframe_is_found():
     pose = se3_exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
     points = CAMERA.backproject(pixels, depth).double()
     means = transform_points(se3_inverse(pose), points).float()
-    found = lies_on_mover(means, CAMERA, pose, weight)
+    found = is_on_dynamic_object(means, CAMERA, pose, weight)
     assert found.tolist() == [True, False, True, False]
 
 

@@ -5,6 +5,7 @@ from minislam.mapping import MappingConfig
 from minislam.mapping.losses import (
     color_loss,
     isotropic_loss,
+    metre,
     render_loss,
     ssim_loss,
     weighted_depth_loss,
@@ -158,7 +159,7 @@ def test_depth_gradient_agrees_with_finite_differences_floaters_included():
     assert_gradients_close(leaf.grad, numerical_gradient(loss, rendered), relative=1e-6)
 
 
-def test_the_whole_render_loss_has_the_gradient_of_its_parts_in_their_shares():
+def test_the_whole_render_loss_has_the_weighted_gradients_of_its_parts():
     image, color = random_image(17, 6, 7), random_image(18, 6, 7)
     depth, reference = random_image(19, 6, 7)[..., 0] + 2, random_image(20, 6, 7)[..., 0] + 2
     weight, config = random_image(21, 6, 7)[..., 0], MappingConfig()
@@ -174,9 +175,8 @@ def test_the_whole_render_loss_has_the_gradient_of_its_parts_in_their_shares():
     expected = numerical_gradient(lambda value: loss(color, value), depth)
     assert_gradients_close(leaves[1].grad, expected, relative=1e-6)
     # lambda_5 : lambda_6 = alpha : 1 - alpha, over all pixels; depth in metres of the constants.
-    metre = 2.5 / config.metric_median
-    outer = weight * torch.sign(depth - reference) / depth.numel() / metre
-    torch.testing.assert_close(leaves[1].grad, (1 - config.color_share) * outer)
+    outer = weight * torch.sign(depth - reference) / depth.numel() / metre(2.5)
+    torch.testing.assert_close(leaves[1].grad, (1 - config.color_weight) * outer)
 
 
 # Degenerate input

@@ -54,7 +54,7 @@ def test_a_mover_becomes_uncertain_and_fades_from_the_map():
     assert psnr(mapper.render(empty.T_camera_world).color, empty.image) > 18
 
 
-def test_movers_are_withdrawn_and_not_inserted_again_once_the_mlp_knows_them():
+def test_gaussians_on_a_mover_are_removed_and_not_inserted_again_once_the_mlp_knows_it():
     mapper = make_mapper(replace(CONFIG, init_iterations=1))
     mapper.initialise([wall_keyframe(0, mover_column=12)])
     mover = mapper.gaussians.means[:, 2] < 1.5
@@ -62,7 +62,7 @@ def test_movers_are_withdrawn_and_not_inserted_again_once_the_mlp_knows_them():
 
     # An MLP that answers the mover's features (0, 1, 0) with a large beta.
     mapper.predict_beta = lambda features: 0.1 + 5 * features[..., 1]
-    mapper._exchange_movers()
+    mapper._replace_dynamic_gaussians()
     assert (mapper.gaussians.means[:, 2] < 1.5).sum() < 0.4 * mover.sum()
     assert (mapper.gaussians.means[:, 2] > 1.5).sum() > 100
 
@@ -174,7 +174,7 @@ def test_each_loss_trains_only_its_own_side():
 def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
     mapper = make_mapper(replace(CONFIG, init_iterations=3), UncertaintyConfig(enabled=False))
     mapper.initialise([wall_keyframe(0)])
-    assert torch.equal(mapper._weight(mapper.keyframes[0], CAMERA), torch.ones(24, 32))
+    assert torch.equal(mapper._keyframe_weight(mapper.keyframes[0], CAMERA), torch.ones(24, 32))
     assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
 
 
@@ -215,7 +215,7 @@ def test_given_masks_take_the_place_of_the_mlp():
     mapper.initialise(keyframes[:2])
     mapper.integrate(keyframes[2])
     assert all(torch.equal(a, b) for a, b in zip(before, mapper.mlp.parameters(), strict=True))
-    weight = mapper._weight(mapper.keyframes[0], CAMERA)
+    weight = mapper._keyframe_weight(mapper.keyframes[0], CAMERA)
     assert torch.equal(weight == 0, keyframes[0].moving_mask)
     assert (mapper.gaussians.means[:, 2] < 1.5).sum() == 0
     empty = wall_keyframe(0)
@@ -266,7 +266,7 @@ def test_one_keyframe_per_frame_index_gap_keeps_its_anchor():
     mapper.initialise([replace(wall_keyframe(0), keyframe_index=3)])
     mapper.integrate(replace(wall_keyframe(3), keyframe_index=7))
     assert set(mapper.gaussians.anchor_keyframe.tolist()) == {3, 7}
-    assert set(mapper._anchor_rows().tolist()) == {0, 1}
+    assert set(mapper.anchor_rows().tolist()) == {0, 1}
 
 
 def test_progress_counts_to_the_end():

@@ -24,20 +24,20 @@ def test_overlap_by_hand():
 
 def test_the_oldest_keyframe_without_overlap_leaves_and_only_that_one():
     views = {k: seen(0, 1) for k in range(6)} | {0: seen(8), 2: seen(9), 5: seen(0, 1)}
-    window = update_window([4, 3, 2, 1, 0], 5, views, poses(*range(6)), 10, 0.4)
+    window = update_window([4, 3, 2, 1, 0], 5, views, poses(*range(6)), 10)
     assert window == [5, 4, 3, 2, 1]
 
 
 def test_the_two_newest_never_leave():
     views = {0: seen(8), 1: seen(9)}
-    assert update_window([0], 1, views, poses(0, 1), 3, 0.4) == [1, 0]
+    assert update_window([0], 1, views, poses(0, 1), 3) == [1, 0]
 
 
 def test_a_full_window_drops_a_keyframe_that_is_far_and_close_to_another():
     # Positions 0 and 1 stand together, far from the new one at 10.
     shifts = [0.0, 0.1, 5.0, 9.0, 10.0]
     views = {k: seen(0, 1) for k in range(5)}
-    window = update_window([3, 2, 1, 0], 4, views, poses(*shifts), 4, 0.4)
+    window = update_window([3, 2, 1, 0], 4, views, poses(*shifts), 4)
     assert window in ([4, 3, 2, 0], [4, 3, 2, 1])
 
 
@@ -65,11 +65,11 @@ def test_nothing_seen_is_no_overlap():
 
 def test_keyframes_at_one_place_do_not_divide_by_zero():
     views = {k: seen(0) for k in range(5)}
-    assert len(update_window([3, 2, 1, 0], 4, views, poses(*[0.0] * 5), 4, 0.4)) == 4
+    assert len(update_window([3, 2, 1, 0], 4, views, poses(*[0.0] * 5), 4)) == 4
 
 
 def test_the_window_never_exceeds_its_size():
     window, views = [0], {k: seen(0) for k in range(40)}
     for new in range(1, 40):
-        window = update_window(window, new, views, poses(*range(40)), 10, 0.4)
+        window = update_window(window, new, views, poses(*range(40)), 10)
         assert len(window) == min(new + 1, 10) and window[0] == new

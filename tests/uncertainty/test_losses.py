@@ -50,14 +50,14 @@ def test_depth_loss_counts_only_known_and_near_pixels():
     assert torch.equal(depth_loss(rendered, reference, 10.0), expected)
 
 
-def test_cell_loss_is_smallest_at_twice_the_root_of_the_misfit():
+def test_cell_loss_is_smallest_at_twice_the_root_of_the_error():
     beta = torch.linspace(0.15, 6, 20000, dtype=torch.float64)
-    for misfit, best in [(0.0625, 0.5), (0.5, 1.4142), (5.0, 4.4721)]:
-        loss = cell_loss(beta[None], torch.full_like(beta[None], misfit), beta[None] + 9, CONFIG)
+    for error, best in [(0.0625, 0.5), (0.5, 1.4142), (5.0, 4.4721)]:
+        loss = cell_loss(beta[None], torch.full_like(beta[None], error), beta[None] + 9, CONFIG)
         assert float(beta[loss[0].argmin()]) + 1e-3 == pytest.approx(best, abs=1e-3)
 
 
-def test_cells_under_the_opacity_gate_teach_nothing():
+def test_cells_that_show_no_surface_teach_nothing():
     beta = torch.ones(1, 2, requires_grad=True)
     cell_loss(beta, torch.ones(1, 2), torch.tensor([[0.89, 0.91]]), CONFIG).sum().backward()
     assert beta.grad[0, 0] == 0 and beta.grad[0, 1] != 0
@@ -65,20 +65,20 @@ def test_cells_under_the_opacity_gate_teach_nothing():
 
 def test_variance_of_two_groups_by_hand():
     features = torch.tensor([[1.0, 0.0], [1.0, 0.1], [0.0, 1.0]])
-    # The first two are alike: mean 2, variance 1 in both rows; the third stands alone.
+    # The first two are similar: mean 2, variance 1 in both rows; the third stands alone.
     beta = torch.tensor([1.0, 3.0, 9.0])
     torch.testing.assert_close(
         variance_regulariser(beta, features, CONFIG), torch.tensor(2.0 / 3.0)
     )
 
 
-def test_only_the_128_most_alike_cells_enter_the_variance():
-    # All are alike, cosine > 0.87, but each more to some than to others.
+def test_only_the_128_most_similar_cells_enter_the_variance():
+    # All are similar, cosine > 0.87, but each more to some than to others.
     angle = 0.5 * torch.rand(200, generator=generator(10), dtype=torch.float64)  # radian
     features = torch.stack([angle.cos(), angle.sin()], -1)
     beta = torch.rand(200, generator=generator(11), dtype=torch.float64)
-    likeness = features @ features.T
-    expected = torch.stack([beta[row.topk(128).indices].var(correction=0) for row in likeness])
+    similarity = features @ features.T
+    expected = torch.stack([beta[row.topk(128).indices].var(correction=0) for row in similarity])
     torch.testing.assert_close(variance_regulariser(beta, features, CONFIG), expected.mean())
 
 
@@ -100,7 +100,7 @@ def test_constant_beta_has_no_variance_whatever_the_features():
     assert float(loss) == pytest.approx(0, abs=1e-10)
 
 
-def test_unlike_features_do_not_tie_their_beta():
+def test_dissimilar_features_do_not_tie_their_beta():
     features = torch.eye(6)
     beta = torch.arange(6.0)
     assert variance_regulariser(beta, features, CONFIG) == 0
@@ -111,11 +111,11 @@ def test_unlike_features_do_not_tie_their_beta():
 
 def test_cell_loss_and_variance_gradients_agree_with_finite_differences():
     beta = 0.2 + torch.rand(4, 5, generator=generator(5), dtype=torch.float64)
-    misfit = torch.rand(4, 5, generator=generator(6), dtype=torch.float64)
+    error = torch.rand(4, 5, generator=generator(6), dtype=torch.float64)
     features = torch.randn(20, 3, generator=generator(7), dtype=torch.float64)
 
     def loss(value):
-        cells = cell_loss(value, misfit, torch.ones_like(misfit), CONFIG).mean()
+        cells = cell_loss(value, error, torch.ones_like(error), CONFIG).mean()
         return cells + variance_regulariser(value.reshape(-1), features, CONFIG)
 
     leaf = beta.clone().requires_grad_()
@@ -123,7 +123,7 @@ def test_cell_loss_and_variance_gradients_agree_with_finite_differences():
     assert_gradients_close(leaf.grad, numerical_gradient(loss, beta), relative=1e-6)
 
 
-def test_beta_under_the_floor_is_moved_only_by_its_alike_cells():
+def test_beta_under_the_floor_is_moved_only_by_its_similar_cells():
     beta = torch.tensor([[0.05]], requires_grad=True)
     cell_loss(beta, torch.ones(1, 1), torch.ones(1, 1), CONFIG).sum().backward()
     assert beta.grad[0, 0] == 0
@@ -158,7 +158,7 @@ def test_median_window_shrinks_on_a_grid_smaller_than_itself():
 def test_an_even_median_window_is_refused_in_one_sentence():
     with pytest.raises(InputError, match="odd median window"):
         UncertaintyConfig(median_size=4)
-    with pytest.raises(InputError, match="dropout share"):
+    with pytest.raises(InputError, match="dropout fraction"):
         UncertaintyConfig(dropout=1.0)
     with pytest.raises(InputError, match="at least as fine"):
         UncertaintyConfig(grid_factor=0)

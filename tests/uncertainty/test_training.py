@@ -1,11 +1,16 @@
 import torch
 
-from minislam.uncertainty import Misfit, UncertaintyConfig, UncertaintyTrainer, measure_misfit
+from minislam.uncertainty import (
+    RenderingError,
+    UncertaintyConfig,
+    UncertaintyTrainer,
+    rendering_error,
+)
 from minislam.uncertainty.training import uncertainty_loss
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 
 
-def two_object_misfit() -> tuple[torch.Tensor, Misfit]:
+def two_object_error() -> tuple[torch.Tensor, RenderingError]:
     """A grid whose left half is explained by the map and whose right half is not."""
     features = torch.zeros(6, 8, 4)
     features[:, :4, 0] = 1
@@ -13,64 +18,64 @@ def two_object_misfit() -> tuple[torch.Tensor, Misfit]:
     features = features + 0.05 * torch.randn(6, 8, 4, generator=generator(0))
     ssim = torch.zeros(6, 8)
     ssim[:, 4:] = 2.0
-    return features, Misfit(ssim, torch.zeros(6, 8), torch.ones(6, 8))
+    return features, RenderingError(ssim, torch.zeros(6, 8), torch.ones(6, 8))
 
 
 def test_the_mlp_learns_which_features_the_map_cannot_explain():
-    features, misfit = two_object_misfit()
+    features, error = two_object_error()
     trainer = UncertaintyTrainer(4, UncertaintyConfig(learning_rate=5e-3), seed=0)
-    losses = [trainer.step(features, misfit, features.reshape(-1, 4)) for _ in range(250)]
+    losses = [trainer.step(features, error, features.reshape(-1, 4)) for _ in range(250)]
     beta = trainer.predict(features)
     assert losses[-1] < losses[0]
     assert beta[:, :4].mean() < 0.4 and beta[:, 4:].mean() > 1.41
 
 
 def test_two_runs_with_one_seed_are_equal_to_the_bit():
-    features, misfit = two_object_misfit()
+    features, error = two_object_error()
     betas = []
     for _ in range(2):
         trainer = UncertaintyTrainer(4, UncertaintyConfig(), seed=3)
         for _ in range(5):
-            trainer.step(features, misfit, features.reshape(-1, 4))
+            trainer.step(features, error, features.reshape(-1, 4))
         betas.append(trainer.predict(features))
     assert torch.equal(betas[0], betas[1])
 
 
-def test_misfit_carries_no_gradient_back_to_the_rendering():
+def test_the_rendering_error_passes_no_gradient_back_to_the_rendering():
     image = torch.rand(16, 16, 3, generator=generator(1))
     color = torch.rand(16, 16, 3, generator=generator(2)).requires_grad_()
     depth = torch.full((16, 16), 2.0, requires_grad=True)
     opacity = torch.ones(16, 16, requires_grad=True)
-    misfit = measure_misfit(
+    error = rendering_error(
         image, torch.ones(16, 16), color, depth, opacity, (4, 4), 0.5, UncertaintyConfig()
     )
     trainer = UncertaintyTrainer(3, UncertaintyConfig(), seed=0)
     features = torch.rand(4, 4, 3, generator=generator(3))
-    trainer.step(features, misfit, features.reshape(-1, 3))
+    trainer.step(features, error, features.reshape(-1, 3))
     assert color.grad is None and depth.grad is None and opacity.grad is None
     # |2 - 1| in units of 0.5.
-    torch.testing.assert_close(misfit.depth, torch.full((4, 4), 2.0))
+    torch.testing.assert_close(error.depth, torch.full((4, 4), 2.0))
 
 
 def test_no_reference_depth_leaves_only_the_ssim_term():
     image = torch.rand(16, 16, 3, generator=generator(1))
     nothing = torch.zeros(16, 16)
-    misfit = measure_misfit(
+    error = rendering_error(
         image, nothing, image, nothing + 2, nothing + 1, (4, 4), 1.0, UncertaintyConfig()
     )
-    assert misfit.depth.max() == 0 and misfit.ssim.max() == 0
+    assert error.depth.max() == 0 and error.ssim.max() == 0
 
 
 def test_the_gradient_of_the_whole_loss_agrees_with_finite_differences():
     config = UncertaintyConfig()
-    features, misfit = two_object_misfit()
+    features, error = two_object_error()
     features = features[::3, ::2].double()
-    misfit = Misfit(*(t[::3, ::2].double() for t in (misfit.ssim, misfit.depth + 0.3,
-                                                      misfit.opacity)))  # fmt: skip
+    error = RenderingError(*(t[::3, ::2].double() for t in (error.ssim, error.depth + 0.3,
+                                                      error.opacity)))  # fmt: skip
     cells = features.reshape(-1, 4)
 
     def loss(beta: torch.Tensor) -> torch.Tensor:
-        return uncertainty_loss(beta, misfit, beta.reshape(-1), cells, config)
+        return uncertainty_loss(beta, error, beta.reshape(-1), cells, config)
 
     beta = 0.2 + torch.rand(2, 4, generator=generator(4), dtype=torch.float64)
     leaf = beta.clone().requires_grad_()
@@ -79,17 +84,17 @@ def test_the_gradient_of_the_whole_loss_agrees_with_finite_differences():
 
 
 def test_each_lambda_scales_its_own_term():
-    features, misfit = two_object_misfit()
-    misfit = Misfit(misfit.ssim, torch.full((6, 8), 0.4), misfit.opacity)
+    features, error = two_object_error()
+    error = RenderingError(error.ssim, torch.full((6, 8), 0.4), error.opacity)
     beta = 0.5 + torch.rand(6, 8, generator=generator(5))
     cells = features.reshape(-1, 4)
 
     def loss(depth: float, variance: float, log: float) -> float:
         config = UncertaintyConfig(lambda_depth=depth, lambda_variance=variance, lambda_log=log)
-        return float(uncertainty_loss(beta, misfit, beta.reshape(-1), cells, config))
+        return float(uncertainty_loss(beta, error, beta.reshape(-1), cells, config))
 
     clipped = beta + 0.001
-    alone = float((misfit.ssim / clipped**2).mean())
+    alone = float((error.ssim / clipped**2).mean())
     assert abs(loss(0, 0, 0) - alone) < 1e-5
     assert abs(loss(0.2, 0, 0) - alone - float((0.08 / clipped**2).mean())) < 1e-5
     assert abs(loss(0, 0, 0.5) - alone - 0.5 * float(clipped.log().mean())) < 1e-5

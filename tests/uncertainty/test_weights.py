@@ -52,14 +52,14 @@ def test_smallest_adjusted_beta_is_0_1016():
     assert float(adjusted_beta(grid(0.02), CAMERA).min()) == pytest.approx(0.101632, abs=1e-6)
 
 
-def test_thresholds_of_full_trust_and_of_invisibility():
+def test_thresholds_of_the_weights_one_and_zero():
     assert float(tracking_weight(grid(0.4711), CAMERA, 8).min()) == pytest.approx(1, abs=1e-3)
     assert float(tracking_weight(grid(0.475), CAMERA, 8).max()) < 1
     assert float(mapping_weight(grid(1.4079), CAMERA).min()) > 0
     assert float(mapping_weight(grid(1.4083), CAMERA).max()) == 0
 
 
-def test_a_given_mask_is_full_trust_or_none():
+def test_a_given_mask_gives_the_full_weight_or_almost_none():
     moving = torch.zeros(24, 32, dtype=torch.bool)
     moving[:, 8:16] = True
     beta = beta_of_mask(moving)
