@@ -153,14 +153,14 @@ class Slam(Stateful):
             self._move_map(first_changed=0)
         iterations = self.config.mapping.refine_iterations
         self.mapper.refine(iterations, self.steps.finishing(stage), done)
-        self.snapshots.record(len(self.sequence) - 1, self.mapper.mlp)
+        self.snapshots.record(len(self.sequence) - 1)
 
     def _pose_all_frames(self) -> None:
         progress = self.steps.progress("posing all frames")
         self._poses = pose_all_frames(self.tracker, self.sequence, progress)
 
     def _record_mlp(self) -> None:
-        self.snapshots.record(self.tracker.keyframes.frames[-1].frame_index, self.mapper.mlp)
+        self.snapshots.record(self.tracker.keyframes.frames[-1].frame_index)
 
     def _move_map(self, first_changed: int) -> None:
         """Carry the map along with keyframes that an adjustment has moved."""

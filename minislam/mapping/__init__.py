@@ -1,4 +1,17 @@
-"""Mapping (Sec. 3.4): a Gaussian map of the static scene, grown keyframe by keyframe."""
+"""Mapping (Sec. 3.4): a Gaussian map of the static scene, grown keyframe by keyframe.
+
+Read the files in this order:
+
+    mapper             when the map gets and loses Gaussians, and when it is optimised
+    optimisation       one iteration: a step of the map on L_render, a step of the MLP on L_uncer
+    losses             L_render, Eq. (6), and L_color, Eq. (7)
+    insertion          where a keyframe adds Gaussians, and which lie on dynamic objects
+    window             the local window of keyframes, and the probability to draw each keyframe
+    deformation        the map follows its keyframes when bundle adjustment moves them
+    pose_refinement    the poses between the keyframes, by re-rendering
+    density            clone, split and prune
+    views, config      keyframes at several image sizes; the settings
+"""
 
 from minislam.mapping.config import (
     DensityConfig,

@@ -1,5 +1,7 @@
 """Deform the map when bundle adjustment changes its keyframes (Sec. 3.4)."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -38,14 +40,7 @@ def deform_rigidly(
     points = gaussians.means.detach().double()[:, None]
     means = transform_points(motion[anchor_rows], points)[:, 0]
     quats = quaternion_product(turn[anchor_rows], gaussians.quats_wxyz.detach().double())
-    return GaussianMap(
-        means.to(dtype),
-        quats.to(dtype),
-        gaussians.log_scales.detach(),
-        gaussians.opacity_logits.detach(),
-        gaussians.colors.detach(),
-        gaussians.anchor_keyframe,
-    )
+    return replace(gaussians.detach(), means=means.to(dtype), quats_wxyz=quats.to(dtype))
 
 
 def rescale_to_depths(
@@ -71,14 +66,8 @@ def rescale_to_depths(
             se3_inverse(T_camera_world[row]), points * factor[:, None]
         )
         log_scales[anchored] += factor.log()[:, None].to(log_scales)
-    return GaussianMap(
-        means.to(gaussians.means.dtype),
-        gaussians.quats_wxyz.detach(),
-        log_scales,
-        gaussians.opacity_logits.detach(),
-        gaussians.colors.detach(),
-        gaussians.anchor_keyframe,
-    )
+    dtype = gaussians.means.dtype
+    return replace(gaussians.detach(), means=means.to(dtype), log_scales=log_scales)
 
 
 def _depth_factor(points_camera: Tensor, old: Tensor, new: Tensor, camera: Camera) -> Tensor:

@@ -1,6 +1,6 @@
 """Clone, split and prune Gaussians, so that there are more of them where detail is missing."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
@@ -88,14 +88,8 @@ def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
     normal = torch.randn(doubled.means.shape, generator=generator).to(doubled.means)
     rotations = rotation_from_quaternion(doubled.quats_wxyz)
     offsets = (rotations @ (doubled.scales * normal)[..., None]).squeeze(-1)
-    return GaussianMap(
-        doubled.means + offsets,
-        doubled.quats_wxyz,
-        doubled.log_scales - torch.tensor(SPLIT_SHRINK).log().to(doubled.means),
-        doubled.opacity_logits,
-        doubled.colors,
-        doubled.anchor_keyframe,
-    )
+    log_scales = doubled.log_scales - torch.tensor(SPLIT_SHRINK).log().to(doubled.means)
+    return replace(doubled, means=doubled.means + offsets, log_scales=log_scales)
 
 
 def useful_rows(

@@ -22,7 +22,7 @@ _FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 1e-3, 10.0, 0.3
 
 
 def refine_pose(
-    gaussians: GaussianMap,  # held, without gradient
+    gaussians: GaussianMap,  # constant
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4) float64, to start from
     image: Tensor,  # (H, W, 3) RGB in [0, 1], what the camera saw
@@ -64,18 +64,18 @@ def _optimise_pose(
         improved = float(loss.detach()) < lowest
         if improved:
             if _motion(se3_log(candidate @ se3_inverse(start)), rendering, camera) > farthest:
-                return start  # Flow is not that wrong: the map must be, or it is blurred.
+                return start  # Flow is more accurate than that: the map must be wrong, or blurred.
             pose, lowest, damping = candidate, float(loss.detach()), _LESS_DAMPING * damping
         if steps_done == config.iterations or not math.isfinite(lowest):
             break
         if improved:
             (gradient,) = torch.autograd.grad(loss, twist)
-            bend = curvature(rendering, image, weight, camera, config.rounding)
-            if not bend.diagonal().min() > 0:
+            hessian = curvature(rendering, image, weight, camera, config.rounding)
+            if not hessian.diagonal().min() > 0:
                 return pose  # The picture does not depend on the pose: it is empty or uniform.
         else:
             damping *= _MORE_DAMPING
-        damped = bend + damping * torch.diag(bend.diagonal())
+        damped = hessian + damping * torch.diag(hessian.diagonal())
         step = -torch.linalg.solve(damped, gradient.double())
         if _motion(step, rendering, camera) < config.tolerance:
             return pose
@@ -91,8 +91,8 @@ def rerendering_loss(
 ) -> Tensor:  # ()
     """Return the mean of weight * opacity * |I^ - I|, with |r| as sqrt(r^2 + rounding^2).
 
-    The opacity is a constant, as in the official code: the camera must not turn to where the map
-    is empty because nothing can be wrong there.
+    The opacity is a constant, as in the official code. With its gradient the camera would turn to
+    where the map is empty, because the loss is 0 there.
     """
     residual = rendering.color - image
     absolute = (residual.square() + rounding**2).sqrt().mean(-1)
@@ -109,9 +109,9 @@ def curvature(
 ) -> Tensor:  # (6, 6) float64
     """Return the Gauss-Newton matrix of the loss: the mean of w J^T J / |I^ - I|.
 
-    A twist moves the point seen at a pixel by A px per unit: `Camera.twist_jacobian`. The picture
-    at the pixel changes by what slides in: with the slope g = (dI^/du, dI^/dv) of a channel,
-    J = -g^T A. All channels share A,
+    A twist xi moves the point seen at a pixel by A xi px, see `Camera.twist_jacobian`. The colour
+    at the pixel changes by -g^T A xi, with the slope g = (dI^/du, dI^/dv) of a channel, so
+    J = -g^T A. The channels have A in common, so
 
         sum_c w J_c^T J_c / |r_c| = A^T G A,        G = sum_c w g_c g_c^T / |r_c|   (2x2).
     """
@@ -127,8 +127,8 @@ def curvature(
     x, y, _ = camera.rays(pixels.reshape(-1, 2)).unbind(-1)
     u, v = camera.twist_jacobian(x, y, 1 / depth.reshape(-1)).unbind(1)  # (6, H W) each
     uu, uv, vv = uu.reshape(-1), uv.reshape(-1), vv.reshape(-1)
-    bend = u @ (uu * u + uv * v).T + v @ (uv * u + vv * v).T
-    return bend.double()
+    hessian = u @ (uu * u + uv * v).T + v @ (uv * u + vv * v).T
+    return hessian.double()
 
 
 def image_slope(image: Tensor) -> Tensor:  # (H, W, 3) -> (2, H, W, 3)
@@ -140,7 +140,7 @@ def image_slope(image: Tensor) -> Tensor:  # (H, W, 3) -> (2, H, W, 3)
 
 
 def _motion(step: Tensor, rendering: Rendering, camera: Camera) -> float:
-    """Return how far a step moves the picture of a point at mean depth [px], about."""
+    """Return about how many pixels a step moves the image of a point at mean depth."""
     depth = float((rendering.depth.sum() / rendering.opacity.sum().clamp_min(1e-12)).detach())
     rho, phi = float(step[:3].norm()), float(step[3:].norm())
     return camera.fx * (phi + rho / max(depth, 1e-12))

@@ -25,7 +25,6 @@ _OPAQUE = 0.5  # a less opaque pixel shows a gap rather than a surface
 class View:
     """A keyframe at one size."""
 
-    camera: Camera
     image: Tensor  # (h, w, 3) RGB in [0, 1]
     depth: Tensor  # (h, w) world units, 0 where unknown
 
@@ -57,13 +56,13 @@ class MappedKeyframe:
         )
 
     def saved_state(self) -> Tree:
-        """Return the state: all but what the image is good for."""
-        made_again = ("image", "_views")
-        return {name: value for name, value in vars(self).items() if name not in made_again}
+        """Return all attributes but the image, which is read again, and its copies."""
+        images = ("image", "_views")
+        return {name: value for name, value in vars(self).items() if name not in images}
 
     @classmethod
     def from_state(cls, state: Tree, frame_of: FrameOf) -> "MappedKeyframe":
-        """Return the keyframe of a saved state, its image read again."""
+        """Return the keyframe of a saved state; its image is read again."""
         return cls(**state, image=frame_of(state["frame_index"]).image)
 
     def view(self, camera: Camera) -> View:
@@ -71,7 +70,7 @@ class MappedKeyframe:
         size = (camera.height, camera.width)
         if size not in self._views:
             image = shrink_image(self.image, *size)
-            self._views[size] = View(camera, image, shrink_depth(self.depth, *size))
+            self._views[size] = View(image, shrink_depth(self.depth, *size))
         return self._views[size]
 
     def set_depth(self, depth: Tensor) -> None:

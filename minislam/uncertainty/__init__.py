@@ -1,4 +1,15 @@
-"""Uncertainty (Sec. 3.2): an MLP learns, while the map grows, which image patches move."""
+"""Uncertainty (Sec. 3.2): an MLP learns, while the map grows, which image patches move.
+
+Read the files in this order:
+
+    mlp           beta = P(F): one image feature in, one beta out
+    weights       the only place where beta becomes a weight, of tracking or of mapping
+    losses        the terms of L_uncer: modified SSIM, L_depth, Eq. (3), and the regularisers
+    training      L_uncer itself, Eq. (4), and the Adam that lowers it
+    resampling    between the image and the feature grid
+    snapshots     copies of the MLP at earlier moments, for the report
+    config        the settings
+"""
 
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 from minislam.uncertainty.mlp import UncertaintyMLP

@@ -1,4 +1,4 @@
-"""Between the image and the feature grid: two regular grids over the same area."""
+"""Resample between the image and the feature grid, two regular grids over the same area."""
 
 from torch import Tensor
 from torch.nn import functional
@@ -9,10 +9,10 @@ def resample(
     height: int,  # rows wanted
     width: int,  # columns wanted
 ) -> Tensor:  # (height, width)
-    """Interpolate one grid at the cell centres of another one that covers the same area.
+    """Interpolate a grid bilinearly at the cell centres of another one over the same area.
 
     Both cover the image evenly: on an image of W px, the centre of column j of w' columns lies at
-    (j + 0.5) W / w' - 0.5. Bilinear, without smoothing when it goes down.
+    (j + 0.5) W / w' - 0.5. Nothing is smoothed before a resampling to fewer cells.
     """
     batch = values[None, None]
     resampled = functional.interpolate(batch, (height, width), mode="bilinear", align_corners=False)

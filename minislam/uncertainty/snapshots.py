@@ -1,4 +1,4 @@
-"""The MLP as it was at earlier moments: how the system found out what moves."""
+"""The MLP as it was at earlier moments, to show how it learnt what moves."""
 
 from torch import Tensor
 from torch.func import functional_call
@@ -6,7 +6,7 @@ from torch.func import functional_call
 from minislam.state.stateful import Stateful
 from minislam.uncertainty.mlp import UncertaintyMLP
 
-_MOST = 32  # copies kept; a copy for DINOv2 features takes 115 kB
+MOST = 32  # copies kept; a copy for DINOv2 features takes 115 kB
 
 
 class MlpSnapshots(Stateful):
@@ -16,7 +16,7 @@ class MlpSnapshots(Stateful):
     _spacing: int = 1  # calls of `record` per copy
     _calls: int = 0
 
-    def __init__(self, mlp: UncertaintyMLP | None = None) -> None:
+    def __init__(self, mlp: UncertaintyMLP) -> None:
         self._weights = {}
         self._mlp = mlp
 
@@ -25,13 +25,13 @@ class MlpSnapshots(Stateful):
         """Return the moments of the copies, in order."""
         return list(self._weights)
 
-    def record(self, moment: int, mlp: UncertaintyMLP) -> None:
-        """Keep a copy of the weights; of very many calls only every second, every fourth, ..."""
-        self._mlp = mlp
+    def record(self, moment: int) -> None:
+        """Copy the present weights; in a long run at every second call, every fourth, ..."""
         if self._calls % self._spacing == 0:
-            self._weights[moment] = {k: v.detach().clone() for k, v in mlp.state_dict().items()}
+            weights = self._mlp.state_dict()
+            self._weights[moment] = {name: w.detach().clone() for name, w in weights.items()}
         self._calls += 1
-        if len(self._weights) > _MOST:
+        if len(self._weights) > MOST:
             self._weights = dict(list(self._weights.items())[::2])
             self._spacing *= 2
 
@@ -40,6 +40,6 @@ class MlpSnapshots(Stateful):
         moment: int,
         features: Tensor,  # (h', w', C)
     ) -> Tensor:  # (h', w')
-        """Return the raw beta that the newest copy up to a moment predicts, or else the first."""
+        """Return the raw beta by the newest copy up to a moment, or by the first copy."""
         newest = max((m for m in self._weights if m <= moment), default=self.moments[0])
         return functional_call(self._mlp, self._weights[newest], (features,)).detach()

@@ -1,12 +1,12 @@
 """The only place where beta becomes a weight.
 
 The paper weights residuals by 1 / beta^2, Eqs. (5) and (6). The official code, which we follow
-here, stretches beta first and caps or cuts the weight:
+here, first stretches beta, then caps the weight in tracking and cuts it in mapping:
 
     beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
     tracking: w capped at 1,        mapping: w below 0.1 set to 0.
 
-So a cell counts fully in tracking below beta_raw = 0.47 and is invisible to mapping above 1.41.
+So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41.
 """
 
 import torch
@@ -17,12 +17,13 @@ from minislam.uncertainty.resampling import resample
 
 BETA_FLOOR = 0.1  # smallest beta, official: keeps 1 / beta^2 and log beta finite
 BETA_OFFSET = 1e-3  # added to the clipped beta, official
-TRAIN_FRACTION = 0.3  # x: position in NeRF On-the-go's schedule, held fixed by the official code
+TRAIN_FRACTION = 0.3  # x: position in NeRF On-the-go's schedule, fixed in the official code
 SCHLICK_SLOPE = 0.8  # s: slope of that schedule at its end, official
 WEIGHT_SCALE = 0.5  # numerator of the weight, official
-TRACKING_CAP = 1.0  # a static cell must not count more than the flow's own confidence says
-BETA_OF_MASK = 2.0 * 5.0**0.5  # of a mover in a given mask: the largest that the loss allows
-MAPPING_CUT = 0.1  # below this the weight is 0: no slow leak of a mover over many iterations
+TRACKING_CAP = 1.0  # beta may lower the weight that the flow confidence gives, not raise it
+BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: the largest that L_uncer gives
+# A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
+MAPPING_CUT = 0.1
 
 
 def schlick_bias(position: float, slope: float) -> float:
@@ -39,9 +40,9 @@ def clipped_beta(beta_raw: Tensor) -> Tensor:
 
 
 def beta_of_mask(moving: Tensor) -> Tensor:
-    """Return the raw beta (H, W) that a given mask (H, W) bool of movers stands for."""
-    mover = torch.full(moving.shape, BETA_OF_MASK, device=moving.device)
-    return torch.where(moving, mover, BETA_FLOOR)
+    """Return the raw beta (H, W) for a given mask (H, W) bool, True on moving pixels."""
+    largest = torch.full(moving.shape, BETA_OF_MASK, device=moving.device)
+    return torch.where(moving, largest, BETA_FLOOR)
 
 
 def adjusted_beta(beta_raw: Tensor, camera: Camera) -> Tensor:

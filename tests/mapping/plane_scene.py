@@ -4,11 +4,26 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
+from minislam.mapping import InsertionConfig, Mapper, MappingConfig
 from minislam.records import Keyframe
+from minislam.uncertainty import UncertaintyConfig
 
 WALL_DEPTH = 2.0  # world units
 CAMERA = Camera(30.0, 30.0, 15.5, 11.5, 32, 24)
 GRID = (6, 8)  # cells of the feature grid
+CONFIG = MappingConfig(
+    image_scale=1.0,
+    init_iterations=60,
+    keyframe_iterations=5,
+    insertion=InsertionConfig(cell=2),
+)
+UNCERTAINTY = UncertaintyConfig(learning_rate=5e-3)
+
+
+def make_mapper(
+    config: MappingConfig = CONFIG, uncertainty: UncertaintyConfig = UNCERTAINTY
+) -> Mapper:
+    return Mapper(CAMERA, config, uncertainty, feature_dimension=3, seed=0)
 
 
 def wall_color(x: Tensor, y: Tensor) -> Tensor:

@@ -3,8 +3,14 @@ from dataclasses import fields
 import pytest
 
 from minislam.errors import InputError
-from minislam.mapping import DensityConfig, InsertionConfig, MappingConfig, paper_mapping
-from minislam.uncertainty import UncertaintyConfig, paper_uncertainty
+from minislam.mapping import (
+    DensityConfig,
+    InsertionConfig,
+    MappingConfig,
+    PoseRefinementConfig,
+    paper_mapping,
+)
+from minislam.splatting import LearningRates
 
 
 def test_steps_of_the_means_scale_with_the_scene_and_decay_to_their_end():
@@ -23,7 +29,7 @@ def test_the_common_factor_reaches_every_parameter():
 
 
 @pytest.mark.parametrize(
-    "config", [MappingConfig, InsertionConfig, DensityConfig, UncertaintyConfig]
+    "config", [MappingConfig, InsertionConfig, DensityConfig, PoseRefinementConfig]
 )
 def test_every_constant_says_what_it_means(config):
     assert all(len(constant.metadata["meaning"]) > 10 for constant in fields(config))
@@ -37,9 +43,10 @@ def test_impossible_values_are_refused_in_one_sentence():
 
 
 def test_the_paper_values_are_the_official_ones():
-    mapping, uncertainty = paper_mapping(), paper_uncertainty()
+    mapping = paper_mapping()
     # The step of the means of a scene of median depth 2 m, before and after its decay.
     assert mapping.rates_at(0, 2.0, 1.0).means == pytest.approx(9.6e-4)
     assert mapping.rates_at(30000, 2.0, 1.0).means == pytest.approx(9.6e-6)
     assert (mapping.init_iterations, mapping.keyframe_iterations) == (1050, 450)
-    assert (uncertainty.lambda_depth, uncertainty.learning_rate) == (0.2, 4e-4)
+    rates = mapping.rates_at(0, 2.0, 1.0)
+    assert rates == LearningRates(), "the step lengths of the official code"

@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 
 import pytest
@@ -6,24 +5,9 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import se3_exp
-from minislam.mapping import DensityConfig, InsertionConfig, Mapper, MappingConfig
-from minislam.splatting import render
+from minislam.mapping import MappingConfig
 from minislam.uncertainty import UncertaintyConfig
-from tests.mapping.plane_scene import CAMERA, GRID, wall_keyframe
-
-CONFIG = MappingConfig(
-    image_scale=1.0,
-    init_iterations=60,
-    keyframe_iterations=5,
-    insertion=InsertionConfig(cell=2),
-)
-UNCERTAINTY = UncertaintyConfig(learning_rate=5e-3)
-
-
-def make_mapper(
-    config: MappingConfig = CONFIG, uncertainty: UncertaintyConfig = UNCERTAINTY
-) -> Mapper:
-    return Mapper(CAMERA, config, uncertainty, feature_dimension=3, seed=0)
+from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe
 
 
 def psnr(first: torch.Tensor, second: torch.Tensor) -> float:
@@ -67,15 +51,6 @@ def test_gaussians_on_a_mover_are_removed_and_not_inserted_again_once_the_mlp_kn
     assert (mapper.gaussians.means[:, 2] > 1.5).sum() > 100
 
 
-def test_a_half_size_image_has_half_the_pixels_and_the_same_means():
-    mapper = make_mapper(replace(CONFIG, image_scale=0.5, init_iterations=1))
-    mapper.initialise([wall_keyframe(0)])
-    camera = CAMERA.resized(16, 12)
-    view = mapper.keyframes[0].view(camera)
-    assert view.image.shape == (12, 16, 3) and view.depth.shape == (12, 16)
-    torch.testing.assert_close(view.image[0, 0], wall_keyframe(0).image[:2, :2].mean((0, 1)))
-
-
 @pytest.mark.parametrize("mean_background", [True, False])
 def test_what_no_keyframe_sees_has_the_mean_colour_or_is_black(mean_background):
     mapper = make_mapper(replace(CONFIG, init_iterations=1, mean_background=mean_background))
@@ -85,16 +60,6 @@ def test_what_no_keyframe_sees_has_the_mean_colour_or_is_black(mean_background):
     beside[0, 3] = -100
     expected = first.image.mean((0, 1)) if mean_background else torch.zeros(3)
     torch.testing.assert_close(mapper.render(beside).color[10, 10], expected)
-
-
-def test_shrinking_depth_averages_known_pixels_only():
-    keyframe = wall_keyframe(0)
-    keyframe.depth[0, 0] = 0
-    keyframe.depth[:2, 2:4] = 0
-    mapper = make_mapper(replace(CONFIG, image_scale=0.5, init_iterations=1))
-    mapper.initialise([keyframe])
-    depth = mapper.keyframes[0].view(CAMERA.resized(16, 12)).depth
-    assert float(depth[0, 0]) == pytest.approx(2.0) and depth[0, 1] == 0
 
 
 # Identities
@@ -143,53 +108,6 @@ def test_covered_pixels_are_not_inserted_again():
     mapper.integrate(wall_keyframe(1))
     # 0.1 to the right at depth 2 and 30 px of focal length uncovers 1.5 of 32 columns.
     assert len(mapper.gaussians) - count < 0.25 * count
-
-
-# Gradients
-
-
-def test_each_loss_trains_only_its_own_side():
-    mapper = make_mapper(replace(CONFIG, init_iterations=1))
-    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
-    weights = [p.detach().clone() for p in mapper.mlp.parameters()]
-    means = mapper.gaussians.means.clone()
-
-    mapper._frozen_until = 10**9  # only L_render steps: the MLP must not move nor get a gradient
-    for parameter in mapper.mlp.parameters():
-        parameter.grad = None
-    mapper.refine(2)
-    assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
-    assert all(torch.equal(a, b) for a, b in zip(weights, mapper.mlp.parameters(), strict=True))
-    assert not torch.equal(means, mapper.gaussians.means)
-
-    leaves = mapper._optimizer.gaussians.parameters.values()
-    pose = mapper.keyframes[0].T_camera_world.float()
-    rendering = render(mapper._optimizer.gaussians, CAMERA, pose)  # with a way back to the map
-    assert rendering.color.requires_grad
-    mapper._train_mlp(0, rendering)
-    assert all(leaf.grad is None for leaf in leaves)
-    assert not torch.equal(weights[0], mapper.mlp.weights[0])
-
-
-def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
-    mapper = make_mapper(replace(CONFIG, init_iterations=3), UncertaintyConfig(enabled=False))
-    mapper.initialise([wall_keyframe(0)])
-    assert torch.equal(mapper._keyframe_weight(mapper.keyframes[0], CAMERA), torch.ones(24, 32))
-    assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
-
-
-def test_the_mlp_rests_until_the_map_has_settled_after_a_change_of_density():
-    config = replace(
-        CONFIG,
-        init_iterations=35,
-        freeze_iterations=4,
-        density=DensityConfig(interval=10, max_gaussians=10**6),
-    )
-    mapper = make_mapper(config)
-    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
-    resting = [k for k, loss in enumerate(mapper.history.uncertainty) if math.isnan(loss)]
-    assert resting == [10, 11, 12, 13, 20, 21, 22, 23, 30, 31, 32, 33]
-    assert len(set(mapper.history.gaussians)) > 1
 
 
 def test_in_fast_mode_most_keyframes_wait_for_their_optimisation():
@@ -267,14 +185,6 @@ def test_one_keyframe_per_frame_index_gap_keeps_its_anchor():
     mapper.integrate(replace(wall_keyframe(3), keyframe_index=7))
     assert set(mapper.gaussians.anchor_keyframe.tolist()) == {3, 7}
     assert set(mapper.anchor_rows().tolist()) == {0, 1}
-
-
-def test_progress_counts_to_the_end():
-    calls = []
-    mapper = make_mapper(replace(CONFIG, init_iterations=3))
-    mapper.initialise([wall_keyframe(0)], lambda done, total: calls.append((done, total)))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
-    assert GRID == tuple(mapper.predict_beta(wall_keyframe(0).features).shape)
 
 
 # Errors

@@ -2,7 +2,6 @@ import pytest
 import torch
 from scipy import ndimage
 
-from minislam.errors import InputError
 from minislam.uncertainty import UncertaintyConfig
 from minislam.uncertainty.losses import (
     STRUCTURE_CAP,
@@ -150,15 +149,3 @@ def test_zero_features_and_a_single_cell_are_finite():
 
 def test_median_window_shrinks_on_a_grid_smaller_than_itself():
     assert median_filter(torch.rand(2, 2, generator=generator(8)), 5).shape == (2, 2)
-
-
-# Errors
-
-
-def test_an_even_median_window_is_refused_in_one_sentence():
-    with pytest.raises(InputError, match="odd median window"):
-        UncertaintyConfig(median_size=4)
-    with pytest.raises(InputError, match="dropout fraction"):
-        UncertaintyConfig(dropout=1.0)
-    with pytest.raises(InputError, match="at least as fine"):
-        UncertaintyConfig(grid_factor=0)

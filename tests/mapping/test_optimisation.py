@@ -1,0 +1,66 @@
+import math
+from dataclasses import replace
+
+import torch
+
+from minislam.mapping import DensityConfig
+from minislam.splatting import render
+from minislam.uncertainty import UncertaintyConfig
+from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
+
+# Known answers
+
+
+def test_the_mlp_rests_until_the_map_has_settled_after_a_change_of_density():
+    config = replace(
+        CONFIG,
+        init_iterations=35,
+        freeze_iterations=4,
+        density=DensityConfig(interval=10, max_gaussians=10**6),
+    )
+    mapper = make_mapper(config)
+    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+    resting = [k for k, loss in enumerate(mapper.history.uncertainty) if math.isnan(loss)]
+    assert resting == [10, 11, 12, 13, 20, 21, 22, 23, 30, 31, 32, 33]
+    assert len(set(mapper.history.gaussians)) > 1
+
+
+def test_progress_counts_to_the_end():
+    calls = []
+    mapper = make_mapper(replace(CONFIG, init_iterations=3))
+    mapper.initialise([wall_keyframe(0)], lambda done, total: calls.append((done, total)))
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert GRID == tuple(mapper.predict_beta(wall_keyframe(0).features).shape)
+
+
+# Gradients
+
+
+def test_each_loss_trains_only_its_own_side():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+    weights = [p.detach().clone() for p in mapper.mlp.parameters()]
+    means = mapper.gaussians.means.clone()
+
+    mapper._frozen_until = 10**9  # only L_render steps: the MLP must not move nor get a gradient
+    for parameter in mapper.mlp.parameters():
+        parameter.grad = None
+    mapper.refine(2)
+    assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
+    assert all(torch.equal(a, b) for a, b in zip(weights, mapper.mlp.parameters(), strict=True))
+    assert not torch.equal(means, mapper.gaussians.means)
+
+    leaves = mapper._optimizer.gaussians.parameters.values()
+    pose = mapper.keyframes[0].T_camera_world.float()
+    rendering = render(mapper._optimizer.gaussians, CAMERA, pose)  # with a way back to the map
+    assert rendering.color.requires_grad
+    mapper._train_mlp(0, rendering)
+    assert all(leaf.grad is None for leaf in leaves)
+    assert not torch.equal(weights[0], mapper.mlp.weights[0])
+
+
+def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
+    mapper = make_mapper(replace(CONFIG, init_iterations=3), UncertaintyConfig(enabled=False))
+    mapper.initialise([wall_keyframe(0)])
+    assert torch.equal(mapper._keyframe_weight(mapper.keyframes[0], CAMERA), torch.ones(24, 32))
+    assert all(parameter.grad is None for parameter in mapper.mlp.parameters())

@@ -1,0 +1,33 @@
+from dataclasses import fields
+
+import pytest
+
+from minislam.errors import InputError
+from minislam.uncertainty import UncertaintyConfig, paper_uncertainty
+
+
+def test_every_constant_says_what_it_means():
+    assert all(len(constant.metadata["meaning"]) > 10 for constant in fields(UncertaintyConfig))
+
+
+def test_beta_is_learnt_unless_it_is_switched_off_or_given():
+    assert UncertaintyConfig().is_learnt
+    assert not UncertaintyConfig(enabled=False).is_learnt
+    assert not UncertaintyConfig(given_masks=True).is_learnt
+
+
+def test_the_paper_values_are_the_official_ones():
+    paper = paper_uncertainty()
+    assert (paper.lambda_depth, paper.learning_rate, paper.median_size) == (0.2, 4e-4, 5)
+
+
+# Errors
+
+
+def test_impossible_values_are_refused_in_one_sentence():
+    with pytest.raises(InputError, match="odd median window"):
+        UncertaintyConfig(median_size=4)
+    with pytest.raises(InputError, match="dropout fraction"):
+        UncertaintyConfig(dropout=1.0)
+    with pytest.raises(InputError, match="at least as fine"):
+        UncertaintyConfig(grid_factor=0)
