@@ -10,10 +10,10 @@ from typing import Any
 from minislam.errors import InputError
 from minislam.mapping.config import MappingConfig, paper_mapping
 from minislam.parameters import parameter
-from minislam.priors.choice import NetworksConfig
 from minislam.priors.depth import SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeaturesConfig
 from minislam.priors.grid_flow import ClassicalFlowConfig
+from minislam.priors.networks.table import NetworksConfig
 from minislam.tracking.config import TrackingConfig
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 

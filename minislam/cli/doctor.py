@@ -6,7 +6,6 @@ import argparse
 import importlib
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -71,7 +70,7 @@ def _self_test() -> float:
     coarse = torch.rand(1, 3, 32, 42, generator=source)
     smooth = torch.nn.functional.interpolate(coarse, scale_factor=8, mode="bicubic")
     image = smooth[0].permute(1, 2, 0).clamp(0, 1)
-    _, matches = ClassicalFlow().start_chain(image[:240, :320]).advanced(image[4:244, 8:328])
+    _, matches = ClassicalFlow().start_chain(image[:240, :320]).advance(image[4:244, 8:328])
     rows, columns = 240 // 8, 320 // 8
     v, u = torch.meshgrid(8 * torch.arange(rows), 8 * torch.arange(columns), indexing="ij")
     flow = matches.targets[0].reshape(2, rows, columns) - torch.stack([u, v])
@@ -98,40 +97,34 @@ def _print_checkpoints(folder: Path) -> int:
 
 def _verdict(file: Path) -> str:
     """Say which network a file belongs to, and whether it is complete."""
-    from minislam.priors.networks.checkpoints import describe, load_checkpoint
+    from minislam.priors.networks.checkpoints import load_checkpoint
+    from minislam.priors.networks.table import describe
 
     try:
         weights = load_checkpoint(file)
-        network = describe(weights)
-        check, use = _check_and_use(network)
+        title = describe(weights)
     except MinislamError as error:
         return f"unreadable: {error}"
-    if check is None:
-        return f"{network}, of no use here"
     try:
-        check(weights)
+        use = _use_of(weights, title)
     except MinislamError as error:
-        return f"{network}, NOT usable: {error}"
-    return f"{network}, complete: {use}"
+        return f"{title}, NOT usable: {error}"
+    return f"{title}, complete: {use}" if use else f"{title}, of no use here"
 
 
-def _check_and_use(network: str) -> tuple[Callable[[Weights], object] | None, str]:
-    """Return how to check a network that `describe` has named, and the flags that use it."""
+def _use_of(weights: Weights, title: str) -> str:
+    """Check a checkpoint; return the flags that use it, "" if nothing does."""
     from minislam.evaluation.lpips import recognise_heads, recognise_trunk
-    from minislam.priors.networks.depth_anything import checked_depth_anything
-    from minislam.priors.networks.dinov2 import checked_dino_features
-    from minislam.priors.networks.droid import checked_droid
-    from minislam.priors.networks.metric3d import checked_metric3d
+    from minislam.priors.networks.table import CLASSIFIER, LPIPS_HEADS, build_checked, recognise
 
-    kinds: list[tuple[str, Callable[[Weights], object], str]] = [
-        ("DROID", checked_droid, "--flow droid --flow-weights"),
-        ("DINOv2", checked_dino_features, "--features dinov2 --features-weights"),
-        ("FiT3D", checked_dino_features, "--features fit3d --features-weights"),
-        ("Metric3D", checked_metric3d, "--depth metric3d --depth-weights"),
-        ("Depth", checked_depth_anything, "--depth depth-anything --depth-weights"),
-        ("LPIPS", lambda weights: recognise_heads(weights.as_dict()), "--lpips-heads"),
-        ("an image", lambda weights: recognise_trunk(weights.as_dict()), "--lpips-trunk"),
-    ]
-    return next(
-        ((check, use) for name, check, use in kinds if network.startswith(name)), (None, "")
-    )
+    network = recognise(weights)
+    if network is not None:
+        build_checked(network, weights)
+        return f"--{network.kind} {network.name} --{network.kind}-weights"
+    if title == LPIPS_HEADS:
+        recognise_heads(weights.as_dict())
+        return "--lpips-heads"
+    if title == CLASSIFIER:
+        recognise_trunk(weights.as_dict())
+        return "--lpips-trunk"
+    return ""

@@ -92,7 +92,7 @@ def _kinds(
     conditions = f"{sequence.description}; {sequence.camera}; {constants}"
     kinds: dict[str, tuple[str, Callable[[Frame], Tensor | None]]] = {}
     if with_features:
-        features = choose_features(choice, sequence.camera, config.features)
+        features = choose_features(choice, sequence.camera, config.features, config.networks)
         factor = config.uncertainty.grid_factor
         origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
         fine = features if factor == 1 else HighResolutionFeatures(features, factor)

@@ -1,7 +1,7 @@
-"""Dense optical flow (OpenCV's DIS) and what is done with it: warp, compose, invert.
+"""Dense optical flow (OpenCV's DIS), and how to warp by it, compose it and invert it.
 
-Dense inverse search finds small displacements well and large ones badly. So the target image is
-first warped by a displacement that is expected, DIS finds what is left, and the two are composed
+Dense inverse search (DIS) finds small displacements well and large ones badly. So the target image
+is first warped by the expected displacement, DIS finds the remainder, and the two are composed
 ("warp-compose").
 """
 
@@ -48,7 +48,7 @@ def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: in
 def residual_flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the DIS flow (H, W, 2) with source(p) = target(p + flow(p)), found from zero."""
     # One object per call: DIS keeps its buffers inside, so objects cannot be shared by threads.
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # type: ignore[attr-defined]
     return dis.calc(source, target, None)
 
 
@@ -65,8 +65,8 @@ def composed_flow(source: np.ndarray, target: np.ndarray, start: np.ndarray) -> 
 def reverse_flow(source: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Return the flow from target to source (H, W, 2), started at the inverse of `forward`.
 
-    The inverse is a fixed point: b(q) = -forward(q + b(q)); three rounds bring a smooth field
-    well inside what DIS corrects by itself.
+    The inverse is a fixed point: b(q) = -forward(q + b(q)). For a smooth field, three iterations
+    bring it close enough for DIS to correct the rest.
     """
     inverse = -forward
     for _ in range(3):

@@ -19,6 +19,9 @@ from minislam.parameters import parameter
 from minislam.priors.files import FrameFiles, read_array
 from minislam.records import Frame
 
+_FIELD_CELLS = 4  # bumps of the smooth error along the shorter image side
+_GROSS_ERROR = 0.3  # relative error at a gross error, of either sign
+_GROSS_RADIUS = 0.12  # shorter image sides, radius of a gross error
 _ASPECT_TOLERANCE = 0.02  # relative; rounding a resized image to whole pixels stays below it
 
 DepthReader = Callable[[int], np.ndarray | None]  # frame_index -> (H, W) world units, 0 = unknown
@@ -26,14 +29,11 @@ DepthReader = Callable[[int], np.ndarray | None]  # frame_index -> (H, W) world 
 
 @dataclass(frozen=True)
 class SimulatedDepthConfig:
-    """How wrong a simulated depth network is; the sizes are those of good metric networks."""
+    """Errors of a simulated depth network, as large as those of good metric networks."""
 
     scale_error: float = parameter(0.03, "standard deviation of one log factor per frame")
     field_error: float = parameter(0.06, "standard deviation of a smooth log factor in the image")
-    field_cells: int = parameter(4, "bumps of that factor along the shorter image side")
-    gross_errors: int = parameter(2, "places per frame where the network is plainly wrong")
-    gross_error: float = parameter(0.3, "relative error at such a place, of either sign")
-    gross_radius: float = parameter(0.12, "radius of such a place [shorter image side]")
+    gross_errors: int = parameter(2, "places per frame with an error of 30 %")
 
 
 class SimulatedDepth:
@@ -58,16 +58,15 @@ class SimulatedDepth:
         height, width = truth.shape
         log_factor = (
             self.config.scale_error * source.standard_normal()
-            + self.config.field_error
-            * _smooth_noise(width, height, self.config.field_cells, source)
+            + self.config.field_error * _smooth_noise(width, height, source)
             + self._gross(width, height, source)
         )
         return _as_depth(truth * np.exp(log_factor), frame, "the simulated depth")
 
     def _gross(self, width: int, height: int, source: np.random.Generator) -> np.ndarray:
-        """Return the log factor (H, W) of the places that are plainly wrong."""
+        """Return the log factor (H, W) of the gross errors."""
         u, v = np.meshgrid(np.arange(width), np.arange(height))
-        radius = self.config.gross_radius * min(width, height)
+        radius = _GROSS_RADIUS * min(width, height)
         total = np.zeros((height, width))
         for _ in range(self.config.gross_errors):
             centre_u, centre_v = source.uniform(0, width), source.uniform(0, height)
@@ -75,29 +74,28 @@ class SimulatedDepth:
             distance = np.hypot(u - centre_u, v - centre_v) / radius
             # Flat inside, falling to zero over the last third: networks err by whole objects.
             profile = np.clip(3 * (1 - distance), 0, 1)
-            total += np.log1p(sign * self.config.gross_error) * profile
+            total += np.log1p(sign * _GROSS_ERROR) * profile
         return total
 
 
 class FileDepth:
     """Depth made elsewhere: a folder of .npy (world units) or 16-bit .png files.
 
-    Which file belongs to which frame, `FrameFiles` says.
+    `FrameFiles` finds the file of a frame.
     """
 
     def __init__(
         self,
         folder: Path | str,
-        png_unit: float | None = None,  # world units of one count; TUM and Bonn: 1 / 5000 m
-        stems: list[str] | None = None,  # image name without ending, by frame_index
+        png_unit: float = 1 / 5000,  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
     ) -> None:
         self.png_unit = png_unit
-        if png_unit is not None and not png_unit > 0:
+        if not png_unit > 0:
             raise InputError(
                 f"expected a positive world unit per count for depth .png files, found {png_unit}; "
                 "for TUM and Bonn give 0.0002"
             )
-        self._files = FrameFiles(folder, "depth", (".npy", ".png"), stems)
+        self._files = FrameFiles(folder, "depth", (".npy", ".png"))
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Read the depth of a frame, resized to its image, or return None if there is no file."""
@@ -108,11 +106,6 @@ class FileDepth:
         return _as_depth(depth, frame, str(path))
 
     def _read_png(self, path: Path) -> np.ndarray:
-        if self.png_unit is None:
-            raise InputError(
-                f"expected the world units of one count for {path}, found none declared; "
-                "give it (TUM and Bonn: 0.0002) or store .npy files"
-            )
         counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
             raise InputError(
@@ -142,11 +135,9 @@ class NoDepth:
         return None
 
 
-def _smooth_noise(
-    width: int, height: int, cells: int, source: np.random.Generator
-) -> np.ndarray:  # (H, W)
+def _smooth_noise(width: int, height: int, source: np.random.Generator) -> np.ndarray:  # (H, W)
     """Return smooth noise of mean 0 and standard deviation 1 over the image."""
-    cell = min(width, height) / cells
+    cell = min(width, height) / _FIELD_CELLS
     coarse = source.standard_normal((round(height / cell) + 1, round(width / cell) + 1))
     noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     deviation = noise.std()

@@ -1,8 +1,8 @@
 """Dense image features without a network: colour, contrast and edges around each cell.
 
-The uncertainty MLP has to tell one object from another by appearance, and nothing more. For that,
-colour and texture statistics of the neighbourhood go a long way. What they cannot do is tell a
-grey person from a grey wall: for that, a pretrained network takes this file's place.
+The uncertainty MLP must tell objects apart by their appearance. Statistics of colour and texture
+are enough for many scenes, but not for a grey person before a grey wall: there a pretrained
+network is needed.
 """
 
 from dataclasses import dataclass
@@ -26,79 +26,82 @@ _CONTRAST_CENTRE = np.array([1.9, 1.6, 1.9], np.float32)  # of log(1 + standard 
 _CONTRAST_SPREAD = np.array([0.9, 0.8, 0.9], np.float32)
 _EDGE_UNIT = 0.5  # Lab L per px: gradients below are noise
 _EDGE_CENTRE, _EDGE_SPREAD = 1.7, 0.7  # of log(1 + mean gradient / unit)
-_ORIENTATION_SPREAD = 0.1  # of the share of one orientation bin around 1 / bins
+_ORIENTATION_SPREAD = 0.1  # of the fraction of edges in one orientation bin around 1 / bins
+
+STRIDE = 7  # px, size of a cell: half the patch of DINOv2, since the windows span several cells
+ORIENTATION_BINS = 8  # of the edge direction over 180 degrees
+# Of contrast and edges relative to colour: colour changes less when the view changes.
+TEXTURE_WEIGHT = np.float32(0.5)
 
 
 @dataclass(frozen=True)
 class ClassicalFeaturesConfig:
-    """What the hand-made features look at."""
+    """Settings of the classical features."""
 
     windows: tuple[int, ...] = parameter(
         (1, 3, 5), "sides of the square windows whose statistics are taken [cells]"
-    )
-    orientation_bins: int = parameter(8, "bins of the edge orientation over 180 degrees")
-    texture_weight: float = parameter(
-        0.5, "weight of contrast and edges relative to colour, which survives a change of view"
     )
 
 
 class ClassicalFeatures:
     """Colour, contrast and edge orientation on a grid of cells: a `FeatureExtractor`."""
 
-    def __init__(
-        self,
-        stride: int = 7,  # px, size of a cell; half the patch of DINOv2: the windows look further
-        config: ClassicalFeaturesConfig | None = None,
-    ) -> None:
-        self.stride = stride
+    stride = STRIDE
+
+    def __init__(self, config: ClassicalFeaturesConfig | None = None) -> None:
         self.config = config or ClassicalFeaturesConfig()
-        self.dimension = len(self.config.windows) * (3 + 3 + self.config.orientation_bins + 1)
+        self.dimension = len(self.config.windows) * (3 + 3 + ORIENTATION_BINS + 1)
 
     def __call__(
         self,
         frame: Frame,
     ) -> Tensor:  # (H // stride, W // stride, C) float32, each of length sqrt(C)
-        """Return one vector per cell; the cosine of two says how alike their surroundings look."""
+        """Return one vector per cell; the cosine of two is the similarity of their surroundings."""
         image = frame.image
-        height, width = image.shape[0] // self.stride, image.shape[1] // self.stride
-        if min(height, width) < 1:
-            raise InputError(
-                f"expected an image of at least {self.stride}x{self.stride} px for the features, "
-                f"found {image.shape[1]}x{image.shape[0]}; give a larger working size"
-            )
+        height, width = grid_size(image, STRIDE)
         lab = cv2.cvtColor(image.detach().cpu().float().numpy(), cv2.COLOR_RGB2LAB)
         mean = _cell_mean(lab, width, height)
         mean_square = _cell_mean(lab * lab, width, height)
-        edges = _cell_mean(oriented_edges(lab[..., 0], self.config.orientation_bins), width, height)
-        groups = [self._describe(mean, mean_square, edges, side) for side in self.config.windows]
+        edges = _cell_mean(oriented_edges(lab[..., 0], ORIENTATION_BINS), width, height)
+        groups = [_describe(mean, mean_square, edges, side) for side in self.config.windows]
         features = torch.from_numpy(np.concatenate(groups, -1).reshape(height, width, -1))
         # Unit length on average per channel: what an MLP with standard initialisation expects.
         length = features.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # never 0/0
         return (features / length * self.dimension**0.5).to(image.device)
 
-    def _describe(
-        self,
-        mean: np.ndarray,  # (h, w, 3) Lab
-        mean_square: np.ndarray,  # (h, w, 3) Lab^2
-        edges: np.ndarray,  # (h, w, bins) Lab L per px
-        side: int,  # cells
-    ) -> np.ndarray:  # (h, w, 3 + 3 + bins + 1)
-        """Return the centred and scaled statistics of the window of `side` cells."""
-        mean, mean_square, edges = (_box(grid, side) for grid in (mean, mean_square, edges))
-        contrast = np.sqrt(np.maximum(mean_square - mean * mean, 0.0))  # round-off may be < 0
-        strength = edges.sum(-1, keepdims=True)
-        bins = edges.shape[-1]
-        # Where there is no edge, orientation is noise: the share fades to uniform.
-        share = (edges + _EDGE_UNIT / bins) / (strength + _EDGE_UNIT) - 1 / bins
 
-        color = (mean - _LAB_CENTRE) / _LAB_SPREAD
-        texture = [
-            (np.log1p(contrast / _CONTRAST_UNIT) - _CONTRAST_CENTRE) / _CONTRAST_SPREAD,
-            share / _ORIENTATION_SPREAD / np.sqrt(bins / 3, dtype=np.float32),
-            (np.log1p(strength / _EDGE_UNIT) - _EDGE_CENTRE) / _EDGE_SPREAD,
-        ]
-        weight = np.float32(self.config.texture_weight)
-        return np.concatenate([color, *(weight * part for part in texture)], -1)
+def grid_size(image: Tensor, stride: int) -> tuple[int, int]:
+    """Return how many whole cells of `stride` px an image (H, W, 3) has: rows, columns."""
+    rows, columns = image.shape[0] // stride, image.shape[1] // stride
+    if min(rows, columns) < 1:
+        raise InputError(
+            f"expected an image of at least {stride}x{stride} px for the features, found "
+            f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
+        )
+    return rows, columns
+
+
+def _describe(
+    mean: np.ndarray,  # (h, w, 3) Lab
+    mean_square: np.ndarray,  # (h, w, 3) Lab^2
+    edges: np.ndarray,  # (h, w, bins) Lab L per px
+    side: int,  # cells
+) -> np.ndarray:  # (h, w, 3 + 3 + bins + 1)
+    """Return the centred and scaled statistics of the window of `side` cells."""
+    mean, mean_square, edges = (_box(grid, side) for grid in (mean, mean_square, edges))
+    contrast = np.sqrt(np.maximum(mean_square - mean * mean, 0.0))  # round-off may be < 0
+    strength = edges.sum(-1, keepdims=True)
+    bins = edges.shape[-1]
+    # Without edges the orientation is noise, so the fractions then tend to 1 / bins.
+    fraction = (edges + _EDGE_UNIT / bins) / (strength + _EDGE_UNIT) - 1 / bins
+
+    color = (mean - _LAB_CENTRE) / _LAB_SPREAD
+    texture = [
+        (np.log1p(contrast / _CONTRAST_UNIT) - _CONTRAST_CENTRE) / _CONTRAST_SPREAD,
+        fraction / _ORIENTATION_SPREAD / np.sqrt(bins / 3, dtype=np.float32),
+        (np.log1p(strength / _EDGE_UNIT) - _EDGE_CENTRE) / _EDGE_SPREAD,
+    ]
+    return np.concatenate([color, *(TEXTURE_WEIGHT * part for part in texture)], -1)
 
 
 def oriented_edges(

@@ -22,9 +22,8 @@ _ALSO_DEPTH = "depths"  # the folder's name where WildGS-SLAM writes its own
 class FrameFiles:
     """Finds the file of a frame in a folder.
 
-    If the folder has an index, by the frame's timestamp: then any choice of the frames it was
-    made for finds its files. Else by name, which is the frame index (`17.npy`, `00017.png`), or
-    that of the input image where these names are given.
+    Files are named by frame index (`17.npy`, `00017.png`). If the folder has an index, a frame is
+    found by its timestamp, so that a run on fewer of the frames finds the right files.
     """
 
     def __init__(
@@ -32,37 +31,35 @@ class FrameFiles:
         folder: Path | str,
         what: str,  # "depth" or "features", for messages
         endings: tuple[str, ...],
-        stems: list[str] | None = None,  # image name without ending, by frame_index
     ) -> None:
-        self.folder, self.what = Path(folder), what
+        self.folder = Path(folder)
+        self.what = what
         if not self.folder.is_dir():
             raise InputError(
                 f"expected a folder of {what} files, found nothing at {self.folder}; check the path"
             )
         # Sorted, so that of 17.npy and 17.png the same one wins on every machine.
         files = sorted(p for p in self.folder.iterdir() if p.suffix.lower() in endings)
-        self._files = _by_stem(files, stems) if stems is not None else _by_number(files)
+        self._files = {int(path.stem): path for path in files if path.stem.isdecimal()}
         if not self._files:
             raise InputError(
-                f"expected {' or '.join(endings)} files named by frame index or image name in "
-                f"{self.folder}, found {len(files)} such files and none that fits; name them like "
-                "00017.npy"
+                f"expected {' or '.join(endings)} files named by frame index in {self.folder}, "
+                f"found {len(files)} such files and none that fits; name them like 00017.npy"
             )
         index = self.folder / INDEX
-        self._number_of = _read_index(index) if stems is None and index.is_file() else None
+        self._number_of = _read_index(index) if index.is_file() else None
 
     def of(self, frame: Frame) -> Path | None:
         """Return the file of a frame, or None if the folder has none for it."""
-        number: int | None = frame.frame_index
-        if self._number_of is not None:
-            number = self._number_of.get(stamp(frame.timestamp))
-            if number is None:
-                raise InputError(
-                    f"expected {self.what} of the frame at {stamp(frame.timestamp)} s, found no "
-                    f"such frame in {self.folder / INDEX}; make them from this sequence with "
-                    "minislam priors"
-                )
-        return self._files.get(number)
+        if self._number_of is None:
+            return self._files.get(frame.frame_index)
+        moment = stamp(frame.timestamp)
+        if moment not in self._number_of:
+            raise InputError(
+                f"expected {self.what} of the frame at {moment} s, found no such frame in "
+                f"{self.folder / INDEX}; make them from this sequence with minislam priors"
+            )
+        return self._files.get(self._number_of[moment])
 
     def any(self) -> Path:
         """Return one of the files."""
@@ -103,7 +100,7 @@ class FileFeatures:
 
 
 def folder_of(name: str, kind: str) -> Path:
-    """Return where the files of a kind are: in a folder's part of that name, or in it itself."""
+    """Return where the files of a kind are: in the subfolder of that name, or in the folder."""
     folder = Path(name).expanduser()
     parts = [kind, _ALSO_DEPTH] if kind == DEPTH else [kind]
     return next((folder / part for part in parts if (folder / part).is_dir()), folder)
@@ -116,7 +113,7 @@ def index_text(origin: str, frames: list[tuple[int, float]]) -> str:
 
 
 def stamp(timestamp: float) -> str:
-    """Return a timestamp [s] to the microsecond: as text it can be looked up exactly."""
+    """Return a timestamp [s] as text, to the microsecond, so that equal ones are found."""
     return f"{timestamp:.6f}"
 
 
@@ -156,12 +153,3 @@ def _read_index(path: Path) -> dict[str, int]:
             f"expected rows of frame index and timestamp in {path}, found something else "
             f"({error}); write it again with minislam priors, or remove it"
         ) from error
-
-
-def _by_number(files: list[Path]) -> dict[int, Path]:
-    return {int(path.stem): path for path in files if path.stem.isdecimal()}
-
-
-def _by_stem(files: list[Path], stems: list[str]) -> dict[int, Path]:
-    paths = {path.stem: path for path in files}
-    return {index: paths[stem] for index, stem in enumerate(stems) if stem in paths}

@@ -1,6 +1,6 @@
-"""Classical optical flow behind the FlowEstimator interface: keyframes in pairs, frames in chains.
+"""Classical optical flow as a `FlowEstimator`: between pairs of keyframes, and in chains of frames.
 
-Every flow starts from an expected one: what geometry predicts, or the last frame's flow.
+Every flow starts from an expected one: the prediction of the geometry, or the last frame's flow.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ from minislam.priors.dense_flow import composed_flow, dense_from_grid, grayscale
 from minislam.priors.grid_flow import (
     ClassicalFlowConfig,
     as_matches,
-    measured_on_grid,
+    measure_on_grid,
     texture_confidence,
 )
 from minislam.priors.interfaces import FlowMatches
@@ -27,7 +27,7 @@ Edge = tuple[int, int]  # keyframe index of source and target
 
 @dataclass(frozen=True)
 class MeasuredEdge:
-    """What was measured along an edge, and from which start."""
+    """The flow measured along an edge, and the start it was measured from."""
 
     source: int  # keyframe index
     target: int  # keyframe index
@@ -39,8 +39,8 @@ class MeasuredEdge:
 class ClassicalFlow(Stateful):
     """DIS flow between registered keyframes, started from a predicted reprojection.
 
-    It takes half the time of tracking, and from the same start it finds the same again: edges
-    are remembered, and measured again only if their start has moved.
+    The flow takes half the time of tracking, and the same start gives the same result. So the
+    result of an edge is kept, and measured again only if its start has moved.
     """
 
     def __init__(self, config: ClassicalFlowConfig | None = None) -> None:
@@ -66,7 +66,7 @@ class ClassicalFlow(Stateful):
         """Register the image (H, W, 3) of a keyframe under its index."""
         gray = grayscale(image)
         self._images[keyframe_index] = gray
-        self._textures[keyframe_index] = texture_confidence(gray, self.config)
+        self._textures[keyframe_index] = texture_confidence(gray, self.stride)
 
     def remove_frame(self, keyframe_index: int) -> None:
         """Forget a keyframe."""
@@ -111,7 +111,7 @@ class ClassicalFlow(Stateful):
             if backward is None:
                 backward = reverse_flow(self._images[source], self._images[target], forward)
             images, texture = (self._images[source], self._images[target]), self._textures[source]
-            on_grid = measured_on_grid(*images, forward, backward, texture, self.config)
+            on_grid = measure_on_grid(*images, forward, backward, texture, self.stride)
             # A copy: a view would keep the starts of all edges of this call.
             return MeasuredEdge(source, target, starts[edge].copy(), *on_grid)
 
@@ -130,11 +130,11 @@ class ClassicalFlow(Stateful):
 
 
 class FlowChain(Stateful):
-    """The flow from one reference frame to the newest frame, carried from frame to frame.
+    """The flow from one reference frame to the newest frame, updated frame by frame.
 
-    The previous frame's flow predicts the next one, so a displacement of any length is followed
-    as long as each step of it is short. It needs no pose: it starts the pose. A chain is never
-    changed: the next frame gives a new one, and a bad frame can be passed over.
+    The flow to the previous frame predicts the flow to the next one, so that long displacements
+    are followed as long as each step is short. No pose is needed; the pose is started from this
+    flow. A chain is never changed: the next frame gives a new one, so a bad frame can be skipped.
     """
 
     _reference: np.ndarray  # (H, W) uint8
@@ -150,30 +150,33 @@ class FlowChain(Stateful):
         increment: np.ndarray,
         config: ClassicalFlowConfig,
     ) -> None:
-        self._reference, self._newest = reference, newest
-        self._flow, self._increment = flow, increment
+        self._reference = reference
+        self._newest = newest
+        self._flow = flow
+        self._increment = increment
         self._config = config
 
-    def advanced(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
+    def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
         gray = grayscale(image)
-        texture = texture_confidence(self._reference, self._config)
+        stride = self._config.stride
+        texture = texture_confidence(self._reference, stride)
 
-        def followed(start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def follow(start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             flow = composed_flow(self._reference, gray, start)
             backward = reverse_flow(self._reference, gray, flow)
             images = self._reference, gray
-            return flow, *measured_on_grid(*images, flow, backward, texture, self._config)
+            return flow, *measure_on_grid(*images, flow, backward, texture, stride)
 
-        # A steady hand continues its motion, a shaking one does not: try both. Only the finished
-        # flow tells which start was right; a wrong one would be continued from frame to frame.
+        # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
+        # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
         starts = (self._flow, self._flow + self._increment)
-        measured = _threads(self._config.workers).map(followed, starts)
+        measured = _threads(self._config.workers).map(follow, starts)
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
         return chain, as_matches([targets], [confidence], [texture], torch.float32)
 
-    def restarted(self) -> "FlowChain":
+    def restart(self) -> "FlowChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
         standing = np.zeros_like(self._flow)
         return FlowChain(self._newest, self._newest, standing, self._increment, self._config)

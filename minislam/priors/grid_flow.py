@@ -1,6 +1,6 @@
-"""What a dense flow says at the cells of the grid, to the last tenth of a pixel, and how surely.
+"""Matches at the grid cells from a dense flow, refined to a tenth of a pixel, with confidences.
 
-Confidence is forward-backward agreement times texture times likeness.
+The confidence is forward-backward agreement times texture times similarity.
 """
 
 from dataclasses import dataclass
@@ -13,24 +13,20 @@ from minislam.parameters import parameter
 from minislam.priors.dense_flow import pixel_maps, sample, warp
 from minislam.priors.interfaces import FlowMatches
 
-LIKENESS_WINDOW = (9, 9)  # px
+SIMILARITY_WINDOW = (9, 9)  # px
 LK_WINDOW = (9, 9)  # px
 LK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.003)  # steps, px
 MAX_REMAINDER = 1.0  # px: what DIS leaves over is less, or the window sees something else
 LEAST_VARIANCE = 1e-5  # of brightness in [0, 1]: below it there is nothing to correlate
+CONSISTENCY_SCALE = 0.6  # px, forward-backward error at which confidence falls to exp(-1/2)
+TEXTURE_SCALE = 2e-4  # 1/px^2, smaller eigenvalue of the structure tensor that halves confidence
 
 
 @dataclass(frozen=True)
 class ClassicalFlowConfig:
-    """Constants of the classical flow."""
+    """Settings of the classical flow."""
 
     stride: int = parameter(8, "distance between grid cells [px], as DROID-SLAM")
-    consistency_scale: float = parameter(
-        0.6, "forward-backward error at which confidence falls to exp(-1/2) [px]"
-    )
-    texture_scale: float = parameter(
-        2e-4, "smaller eigenvalue of the structure tensor that halves confidence [1/px^2]"
-    )
     start_tolerance: float = parameter(
         0.25, "an edge is measured again if its start has moved by this (median) [px]; 0: always"
     )
@@ -48,33 +44,33 @@ class Windows:
     covariance: np.ndarray  # of the two
 
 
-def measured_on_grid(
+def measure_on_grid(
     source: np.ndarray,  # (H, W) uint8
     target: np.ndarray,  # (H, W) uint8
     forward: np.ndarray,  # (H, W, 2) px, flow source to target
     backward: np.ndarray,  # (H, W, 2) px, flow target to source
     texture: np.ndarray,  # (h, w) in [0, 1)
-    config: ClassicalFlowConfig,
+    stride: int,  # px
 ) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
-    """Return where each grid cell is in the target, as exactly as the images say, and how sure."""
-    stride, warped = config.stride, warp(target, forward, cv2.INTER_CUBIC)
+    """Return the position of each grid cell in the target, refined by Lucas-Kanade; confidence."""
+    warped = warp(target, forward, cv2.INTER_CUBIC)
     windows = windows_of(source, warped, stride)
-    remainder = lucas_kanade(source, same_exposure(warped, windows), stride)
-    return grid_matches(forward, remainder, backward, likeness(windows) * texture, config)
+    remainder = lucas_kanade(source, match_exposure(warped, windows), stride)
+    return grid_matches(forward, remainder, backward, similarity(windows) * texture, stride)
 
 
 def windows_of(source: np.ndarray, warped: np.ndarray, stride: int) -> Windows:
-    """Return what is seen around each grid cell in two images (H, W) uint8."""
+    """Return the moments of brightness around each grid cell of two images (H, W) uint8."""
 
     def at_cells(image: np.ndarray) -> np.ndarray:
         return image[::stride, ::stride]
 
     mean, warped_mean = (
-        at_cells(cv2.boxFilter(image, cv2.CV_32F, LIKENESS_WINDOW)) / 255
+        at_cells(cv2.boxFilter(image, cv2.CV_32F, SIMILARITY_WINDOW)) / 255
         for image in (source, warped)
     )
     square, warped_square, product = (
-        at_cells(cv2.boxFilter(cv2.multiply(*images, dtype=cv2.CV_32F), -1, LIKENESS_WINDOW))
+        at_cells(cv2.boxFilter(cv2.multiply(*images, dtype=cv2.CV_32F), -1, SIMILARITY_WINDOW))
         / 255**2
         for images in ((source, source), (warped, warped), (source, warped))
     )
@@ -84,10 +80,10 @@ def windows_of(source: np.ndarray, warped: np.ndarray, stride: int) -> Windows:
     )  # fmt: skip
 
 
-def same_exposure(warped: np.ndarray, windows: Windows) -> np.ndarray:
+def match_exposure(warped: np.ndarray, windows: Windows) -> np.ndarray:
     """Return the warped image (H, W) uint8 with the brightness and contrast of the source.
 
-    Both are medians over small windows, so that what moves or is covered has no say.
+    Both are medians over small windows, so that moving or covered regions do not matter.
     """
     textured = np.minimum(windows.variance, windows.warped_variance) > LEAST_VARIANCE
     if not textured.any():
@@ -98,11 +94,11 @@ def same_exposure(warped: np.ndarray, windows: Windows) -> np.ndarray:
 
 
 def lucas_kanade(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
-    """Return the displacement (h, w, 2) [px] of each grid cell that the warp has left over.
+    """Return the displacement (h, w, 2) [px] that remains at each grid cell after the warp.
 
-    The flow of DIS is a blend of patches that overlap, off by some hundredths of a pixel in the
-    same direction over large parts of an image, which turns the camera. A least-squares match of
-    one window per cell has errors of its own, which average out.
+    DIS blends overlapping patches. Its errors, some hundredths of a pixel, have the same direction
+    over large parts of an image and so rotate the estimated camera. A least-squares match of one
+    window per cell has independent errors, which average out.
     """
     cells = np.mgrid[: source.shape[0] : stride, : source.shape[1] : stride][::-1]
     points = cells.reshape(2, -1).T[:, None].astype(np.float32)
@@ -117,31 +113,33 @@ def lucas_kanade(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndar
 
 def grid_matches(
     forward: np.ndarray,  # (H, W, 2) px, flow source to target
-    remainder: np.ndarray,  # (h, w, 2) px, what it has left over at the grid cells
+    remainder: np.ndarray,  # (h, w, 2) px, what it lacks at the grid cells
     backward: np.ndarray,  # (H, W, 2) px, flow target to source
     texture: np.ndarray,  # (h, w) in [0, 1)
-    config: ClassicalFlowConfig,
+    stride: int,  # px
 ) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
-    """Sample a flow on the grid and judge it: forward-backward agreement, texture, on the image."""
+    """Sample a flow at the grid cells; confidence is texture times forward-backward agreement.
+
+    Matches outside of the target have confidence 0.
+    """
     height, width = forward.shape[:2]
-    stride = config.stride
     column, row = (m[::stride, ::stride] for m in pixel_maps((height, width)))
     moved_u, moved_v = column + remainder[..., 0], row + remainder[..., 1]
     flow = sample(forward, moved_u, moved_v)
     target_u, target_v = moved_u + flow[..., 0], moved_v + flow[..., 1]
     returned = sample(backward, target_u, target_v)
     squared_error = ((remainder + flow + returned) ** 2).sum(-1)
-    agreement = np.exp(-0.5 * squared_error / config.consistency_scale**2)
+    agreement = np.exp(-0.5 * squared_error / CONSISTENCY_SCALE**2)
     inside = (target_u >= 0) & (target_u <= width - 1) & (target_v >= 0) & (target_v <= height - 1)
     return np.stack([target_u, target_v], -1), agreement * texture * inside
 
 
-def texture_confidence(gray: np.ndarray, config: ClassicalFlowConfig) -> np.ndarray:
+def texture_confidence(gray: np.ndarray, stride: int) -> np.ndarray:
     """Return how well each grid cell can be located (h, w), in [0, 1).
 
-    On a bare wall forward and backward flow agree on anything, so agreement alone is no
-    confidence. The smaller eigenvalue of the structure tensor says whether a displacement in
-    any direction would be noticed.
+    On a bare wall forward and backward flow agree although both are wrong, so agreement alone is
+    no confidence. If the smaller eigenvalue of the structure tensor is large, a displacement in
+    any direction changes the image.
     """
     scaled = gray.astype(np.float32) / 255
     gx = cv2.Scharr(scaled, cv2.CV_32F, 1, 0) / 32  # 32: sum of the kernel's positive weights x 2
@@ -149,15 +147,16 @@ def texture_confidence(gray: np.ndarray, config: ClassicalFlowConfig) -> np.ndar
     window = (7, 7)
     xx, yy, xy = (cv2.boxFilter(p, -1, window) for p in (gx * gx, gy * gy, gx * gy))
     smaller = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
-    smaller = np.maximum(smaller[:: config.stride, :: config.stride], 0)
-    return smaller / (smaller + config.texture_scale)
+    smaller = np.maximum(smaller[::stride, ::stride], 0)
+    return smaller / (smaller + TEXTURE_SCALE)
 
 
-def likeness(windows: Windows) -> np.ndarray:
-    """Return how alike a source and its warped target look around each cell (h, w), in [0, 1].
+def similarity(windows: Windows) -> np.ndarray:
+    """Return the similarity of source and warped target around each cell (h, w), in [0, 1].
 
-    It is the squared normalised cross-correlation, blind to exposure. Forward and backward flow
-    agree with each other on a black target and, here and there, on any other: this asks the images.
+    It is the squared normalised cross-correlation, which does not depend on the exposure. It is
+    needed because forward and backward flow may agree where the images differ, for instance on a
+    black target.
     """
     squared_scale = np.maximum(windows.variance * windows.warped_variance, LEAST_VARIANCE**2)
     return np.clip(windows.covariance / np.sqrt(squared_scale), 0, 1) ** 2

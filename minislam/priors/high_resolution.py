@@ -1,8 +1,8 @@
 """Features on a finer grid: those of several shifted copies of an image, interleaved.
 
-DINOv2 gives one feature per patch of 14 px, so beta is blurred over the outline of an object. On
-an image that is shifted by a fraction of a patch, the same network describes the patches in
-between. The price is one pass of the network per shift (paper supplement).
+DINOv2 gives one feature per patch of 14 px, so beta is blurred at the outline of an object. If the
+image is shifted by a fraction of a patch, the same network describes the patches in between, at
+the cost of one pass of the network per shift (paper supplement).
 """
 
 from dataclasses import replace
@@ -16,10 +16,10 @@ from minislam.records import Frame
 
 
 class HighResolutionFeatures:
-    """A feature extractor whose grid is `factor` times as fine as that of the one inside.
+    """A feature extractor whose grid is `factor` times as fine as that of the extractor inside.
 
-    A feature still describes a whole patch of the extractor: the patches overlap, but they are
-    no smaller. So the finer grid costs factor^2 passes and needs no other training.
+    A feature still describes a whole patch of the extractor; the patches overlap. So the finer
+    grid costs factor^2 passes and needs no other training.
     """
 
     def __init__(self, extractor: FeatureExtractor, factor: int) -> None:

@@ -1,7 +1,7 @@
-"""What the system asks of an image before it knows any geometry: flow, features, depth.
+"""The interfaces of flow, features and depth.
 
-Each of the three has a classical implementation that needs no weights, and can be replaced by a
-pretrained network without any change elsewhere.
+Each has an implementation that needs no weights. A pretrained network can replace it, and nothing
+else changes.
 """
 
 from dataclasses import dataclass
@@ -23,19 +23,20 @@ class FlowMatches:
 
 
 class FlowChain(Protocol):
-    """Flow from a reference frame, followed from frame to frame without any geometry."""
+    """Flow from a reference frame to the newest frame, followed without any geometry."""
 
-    def advanced(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
+    def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
         """Return the chain, and the matches (E = 1), from the reference to this next image."""
 
-    def restarted(self) -> "FlowChain":
+    def restart(self) -> "FlowChain":
         """Return a chain whose reference is the newest image of this one."""
 
 
 class FlowEstimator(Protocol):
     """Dense correspondence between keyframes, started from a prediction.
 
-    For checkpoints, it and its chains are `Stateful`, too.
+    An estimator and its chains must also be `Stateful` (minislam/state), so that an interrupted
+    run can be resumed.
     """
 
     stride: int  # px between neighbouring grid cells

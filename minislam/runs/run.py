@@ -64,7 +64,7 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
         )
     return Priors(
         choose_flow(choice, config.flow, networks),
-        choose_features(choice, sequence.camera, config.features),
+        choose_features(choice, sequence.camera, config.features, networks),
         choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
 

@@ -90,13 +90,13 @@ class Tracker(Stateful):
             self._add_keyframe(frame, identity, torch.ones(len(self.grid.rays)))
             self._log(frame, TrackingStatus.OK, 1.0)
             return True
-        chain, matches = self._chain.advanced(frame.image)
+        chain, matches = self._chain.advance(frame.image)
         added = False
         if not self._is_followed(matches) and self._passed_over is not None:
             # Too far from the last keyframe, but perhaps not from the last frame: make that one
             # a keyframe after all and go on from there.
             added = self._insert(*self._passed_over, may_cull=False)
-            chain, matches = self._chain.advanced(frame.image)
+            chain, matches = self._chain.advance(frame.image)
         ratio = float(matches.matched_ratios)
         if not self._is_followed(matches):
             return self._find_again(frame, ratio) or added
@@ -181,7 +181,7 @@ class Tracker(Stateful):
             if may_cull and self._is_culled(frame, pose):
                 return False
             self._motion.remember(matches, pose)
-        self._chain, self._passed_over = self._chain.restarted(), None
+        self._chain, self._passed_over = self._chain.restart(), None
         self._steps.append(matches)
         self._add_keyframe(frame, pose, carried)
         if self.initialised:

@@ -107,7 +107,7 @@ def bench_flow() -> None:
     still = CAMERA.pixel_grid(STRIDE).flatten(0, 1).T[None]
     edge = milliseconds(lambda: flow.match([0], [4], still))
     chain = flow.start_chain(images[0])
-    step = milliseconds(lambda: chain.advanced(images[1]))
+    step = milliseconds(lambda: chain.advance(images[1]))
     print(f"flow at 320x240: {edge:.0f} ms per edge, {step:.0f} ms per frame of the chain")
 
 

@@ -22,7 +22,7 @@ def test_every_file_is_recognised_with_its_size_and_its_flag(tmp_path: Path, cap
             "an image classifier of torchvision, complete: --lpips-trunk"
         ),
         "depth_anything_v2_metric_hypersim_vits.pth": (
-            "Depth Anything V2 (ViT of width 384), complete: "
+            "Depth Anything V2 (ViT of width 384, no registers), complete: "
             "--depth depth-anything --depth-weights"
         ),
         "dinov2_reg_small_finetuned.pth": (
@@ -31,7 +31,8 @@ def test_every_file_is_recognised_with_its_size_and_its_flag(tmp_path: Path, cap
         ),
         "droid.pth": "DROID-SLAM, complete: --flow droid --flow-weights",
         "metric_depth_vit_small_800k.pth": (
-            "Metric3D v2 (ViT of width 384), complete: --depth metric3d --depth-weights"
+            "Metric3D v2 (ViT of width 384, with registers), complete: "
+            "--depth metric3d --depth-weights"
         ),
     }  # fmt: skip
     size = (tmp_path / "weights/droid.pth").stat().st_size / 1e6

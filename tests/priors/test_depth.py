@@ -106,13 +106,6 @@ def test_sixteen_bit_png_is_scaled_by_the_declared_unit(tmp_path: Path):
     torch.testing.assert_close(depth, torch.ones(60, 80))
 
 
-def test_files_are_found_by_the_names_of_the_images(tmp_path: Path):
-    np.save(tmp_path / "b 02.npy", np.full((60, 80), 2, np.float32))
-    prior = FileDepth(tmp_path, stems=["a 01", "b 02"])
-    assert prior(frame(0), CAMERA) is None
-    assert prior(frame(1), CAMERA).unique().tolist() == [2.0]
-
-
 def test_another_size_is_resized_without_inventing_depths(tmp_path: Path):
     depth = np.where(np.arange(160) < 80, 1.0, 9.0)[None].repeat(120, 0)
     depth[:, 100] = np.nan
@@ -171,14 +164,11 @@ def test_bad_folders_are_refused_in_one_sentence(tmp_path: Path, write, sentence
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_folder_and_an_undeclared_or_zero_unit_are_refused(tmp_path: Path):
+def test_a_missing_folder_and_a_zero_unit_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match="found nothing at"):
         FileDepth(tmp_path / "none")
     with pytest.raises(InputError, match=r"positive world unit .* found 0"):
         FileDepth(tmp_path, png_unit=0)
-    cv2.imwrite(str(tmp_path / "0.png"), np.ones((60, 80), np.uint16))
-    with pytest.raises(InputError, match="none declared"):
-        FileDepth(tmp_path)(frame(0), CAMERA)
 
 
 # The other two

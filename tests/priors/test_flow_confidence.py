@@ -19,6 +19,7 @@ from tests.priors.patterns import (
     view,
 )
 
+STRIDE = CONFIG.stride
 NOTHING_LEFT = np.zeros((HEIGHT // 8, WIDTH // 8, 2), np.float32)
 
 # Confidence
@@ -36,17 +37,17 @@ def test_what_leaves_the_image_has_no_confidence():
 def test_the_border_of_the_image_counts_as_inside():
     texture = np.full((HEIGHT // 8, WIDTH // 8), 0.9)
     targets, confidence = grid_matches(
-        constant(0, 0), NOTHING_LEFT, constant(0, 0), texture, CONFIG
+        constant(0, 0), NOTHING_LEFT, constant(0, 0), texture, STRIDE
     )
     assert targets[0, 0].tolist() == [0, 0] and (confidence == 0.9).all()
-    _, left = grid_matches(constant(-0.5, 0), NOTHING_LEFT, constant(0.5, 0), texture, CONFIG)
+    _, left = grid_matches(constant(-0.5, 0), NOTHING_LEFT, constant(0.5, 0), texture, STRIDE)
     assert (left[:, 0] == 0).all() and (left[:, 1:] == 0.9).all()
 
 
 def test_disagreement_costs_confidence_by_its_formula():
     texture = np.ones((HEIGHT // 8, WIDTH // 8))
     backward = constant(-2.0, 0.6)  # off by 0.6 px, the consistency scale
-    _, confidence = grid_matches(constant(2.0, 0.0), NOTHING_LEFT, backward, texture, CONFIG)
+    _, confidence = grid_matches(constant(2.0, 0.0), NOTHING_LEFT, backward, texture, STRIDE)
     np.testing.assert_allclose(confidence[1:-1, 1:-1], np.exp(-0.5), rtol=1e-5)
 
 
@@ -56,10 +57,10 @@ def test_a_bare_wall_and_an_edge_have_no_confidence():
     edge[:, 64:] = 200  # vertical: a motion along it would go unnoticed
     corner = edge.copy()
     corner[48:] = 40
-    assert (texture_confidence(wall, CONFIG) == 0).all()
-    assert texture_confidence(edge, CONFIG).max() < 1e-3
-    assert texture_confidence(corner, CONFIG)[6, 8] > 0.9
-    assert texture_confidence(grayscale(shifted(0, 0, SIZE)), CONFIG).mean() > 0.7
+    assert (texture_confidence(wall, STRIDE) == 0).all()
+    assert texture_confidence(edge, STRIDE).max() < 1e-3
+    assert texture_confidence(corner, STRIDE)[6, 8] > 0.9
+    assert texture_confidence(grayscale(shifted(0, 0, SIZE)), STRIDE).mean() > 0.7
 
 
 def test_half_a_bare_wall_leaves_the_other_half():
@@ -90,11 +91,11 @@ def test_black_images_match_nothing():
     matches = flow_of([black, seen, black]).match([0, 0], [1, 2], still(2))
     assert torch.isfinite(matches.targets).all()
     assert (matches.confidences == 0).all() and (matches.matched_ratios == 0).all()
-    _, of_chain = flow_of([]).start_chain(black).advanced(black)
+    _, of_chain = flow_of([]).start_chain(black).advance(black)
     assert float(of_chain.matched_ratios) == 0
 
 
-def test_unrelated_images_share_little():
+def test_unrelated_images_hardly_match():
     other = view(np.eye(2), np.array([5000.0, 3000.0]), SIZE)
     matches = flow_of([shifted(0, 0, SIZE), other]).match([0, 0], [0, 1], still(2))
     assert matches.matched_ratios[1] < 0.15 < 0.9 < matches.matched_ratios[0]
@@ -104,7 +105,7 @@ def test_unrelated_images_share_little():
 def test_a_view_that_goes_blank_is_not_matched(brightness: float):
     blank, seen = torch.full((*SIZE, 3), brightness), shifted(0, 0, SIZE)
     assert flow_of([seen, blank]).match([0], [1], still()).matched_ratios[0] < 0.01
-    _, of_chain = flow_of([]).start_chain(seen).advanced(blank)
+    _, of_chain = flow_of([]).start_chain(seen).advance(blank)
     assert float(of_chain.matched_ratios) < 0.01
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from minislam.priors import grid_flow
 from minislam.priors.dense_flow import grayscale
-from minislam.priors.grid_flow import lucas_kanade, measured_on_grid, same_exposure, windows_of
+from minislam.priors.grid_flow import lucas_kanade, match_exposure, measure_on_grid, windows_of
 from tests.priors.patterns import CONFIG, HEIGHT, SIZE, WIDTH, constant, shifted, view
 
 STRIDE = CONFIG.stride
@@ -15,11 +15,11 @@ SURE = np.ones((HEIGHT // STRIDE, WIDTH // STRIDE), np.float32)
 
 def brought_to(source: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the other image with the exposure of the source."""
-    return same_exposure(other, windows_of(source, other, STRIDE))
+    return match_exposure(other, windows_of(source, other, STRIDE))
 
 
 @pytest.mark.parametrize("shift", [(0.3, -0.2), (-0.6, 0.4), (0.0, 0.0)])
-def test_a_part_of_a_pixel_is_found(shift: tuple[float, float]):
+def test_a_fraction_of_a_pixel_is_found(shift: tuple[float, float]):
     source, warped = grayscale(shifted(0, 0, SIZE)), grayscale(shifted(*shift, SIZE))
     found = lucas_kanade(source, warped, STRIDE)
     assert found.shape == (HEIGHT // STRIDE, WIDTH // STRIDE, 2)
@@ -45,7 +45,7 @@ def test_a_flow_that_is_off_everywhere_by_the_same_is_set_right():
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     truth = (np.stack([u, v], -1) - centre) @ (R - np.eye(2)).T
     off = (truth + np.array([0.25, -0.15])).astype(np.float32)
-    targets, _ = measured_on_grid(source, target, off, -off, SURE, CONFIG)
+    targets, _ = measure_on_grid(source, target, off, -off, SURE, STRIDE)
     cells = np.stack([u, v], -1)[::STRIDE, ::STRIDE]
     error = (targets - cells - truth[::STRIDE, ::STRIDE])[INNER_CELLS]
     assert np.abs(error.mean((0, 1))).max() < 0.01
@@ -65,7 +65,7 @@ def test_another_exposure_is_taken_back(contrast: float, brightness: float):
     assert np.abs(found).max() < 0.15 and np.median(np.abs(found)) < 0.03
 
 
-def test_what_is_covered_has_no_say_in_the_exposure():
+def test_covered_regions_do_not_change_the_exposure():
     source = grayscale(shifted(0, 0, SIZE))
     covered = source.copy()
     covered[:, : WIDTH // 3] = grayscale(0.4 * shifted(40, 9, SIZE))[:, : WIDTH // 3]
@@ -86,9 +86,7 @@ def test_an_exposure_that_nothing_tells_is_left_alone():
 def test_a_bare_wall_leaves_nothing_over(brightness: int):
     wall = np.full(SIZE, brightness, np.uint8)
     assert (lucas_kanade(wall, wall, STRIDE) == 0).all()
-    targets, confidence = measured_on_grid(
-        wall, wall, constant(1, 0), constant(-1, 0), SURE, CONFIG
-    )
+    targets, confidence = measure_on_grid(wall, wall, constant(1, 0), constant(-1, 0), SURE, STRIDE)
     assert np.isfinite(targets).all() and (confidence == 0).all()
 
 
@@ -96,6 +94,6 @@ def test_nothing_is_changed():
     source, target = (grayscale(shifted(d, 0, SIZE)) for d in (0, 2))
     copies = source.copy(), target.copy(), constant(2, 0)
     flow = constant(2, 0)
-    measured_on_grid(source, target, flow, -flow, SURE, CONFIG)
+    measure_on_grid(source, target, flow, -flow, SURE, STRIDE)
     for now, then in zip((source, target, flow), copies, strict=True):
         np.testing.assert_array_equal(now, then)

@@ -1,22 +1,19 @@
-"""Official checkpoint files: read safely, recognised by their keys, complained about in words.
+"""Read official checkpoint files; nothing in them is executed.
 
 The networks of this folder are plain functions over `Weights`, a dictionary of tensors under
-their official names. There is no tree of modules to mirror: sizes are read from the shapes, and
-a name is written where it is used. Running a network once on a tiny image therefore checks a
-file completely: a missing tensor is named, and a tensor that was never asked for is unexpected.
+their official names. Sizes are read from the shapes, and each name is written where it is used.
+Therefore one run on a tiny image checks a file completely: a missing tensor is named, and a
+tensor that was never asked for is unexpected.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from minislam.errors import InputError
-
-Network = TypeVar("Network")
 
 _CONTAINERS = ("model_state_dict", "state_dict", "model")  # where trainers put the weights
 _DATA_PARALLEL = "module."  # what torch's DistributedDataParallel puts before every name
@@ -67,7 +64,7 @@ class Weights:
         return number
 
     def unused(self) -> list[str]:
-        """Return the names no one has asked for so far."""
+        """Return the names of the tensors that nobody has asked for so far."""
         return sorted(name for name in self._tensors if name not in self._used)
 
     @property
@@ -133,64 +130,3 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
             f"expected named tensors in {path}, found none; give the file with the weights"
         )
     return Weights(named, str(path))
-
-
-def describe(weights: Weights) -> str:
-    """Say in a few words which network a checkpoint belongs to, by the names in it."""
-    if "update.gru.convz.weight" in weights:
-        return "DROID-SLAM"
-    if "depth_model.decoder.token2feature.read_0.readoper.project_patch.weight" in weights:
-        width = weights["depth_model.encoder.patch_embed.proj.weight"].shape[0]
-        return f"Metric3D v2 (ViT of width {width})"
-    if "depth_head.scratch.output_conv1.weight" in weights:
-        width = weights["pretrained.patch_embed.proj.weight"].shape[0]
-        return f"Depth Anything V2 (ViT of width {width})"
-    if "patch_embed.proj.weight" in weights and "blocks.0.ls1.gamma" in weights:
-        width = weights["patch_embed.proj.weight"].shape[0]
-        maker = "FiT3D" if is_timm_layout(weights) else "DINOv2"
-        registers = {"register_tokens", "reg_token"} & set(weights)
-        return f"{maker} (ViT of width {width}, {'with' if registers else 'no'} registers)"
-    if "lin0.model.1.weight" in weights:
-        return "LPIPS linear weights"
-    if "features.0.weight" in weights:
-        return "an image classifier of torchvision"
-    names = sorted(weights)
-    return f"something unknown ({len(names)} tensors, the first is {names[0]})"
-
-
-def is_timm_layout(weights: Weights) -> bool:
-    """Tell a ViT of the timm library (FiT3D) from one of DINOv2: only DINOv2 has a mask token."""
-    return "mask_token" not in weights
-
-
-def require(weights: Weights, kind: str) -> None:
-    """Refuse a checkpoint of another network; `kind` is how `describe` begins."""
-    found = describe(weights)
-    if not found.startswith(tuple(kind.split(" or "))):
-        raise InputError(
-            f"expected a {kind} checkpoint, found {weights.file}, which looks like {found}; "
-            "give the file that belongs to this network"
-        )
-
-
-def probed(
-    weights: Weights,
-    build_and_run: Callable[[], Network],  # builds a network, runs it once, returns it
-    ignored: tuple[str, ...] = (),  # ends of names that are stored and not needed
-) -> Network:
-    """Return a network whose file is checked: every tensor fits, is there, and is needed."""
-    try:
-        with torch.no_grad():
-            network = build_and_run()
-    except (RuntimeError, IndexError, ValueError) as error:
-        raise InputError(
-            f"expected the shapes of {describe(weights)} in {weights.file}, found tensors that do "
-            f"not fit together ({str(error).splitlines()[0]}); it is another version"
-        ) from error
-    extra = [name for name in weights.unused() if not name.endswith(ignored)]
-    if extra:
-        raise InputError(
-            f"expected only the tensors of {describe(weights)} in {weights.file}, found "
-            f"{len(extra)} more, such as {extra[0]}; it is another version of the network"
-        )
-    return network

@@ -1,8 +1,8 @@
 """Depth Anything V2 with its metric heads (paper, ablation of the depth prior).
 
-A ViT is read at four depths. Each reading becomes a map of its own resolution, and from coarse to
-fine each map is added to what the coarser ones have made of the image (a "dense prediction
-transformer"). It knows no focal length: the camera is assumed to be like that of its training.
+The tokens of a ViT are read after four of its blocks. Each reading becomes a map of its own
+resolution, and the maps are fused from coarse to fine (a "dense prediction transformer"). The
+network does not know the focal length: it assumes the camera of its training.
 """
 
 import math
@@ -17,7 +17,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
-from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probed, require
+from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
 from minislam.records import Frame
 
@@ -29,7 +29,7 @@ _TAPS = {12: (2, 5, 8, 11), 24: (4, 11, 17, 23)}  # by the number of blocks: S a
 
 @dataclass(frozen=True)
 class DepthAnythingConfig:
-    """What the network is shown, and how its output is read."""
+    """Size of the input, and scale of the output."""
 
     shorter_side: int = parameter(SHORTER_SIDE, "shorter side of what it sees [px], official")
     depth_limit: float = parameter(
@@ -76,7 +76,7 @@ class DepthAnythingHead:
         return scratch.conv("output_conv2.2", out)[:, 0]
 
 
-def _fuse(weights: Weights, coarse: Tensor, fine: Tensor | None, size: tuple[int, int]) -> Tensor:
+def _fuse(weights: Weights, coarse: Tensor, fine: Tensor | None, size: tuple[int, ...]) -> Tensor:
     """Add a finer map to a coarser one and bring the sum to a size."""
     if fine is not None:
         coarse = coarse + _residual_unit(weights.below("resConfUnit1."), fine)
@@ -89,7 +89,7 @@ def _residual_unit(weights: Weights, x: Tensor) -> Tensor:
     return x + weights.conv("conv2", functional.relu(hidden))
 
 
-def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:
+def _resize(x: Tensor, size: tuple[int, ...]) -> Tensor:
     return functional.interpolate(x, size, mode="bilinear", align_corners=True)
 
 
@@ -102,7 +102,6 @@ class DepthAnything:
         depth_limit: float,  # metre, of the training data: INDOOR_LIMIT or OUTDOOR_LIMIT
         shorter_side: int = SHORTER_SIDE,
     ) -> None:
-        require(weights, "Depth Anything V2")
         if not depth_limit > 0:
             raise InputError(
                 f"expected the largest depth of the training in metres, found {depth_limit}; "
@@ -139,40 +138,18 @@ def _whole_patches(side: float, shortest: int) -> int:
     return rounded if rounded >= shortest else math.ceil(side / PATCH) * PATCH
 
 
-def load_depth_anything(
-    path: Path | str,
-    device: torch.device | str = "cpu",
-    config: DepthAnythingConfig = DepthAnythingConfig(),
-) -> DepthAnything:
-    """Read a Depth Anything V2 checkpoint with a metric head and check it."""
-    return checked_depth_anything(load_checkpoint(path, device), config)
-
-
-def checked_depth_anything(
-    weights: Weights, config: DepthAnythingConfig = DepthAnythingConfig()
-) -> DepthAnything:
-    """Return the prior after its weights have been checked on a tiny image."""
-    require(weights, "Depth Anything V2")
+def build_depth_anything(weights: Weights, config: DepthAnythingConfig) -> DepthAnything:
+    """Return the prior after one run on a tiny image, which asks for every tensor it needs."""
     limit = config.depth_limit or limit_of_name(Path(weights.file))
-
-    def build_and_run() -> DepthAnything:
-        prior = DepthAnything(weights, limit, config.shorter_side)
-        prior.network(torch.zeros(1, 3, 2 * PATCH, 2 * PATCH, device=weights.device))
-        return prior
-
-    # The first unit of the coarsest level has nothing to add, yet it is stored.
-    unneeded = tuple(
-        f"refinenet4.resConfUnit1.{conv}.{kind}"
-        for conv in ("conv1", "conv2")
-        for kind in ("weight", "bias")
-    )
-    return probed(weights, build_and_run, ignored=("mask_token", *unneeded))
+    prior = DepthAnything(weights, limit, config.shorter_side)
+    prior.network(torch.zeros(1, 3, 2 * PATCH, 2 * PATCH, device=weights.device))
+    return prior
 
 
 def limit_of_name(path: Path) -> float:
     """Return the largest depth [m] that a checkpoint was trained with, from its official name.
 
-    The file itself does not say it, nor whether its output is a metric depth at all.
+    The file itself states neither this depth nor whether its output is metric.
     """
     for part, limit in _LIMIT_OF_NAME.items():
         if part in path.name:

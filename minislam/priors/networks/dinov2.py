@@ -3,20 +3,12 @@
 FiT3D is DINOv2 made consistent across views; its files come in the layout of the timm library.
 """
 
-from pathlib import Path
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.errors import InputError
-from minislam.priors.networks.checkpoints import (
-    Weights,
-    is_timm_layout,
-    load_checkpoint,
-    probed,
-    require,
-)
+from minislam.priors.features import grid_size
+from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
 from minislam.records import Frame
 
@@ -26,8 +18,7 @@ class DinoFeatures:
 
     stride = PATCH
 
-    def __init__(self, weights: Weights, kind: str = "DINOv2 or FiT3D") -> None:
-        require(weights, kind)
+    def __init__(self, weights: Weights) -> None:
         self.device = weights.device
         self._transformer = VisionTransformer(weights, position_resize_of(weights))
         self.dimension = self._transformer.width
@@ -38,12 +29,7 @@ class DinoFeatures:
     ) -> Tensor:  # (H // 14, W // 14, C) float32
         """Return one feature per patch of 14 px; the image is stretched to whole patches."""
         image = frame.image
-        rows, cols = image.shape[0] // PATCH, image.shape[1] // PATCH
-        if min(rows, cols) < 1:
-            raise InputError(
-                f"expected an image of at least {PATCH}x{PATCH} px for the features, "
-                f"found {image.shape[1]}x{image.shape[0]}; give a larger working size"
-            )
+        rows, cols = grid_size(image, PATCH)
         with torch.no_grad():
             size = (PATCH * rows, PATCH * cols)
             whole = functional.interpolate(normalise(image, self.device), size, mode="bilinear")
@@ -54,27 +40,15 @@ class DinoFeatures:
 def position_resize_of(weights: Weights) -> PositionResize:
     """Return how a features checkpoint was trained to resize its positions.
 
-    The file does not say so, but the three published kinds differ in what it contains.
+    The file does not state it, but the three published kinds differ in what they contain: FiT3D
+    alone lacks the mask token of the training, and DINOv2 has registers or not.
     """
-    antialias = is_timm_layout(weights) or "register_tokens" in weights
+    antialias = "mask_token" not in weights or "register_tokens" in weights
     return PositionResize.ANTIALIAS if antialias else PositionResize.OFFSET
 
 
-def load_dino_features(
-    path: Path | str,
-    device: torch.device | str = "cpu",
-    kind: str = "DINOv2 or FiT3D",  # what the file must hold
-) -> DinoFeatures:
-    """Read a DINOv2 or FiT3D checkpoint and check it."""
-    return checked_dino_features(load_checkpoint(path, device), kind)
-
-
-def checked_dino_features(weights: Weights, kind: str = "DINOv2 or FiT3D") -> DinoFeatures:
-    """Return the features after their weights have been checked on a tiny image."""
-
-    def build_and_run() -> DinoFeatures:
-        features = DinoFeatures(weights, kind)
-        features(Frame(0, 0.0, torch.zeros(PATCH, PATCH, 3)))
-        return features
-
-    return probed(weights, build_and_run, ignored=("mask_token",))  # used in training only
+def build_dino_features(weights: Weights) -> DinoFeatures:
+    """Return the features after one run on a tiny image, which asks for every tensor they need."""
+    features = DinoFeatures(weights)
+    features(Frame(0, 0.0, torch.zeros(PATCH, PATCH, 3)))
+    return features

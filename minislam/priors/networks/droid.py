@@ -1,11 +1,10 @@
-"""DROID-SLAM's network behind the `FlowEstimator` interface: the front-end of the paper.
+"""DROID-SLAM's network behind the `FlowEstimator` interface, as in the paper.
 
-Each edge keeps the hidden state of its recurrent unit as long as it is asked for call after call,
-so a later answer builds on the earlier ones while the geometry between them improves.
+An edge keeps the hidden state of its recurrent unit as long as every call asks for it. So a later
+answer builds on the earlier ones, while the geometry improves between the calls.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,12 +12,11 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.parameters import parameter
 from minislam.priors.interfaces import FlowMatches
-from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probed, require
+from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid_network import (
     LEVELS,
     STRIDE,
     Context,
-    aggregate,
     cell_grid,
     correlation_pyramid,
     encode_context,
@@ -66,7 +64,6 @@ class DroidFlow(Stateful):
     stride = STRIDE
 
     def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
-        require(weights, "DROID-SLAM")
         self.weights = weights
         self.config = config or DroidFlowConfig()
         self._frames: dict[int, EncodedFrame] = {}
@@ -108,8 +105,7 @@ class DroidFlow(Stateful):
             found, confidence = self._refine(batch, expected[start : start + len(batch)])
             states |= dict(zip(batch, found, strict=True))
             confidences.append(confidence)
-        # Edges that were not asked for start afresh next time, as in a new graph: memory stays
-        # bounded by one call.
+        # Edges that this call does not ask for start anew next time. So memory is bounded.
         self._edges = states
         targets = torch.stack([states[edge].target for edge in edges])
         return self.as_matches(targets, torch.cat(confidences), predicted_targets)
@@ -130,7 +126,7 @@ class DroidFlow(Stateful):
         last = [
             state.target if state else where for state, where in zip(known, expected, strict=True)
         ]
-        refined = self.refined(
+        refined = self.refine(
             torch.cat([source.features for source in sources]),
             Context(torch.cat(hidden), torch.cat([s.context.features for s in sources])),
             targets,
@@ -140,7 +136,7 @@ class DroidFlow(Stateful):
         )
         return [_EdgeState(h, t) for h, t in zip(*refined[:2], strict=True)], refined[2]
 
-    def refined(
+    def refine(
         self,
         source_features: Tensor,  # (E, 128, h, w)
         source_context: Context,  # of E frames
@@ -156,7 +152,7 @@ class DroidFlow(Stateful):
             correlation = look_up(pyramid, expected)
             answer = update(self.weights, hidden, context, correlation, expected, last_target)
             hidden, last_target = answer.hidden, expected + answer.revision
-            expected = last_target  # until the geometry is updated, this is the best guess
+            expected = last_target  # the best guess until the geometry is updated
         return hidden, last_target, answer.confidence
 
     @torch.no_grad()
@@ -198,19 +194,21 @@ class DroidChain(Stateful):
         newest: EncodedFrame | None,
         target: Tensor | None,
     ) -> None:
-        self._flow, self._reference = flow, reference
+        self._flow = flow
+        self._reference = reference
         self._newest = newest or reference
         self._target = target
 
     @torch.no_grad()
-    def advanced(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
+    def advance(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
-        newest, reference = self._flow.encode(image), self._reference
+        newest = self._flow.encode(image)
+        reference = self._reference
         expected = self._target
         if expected is None:
             height, width = reference.features.shape[2:]
             expected = cell_grid(reference.features.new_zeros(1, height, width, 2))[None]
-        _, target, confidence = self._flow.refined(
+        _, target, confidence = self._flow.refine(
             reference.features,
             reference.context,
             newest.features,
@@ -221,29 +219,14 @@ class DroidChain(Stateful):
         matches = self._flow.as_matches(target, confidence, image)
         return DroidChain(self._flow, reference, newest, target), matches
 
-    def restarted(self) -> "DroidChain":
+    def restart(self) -> "DroidChain":
         """Return a chain that starts at the newest frame."""
         return DroidChain(self._flow, self._newest, None, None)
 
 
-def load_droid(
-    path: Path | str,
-    device: torch.device | str = "cpu",
-    config: DroidFlowConfig = DroidFlowConfig(),
-) -> DroidFlow:
-    """Read DROID-SLAM's checkpoint and check it."""
-    return checked_droid(load_checkpoint(path, device), config)
-
-
-def checked_droid(weights: Weights, config: DroidFlowConfig = DroidFlowConfig()) -> DroidFlow:
-    """Return the flow after its weights have been checked on a tiny image."""
+def build_droid(weights: Weights, config: DroidFlowConfig) -> DroidFlow:
+    """Return the flow after one run on a tiny image, which asks for every tensor it needs."""
+    flow = DroidFlow(weights, config)
     tiny = torch.zeros(STRIDE * _SMALLEST_GRID, STRIDE * _SMALLEST_GRID, 3)
-
-    def build_and_run() -> DroidFlow:
-        flow = DroidFlow(weights, config)
-        flow.start_chain(tiny).advanced(tiny)
-        hidden = flow.encode(tiny).context.hidden
-        aggregate(weights, hidden, torch.zeros(1, dtype=torch.long, device=weights.device))
-        return flow
-
-    return probed(weights, build_and_run)
+    flow.start_chain(tiny).advance(tiny)
+    return flow

@@ -1,10 +1,10 @@
-"""The network of DROID-SLAM: it looks where a cell is expected and says where it really is.
+"""The network of DROID-SLAM: it corrects the expected position of each cell in another frame.
 
     image -> features (compared between frames) and context (of the source frame)
     expected position -> correlation of the features around it
     correlation, motion, context -> recurrent unit -> revision of the position, confidence
 
-All positions and lengths in this file are in cells (1 cell = 8 px); px are droid.py's affair.
+All positions and lengths in this file are in cells (1 cell = 8 px); droid.py converts them to px.
 """
 
 from dataclasses import dataclass
@@ -20,15 +20,14 @@ CHANNELS = 128  # of features, hidden state and context
 LEVELS = 4  # of the correlation pyramid
 RADIUS = 3  # cells looked at around the expected position, at every level
 _MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
-_DAMPING_SCALE = 0.01  # of the damping head's softplus
 
 
 @dataclass(frozen=True)
 class Context:
-    """What the recurrent unit knows about the source frame."""
+    """Input of the recurrent unit from the source frame."""
 
-    hidden: Tensor  # (B, 128, h, w) where it starts
-    features: Tensor  # (B, 128, h, w) what it sees in every update
+    hidden: Tensor  # (B, 128, h, w) initial hidden state
+    features: Tensor  # (B, 128, h, w) input of every update
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Update:
 
 
 def encode_features(weights: Weights, image: Tensor) -> Tensor:  # (B, 128, h, w)
-    """Return what is compared between frames, of normalised images (B, 3, H, W)."""
+    """Return the features that frames are compared by, of normalised images (B, 3, H, W)."""
     return _encode(weights.below("fnet."), image, normalised=True)
 
 
@@ -112,7 +111,7 @@ def update(
     expected: Tensor,  # (E, h, w, 2) cells in the target, by the present geometry
     last_target: Tensor,  # (E, h, w, 2) cells, the answer of the last update
 ) -> Update:
-    """Return where cells are seen, relative to where they were expected, and how surely."""
+    """Return the revision of each expected position, its confidence and the new hidden state."""
     weights = weights.below("update.")
     motion = torch.cat([expected - cell_grid(expected), last_target - expected], -1)
     motion = motion.clamp(-_MOTION_LIMIT, _MOTION_LIMIT).permute(0, 3, 1, 2)
@@ -141,7 +140,7 @@ def _two_convs(weights: Weights, x: Tensor) -> Tensor:
 
 
 def _gru(weights: Weights, hidden: Tensor, inputs: Tensor) -> Tensor:
-    """Update the hidden state; a gated mean over the image tells every cell about the whole."""
+    """Update the hidden state; every cell also gets a gated mean over the whole image."""
     gated = weights.conv("w", hidden).sigmoid() * hidden
     whole = gated.mean((2, 3), keepdim=True)  # (E, 128, 1, 1)
     both = torch.cat([hidden, inputs], 1)
@@ -150,19 +149,3 @@ def _gru(weights: Weights, hidden: Tensor, inputs: Tensor) -> Tensor:
     proposal = torch.cat([r * hidden, inputs], 1)
     q = torch.tanh(weights.conv("convq", proposal) + weights.conv("convq_glo", whole))
     return (1 - z) * hidden + z * q
-
-
-def aggregate(
-    weights: Weights,
-    hidden: Tensor,  # (E, 128, h, w)
-    edges_source: Tensor,  # (E,) frame index
-) -> tuple[Tensor, Tensor]:  # (K, h, w), (K, 576, h, w), by increasing frame index
-    """Return per source frame the damping of its disparities and its upsampling logits."""
-    weights = weights.below("update.agg.")
-    frames, position = edges_source.unique(return_inverse=True)
-    seen = weights.conv("conv1", hidden).relu()
-    mean = seen.new_zeros(len(frames), *seen.shape[1:]).index_add_(0, position, seen)
-    mean = mean / torch.bincount(position).view(-1, 1, 1, 1)
-    features = weights.conv("conv2", mean).relu()
-    damping = _DAMPING_SCALE * functional.softplus(weights.conv("eta.0", features))
-    return damping[:, 0], weights.conv("upmask.0", features)

@@ -1,16 +1,14 @@
 """Metric3D v2: the metric depth of the paper (D~ in Eq. (3), Eq. (4) and Eq. (5)).
 
-An image alone does not tell a near small thing from a far large one: the focal length decides.
-So the network is trained as if every image came from one "canonical" camera of 1000 px, and its
-answer is scaled by the true focal length afterwards. What counts is the focal length of the
-image the network SAW, that is after resizing.
+A near small object and a far large one look the same; only the focal length tells them apart. So
+the network answers as if every image came from one "canonical" camera of 1000 px, and the answer
+is scaled by the true focal length: that of the image the network SAW, after resizing.
 
     tokens of the ViT -> maps at 4 resolutions -> fused coarse to fine -> first estimate
     -> a few rounds of recurrent refinement (metric3d_refinement.py) -> 4x upsampling
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,7 +17,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
-from minislam.priors.networks.checkpoints import Weights, load_checkpoint, probed, require
+from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.metric3d_refinement import Metric3DOutput, refine
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
 from minislam.records import Frame
@@ -34,7 +32,7 @@ _ROUNDS = {_SMALL: 4, _LARGE: 8}  # of refinement
 
 @dataclass(frozen=True)
 class Metric3DConfig:
-    """What the network is shown."""
+    """Size of the input."""
 
     size: tuple[int, int] = parameter(
         NETWORK_SIZE, "rows and columns it sees [px], official; multiples of 28, half costs a fifth"
@@ -152,7 +150,6 @@ class Metric3DDepth:
         weights: Weights,
         network_size: tuple[int, int] = NETWORK_SIZE,  # px; half of it costs a fifth
     ) -> None:
-        require(weights, "Metric3D v2")
         if any(side < _SIZE_STEP or side % _SIZE_STEP for side in network_size):
             raise InputError(
                 f"expected a network size of multiples of {_SIZE_STEP} px, found {network_size}; "
@@ -178,22 +175,8 @@ class Metric3DDepth:
         return depth, fitted.scale
 
 
-def load_metric3d(
-    path: Path | str,
-    device: torch.device | str = "cpu",
-    config: Metric3DConfig = Metric3DConfig(),
-) -> Metric3DDepth:
-    """Read a Metric3D v2 checkpoint (ViT-small or -large) and check it."""
-    return checked_metric3d(load_checkpoint(path, device), config)
-
-
-def checked_metric3d(weights: Weights, config: Metric3DConfig = Metric3DConfig()) -> Metric3DDepth:
-    """Return the prior after its weights have been checked on a tiny image."""
-
-    def build_and_run() -> Metric3DDepth:
-        prior = Metric3DDepth(weights, config.size)
-        prior.network(torch.zeros(1, 3, _SIZE_STEP, _SIZE_STEP, device=weights.device))
-        return prior
-
-    # Stored and not needed: a token of the training, and one layer norm under a second name.
-    return probed(weights, build_and_run, ("mask_token", "norm3.weight", "norm3.bias"))
+def build_metric3d(weights: Weights, config: Metric3DConfig) -> Metric3DDepth:
+    """Return the prior after one run on a tiny image, which asks for every tensor it needs."""
+    prior = Metric3DDepth(weights, config.size)
+    prior.network(torch.zeros(1, 3, _SIZE_STEP, _SIZE_STEP, device=weights.device))
+    return prior

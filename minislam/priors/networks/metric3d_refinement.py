@@ -1,8 +1,8 @@
 """The second half of Metric3D v2: a first estimate, refined by recurrent units, then upsampled.
 
-As in RAFT, three gated recurrent units (GRU) at three resolutions look at the present estimate
-and propose a change, a few times in a row. The state has six channels: scaled depth, depth
-confidence, normal (3), normal confidence.
+As in RAFT, three gated recurrent units (GRU) at three resolutions read the present estimate and
+propose a change to it, several times. The state has six channels: scaled depth, depth confidence,
+normal (3), normal confidence.
 """
 
 import math
@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.upsampling import convex_upsample
 
 NEAREST, FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
 _BINS = 256  # of depth, between the two on a logarithmic scale
@@ -28,7 +27,7 @@ _GRU_NAMES = ("gru08", "gru16", "gru32")
 
 @dataclass(frozen=True)
 class Metric3DOutput:
-    """What Metric3D says about an image."""
+    """The output of Metric3D for an image."""
 
     depth: Tensor  # (B, H, W) metre, for the canonical camera
     confidence: Tensor  # (B, H, W) of the depth
@@ -88,7 +87,7 @@ def normalised(oriented: Tensor) -> Tensor:
 
 
 def _start(weights: Weights, context: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-    """Return per level the hidden state and what the context adds to the three gates."""
+    """Return per level the hidden state, and the offsets that the context gives the three gates."""
     hidden, gates = [], []
     for level, (name, features) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
         encoder = weights.below(f"context_feature_encoder.{name}.")
@@ -129,7 +128,7 @@ def _recurrent_round(
 
 
 def _gru(weights: Weights, hidden: Tensor, gate_offsets: Tensor, inputs: Tensor) -> Tensor:
-    """Let a gated unit forget a part of its state and take in as much of a proposal."""
+    """Blend the hidden state with a proposal, by a gate per channel."""
     offset_z, offset_r, offset_q = gate_offsets.chunk(3, 1)
     both = torch.cat([hidden, inputs], 1)
     z = torch.sigmoid(weights.conv("convz", both) + offset_z)
@@ -152,3 +151,16 @@ def _proposed_change(weights: Weights, hidden: Tensor) -> Tensor:
     depth = weights.conv("conv2d", weights.conv("conv1d", hidden).relu())
     normal = weights.conv("conv2n", weights.conv("conv1n", hidden).relu())
     return torch.cat([depth, normal], 1)
+
+
+def convex_upsample(
+    coarse: Tensor,  # (B, C, h, w)
+    logits: Tensor,  # (B, 9 * factor^2, h, w)
+    factor: int,
+) -> Tensor:  # (B, C, factor * h, factor * w)
+    """Upsample: each fine pixel is a convex combination of the 3x3 coarse ones around it (RAFT)."""
+    batch, channels, height, width = coarse.shape
+    weight = logits.view(batch, 1, 9, factor, factor, height, width).softmax(2)
+    around = functional.unfold(coarse, 3, padding=1).view(batch, channels, 9, 1, 1, height, width)
+    fine = (weight * around).sum(2)  # (B, C, factor, factor, h, w)
+    return fine.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, factor * height, factor * width)

@@ -1,8 +1,8 @@
 """The vision transformer of DINOv2, on which FiT3D and both depth networks are built.
 
-Patches of 14x14 px become tokens, preceded by one class token and by four "registers" in some
-checkpoints. A block adds to the tokens first what they read from each other (attention), then
-what each makes of itself (MLP):
+Patches of 14x14 px become tokens; one class token, and in some checkpoints four "registers", stand
+before them. A block adds to each token first what it reads from all tokens (attention), then the
+output of an MLP on the token itself:
 
     x <- x + ls1 * proj(attention(norm1(x)))
     x <- x + ls2 * fc2(gelu(fc1(norm2(x))))
@@ -30,9 +30,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class PositionResize(Enum):
-    """How the table of positions is brought to another image size.
+    """How the table of positions is resized to another image size.
 
-    Networks were trained with one or the other, and the checkpoint does not say with which.
+    Each network was trained with one of them, and its checkpoint does not state which.
     """
 
     OFFSET = "offset"  # bicubic with the factor (n + 0.1) / 37: DINOv2 and the depth networks
@@ -41,7 +41,7 @@ class PositionResize(Enum):
 
 @dataclass(frozen=True)
 class Tokens:
-    """What a block of the transformer gives out, after the final norm."""
+    """The output of a block of the transformer, after the final norm."""
 
     leading: Tensor  # (B, 1 + registers, C), the class token first
     patches: Tensor  # (B, C, rows, cols)

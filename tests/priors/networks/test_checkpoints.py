@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from minislam.errors import InputError
-from minislam.priors.networks.checkpoints import Weights, describe, load_checkpoint
-from minislam.priors.networks.dinov2 import load_dino_features
+from minislam.priors.networks.checkpoints import Weights, load_checkpoint
 from tests.checkpoint_files import tiny_fit3d
-from tests.helpers import frame_of
 from tests.priors.networks import rebuilt
 
 
@@ -47,36 +45,7 @@ def test_flat_wrapped_and_data_parallel_files_are_the_same(tmp_path: Path, tenso
     assert torch.equal(weights["norm.weight"], tensors["norm.weight"])
 
 
-@pytest.mark.parametrize(
-    ("network", "words"),
-    [
-        ("dinov2_vits14", "DINOv2 (ViT of width 384, no registers)"),
-        ("dinov2_vits14_reg", "DINOv2 (ViT of width 384, with registers)"),
-        ("fit3d_small", "FiT3D (ViT of width 384, no registers)"),
-        ("fit3d_reg_small", "FiT3D (ViT of width 384, with registers)"),
-        ("depth_anything_v2_vitl", "Depth Anything V2 (ViT of width 1024)"),
-        ("metric3d_vit_large", "Metric3D v2 (ViT of width 1024)"),
-    ],
-)
-def test_files_are_recognised_by_their_names(network: str, words: str):
-    shapes = rebuilt.shapes_of(network)
-    empty = {n: torch.empty(s, device="meta") for n, s in shapes.items()}
-    assert describe(Weights(empty, "w.pth")) == words
-
-
-def test_other_files_are_described():
-    one = torch.zeros(1)
-    assert describe(Weights({"features.0.weight": one}, "f")).startswith("an image classifier")
-    assert "1 tensors, the first is abc" in describe(Weights({"abc": one}, "f"))
-    assert describe(Weights({"update.gru.convz.weight": one}, "f")) == "DROID-SLAM"
-
-
 # Identities
-
-
-def test_a_good_file_loads_and_runs(tmp_path: Path, tensors):
-    features = load_dino_features(write(tmp_path / "w.pth", tensors))
-    assert features(frame_of(torch.zeros(28, 42, 3))).shape == (2, 3, 384)
 
 
 def test_parts_share_what_has_been_used():
@@ -121,32 +90,3 @@ def test_a_file_without_tensors_is_refused(tmp_path: Path):
     for content in ({}, {"epoch": 3}, [1, 2], torch.zeros(3)):
         with pytest.raises(InputError, match="named tensors"):
             load_checkpoint(write(tmp_path / "w.pth", content))
-
-
-def test_another_network_is_named(tmp_path: Path):
-    path = write(tmp_path / "droid.pth", {"module.update.gru.convz.weight": torch.zeros(1)})
-    sentence = r"expected a DINOv2 or FiT3D checkpoint, found .*droid\.pth, which looks like DROID"
-    with pytest.raises(InputError, match=sentence):
-        load_dino_features(path)
-
-
-def test_missing_unexpected_and_misshapen_tensors_are_named(tmp_path: Path, tensors):
-    missing = {n: t for n, t in tensors.items() if n != "blocks.1.mlp.fc2.weight"}
-    with pytest.raises(InputError, match=r"expected the tensor blocks\.1\.mlp\.fc2\.weight"):
-        load_dino_features(write(tmp_path / "a.pth", missing))
-    extra = {**tensors, "blocks.0.attn.lora": torch.zeros(1)}
-    with pytest.raises(InputError, match=r"found 1 more, such as blocks\.0\.attn\.lora"):
-        load_dino_features(write(tmp_path / "b.pth", extra))
-    misshapen = {**tensors, "blocks.0.mlp.fc1.weight": torch.zeros(1536, 383)}
-    with pytest.raises(InputError, match="do not fit together"):
-        load_dino_features(write(tmp_path / "c.pth", misshapen))
-    misshapen = {**tensors, "cls_token": torch.zeros(1, 1, 12)}
-    with pytest.raises(InputError, match="do not fit together"):
-        load_dino_features(write(tmp_path / "d.pth", misshapen))
-
-
-def test_dinov2_and_fit3d_can_be_told_apart(tmp_path: Path, tensors):
-    path = write(tmp_path / "fit3d.pth", tensors)
-    assert load_dino_features(path, kind="FiT3D").dimension == 384
-    with pytest.raises(InputError, match=r"expected a DINOv2 checkpoint, .*looks like FiT3D"):
-        load_dino_features(path, kind="DINOv2")

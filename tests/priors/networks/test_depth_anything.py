@@ -14,8 +14,8 @@ from minislam.priors.networks.depth_anything import (
     DepthAnything,
     DepthAnythingConfig,
     DepthAnythingHead,
+    build_depth_anything,
     limit_of_name,
-    load_depth_anything,
 )
 from minislam.priors.networks.vit import normalise
 from minislam.records import Frame
@@ -23,7 +23,6 @@ from tests.priors.networks import rebuilt
 
 RELATIVE, METRIC = 2e-5, 1e-4  # the official code differs from its own float64 run by 2e-5 m
 CPU = torch.device("cpu")
-INDOOR = DepthAnythingConfig(shorter_side=28, depth_limit=INDOOR_LIMIT)
 
 
 @cache
@@ -75,24 +74,6 @@ def test_the_depth_scales_with_the_limit_of_the_training():
     torch.testing.assert_close(outdoor, 4 * indoor)
 
 
-def test_a_checkpoint_file_is_checked_and_runs(tmp_path: Path):
-    tensors = {name: weights()[name] for name in weights()}
-    torch.save(tensors, tmp_path / "w.pth")
-    prior = load_depth_anything(tmp_path / "w.pth", config=INDOOR)
-    assert prior(*frame(torch.zeros(30, 40, 3))).shape == (30, 40)
-
-
-def test_a_missing_bias_and_an_extra_tensor_are_named(tmp_path: Path):
-    tensors = {name: weights()[name] for name in weights()}
-    torch.save({**tensors, "depth_head.extra": torch.zeros(1)}, tmp_path / "w.pth")
-    with pytest.raises(InputError, match=r"1 more, such as depth_head\.extra"):
-        load_depth_anything(tmp_path / "w.pth", config=INDOOR)
-    del tensors["depth_head.scratch.output_conv2.2.bias"]
-    torch.save(tensors, tmp_path / "w.pth")
-    with pytest.raises(InputError, match=r"expected the tensor .*output_conv2\.2\.bias"):
-        load_depth_anything(tmp_path / "w.pth", config=INDOOR)
-
-
 def test_the_limit_follows_from_the_official_name():
     assert limit_of_name(Path("a/depth_anything_v2_metric_hypersim_vits.pth")) == 20
     assert limit_of_name(Path("depth_anything_v2_metric_vkitti_vitl.pth")) == 80
@@ -101,18 +82,14 @@ def test_the_limit_follows_from_the_official_name():
 # Errors
 
 
-def test_a_relative_checkpoint_is_refused_by_its_name(tmp_path: Path):
-    tensors = {name: weights()[name] for name in weights()}
-    torch.save(tensors, tmp_path / "depth_anything_v2_vits.pth")
+def test_a_relative_checkpoint_is_refused_by_its_name():
     with pytest.raises(InputError, match=r"found depth_anything_v2_vits\.pth, whose output may"):
-        load_depth_anything(tmp_path / "depth_anything_v2_vits.pth")
+        build_depth_anything(weights(), DepthAnythingConfig())
 
 
-def test_a_limit_that_is_not_positive_and_another_network_are_refused():
+def test_a_limit_that_is_not_positive_is_refused():
     with pytest.raises(InputError, match=r"largest depth .* found 0; give 20\.0"):
         DepthAnything(weights(), 0)
-    with pytest.raises(InputError, match="looks like DROID-SLAM"):
-        DepthAnything(Weights({"update.gru.convz.weight": torch.zeros(1)}, "f"), 20.0)
 
 
 def test_a_file_without_its_last_blocks_is_refused():

@@ -1,13 +1,22 @@
-"""Learned upsampling on logits that make its answer known."""
+"""The refinement of Metric3D: normals, and upsampling on logits that make its answer known.
+
+That its results are those of the official code is tested with the whole network.
+"""
 
 import torch
 from torch.nn import functional
 
-from minislam.priors.networks.upsampling import convex_upsample
+from minislam.priors.networks.metric3d_refinement import convex_upsample, normalised
 from tests.helpers import generator
 
 
-def test_upsampling_with_even_shares_averages_the_neighbourhood():
+def test_normals_have_unit_length_and_positive_confidence():
+    found = normalised(torch.randn(2, 4, 6, 7, generator=generator(1)))
+    torch.testing.assert_close(found[:, :3].norm(dim=1), torch.ones(2, 6, 7))
+    assert (found[:, 3] > 0).all()
+
+
+def test_upsampling_with_even_weights_averages_the_neighbourhood():
     coarse = torch.rand(1, 2, 4, 5, generator=generator(0))
     fine = convex_upsample(coarse, torch.zeros(1, 9 * 16, 4, 5), 4)
     mean = functional.avg_pool2d(coarse, 3, stride=1, padding=1)

@@ -1,0 +1,142 @@
+"""The table of pretrained networks, read by `choice.py` and `minislam doctor`.
+
+To add a network, write its module: a class that is a `FlowEstimator`, a `FeatureExtractor` or a
+`DepthPrior`, and a function that builds it and runs it once on a tiny image. Then add its row to
+NETWORKS below, and a field to NetworksConfig if it has settings.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from minislam.errors import InputError
+from minislam.priors.networks.checkpoints import Weights, load_checkpoint
+from minislam.priors.networks.depth_anything import DepthAnythingConfig, build_depth_anything
+from minislam.priors.networks.dinov2 import build_dino_features
+from minislam.priors.networks.droid import DroidFlowConfig, build_droid
+from minislam.priors.networks.metric3d import Metric3DConfig, build_metric3d
+
+
+@dataclass(frozen=True)
+class NetworksConfig:
+    """Settings of the pretrained networks."""
+
+    droid: DroidFlowConfig = field(default_factory=DroidFlowConfig)
+    metric3d: Metric3DConfig = field(default_factory=Metric3DConfig)
+    depth_anything: DepthAnythingConfig = field(default_factory=DepthAnythingConfig)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A row of the table."""
+
+    kind: str  # what it computes: "flow", "features" or "depth", as the flags are called
+    name: str  # the value of the flag --KIND
+    title: str  # what messages call it
+    marks: tuple[str, ...]  # tensors by which its checkpoint is recognised
+    build: Callable[[Weights, NetworksConfig], Any]  # makes it and runs it on a tiny image
+    unneeded: tuple[str, ...] = ()  # parts of names that are stored in its files but not used
+    transformer: str | None = None  # prefix of the names of its vision transformer, if it has one
+
+
+# The first row whose marks are all in a file tells what the file is.
+NETWORKS = (
+    Network(
+        "flow", "droid", "DROID-SLAM", ("update.gru.convz.weight",),
+        lambda weights, config: build_droid(weights, config.droid),
+        unneeded=("update.agg.",),  # damping and upsampling of a bundle adjustment that is not ours
+    ),
+    Network(
+        "features", "dinov2", "DINOv2", ("blocks.0.ls1.gamma", "mask_token"),
+        lambda weights, config: build_dino_features(weights),
+        unneeded=("mask_token",),  # used in training only, here and below
+        transformer="",
+    ),
+    Network(
+        "features", "fit3d", "FiT3D", ("blocks.0.ls1.gamma", "patch_embed.proj.weight"),
+        lambda weights, config: build_dino_features(weights),
+        transformer="",
+    ),
+    Network(
+        "depth", "metric3d", "Metric3D v2",
+        ("depth_model.decoder.token2feature.read_0.readoper.project_patch.weight",),
+        lambda weights, config: build_metric3d(weights, config.metric3d),
+        unneeded=("mask_token", "norm3."),  # norm3 is another norm under a second name
+        transformer="depth_model.encoder.",
+    ),
+    Network(
+        "depth", "depth-anything", "Depth Anything V2", ("depth_head.scratch.output_conv1.weight",),
+        lambda weights, config: build_depth_anything(weights, config.depth_anything),
+        # The first unit of the coarsest level has nothing to add, yet it is stored.
+        unneeded=("mask_token", "refinenet4.resConfUnit1."),
+        transformer="pretrained.",
+    ),
+)  # fmt: skip
+LPIPS_HEADS, CLASSIFIER = "LPIPS linear weights", "an image classifier of torchvision"
+_OTHER_MARKS = {"lin0.model.1.weight": LPIPS_HEADS, "features.0.weight": CLASSIFIER}
+
+
+def find_network(kind: str, name: str) -> Network | None:
+    """Return the row of a flag --KIND NAME, or None if no network has this name."""
+    return next((n for n in NETWORKS if (n.kind, n.name) == (kind, name)), None)
+
+
+def recognise(weights: Weights) -> Network | None:
+    """Return the network that a checkpoint belongs to, by the names of its tensors."""
+    return next((n for n in NETWORKS if all(mark in weights for mark in n.marks)), None)
+
+
+def describe(weights: Weights) -> str:
+    """Say in a few words which network a checkpoint belongs to."""
+    network = recognise(weights)
+    if network is None:
+        names = sorted(weights)
+        unknown = f"something unknown ({len(names)} tensors, the first is {names[0]})"
+        return next((other for mark, other in _OTHER_MARKS.items() if mark in weights), unknown)
+    if network.transformer is None:
+        return network.title
+    transformer = weights.below(network.transformer)
+    width = transformer["patch_embed.proj.weight"].shape[0]
+    has_registers = "register_tokens" in transformer or "reg_token" in transformer
+    registers = "with registers" if has_registers else "no registers"
+    return f"{network.title} (ViT of width {width}, {registers})"
+
+
+def load_network(
+    network: Network,
+    path: Path | str,
+    device: torch.device | str = "cpu",
+    config: NetworksConfig = NetworksConfig(),
+) -> Any:  # a FlowEstimator, FeatureExtractor or DepthPrior
+    """Return a network from its checkpoint file, which is checked."""
+    weights = load_checkpoint(path, device)
+    if recognise(weights) is not network:
+        raise InputError(
+            f"expected a {network.title} checkpoint, found {weights.file}, which looks like "
+            f"{describe(weights)}; give the file that belongs to this network"
+        )
+    return build_checked(network, weights, config)
+
+
+def build_checked(
+    network: Network, weights: Weights, config: NetworksConfig = NetworksConfig()
+) -> Any:  # a FlowEstimator, FeatureExtractor or DepthPrior
+    """Return a network whose tensors are checked: all are there, fit together, and are needed."""
+    try:
+        with torch.no_grad():
+            built = network.build(weights, config)
+    except (RuntimeError, IndexError, ValueError) as error:
+        raise InputError(
+            f"expected the shapes of {network.title} in {weights.file}, found tensors that do "
+            f"not fit together ({str(error).splitlines()[0]}); it is another version"
+        ) from error
+    extra = [n for n in weights.unused() if not any(part in n for part in network.unneeded)]
+    if extra:
+        raise InputError(
+            f"expected only the tensors of {network.title} in {weights.file}, found "
+            f"{len(extra)} more, such as {extra[0]}; it is another version of the network"
+        )
+    return built

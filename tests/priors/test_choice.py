@@ -1,0 +1,73 @@
+"""Priors are chosen by name; what does not fit together is refused in one sentence."""
+
+import pytest
+import torch
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
+from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepthConfig
+from minislam.priors.features import ClassicalFeatures, ClassicalFeaturesConfig
+from minislam.priors.flow import ClassicalFlow
+from minislam.priors.grid_flow import ClassicalFlowConfig
+from minislam.priors.networks.table import NetworksConfig
+
+CAMERA, NETWORKS = Camera(60.0, 60.0, 39.5, 29.5, 80, 60), NetworksConfig()
+
+
+class Recorded:
+    """A sequence of which nothing is known but its name."""
+
+    name = "desk"
+    ground_truth = None
+
+    def sensor_depth(self, frame_index: int) -> None:
+        return None
+
+
+def flow(**flags: str):
+    return choose_flow(PriorChoice(**flags), ClassicalFlowConfig(), NETWORKS)
+
+
+def features(**flags: str):
+    return choose_features(PriorChoice(**flags), CAMERA, ClassicalFeaturesConfig(), NETWORKS)
+
+
+def depth(**flags: str):
+    return choose_depth(PriorChoice(**flags), Recorded(), 0, SimulatedDepthConfig(), NETWORKS)
+
+
+# Known answers
+
+
+def test_priors_without_weights_are_found_by_their_names():
+    assert isinstance(flow(), ClassicalFlow)
+    assert isinstance(features(), ClassicalFeatures)
+    assert isinstance(depth(), NoDepth) and isinstance(depth(depth="sensor"), SensorDepth)
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("choose", "flags", "sentence"),
+    [
+        (flow, {"flow": "raft"}, "expected --flow classical or droid, found 'raft'"),
+        (features, {"features": "x"}, "classical, dinov2, fit3d or files:FOLDER, found 'x'"),
+        (depth, {"depth": "x"}, "none, simulated, sensor, metric3d, depth-anything or files:F"),
+        (flow, {"flow": "droid"}, "expected --flow-weights FILE with --flow droid, found none"),
+        (depth, {"depth_weights": "a.pth"}, "expected --depth metric3d or depth-anything with"),
+        (features, {"features": "fit3d", "features_weights": "none.pth"}, "found nothing at none"),
+        (depth, {"depth": "simulated"}, "true depth for --depth simulated, found none in desk"),
+        (flow, {"device": "tpu"}, "expected --device cpu or cuda, found 'tpu'"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_together_is_refused(choose, flags: dict[str, str], sentence: str):
+    with pytest.raises(InputError, match=sentence):
+        choose(**flags)
+
+
+def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="expected a GPU that this torch can use"):
+        flow(flow="droid", flow_weights="droid.pth", device="cuda")
