@@ -7,13 +7,13 @@ from torch import Tensor
 
 from minislam.checks.grading import CAMERA, Case, Function, Verdict, check_function, doubles
 from minislam.geometry import Camera, se3_exp, transform_points
+from minislam.splatting.constants import LOW_PASS_VARIANCE
 from minislam.splatting.projection import (
-    conics_from_footprints,
-    conics_from_footprints_vjp,
+    conics_from_factors2d,
+    conics_from_factors2d_vjp,
     to_camera_twist_vjp,
 )
 from minislam.splatting.reference import project_covariances
-from minislam.splatting.rendering import LOW_PASS_VARIANCE
 
 
 def check_projected_covariance(
@@ -90,14 +90,14 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
 
 
 def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
-    """Check (footprints, conics, v_conics) -> v_footprints (2, 3, N)."""
+    """Check (factors2d, conics, v_conics) -> v_factors2d (2, 3, N)."""
 
     def scaled(off_diagonal: float, all_of_it: float) -> Function:
         scale = all_of_it * doubles([1.0], [off_diagonal], [1.0])
-        return lambda V, conics, v: conics_from_footprints_vjp(V, conics, scale * v)
+        return lambda V, conics, v: conics_from_factors2d_vjp(V, conics, scale * v)
 
     V = doubles([[3.0], [1.0], [0.5]], [[-1.0], [2.0], [0.0]])
-    conics, _ = conics_from_footprints(V)
+    conics, _ = conics_from_factors2d(V)
     cases = [
         Case((V, conics, doubles([1.0], [0.0], [0.0])), "a gradient of a alone"),
         Case((V, conics, doubles([0.7], [-1.2], [0.4])), "a gradient of a, b and c"),
@@ -108,7 +108,7 @@ def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verd
         (scaled(2, 1), "b is counted twice: it stands twice in Q, so each place gets v_b / 2."),
     ]
     # Gradients of conics are small numbers: an error of 1 % must not pass as rounding.
-    return check_function(student, conics_from_footprints_vjp, cases, 1e-9, hints)
+    return check_function(student, conics_from_factors2d_vjp, cases, 1e-9, hints)
 
 
 def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> Verdict:

@@ -138,7 +138,7 @@ class Mapper(JointOptimisation):
     def _seen(self, position: int) -> Tensor:
         """Return (N,) bool, the Gaussians that a keyframe sees."""
         pose = self.keyframes[position].T_camera_world
-        return self.render(pose, self._online_camera).contribution > VISIBLE
+        return self.render(pose, self._online_camera).weight_sums > VISIBLE
 
     @torch.no_grad()
     def _insert(self, keyframe: MappedKeyframe) -> None:

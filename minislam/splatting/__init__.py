@@ -1,9 +1,28 @@
-"""Gaussian splatting (Sec. 3.1): the map, and a renderer with every derivative written out."""
+"""Gaussian splatting (Sec. 3.1): the map, and a renderer with every derivative written out.
 
+Read the files in this order, the slow twin first:
+
+    constants.py    what both renderers share
+    gaussians.py    the map, and the Adam that optimises it
+    reference.py    the slow twin: Eqs. (1) and (2) and Sigma' as the paper writes them
+    covariance.py   Sigma = L L^T from quaternion and scales
+    projection.py   mean and covariance from the world to the image
+    visible.py      all steps of projection.py in a row, for the visible Gaussians, nearest first
+    compositing.py  Eqs. (1) and (2) for a group of tiles
+    tiles.py        which Gaussians touch which tile
+    tile_loop.py    compositing over all tiles of an image
+    renderer.py     `render`: the whole chain as one differentiable function
+
+Layout: a map, and everything in the slow twin, has one row per Gaussian, (N, 3). Inside the fast
+renderer arrays are component-first, (3, N) and (3, 3, N): each component is one contiguous run
+of N numbers, and a formula per component is one fast pass over memory. `f_vjp`, right below `f`,
+pulls a gradient back through `f`.
+"""
+
+from minislam.splatting.constants import Rendering
 from minislam.splatting.gaussians import GaussianMap, LearningRates, MapOptimizer
-from minislam.splatting.rasterizer import render
 from minislam.splatting.reference import render_reference
-from minislam.splatting.rendering import Rendering
+from minislam.splatting.renderer import render
 
 __all__ = [
     "GaussianMap",

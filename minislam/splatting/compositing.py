@@ -1,18 +1,18 @@
-"""Eqs. (1) and (2) on blocks of pixels: what the Gaussians of a tile show, front to back.
+"""Eqs. (1) and (2) for a group of tiles: colour and depth of each pixel, front to back.
 
-A group of B tiles with P pixels each and K slots per tile is one dense block. With the features
-f = (red, green, blue, z) of slot k, per pixel
+A group of B tiles with P pixels each and K slots per tile is one dense block; a slot holds one
+Gaussian. With the channels f_k = (red, green, blue, z) of slot k, per pixel
 
     T_0 = 1,   T_{k+1} = T_k (1 - alpha_k),   out = sum_k T_k alpha_k f_k + T_K f_background.
 
 Three rewritings make it fast without compiled code:
-* ln alpha is a quadratic polynomial in the pixel position, so all of them are one matrix product
-  of six coefficients per slot with six monomials per pixel.
+* ln alpha is a quadratic polynomial in the pixel position, so one matrix product of six
+  coefficients per slot with six monomials per pixel gives all of them.
 * Since T_k alpha_k = T_k - T_{k+1}, summation by parts gives out = sum_k T_k (f_k - f_{k-1}) with
-  f_{-1} = 0 and f_K = f_background: a matrix product with T itself, no weights are formed.
-* Depth is walked in chunks that stay in the cache. Only T at the start of each chunk is kept; the
-  backward computes the rest anew, which is as fast as reading it back and needs a tenth of the
-  memory. All large arrays are reused: fresh memory costs more than the arithmetic in it.
+  f_{-1} = 0 and f_K = f_background: a matrix product with T itself, without blending weights.
+* The slots are processed in chunks that stay in the cache. Only T at the start of each chunk is
+  kept; the backward computes the rest anew, which is as fast as reading it back and needs a tenth
+  of the memory. All large arrays are reused: fresh memory costs more than the arithmetic in it.
 """
 
 import math
@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from minislam.splatting.rendering import MIN_ALPHA
+from minislam.splatting.constants import MIN_ALPHA
 from minislam.splatting.tiles import PIXELS, TILE
 
 CHUNK = 12  # slots per step: longer steps leave a 2 MB cache, shorter ones cost more calls
@@ -36,7 +36,7 @@ class Block(NamedTuple):
 
 
 class Workspace:
-    """What all groups of an image share: the monomials, and buffers for the largest block."""
+    """Shared by all groups of an image: the monomials, and buffers for the largest block."""
 
     def __init__(self, tiles: int, like: Tensor) -> None:
         self.monomials = monomials(like)  # (6, P)
@@ -48,8 +48,8 @@ class Workspace:
     def block(self, number: int, slots: int, tiles: int, tile_major: bool = False) -> Block:
         """Return buffer `number` as a block; `tile_major` is the order of its memory."""
         key = number, slots, tiles
-        # Kept for the next chunk, because cutting a block into slots takes as long as the work on
-        # two of them.
+        # Kept for the next chunk, because cutting a block into slots takes as long as the
+        # arithmetic on two of them.
         if key not in self._blocks:
             flat = self._buffers[number, : slots * tiles * PIXELS]
             if tile_major:
@@ -61,11 +61,11 @@ class Workspace:
 
 
 class GroupOutput(NamedTuple):
-    """What a group of tiles shows."""
+    """A composited group of tiles."""
 
-    features: Tensor  # (B, 4, P)
+    channels: Tensor  # (B, 4, P)
     transmittance: Tensor  # (B, P), T_K
-    contribution: Tensor  # (K, B), sum of T_k alpha_k over the pixels of a tile
+    weight_sums: Tensor  # (K, B), blending weight T_k alpha_k summed over the pixels of a tile
     checkpoints: Tensor  # (ceil(K / CHUNK), B, P), T at the start of each chunk
 
 
@@ -76,12 +76,15 @@ def monomials(like: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def exponents(
+def log_alpha_coefficients(
     offsets: Tensor,  # (2, S) px, mean minus tile centre
     conics: Tensor,  # (3, S) px^-2
     log_opacities: Tensor,  # (S,)
 ) -> Tensor:  # (6, S)
-    """Return the coefficients of ln alpha = ln o - d^T Q d / 2 over the monomials. Eq. (1)."""
+    """Return the coefficients of ln alpha = ln o - d^T Q d / 2 over the monomials.
+
+    Slow twin: reference.gaussian_alphas. Eq. (1).
+    """
     m_x, m_y = offsets
     a, b, c = conics
     p, q = torch.addcmul(a * m_x, b, m_y), torch.addcmul(b * m_x, c, m_y)  # Q m
@@ -89,18 +92,17 @@ def exponents(
     return torch.stack([constant, p, q, -0.5 * a, -b, -0.5 * c])
 
 
-def exponents_vjp(
+def log_alpha_coefficients_vjp(
     offsets: Tensor,  # (2, S)
-    v_exponents: Tensor,  # (6, S)  sums of g, g X, g Y, g X^2, g X Y, g Y^2 over the pixels
+    v_coefficients: Tensor,  # (6, S)  sums of g, g X, g Y, g X^2, g X Y, g Y^2 over the pixels
 ) -> Tensor:  # (6, S)  sums of g, g d_x, g d_y, g d_x^2, g d_x d_y, g d_y^2
     """Shift the moments of g = dL/d ln alpha from the tile's centre to the mean, d = X - m.
 
-    The shifted moments are the whole backward of Eq. (1), and add up over the tiles of a
-    Gaussian: v_ln_o is the first, v_mu' is Q times the next two, and the conic (a, b, c) gets
-    -1/2, -1 and -1/2 times the last three. See `ellipse_vjp`.
+    The shifted moments may be summed over the tiles of a Gaussian, and `moments_vjp` turns the
+    sums into gradients: together they are the whole backward of Eq. (1).
     """
     m_x, m_y = offsets
-    moments = v_exponents.clone()  # then in place, which takes half the time
+    moments = v_coefficients.clone()  # then in place, which takes half the time
     g, g_x, g_y, g_xx, g_xy, g_yy = moments
     # X^2 to d_x X, X Y to d_x Y, Y^2 to d_y Y
     g_xx.addcmul_(m_x, g_x, value=-1)
@@ -116,9 +118,9 @@ def exponents_vjp(
     return moments
 
 
-def ellipse_vjp(
+def moments_vjp(
     conics: Tensor,  # (3, N)
-    moments: Tensor,  # (6, N) from `exponents_vjp`, summed over the tiles
+    moments: Tensor,  # (6, N) from `log_alpha_coefficients_vjp`, summed over the tiles
 ) -> tuple[Tensor, Tensor, Tensor]:  # (N,), (2, N), (3, N)
     """Return the gradients of ln o, of the projected mean and of the conic. Eq. (1).
 
@@ -132,63 +134,66 @@ def ellipse_vjp(
 
 
 def composite(
-    coefficients: Tensor,  # (6, K * B) from `exponents`, slot-major
-    features: Tensor,  # (K, B, 4)
+    coefficients: Tensor,  # (6, K * B) from `log_alpha_coefficients`, slot-major
+    channels: Tensor,  # (K, B, 4)
     background: Tensor,  # (4,)
     inside: Tensor,  # (B, P) 1 on the image, 0 on pixels beyond its border
     workspace: Workspace,
 ) -> GroupOutput:
-    """Composite a group of tiles from front to back. Eq. (2)."""
-    slots, tiles, _ = features.shape
+    """Composite a group of tiles from front to back.
+
+    Slow twin: reference.composite. Eq. (2).
+    """
+    slots, tiles, _ = channels.shape
     checkpoints = inside.new_empty(-(-slots // CHUNK), tiles, PIXELS)
     checkpoints[0] = inside  # T = 0 beyond the border: nothing is shown or counted there
     out = inside.new_zeros(tiles, 4, PIXELS)
-    light = inside.new_empty(slots + 1, tiles)  # T_k summed over the pixels of a tile
-    steps = features.diff(dim=0, prepend=torch.zeros_like(features[:1]))  # f_k - f_{k-1}
+    T_sums = inside.new_empty(slots + 1, tiles)  # T_k summed over the pixels of a tile
+    steps = channels.diff(dim=0, prepend=torch.zeros_like(channels[:1]))  # f_k - f_{k-1}
 
     for chunk, first in enumerate(range(0, slots, CHUNK)):
         last = min(first + CHUNK, slots)
         T = workspace.block(_T, last - first + 1, tiles)
         T.slots[0].copy_(checkpoints[chunk])
         # alpha_k waits where T_{k+1} goes: half the memory, so more of it stays in the cache.
-        _alphas(coefficients[:, first * tiles : last * tiles], workspace, out=T.all[1:])
+        _gaussian_alphas(coefficients[:, first * tiles : last * tiles], workspace, out=T.all[1:])
         _transmittances(T, T.slots[1:])
         out.baddbmm_(steps[first:last].permute(1, 2, 0), T.all[:-1].transpose(0, 1))
-        torch.sum(T.all, 2, out=light[first : last + 1])
+        torch.sum(T.all, 2, out=T_sums[first : last + 1])
         if last < slots:
             checkpoints[chunk + 1] = T.slots[-1]
     transmittance = T.slots[-1].clone()
-    out.addcmul_((background - features[-1])[:, :, None], transmittance[:, None])
-    return GroupOutput(out, transmittance, light[:-1] - light[1:], checkpoints)
+    out.addcmul_((background - channels[-1])[:, :, None], transmittance[:, None])
+    return GroupOutput(out, transmittance, T_sums[:-1] - T_sums[1:], checkpoints)
 
 
 def composite_vjp(
     coefficients: Tensor,  # (6, K * B)
-    features: Tensor,  # (K, B, 4)
+    channels: Tensor,  # (K, B, 4)
     background: Tensor,  # (4,)
     checkpoints: Tensor,  # (ceil(K / CHUNK), B, P)
     v_out: Tensor,  # (B, 4, P)
     v_transmittance: Tensor,  # (B, P)  dL/dT_K
     workspace: Workspace,
 ) -> tuple[Tensor, Tensor]:  # (6, K * B), (K, B, 4)
-    """Pull gradients of a group's pixels back to coefficients and features. Eq. (2).
+    """Pull gradients of a group's pixels back to coefficients and channels. Eq. (2).
 
-    From back to front, let R_k be v_out . (what slot k and all behind it would show if T
-    restarted at 1 there):
+    From back to front, let R_k be v_out . (what slot k and all slots behind it would show if
+    nothing stood in front of slot k):
 
         R_K = f_background . v_out + v_T_K,
         R_k = R_{k+1} + g_k,   g_k = alpha_k (f_k . v_out - R_{k+1}),
         dL/d ln alpha_k = T_k g_k,
         dL/df_k = sum over pixels of (T_k - T_{k+1}) v_out.
 
-    Nowhere is anything divided by 1 - alpha.
+    Nothing is divided by 1 - alpha, which may be tiny.
     """
-    slots, tiles, _ = features.shape
+    slots, tiles, _ = channels.shape
     v_coefficients = torch.empty_like(coefficients)
     v_out_t = v_out.transpose(1, 2).contiguous()
-    light = features.new_empty(slots + 1, tiles, 4)  # T_k v_out summed over the pixels of a tile
+    T_v_sums = channels.new_empty(slots + 1, tiles, 4)  # T_k v_out summed over a tile's pixels
     R = (background[:, None] * v_out).sum(1).add_(v_transmittance)
-    excess = torch.empty_like(R)
+    gain = torch.empty_like(R)  # f_k . v_out - R_{k+1}: slot k instead of what it hides
 
     for chunk in reversed(range(len(checkpoints))):
         first, last = chunk * CHUNK, min((chunk + 1) * CHUNK, slots)
@@ -198,27 +203,27 @@ def composite_vjp(
         v_weights = workspace.block(_V_WEIGHTS, last - first, tiles, tile_major=True)
 
         T.slots[0].copy_(checkpoints[chunk])
-        _alphas(coefficients[:, span], workspace, out=alphas.all)
+        _gaussian_alphas(coefficients[:, span], workspace, out=alphas.all)
         _transmittances(T, alphas.slots)
-        light[first : last + 1] = torch.bmm(T.all.transpose(0, 1), v_out_t).transpose(0, 1)
+        T_v_sums[first : last + 1] = torch.bmm(T.all.transpose(0, 1), v_out_t).transpose(0, 1)
         # f_k . v_out, in memory tile by tile because bmm fills no other order.
-        torch.bmm(features[first:last].transpose(0, 1), v_out, out=v_weights.all.transpose(0, 1))
+        torch.bmm(channels[first:last].transpose(0, 1), v_out, out=v_weights.all.transpose(0, 1))
         for v_weight, alpha in zip(v_weights.slots[::-1], alphas.slots[::-1], strict=True):
-            torch.sub(v_weight, R, out=excess)
-            R.add_(alpha.mul_(excess))  # alpha_k is not needed again: g_k takes its place
+            torch.sub(v_weight, R, out=gain)
+            R.add_(alpha.mul_(gain))  # alpha_k is not needed again: g_k takes its place
         v_log_alphas = alphas.all.mul_(T.all[:-1]).view(-1, PIXELS)
         torch.mm(workspace.monomials, v_log_alphas.T, out=v_coefficients[:, span])
-    return v_coefficients, light[:-1] - light[1:]
+    return v_coefficients, T_v_sums[:-1] - T_v_sums[1:]
 
 
-def _alphas(
+def _gaussian_alphas(
     coefficients: Tensor,  # (6, n * B)
     workspace: Workspace,
     out: Tensor,  # (n, B, P)
 ) -> None:
-    """Evaluate alpha of n slots. Eq. (1)."""
+    """Evaluate alpha of n slots."""
     torch.mm(coefficients.T, workspace.monomials_log2, out=out.view(-1, PIXELS))
-    torch.nn.functional.threshold_(out.exp2_(), MIN_ALPHA, 0.0)
+    torch.nn.functional.threshold(out.exp2_(), MIN_ALPHA, 0.0, inplace=True)
 
 
 def _transmittances(

@@ -1,9 +1,8 @@
 """The shape of a Gaussian: Sigma = R(q) diag(s)^2 R(q)^T (Sec. 3.1), written as Sigma = L L^T.
 
 The factor L = R(q) diag(s) is all that the renderer needs: it turns with the camera, it projects
-linearly, and it keeps Sigma positive semi-definite by construction. Arrays here and in
-projection.py are component-first, (3, 3, N) and not (N, 3, 3): each component is one contiguous
-run of N numbers, and a formula per component is one fast pass over memory.
+linearly, and it keeps Sigma positive semi-definite by construction. Arrays are component-first,
+see splatting/__init__.py.
 """
 
 import torch
@@ -13,7 +12,10 @@ from torch import Tensor
 def rotations(
     quats: Tensor,  # (4, N) w, x, y, z, any length; zero is the identity
 ) -> Tensor:  # (3, 3, N)
-    """Return the rotation of each quaternion q / |q|."""
+    """Return the rotation of each quaternion q / |q|.
+
+    Slow twin: geometry.se3.rotation_from_quaternion.
+    """
     w, x, y, z = quats * _inverse_norms(quats)
     result = quats.new_empty(3, 3, quats.shape[1])
     result[0, 0] = 1 - 2 * (y * y + z * z)
@@ -57,7 +59,10 @@ def covariance_factors(
     quats: Tensor,  # (4, N)
     scales: Tensor,  # (3, N) world units
 ) -> Tensor:  # (3, 3, N) world units
-    """Return L = R(q) diag(s), the factor of Sigma = L L^T."""
+    """Return L = R(q) diag(s), the factor of Sigma = L L^T.
+
+    Slow twin: reference.covariances.
+    """
     return rotations(quats) * scales
 
 

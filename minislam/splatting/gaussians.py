@@ -1,4 +1,4 @@
-"""The map: one row per Gaussian in six tensors, and the Adam that lives and dies with the rows."""
+"""The map: one row per Gaussian in six tensors, and an Adam whose moments follow the rows."""
 
 from dataclasses import dataclass, fields
 
@@ -59,53 +59,34 @@ class GaussianMap:
         """Return a map of no Gaussians."""
         shapes = [(0, 3), (0, 4), (0, 3), (0,), (0, 3)]
         tensors = [torch.zeros(shape, dtype=dtype, device=device) for shape in shapes]
-        return cls(*tensors, torch.zeros(0, dtype=torch.int64, device=device))
+        return cls(*[*tensors, torch.zeros(0, dtype=torch.int64, device=device)])
 
     def concatenate(self, other: "GaussianMap") -> "GaussianMap":
         """Return the map of both: the rows of `other` come last."""
-        return GaussianMap(
-            *[
-                torch.cat([ours, theirs])
-                for ours, theirs in zip(_rows(self), _rows(other), strict=True)
-            ]
-        )
+        pairs = zip(_tensors(self), _tensors(other), strict=True)
+        return GaussianMap(*[torch.cat(pair) for pair in pairs])
 
     def prune(self, keep: Tensor) -> "GaussianMap":
         """Return the map of the rows where `keep` (N,) bool is True, in the same order."""
         _check_mask(keep, len(self))
-        return GaussianMap(*[tensor[keep] for tensor in _rows(self)])
+        return GaussianMap(*[tensor[keep] for tensor in _tensors(self)])
 
     def detach(self) -> "GaussianMap":
         """Return the same values cut from any graph."""
-        return GaussianMap(*[tensor.detach() for tensor in _rows(self)])
+        return GaussianMap(*[tensor.detach() for tensor in _tensors(self)])
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of all six tensors as numpy arrays, by name."""
         names = [tensor_field.name for tensor_field in fields(self)]
         return {name: getattr(self, name).detach().cpu().numpy().copy() for name in names}
 
-    @classmethod
-    def from_arrays(
-        cls,
-        arrays: dict[str, np.ndarray],  # as `to_arrays` returns them
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str = "cpu",
-    ) -> "GaussianMap":
-        """Build a map from arrays; `anchor_keyframe` may be missing and is then -1."""
-        raw = [
-            torch.tensor(arrays[tensor_field.name], dtype=dtype, device=device)
-            for tensor_field in fields(cls)[:-1]
-        ]
-        anchors = arrays.get("anchor_keyframe", np.full(len(raw[0]), -1))
-        return cls(*raw, torch.tensor(anchors, dtype=torch.int64, device=device))
-
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step per parameter group. Source: official WildGS-SLAM, where not said otherwise.
+    """Adam's step per parameter group. Source: official WildGS-SLAM.
 
-    The official code multiplies the steps of means and log-scales by a constant 6; it is included
-    here. Its colours are c = 0.28209 f + 0.5 with a step of 2.5e-3 for f; ours is the step of c.
+    The official code multiplies the steps of means and log-scales by 6, which is included here.
+    Its colours are c = 0.28209 f + 0.5 with a step of 2.5e-3 for f; ours is the step of c.
     """
 
     means: float = parameter(9.6e-4, "step of the means [world units per iteration]")
@@ -134,23 +115,19 @@ class MapOptimizer(Stateful):
     def __init__(self, gaussians: GaussianMap, rates: LearningRates) -> None:
         self.rates = rates
         self._set_rows(gaussians)
-        self.reset_moments()
+        parameters = self.gaussians.parameters
+        self._first = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
+        self._second = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
+        self._steps = torch.zeros_like(parameters["opacity_logits"].detach())  # (N,)
 
     def _set_rows(self, gaussians: GaussianMap) -> None:
         leaves = [t.detach().clone().requires_grad_() for t in gaussians.parameters.values()]
-        self.gaussians = GaussianMap(*leaves, gaussians.anchor_keyframe)
+        self.gaussians = GaussianMap(*[*leaves, gaussians.anchor_keyframe])
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
         super().restore_state(state, frame_of)
         self._set_rows(self.gaussians)
-
-    def reset_moments(self) -> None:
-        """Forget all moments and step counts, as for a new optimiser."""
-        parameters = self.gaussians.parameters
-        self._first = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
-        self._second = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
-        self._steps = torch.zeros_like(parameters["opacity_logits"].detach())
 
     @torch.no_grad()
     def step(self) -> None:
@@ -192,7 +169,7 @@ class MapOptimizer(Stateful):
                 moments[name] = moments[name][keep]
         self._steps = self._steps[keep]
 
-    def replace(self, gaussians: GaussianMap, keep_moments: bool = True) -> None:
+    def replace(self, gaussians: GaussianMap) -> None:
         """Set new values for the same rows, for instance after a deformation of the map."""
         if len(gaussians) != len(self.gaussians):
             raise InputError(
@@ -200,11 +177,9 @@ class MapOptimizer(Stateful):
                 "use append or prune to change the number of rows"
             )
         self._set_rows(gaussians)
-        if not keep_moments:
-            self.reset_moments()
 
 
-def _rows(gaussians: GaussianMap) -> list[Tensor]:
+def _tensors(gaussians: GaussianMap) -> list[Tensor]:
     return [getattr(gaussians, tensor_field.name) for tensor_field in fields(gaussians)]
 
 

@@ -5,14 +5,14 @@
     V = J B,   Sigma' = V V^T + 0.3 I,   Q = Sigma'^-1
 
 W, t are the rotation and translation of T_camera_world and J = d mu' / d x. Each step has its
-backward right below. Arrays are component-first, see covariance.py.
+backward right below. Arrays are component-first, see splatting/__init__.py.
 """
 
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.splatting.rendering import LOW_PASS_VARIANCE, tangent_limits
+from minislam.splatting.constants import LOW_PASS_VARIANCE, tangent_limits
 
 
 def to_camera(
@@ -20,7 +20,10 @@ def to_camera(
     factors: Tensor,  # (3, 3, N) L in the world frame
     T_camera_world: Tensor,  # (4, 4)
 ) -> tuple[Tensor, Tensor]:  # (3, N), (3, 3, N)
-    """Return the means and covariance factors in the camera frame, x = W mu + t and B = W L."""
+    """Return the means and covariance factors in the camera frame, x = W mu + t and B = W L.
+
+    Slow twin: geometry.transform_points.
+    """
     rotation, translation = T_camera_world[:3, :3], T_camera_world[:3, 3:]
     points_camera = torch.addmm(translation, rotation, means)
     return points_camera, (rotation @ factors.reshape(3, -1)).view_as(factors)
@@ -59,7 +62,10 @@ def to_camera_twist_vjp(
 
 
 def project_means(points_camera: Tensor, camera: Camera) -> Tensor:
-    """Return the projected means mu' (2, N) in px of points (3, N)."""
+    """Return the projected means mu' (2, N) in px of points (3, N).
+
+    Slow twin: Camera.project.
+    """
     x, y, z = points_camera
     return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
@@ -71,7 +77,8 @@ def project_means_vjp(
 ) -> Tensor:  # (3, N)
     """Pull a pixel gradient back to the points: v_x = J^T v_mu'.
 
-    J = [[fx/z, 0, -fx x/z^2], [0, fy/z, -fy y/z^2]].
+    J is `Camera.project_jacobian`. It is not formed here, because the product alone takes fewer
+    operations; their order also fixes the rounding.
     """
     x, y, z = points_camera
     v_x = camera.fx * v_means2d[0] / z
@@ -84,28 +91,30 @@ def project_factors(
     camera_factors: Tensor,  # (3, 3, N) B
     camera: Camera,
 ) -> Tensor:  # (2, 3, N) px
-    """Return the footprints V = J B, the factors of the covariances in the image.
+    """Return V = J B, the factors of the covariances in the image.
 
     With the tangents h = (x/z, y/z), limited to the surroundings of the view, the rows are
 
         V_u = fx/z (B_x - h_x B_z),   V_v = fy/z (B_y - h_y B_z).
+
+    Slow twin: reference.project_covariances, which returns V V^T + 0.3 I.
     """
     (tangent_x, tangent_y), _ = _limited_tangents(points_camera, camera)
     along_x, along_y, along_z = camera_factors
     inverse_z = 1 / points_camera[2]
-    footprint_u = (along_x - tangent_x * along_z) * (camera.fx * inverse_z)
-    footprint_v = (along_y - tangent_y * along_z) * (camera.fy * inverse_z)
-    return torch.stack([footprint_u, footprint_v])
+    factors_u = (along_x - tangent_x * along_z) * (camera.fx * inverse_z)
+    factors_v = (along_y - tangent_y * along_z) * (camera.fy * inverse_z)
+    return torch.stack([factors_u, factors_v])
 
 
 def project_factors_vjp(
     points_camera: Tensor,  # (3, N)
     camera_factors: Tensor,  # (3, 3, N)
-    footprints: Tensor,  # (2, 3, N) the output V
+    factors2d: Tensor,  # (2, 3, N) the output V
     camera: Camera,
-    v_footprints: Tensor,  # (2, 3, N)
+    v_factors2d: Tensor,  # (2, 3, N)
 ) -> tuple[Tensor, Tensor]:  # (3, N), (3, 3, N)
-    """Pull gradients of the footprints back to points and factors, J's own change included.
+    """Pull gradients of V back to points and factors, J's own change included.
 
     V depends on the point through the tangents h, unless they are limited, and through 1/z, in
     which it is linear: dV/dz at fixed h is -V/z.
@@ -113,45 +122,43 @@ def project_factors_vjp(
     (tangent_x, tangent_y), inside = _limited_tangents(points_camera, camera)
     x, y, z = points_camera
     inverse_z = 1 / z
-    v_along_x = v_footprints[0] * (camera.fx * inverse_z)
-    v_along_y = v_footprints[1] * (camera.fy * inverse_z)
+    v_along_x = v_factors2d[0] * (camera.fx * inverse_z)
+    v_along_y = v_factors2d[1] * (camera.fy * inverse_z)
     v_along_z = -(tangent_x * v_along_x + tangent_y * v_along_y)
 
     v_tangent_x = -(v_along_x * camera_factors[2]).sum(0) * inside[0]
     v_tangent_y = -(v_along_y * camera_factors[2]).sum(0) * inside[1]
-    scaling = (v_footprints * footprints).sum((0, 1))
+    scaling = (v_factors2d * factors2d).sum((0, 1))
     v_z = -(v_tangent_x * x + v_tangent_y * y) * inverse_z - scaling
     v_points = torch.stack([v_tangent_x, v_tangent_y, v_z]) * inverse_z
     return v_points, torch.stack([v_along_x, v_along_y, v_along_z])
 
 
-def conics_from_footprints(
-    footprints: Tensor,  # (2, 3, N) px
+def conics_from_factors2d(
+    factors2d: Tensor,  # (2, 3, N) px
 ) -> tuple[Tensor, Tensor]:  # (3, N) px^-2, (3, N) px^2
     """Return Q = Sigma'^-1 as (a, b, c) of [[a, b], [b, c]], and Sigma' = V V^T + 0.3 I.
 
     The determinant of Sigma' is written as |V_u x V_v|^2 + 0.3 (|V_u|^2 + |V_v|^2) + 0.3^2, a sum
     of positive terms: xx yy - xy^2 loses all digits for long thin ellipses in float32.
     """
-    (u0, u1, u2), (v0, v1, v2) = footprints
+    (u0, u1, u2), (v0, v1, v2) = factors2d
     norm_u = u0 * u0 + u1 * u1 + u2 * u2
     norm_v = v0 * v0 + v1 * v1 + v2 * v2
-    xx, xy, yy = (
-        norm_u + LOW_PASS_VARIANCE,
-        u0 * v0 + u1 * v1 + u2 * v2,
-        norm_v + LOW_PASS_VARIANCE,
-    )
+    xx = norm_u + LOW_PASS_VARIANCE
+    xy = u0 * v0 + u1 * v1 + u2 * v2
+    yy = norm_v + LOW_PASS_VARIANCE
     cross = (u1 * v2 - u2 * v1) ** 2 + (u2 * v0 - u0 * v2) ** 2 + (u0 * v1 - u1 * v0) ** 2
     determinant = cross + LOW_PASS_VARIANCE * (norm_u + yy)
     return torch.stack([yy, -xy, xx]) / determinant, torch.stack([xx, xy, yy])
 
 
-def conics_from_footprints_vjp(
-    footprints: Tensor,  # (2, 3, N)
+def conics_from_factors2d_vjp(
+    factors2d: Tensor,  # (2, 3, N)
     conics: Tensor,  # (3, N) the output Q
     v_conics: Tensor,  # (3, N)  dL/d(a, b, c), b counted once
 ) -> Tensor:  # (2, 3, N)
-    """Pull a gradient of the conics back to the footprints.
+    """Pull a gradient of the conics Q back to the factors V.
 
     For symmetric G = [[v_a, v_b/2], [v_b/2, v_c]]: dL/dSigma' = S = -Q G Q, and Sigma' = V V^T
     gives v_V = 2 S V. The entry b appears twice in Q and its gradient is split in two halves.
@@ -163,7 +170,7 @@ def conics_from_footprints_vjp(
     twice_xx = -2 * (left_aa * a + left_ab * b)
     twice_xy = -2 * (left_aa * b + left_ab * c)
     twice_yy = -2 * (left_ba * b + left_bb * c)
-    along_u, along_v = footprints
+    along_u, along_v = factors2d
     v_u = twice_xx * along_u + twice_xy * along_v
     return torch.stack([v_u, twice_xy * along_u + twice_yy * along_v])
 
@@ -171,8 +178,6 @@ def conics_from_footprints_vjp(
 def _limited_tangents(points_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return (x/z, y/z) (2, N), kept near the view, and where (2, N) they needed no limit."""
     tangents = points_camera[:2] / points_camera[2]
-    lower, upper = tangent_limits(camera)
-    lower = torch.tensor(lower).to(tangents)[:, None]
-    upper = torch.tensor(upper).to(tangents)[:, None]
+    lower, upper = (torch.tensor(limit).to(tangents)[:, None] for limit in tangent_limits(camera))
     inside = (tangents >= lower) & (tangents <= upper)
     return torch.clamp(tangents, lower, upper), inside

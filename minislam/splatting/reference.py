@@ -1,16 +1,19 @@
 """The renderer as the paper writes it: dense, plain torch, differentiated by autograd.
 
-It is slow (every Gaussian at every pixel) and serves two ends: to be read, and to be the truth
-that the fast renderer in rasterizer.py is tested against, in both directions.
+It evaluates every Gaussian at every pixel and is therefore slow. Read it first; it is also the
+truth that the fast renderer is tested against, in both directions. Its functions have the names
+of their fast twins wherever both compute the same thing, but its arrays have one row per
+Gaussian, (N, 3), where the fast ones are component-first, (3, N).
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.geometry.se3 import rotation_from_quaternion
-from minislam.splatting.gaussians import GaussianMap
-from minislam.splatting.rendering import (
+from minislam.splatting.constants import (
     LOW_PASS_VARIANCE,
     MAX_OPACITY,
     MIN_ALPHA,
@@ -18,6 +21,16 @@ from minislam.splatting.rendering import (
     Rendering,
     tangent_limits,
 )
+from minislam.splatting.gaussians import GaussianMap
+
+
+class ProjectedGaussians(NamedTuple):
+    """The Gaussians in front of the camera, nearest first."""
+
+    rows: Tensor  # (V,) int64, row in the map
+    points_camera: Tensor  # (V, 3) world units
+    means2d: Tensor  # (V, 2) px
+    covariances2d: Tensor  # (V, 2, 2) px^2
 
 
 def render_reference(
@@ -28,48 +41,60 @@ def render_reference(
     twist: Tensor | None = None,  # (6,) left perturbation of the pose: T <- exp(twist) T
     screen_offsets: Tensor | None = None,  # (N, 2) px, added to the projected means
 ) -> Rendering:
-    """Render colour, depth and opacity with every Gaussian evaluated at every pixel. Eq. (2)."""
+    """Render colour, depth and opacity of a map from a camera pose.
+
+    Fast twin: renderer.render.
+    """
     T_camera_world = T_camera_world.to(gaussians.means)
     if twist is not None:
         T_camera_world = se3_exp(twist) @ T_camera_world
-    if background is None:
-        background = torch.zeros(3).to(gaussians.means)
+    behind = gaussians.means.new_zeros(4)  # channels of the background: colour, and depth 0
+    if background is not None:
+        behind = torch.cat([background, behind[3:]])
 
-    points_camera = transform_points(T_camera_world, gaussians.means)  # (N, 3)
+    rows, points_camera, means2d, covariances2d = project_gaussians(
+        gaussians, camera, T_camera_world, screen_offsets
+    )
+    alphas = gaussian_alphas(means2d, covariances2d, gaussians.opacities[rows], camera)
+    channels = torch.cat([gaussians.colors[rows], points_camera[:, 2:]], 1)
+    image, transmittance, weights = composite(alphas, channels, behind)
+
+    weight_sums = torch.zeros_like(gaussians.opacities.detach())
+    weight_sums[rows] = weights.detach().sum((1, 2))
+    radii = torch.zeros_like(weight_sums)
+    radii[rows] = 3 * torch.linalg.eigvalsh(covariances2d.detach())[:, 1].sqrt()
+    radii = radii * (weight_sums > 0)
+    return Rendering(image[..., :3], image[..., 3], 1 - transmittance, radii, weight_sums)
+
+
+def project_gaussians(
+    gaussians: GaussianMap,
+    camera: Camera,
+    T_camera_world: Tensor,  # (4, 4)
+    screen_offsets: Tensor | None,  # (N, 2) px
+) -> ProjectedGaussians:
+    """Project the Gaussians in front of the camera, in order of depth (Sec. 3.1).
+
+    Fast twin: visible.project_gaussians, which also drops what lies outside the image.
+    """
+    points_camera = transform_points(T_camera_world, gaussians.means)
     in_front = (points_camera[:, 2] > NEAR_DEPTH).nonzero()[:, 0]
-    front_to_back = in_front[points_camera[in_front, 2].argsort(stable=True)]
-    points_camera = points_camera[front_to_back]
-    depths = points_camera[:, 2]
-
+    rows = in_front[points_camera[in_front, 2].argsort(stable=True)]
+    points_camera = points_camera[rows]
     means2d = camera.project(points_camera)
     if screen_offsets is not None:
-        means2d = means2d + screen_offsets[front_to_back]
+        means2d = means2d + screen_offsets[rows]
     covariances2d = project_covariances(
-        covariances(gaussians)[front_to_back], points_camera, T_camera_world, camera
+        covariances(gaussians)[rows], points_camera, T_camera_world, camera
     )
-    alphas = gaussian_alphas(
-        means2d, covariances2d, gaussians.opacities[front_to_back], camera
-    )  # (N, H, W)
-
-    transmittance_after = (1 - alphas).cumprod(0)  # (N, H, W), Gaussian n included
-    transmittance_before = torch.cat([alphas.new_ones(1, *alphas.shape[1:]), transmittance_after])
-    weights = alphas * transmittance_before[:-1]
-    opacity = 1 - transmittance_before[-1]
-    color = torch.einsum("nhw,nc->hwc", weights, gaussians.colors[front_to_back])
-    color = color + transmittance_before[-1, :, :, None] * background
-    depth = torch.einsum("nhw,n->hw", weights, depths)
-
-    contribution = torch.zeros_like(gaussians.opacities.detach())
-    contribution[front_to_back] = weights.detach().sum((1, 2))
-    radii = torch.zeros_like(contribution)
-    largest_variance = torch.linalg.eigvalsh(covariances2d.detach())[:, 1]
-    radii[front_to_back] = 3 * largest_variance.sqrt()
-    radii = radii * (contribution > 0)
-    return Rendering(color, depth, opacity, radii, contribution)
+    return ProjectedGaussians(rows, points_camera, means2d, covariances2d)
 
 
 def covariances(gaussians: GaussianMap) -> Tensor:  # (N, 3, 3) world units^2
-    """Return Sigma = R diag(s)^2 R^T of each Gaussian (Sec. 3.1)."""
+    """Return Sigma = R diag(s)^2 R^T of each Gaussian (Sec. 3.1).
+
+    Fast twin: covariance.covariance_factors, the L of Sigma = L L^T.
+    """
     rotations = rotation_from_quaternion(gaussians.quats_wxyz)
     variances = gaussians.scales**2
     return rotations @ torch.diag_embed(variances) @ rotations.transpose(-1, -2)
@@ -81,14 +106,14 @@ def project_covariances(
     T_camera_world: Tensor,  # (4, 4)
     camera: Camera,
 ) -> Tensor:  # (N, 2, 2) px^2
-    """Return Sigma' = J W Sigma W^T J^T, plus the low-pass filter (Sec. 3.1).
+    """Return Sigma' = J W Sigma W^T J^T + 0.3 I, low-pass filter included (Sec. 3.1).
 
     J is the Jacobian of the projection at the mean, at most VIEW_MARGIN outside the image.
+    Fast twin: projection.project_factors, the V of Sigma' = V V^T + 0.3 I.
     """
     z = points_camera[:, 2:]
     tangents = points_camera[:, :2] / z
-    lower, upper = tangent_limits(camera)
-    lower, upper = torch.tensor(lower).to(tangents), torch.tensor(upper).to(tangents)
+    lower, upper = (torch.tensor(limit).to(tangents) for limit in tangent_limits(camera))
     limited = torch.cat([torch.minimum(torch.maximum(tangents, lower), upper) * z, z], -1)
     to_pixels = camera.project_jacobian(limited) @ T_camera_world[:3, :3]  # J W, (N, 2, 3)
     projected = to_pixels @ covariances_world @ to_pixels.transpose(-1, -2)
@@ -101,10 +126,29 @@ def gaussian_alphas(
     opacities: Tensor,  # (N,)
     camera: Camera,
 ) -> Tensor:  # (N, H, W)
-    """Return alpha = o exp(-d^T Sigma'^-1 d / 2) of each Gaussian at each pixel. Eq. (1)."""
+    """Return alpha = o exp(-d^T Sigma'^-1 d / 2) of each Gaussian at each pixel, d from its mean.
+
+    Fast twin: compositing.log_alpha_coefficients. Eq. (1).
+    """
     pixels = camera.pixel_grid(dtype=means2d.dtype, device=means2d.device)
     offsets = pixels - means2d[:, None, None, :]  # (N, H, W, 2)
     conics = torch.linalg.inv(covariances2d)
     distances = torch.einsum("nhwi,nij,nhwj->nhw", offsets, conics, offsets)
     alphas = opacities.clamp(max=MAX_OPACITY)[:, None, None] * torch.exp(-0.5 * distances)
     return torch.where(alphas > MIN_ALPHA, alphas, torch.zeros_like(alphas))
+
+
+def composite(
+    alphas: Tensor,  # (N, H, W), nearest Gaussian first
+    channels: Tensor,  # (N, 4) red, green, blue and z
+    background: Tensor,  # (4,)
+) -> tuple[Tensor, Tensor, Tensor]:  # (H, W, 4), (H, W), (N, H, W)
+    """Return the image sum_n w_n f_n + T_N f_background, T_N, and the blending weights w_n.
+
+    w_n = T_n alpha_n, where T_n = prod over m < n of (1 - alpha_m) is the transmittance in front
+    of Gaussian n. Fast twin: compositing.composite. Eq. (2).
+    """
+    transmittances = torch.cat([alphas.new_ones(1, *alphas.shape[1:]), (1 - alphas).cumprod(0)])
+    weights = transmittances[:-1] * alphas
+    image = torch.einsum("nhw,nc->hwc", weights, channels)
+    return image + transmittances[-1, :, :, None] * background, transmittances[-1], weights

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.splatting.rendering import MIN_ALPHA
+from minislam.splatting.constants import MIN_ALPHA
 
 TILE = 8  # px, side of a tile; 8 wastes fewest pixels per list entry (4 and 16 are 20 % slower)
 PIXELS = TILE * TILE

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.splatting import GaussianMap
+from minislam.splatting.constants import MAX_OPACITY, MIN_ALPHA, NEAR_DEPTH
 from minislam.splatting.reference import covariances, project_covariances
-from minislam.splatting.rendering import MAX_OPACITY, MIN_ALPHA, NEAR_DEPTH
 
 SIDE = 16  # px
 DEVIATIONS = 3.33  # of the bounding box: beyond it alpha is below MIN_ALPHA

@@ -39,6 +39,12 @@ def random_map(kind: str, count: int, seed: int) -> GaussianMap:
     return GaussianMap(means, normal(count, 4), log_scales, logits, colors, anchors)
 
 
+def converted(gaussians: GaussianMap, dtype: torch.dtype) -> GaussianMap:
+    """Return a copy of a map with all parameters in another floating-point type."""
+    parameters = [values.to(dtype, copy=True) for values in gaussians.parameters.values()]
+    return GaussianMap(*parameters, gaussians.anchor_keyframe)
+
+
 def random_camera(seed: int) -> Camera:
     """Return a small camera: any size, unequal focal lengths, principal point off the centre."""
     source = generator(seed)

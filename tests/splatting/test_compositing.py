@@ -9,12 +9,12 @@ from minislam.splatting.compositing import (
     Workspace,
     composite,
     composite_vjp,
-    ellipse_vjp,
-    exponents,
-    exponents_vjp,
+    log_alpha_coefficients,
+    log_alpha_coefficients_vjp,
+    moments_vjp,
     monomials,
 )
-from minislam.splatting.rendering import MIN_ALPHA
+from minislam.splatting.constants import MIN_ALPHA
 from minislam.splatting.tiles import PIXELS
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 
@@ -31,31 +31,31 @@ def conics_of(seed: int, count: int) -> Tensor:
 
 
 def block(seed: int, slots: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return coefficients (6, K * B), features (K, B, 4) and background (4,)."""
+    """Return coefficients (6, K * B), channels (K, B, 4) and background (4,)."""
     count = slots * TILES
     offsets, log_opacities = 4 * normal(seed, 2, count), -normal(seed + 1, count).abs() - 0.02
-    coefficients = exponents(offsets, 0.1 * conics_of(seed + 2, count), log_opacities)
+    coefficients = log_alpha_coefficients(offsets, 0.1 * conics_of(seed + 2, count), log_opacities)
     return coefficients, normal(seed + 3, slots, TILES, 4), normal(seed + 4, 4)
 
 
-def composite_plainly(coefficients: Tensor, features: Tensor, background: Tensor) -> Tensor:
-    """Return what the tiles show (B, 5, P): features and opacity, as Eq. (2) is written."""
-    alphas = (coefficients.T @ monomials(features)).exp().view(-1, TILES, PIXELS)
+def composite_plainly(coefficients: Tensor, channels: Tensor, background: Tensor) -> Tensor:
+    """Return what the tiles show (B, 5, P): channels and opacity, as Eq. (2) is written."""
+    alphas = (coefficients.T @ monomials(channels)).exp().view(-1, TILES, PIXELS)
     alphas = alphas * (alphas > MIN_ALPHA)
     transmittance = torch.ones(TILES, PIXELS, dtype=torch.float64)
     shown = torch.zeros(TILES, 4, PIXELS, dtype=torch.float64)
     for k, alpha in enumerate(alphas):
-        shown = shown + features[k, :, :, None] * (transmittance * alpha)[:, None]
+        shown = shown + channels[k, :, :, None] * (transmittance * alpha)[:, None]
         transmittance = transmittance * (1 - alpha)
     shown = shown + background[:, None] * transmittance[:, None]
     return torch.cat([shown, 1 - transmittance[:, None]], 1)
 
 
-def composite_block(coefficients: Tensor, features: Tensor, background: Tensor) -> Tensor:
+def composite_block(coefficients: Tensor, channels: Tensor, background: Tensor) -> Tensor:
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    workspace = Workspace(TILES, features)
-    out = composite(coefficients, features, background, inside, workspace)
-    return torch.cat([out.features, 1 - out.transmittance[:, None]], 1)
+    workspace = Workspace(TILES, channels)
+    out = composite(coefficients, channels, background, inside, workspace)
+    return torch.cat([out.channels, 1 - out.transmittance[:, None]], 1)
 
 
 # Known answers
@@ -63,20 +63,22 @@ def composite_block(coefficients: Tensor, features: Tensor, background: Tensor) 
 
 def test_exponent_at_the_mean_is_the_log_opacity():
     offsets = torch.tensor([[0.5], [-1.5]], dtype=torch.float64)  # px, on a pixel centre
-    coefficients = exponents(offsets, conics_of(0, 1), torch.tensor([-0.3], dtype=torch.float64))
+    coefficients = log_alpha_coefficients(
+        offsets, conics_of(0, 1), torch.tensor([-0.3], dtype=torch.float64)
+    )
     at = (monomials(offsets)[1] == 0.5) & (monomials(offsets)[2] == -1.5)
     value = (coefficients.T @ monomials(offsets))[0, at]
     assert value.item() == pytest.approx(-0.3, abs=1e-14)
 
 
 def test_contribution_is_the_blending_weight_of_each_slot():
-    coefficients, features, background = block(1, slots=2)
+    coefficients, channels, background = block(1, slots=2)
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    out = composite(coefficients, features, background, inside, Workspace(TILES, features))
-    alphas = (coefficients.T @ monomials(features)).exp().view(2, TILES, PIXELS)
+    out = composite(coefficients, channels, background, inside, Workspace(TILES, channels))
+    alphas = (coefficients.T @ monomials(channels)).exp().view(2, TILES, PIXELS)
     alphas = alphas * (alphas > MIN_ALPHA)
-    torch.testing.assert_close(out.contribution[0], alphas[0].sum(1))
-    torch.testing.assert_close(out.contribution[1], (alphas[1] * (1 - alphas[0])).sum(1))
+    torch.testing.assert_close(out.weight_sums[0], alphas[0].sum(1))
+    torch.testing.assert_close(out.weight_sums[1], (alphas[1] * (1 - alphas[0])).sum(1))
 
 
 # Identities
@@ -91,27 +93,27 @@ def test_chunks_give_the_plain_sum(slots: int):
 
 
 def test_pixels_beyond_the_border_show_and_count_nothing():
-    coefficients, features, background = block(3, slots=5)
+    coefficients, channels, background = block(3, slots=5)
     inside = torch.zeros(TILES, PIXELS, dtype=torch.float64)
-    out = composite(coefficients, features, background, inside, Workspace(TILES, features))
-    assert out.features.abs().max() == 0
-    assert out.contribution.abs().max() == 0
+    out = composite(coefficients, channels, background, inside, Workspace(TILES, channels))
+    assert out.channels.abs().max() == 0
+    assert out.weight_sums.abs().max() == 0
 
 
 # Gradients
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_exponents_and_ellipse_vjp(seed: int):
+def test_log_alpha_coefficients_and_moments_vjp(seed: int):
     offsets, conics, logs = 3 * normal(seed, 2, 4), conics_of(seed, 4), -normal(seed, 4).abs()
     cotangent = normal(seed + 1, 6, 4)
     leaves = [value.clone().requires_grad_() for value in (logs, offsets, conics)]
-    (exponents(leaves[1], leaves[2], leaves[0]) * cotangent).sum().backward()
-    actual = ellipse_vjp(conics, exponents_vjp(offsets, cotangent))
+    (log_alpha_coefficients(leaves[1], leaves[2], leaves[0]) * cotangent).sum().backward()
+    actual = moments_vjp(conics, log_alpha_coefficients_vjp(offsets, cotangent))
     for ours, leaf in zip(actual, leaves, strict=True):
         assert_gradients_close(ours, leaf.grad, relative=1e-10)
     numerical = numerical_gradient(
-        lambda m: (exponents(m, conics, logs) * cotangent).sum(), offsets
+        lambda m: (log_alpha_coefficients(m, conics, logs) * cotangent).sum(), offsets
     )
     assert_gradients_close(actual[1], numerical, relative=1e-7)
 
@@ -119,16 +121,16 @@ def test_exponents_and_ellipse_vjp(seed: int):
 @pytest.mark.parametrize("slots", [1, CHUNK, 2 * CHUNK + 3])
 @pytest.mark.parametrize("seed", range(7))
 def test_composite_vjp(slots: int, seed: int):
-    coefficients, features, background = block(seed, slots)
+    coefficients, channels, background = block(seed, slots)
     cotangent = normal(seed + 7, TILES, 5, PIXELS)
-    leaves = [coefficients.clone().requires_grad_(), features.clone().requires_grad_()]
+    leaves = [coefficients.clone().requires_grad_(), channels.clone().requires_grad_()]
     (composite_plainly(*leaves, background) * cotangent).sum().backward()
 
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    workspace = Workspace(TILES, features)
-    checkpoints = composite(coefficients, features, background, inside, workspace).checkpoints
+    workspace = Workspace(TILES, channels)
+    checkpoints = composite(coefficients, channels, background, inside, workspace).checkpoints
     actual = composite_vjp(
-        coefficients, features, background, checkpoints,
+        coefficients, channels, background, checkpoints,
         cotangent[:, :4].contiguous(), -cotangent[:, 4], workspace,
     )  # fmt: skip
     for ours, leaf in zip(actual, leaves, strict=True):
@@ -138,7 +140,7 @@ def test_composite_vjp(slots: int, seed: int):
     def varied(value: Tensor) -> Tensor:
         return (composite_plainly(coefficients, value, background) * cotangent).sum()
 
-    assert_gradients_close(actual[1], numerical_gradient(varied, features), relative=1e-7)
+    assert_gradients_close(actual[1], numerical_gradient(varied, channels), relative=1e-7)
 
 
 # Degenerate input
@@ -148,13 +150,13 @@ def test_light_blocked_by_many_opaque_slots_gives_finite_gradients():
     slots = 40
     coefficients = torch.zeros(6, slots * TILES, dtype=torch.float32)
     coefficients[0] = -0.01  # alpha 0.99 everywhere: T falls to 1e-80, below any float32
-    features = torch.ones(slots, TILES, 4)
-    workspace = Workspace(TILES, features)
+    channels = torch.ones(slots, TILES, 4)
+    workspace = Workspace(TILES, channels)
     background, inside = torch.zeros(4), torch.ones(TILES, PIXELS)
-    out = composite(coefficients, features, background, inside, workspace)
-    v_coefficients, v_features = composite_vjp(
-        coefficients, features, background, out.checkpoints,
+    out = composite(coefficients, channels, background, inside, workspace)
+    v_coefficients, v_channels = composite_vjp(
+        coefficients, channels, background, out.checkpoints,
         torch.ones(TILES, 4, PIXELS), torch.zeros(TILES, PIXELS), workspace,
     )  # fmt: skip
-    torch.testing.assert_close(out.features, torch.ones(TILES, 4, PIXELS))
-    assert v_coefficients.isfinite().all() and v_features.isfinite().all()
+    torch.testing.assert_close(out.channels, torch.ones(TILES, 4, PIXELS))
+    assert v_coefficients.isfinite().all() and v_channels.isfinite().all()

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
+from minislam.splatting.constants import LOW_PASS_VARIANCE, tangent_limits
 from minislam.splatting.covariance import covariance_factors
 from minislam.splatting.projection import (
-    conics_from_footprints,
-    conics_from_footprints_vjp,
+    conics_from_factors2d,
+    conics_from_factors2d_vjp,
     project_factors,
     project_factors_vjp,
     project_means,
@@ -20,7 +21,6 @@ from minislam.splatting.projection import (
     to_camera_vjp,
 )
 from minislam.splatting.reference import covariances, project_covariances
-from minislam.splatting.rendering import LOW_PASS_VARIANCE, tangent_limits
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 from tests.splatting.scenes import random_camera, random_map, random_pose
 
@@ -72,7 +72,7 @@ def test_round_gaussian_on_the_axis_has_a_round_footprint():
     camera = Camera(100.0, 100.0, 15.0, 10.0, 30, 20)
     point = torch.tensor([[0.0], [0.0], [4.0]], dtype=torch.float64)
     factor = 0.2 * torch.eye(3, dtype=torch.float64)[..., None]
-    conic, covariance = conics_from_footprints(project_factors(point, factor, camera))
+    conic, covariance = conics_from_factors2d(project_factors(point, factor, camera))
     torch.testing.assert_close(covariance[:, 0].tolist(), [25.3, 0.0, 25.3])
     torch.testing.assert_close(conic[:, 0].tolist(), [1 / 25.3, 0.0, 1 / 25.3])
 
@@ -85,7 +85,7 @@ def test_footprints_give_the_covariances_of_the_twin(kind: str):
     gaussians, camera, pose = random_map(kind, 30, 5), random_camera(6), random_pose(7)
     factors = covariance_factors(gaussians.quats_wxyz.T, gaussians.scales.T)
     points, camera_factors = to_camera(gaussians.means.T, factors, pose)
-    conics, ours = conics_from_footprints(project_factors(points, camera_factors, camera))
+    conics, ours = conics_from_factors2d(project_factors(points, camera_factors, camera))
     twin = project_covariances(covariances(gaussians), points.T, pose, camera)
     torch.testing.assert_close(
         ours.T, torch.stack([twin[:, 0, 0], twin[:, 0, 1], twin[:, 1, 1]], 1)
@@ -98,7 +98,7 @@ def test_determinant_keeps_its_digits_for_needles_in_float32():
     # A diagonal needle of 300 px: det = 0.3 * (2 * 300^2) + 0.3^2 exactly, while xx yy - xy^2
     # subtracts two numbers of 8e9 in float32.
     along = torch.tensor([[300.0, 0, 0], [300.0, 0, 0]])[..., None]
-    conic, _ = conics_from_footprints(along)
+    conic, _ = conics_from_factors2d(along)
     exact = LOW_PASS_VARIANCE * 2 * 300**2 + LOW_PASS_VARIANCE**2
     expected = (300**2 + LOW_PASS_VARIANCE) / exact
     assert abs(float(conic[0, 0]) / expected - 1) < 1e-6
@@ -170,8 +170,8 @@ def test_limited_tangents_stop_the_gradient_across_but_not_along_the_axis():
     points = torch.tensor([[5.0], [0.1], [2.0]], dtype=torch.float64)  # x/z = 2.5, limit 0.52
     assert tangent_limits(camera)[1][0] == pytest.approx(1.3 * 16 / 40)
     factors = normal(3, 3, 3, 1)
-    footprints = project_factors(points, factors, camera)
-    v_points, _ = project_factors_vjp(points, factors, footprints, camera, normal(4, 2, 3, 1))
+    factors2d = project_factors(points, factors, camera)
+    v_points, _ = project_factors_vjp(points, factors, factors2d, camera, normal(4, 2, 3, 1))
     assert v_points[0] == 0
     assert v_points[2] != 0
 
@@ -179,12 +179,12 @@ def test_limited_tangents_stop_the_gradient_across_but_not_along_the_axis():
 @pytest.mark.parametrize("size", [1.0, 0.01, 100.0])
 @pytest.mark.parametrize("seed", range(7))
 def test_conics_vjp(size: float, seed: int):
-    footprints = size * normal(seed, 2, 3, 4)
-    function = lambda V: conics_from_footprints(V)[0]  # noqa: E731
-    gradient = conics_from_footprints_vjp(
-        footprints, function(footprints), cotangent_of(function, [footprints], seed)
+    factors2d = size * normal(seed, 2, 3, 4)
+    function = lambda V: conics_from_factors2d(V)[0]  # noqa: E731
+    gradient = conics_from_factors2d_vjp(
+        factors2d, function(factors2d), cotangent_of(function, [factors2d], seed)
     )
-    assert_vjp(function, [footprints], [gradient], seed)
+    assert_vjp(function, [factors2d], [gradient], seed)
 
 
 # The checker itself

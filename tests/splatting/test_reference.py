@@ -9,7 +9,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.geometry.se3 import quaternion_from_rotation, rotation_from_quaternion
 from minislam.splatting import GaussianMap, render, render_reference
-from minislam.splatting.rendering import LOW_PASS_VARIANCE, NEAR_DEPTH
+from minislam.splatting.constants import LOW_PASS_VARIANCE, NEAR_DEPTH
 from tests.splatting.scenes import one_gaussian, random_camera, random_map, random_pose
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
@@ -32,7 +32,7 @@ def test_profile_of_one_gaussian(renderer: Callable):
     torch.testing.assert_close(rendering.color, alpha[..., None] * color, **close)
     assert rendering.opacity.argmax() == 9 * CAMERA.width + 12
     assert rendering.radii[0].item() == pytest.approx(3 * (36 + LOW_PASS_VARIANCE) ** 0.5)
-    assert rendering.contribution[0].item() == pytest.approx(alpha.sum().item())
+    assert rendering.weight_sums[0].item() == pytest.approx(alpha.sum().item())
 
 
 @both
@@ -68,7 +68,7 @@ def test_order_of_the_map_does_not_matter(renderer: Callable):
     straight, mixed = renderer(gaussians, camera, pose), renderer(shuffled, camera, pose)
     for ours, theirs in zip(straight[:3], mixed[:3], strict=True):
         torch.testing.assert_close(ours, theirs, **close)
-    torch.testing.assert_close(straight.contribution[order], mixed.contribution, **close)
+    torch.testing.assert_close(straight.weight_sums[order], mixed.weight_sums, **close)
 
 
 @both
@@ -87,7 +87,7 @@ def test_weights_and_transmittance_add_up_to_one(renderer: Callable):
     )
     rendering = renderer(white, camera, pose, torch.ones(3, dtype=torch.float64))
     torch.testing.assert_close(rendering.color, torch.ones_like(rendering.color), **close)
-    total = rendering.contribution.sum()
+    total = rendering.weight_sums.sum()
     torch.testing.assert_close(total, rendering.opacity.sum(), **close)
 
 
@@ -171,7 +171,7 @@ def test_nothing_to_see_is_the_background(renderer: Callable):
         assert rendering.color.shape == (21, 27, 3)
         torch.testing.assert_close(rendering.color[3, 4], background)
         assert rendering.opacity.abs().max() == 0 and rendering.depth.abs().max() == 0
-        assert rendering.radii.sum() == 0 and rendering.contribution.sum() == 0
+        assert rendering.radii.sum() == 0 and rendering.weight_sums.sum() == 0
 
 
 # Errors

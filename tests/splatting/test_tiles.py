@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from minislam.splatting.ellipses import project_gaussians
 from minislam.splatting.reference import gaussian_alphas
 from minislam.splatting.tiles import TILE, TileLists, build_tile_lists, tile_grid
+from minislam.splatting.visible import project_gaussians
 from tests.splatting.scenes import KINDS, random_camera, random_map, random_pose
 
 
@@ -26,7 +26,7 @@ def lists_and_truth(kind: str, seed: int) -> tuple[TileLists, torch.Tensor, int]
     padding = (0, columns * TILE - camera.width, 0, rows * TILE - camera.height)
     padded = torch.nn.functional.pad(alphas, padding)
     tiled = padded.view(-1, rows, TILE, columns, TILE).amax((2, 4)).flatten(1)
-    return lists, tiled > 0, len(projected.index)
+    return lists, tiled > 0, len(projected.rows)
 
 
 def listed_pairs(lists: TileLists, shape: torch.Size, count: int) -> torch.Tensor:

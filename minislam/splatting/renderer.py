@@ -13,10 +13,10 @@ from torch.autograd.function import once_differentiable
 
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_exp, se3_left_jacobian
-from minislam.splatting.ellipses import project_gaussians, project_gaussians_vjp
+from minislam.splatting.constants import Rendering
 from minislam.splatting.gaussians import GaussianMap
-from minislam.splatting.image import composite_image, composite_image_vjp
-from minislam.splatting.rendering import Rendering
+from minislam.splatting.tile_loop import composite_image, composite_image_vjp
+from minislam.splatting.visible import project_gaussians, project_gaussians_vjp
 
 
 def render(
@@ -27,12 +27,14 @@ def render(
     twist: Tensor | None = None,  # (6,) left perturbation of the pose: T <- exp(twist) T
     screen_offsets: Tensor | None = None,  # (N, 2) px, added to the projected means
 ) -> Rendering:
-    """Render colour, depth and opacity of a map from a camera pose. Eq. (2).
+    """Render colour, depth and opacity of a map from a camera pose.
 
-    Gradients reach whichever inputs ask for them. For tracking, give `twist` as zeros that
+    Gradients reach the inputs that require them. To refine a pose, give `twist` as zeros that
     require a gradient and detach the map: nothing is then computed for the Gaussians. For
     densification, give `screen_offsets` as zeros that require a gradient: after the backward
     pass its rows are the gradients of the projected means in pixels.
+
+    Slow twin: reference.render_reference. Eq. (2).
     """
     if T_camera_world.shape != (4, 4):
         raise InputError(
@@ -40,9 +42,9 @@ def render(
             "give T_camera_world of one view"
         )
     like = gaussians.means
-    features_behind = like.new_zeros(4)  # of the background: at depth 0, which adds nothing
+    channels_behind = like.new_zeros(4)  # of the background: at depth 0, which adds nothing
     if background is not None:
-        features_behind[:3] = background.detach()
+        channels_behind[:3] = background.detach()
     return Rendering(
         *_Render.apply(
             like,
@@ -53,7 +55,7 @@ def render(
             twist,
             screen_offsets,
             T_camera_world.detach().to(like),
-            features_behind,
+            channels_behind,
             camera,
         )
     )
@@ -79,17 +81,17 @@ class _Render(torch.autograd.Function):
         if twist is not None and twist.any():
             T = se3_exp(twist).to(T) @ T
         with _denormals_flushed():
-            ellipses = project_gaussians(means, quats, scales, opacities, offsets2d, T, camera)
-            features = colors.index_select(0, ellipses.index)
-            features = torch.cat([features, ellipses.points_camera[2:].T], 1)
-            image = composite_image(ellipses, features, background, camera)
+            visible = project_gaussians(means, quats, scales, opacities, offsets2d, T, camera)
+            channels = colors.index_select(0, visible.rows)
+            channels = torch.cat([channels, visible.points_camera[2:].T], 1)
+            image = composite_image(visible, channels, background, camera)
         per_gaussian = means.new_zeros(2, len(means))
-        per_gaussian[0, ellipses.index] = ellipses.radii * (image.contribution > 0)
-        per_gaussian[1, ellipses.index] = image.contribution
-        color = image.features[:3].permute(1, 2, 0).contiguous()
-        outputs = color, image.features[3].clone(), image.opacity, per_gaussian[0], per_gaussian[1]
+        per_gaussian[0, visible.rows] = visible.radii * (image.weight_sums > 0)
+        per_gaussian[1, visible.rows] = image.weight_sums
+        color = image.channels[:3].permute(1, 2, 0).contiguous()
+        outputs = color, image.channels[3].clone(), image.opacity, per_gaussian[0], per_gaussian[1]
         tiles = image.groups, image.workspace
-        ctx.state = ellipses, tiles, T, background, camera, len(means), twist
+        ctx.state = visible, tiles, T, background, camera, len(means), twist
         ctx.mark_non_differentiable(*outputs[3:])
         return outputs
 
@@ -101,37 +103,37 @@ class _Render(torch.autograd.Function):
         v_depth: Tensor,  # (H, W)
         v_opacity: Tensor,  # (H, W)
         _v_radii: Tensor,
-        _v_contribution: Tensor,
+        _v_weight_sums: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        ellipses, tiles, T, background, camera, count, twist = ctx.state
+        visible, (groups, workspace), T, background, camera, count, twist = ctx.state
         needs_means, needs_quats, needs_scales, needs_opacities, needs_colors = (
             ctx.needs_input_grad[:5]
         )
         needs_twist, needs_offsets2d = ctx.needs_input_grad[5:7]
         v_image = torch.cat([v_color.permute(2, 0, 1), v_depth[None]])
         with _denormals_flushed():
-            moments, v_features = composite_image_vjp(
-                *tiles, len(ellipses.index), background, v_image, v_opacity, camera
+            moments, v_channels = composite_image_vjp(
+                groups, workspace, len(visible.rows), background, v_image, v_opacity, camera
             )
             v = project_gaussians_vjp(
-                ellipses, moments, v_features[3], T, camera, needs_quats or needs_scales
+                visible, moments, v_channels[3], T, camera, needs_quats or needs_scales
             )
 
-        def rows(values: Tensor, needed: bool) -> Tensor | None:
-            """Spread (C, V) or (V,) over the rows of the map, zero where nothing is visible."""
-            if not needed:
+        def spread(values: Tensor | None, needed: bool) -> Tensor | None:
+            """Write (C, V) or (V,) to the rows of the map; invisible rows are zero."""
+            if values is None or not needed:
                 return None
             values = values.T if values.dim() == 2 else values
-            return values.new_zeros(count, *values.shape[1:]).index_copy_(0, ellipses.index, values)
+            return values.new_zeros(count, *values.shape[1:]).index_copy_(0, visible.rows, values)
 
         return (
-            rows(v.means, needs_means),
-            rows(v.quats, needs_quats),
-            rows(v.scales, needs_scales),
-            rows(v.opacities, needs_opacities),
-            rows(v_features[:3], needs_colors),
+            spread(v.means, needs_means),
+            spread(v.quats, needs_quats),
+            spread(v.scales, needs_scales),
+            spread(v.opacities, needs_opacities),
+            spread(v_channels[:3], needs_colors),
             _at_twist(v.twist, twist) if needs_twist else None,
-            rows(v.means2d, needs_offsets2d),
+            spread(v.means2d, needs_offsets2d),
             None,
             None,
             None,

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.splatting.ellipses import project_gaussians
+from minislam.splatting.visible import project_gaussians
 from tests.helpers import generator
 
 
@@ -20,4 +20,4 @@ def test_nearest_come_first_and_equal_depths_stay_in_map_order(dtype: torch.dtyp
         None, torch.eye(4, dtype=dtype), Camera(50.0, 50.0, 20.0, 15.0, 40, 30),
     )  # fmt: skip
     expected = sorted(range(count), key=lambda row: float(means[row, 2]))  # stable
-    assert projected.index.tolist() == expected
+    assert projected.rows.tolist() == expected

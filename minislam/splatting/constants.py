@@ -1,4 +1,4 @@
-"""What a renderer returns, and the constants that its two implementations share."""
+"""What the slow and the fast renderer share: constants, and the form of their result."""
 
 from typing import NamedTuple
 
@@ -12,10 +12,10 @@ NEAR_DEPTH = 0.05
 LOW_PASS_VARIANCE = 0.3
 # The largest opacity of one Gaussian; keeps 1 - alpha away from zero (3DGS).
 MAX_OPACITY = 0.99
-# Fainter contributions to a pixel are dropped: less than one step of an 8-bit image (3DGS).
+# Smaller alphas are dropped: they change a pixel by less than one step of an 8-bit image (3DGS).
 MIN_ALPHA = 1 / 255
-# The linearised projection is evaluated at most this share of a half-image outside the border,
-# because it is a poor approximation there and grows without bound (3DGS: 1.3 half-images).
+# The projection is linearised at most this fraction of a half-image outside the border, because
+# the approximation becomes poor there and grows without bound (3DGS: 1.3 half-images).
 VIEW_MARGIN = 0.3
 
 
@@ -25,8 +25,8 @@ class Rendering(NamedTuple):
     color: Tensor  # (H, W, 3)
     depth: Tensor  # (H, W) sum of weight * z in world units, NOT divided by the opacity
     opacity: Tensor  # (H, W) in [0, 1], 1 - transmittance
-    radii: Tensor  # (N,) px, three standard deviations in the image; 0 where contribution is 0
-    contribution: Tensor  # (N,) px, sum of a Gaussian's blending weight over all pixels
+    radii: Tensor  # (N,) px, three standard deviations in the image; 0 where invisible
+    weight_sums: Tensor  # (N,) px, blending weight T alpha of a Gaussian, summed over all pixels
 
 
 def tangent_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -1,4 +1,4 @@
-"""All steps of projection.py in a row: from the map to ellipses in the image, and back."""
+"""The visible Gaussians: all steps of projection.py in a row, nearest first, and back."""
 
 import math
 from typing import NamedTuple
@@ -8,11 +8,18 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.splatting.compositing import ellipse_vjp
+from minislam.splatting.compositing import moments_vjp
+from minislam.splatting.constants import (
+    LOW_PASS_VARIANCE,
+    MAX_OPACITY,
+    MIN_ALPHA,
+    NEAR_DEPTH,
+    tangent_limits,
+)
 from minislam.splatting.covariance import covariance_factors, covariance_factors_vjp
 from minislam.splatting.projection import (
-    conics_from_footprints,
-    conics_from_footprints_vjp,
+    conics_from_factors2d,
+    conics_from_factors2d_vjp,
     project_factors,
     project_factors_vjp,
     project_means,
@@ -21,31 +28,24 @@ from minislam.splatting.projection import (
     to_camera_twist_vjp,
     to_camera_vjp,
 )
-from minislam.splatting.rendering import (
-    LOW_PASS_VARIANCE,
-    MAX_OPACITY,
-    MIN_ALPHA,
-    NEAR_DEPTH,
-    tangent_limits,
-)
 
-# px. The determinant of Sigma' grows with the fourth power, and float32 ends at 1e38.
+# px. The determinant of Sigma' grows with the fourth power of it, and float32 ends at 1e38.
 _MAX_RADIUS = 1e8
 
 
-class Ellipses(NamedTuple):
+class VisibleGaussians(NamedTuple):
     """The visible Gaussians, nearest first, in every form that the backward needs."""
 
-    index: Tensor  # (V,) int64, row in the map
+    rows: Tensor  # (V,) int64, row in the map
     quats: Tensor  # (4, V)
     scales: Tensor  # (3, V)
     opacities: Tensor  # (V,) at most MAX_OPACITY
     points_camera: Tensor  # (3, V)
     camera_factors: Tensor  # (3, 3, V)
-    footprints: Tensor  # (2, 3, V)
+    factors2d: Tensor  # (2, 3, V)
     means2d: Tensor  # (2, V)
-    conics: Tensor  # (3, V)
-    covariances2d: Tensor  # (3, V)
+    conics: Tensor  # (3, V) a, b, c of Q = [[a, b], [b, c]]
+    covariances2d: Tensor  # (3, V) xx, xy, yy of Sigma'
 
     @property
     def radii(self) -> Tensor:
@@ -55,8 +55,8 @@ class Ellipses(NamedTuple):
         return 3 * largest.sqrt()
 
 
-class EllipseGradients(NamedTuple):
-    """dL/d of the visible Gaussians' parameters, in the order of `Ellipses.index`."""
+class VisibleGradients(NamedTuple):
+    """dL/d of the visible Gaussians' parameters, in the order of `VisibleGaussians.rows`."""
 
     means: Tensor  # (3, V)
     quats: Tensor | None  # (4, V)
@@ -74,61 +74,64 @@ def project_gaussians(
     screen_offsets: Tensor | None,  # (N, 2) px, small: what is visible is decided without them
     T_camera_world: Tensor,  # (4, 4)
     camera: Camera,
-) -> Ellipses:
-    """Sort out what cannot be seen, and project the rest in order of depth."""
-    index = _visible_front_to_back(means, scales, opacities, T_camera_world, camera)
+) -> VisibleGaussians:
+    """Drop what cannot be seen, and project the rest in order of depth.
+
+    Slow twin: reference.project_gaussians.
+    """
+    rows = _visible_front_to_back(means, scales, opacities, T_camera_world, camera)
     # index_select throughout: it is several times faster than indexing with a tensor.
     means, quats, scales = (
-        rows.index_select(0, index).T.contiguous() for rows in (means, quats, scales)
+        values.index_select(0, rows).T.contiguous() for values in (means, quats, scales)
     )
     # Capped per Gaussian, not per pixel: the profile stays smooth, and alpha <= o is safe as well.
-    opacities = opacities[index].clamp(max=MAX_OPACITY)
+    opacities = opacities[rows].clamp(max=MAX_OPACITY)
     points_camera, camera_factors = to_camera(
         means, covariance_factors(quats, scales), T_camera_world
     )
     means2d = project_means(points_camera, camera)
     if screen_offsets is not None:
-        means2d = means2d + screen_offsets[index].T
-    footprints = project_factors(points_camera, camera_factors, camera)
-    conics, covariances2d = conics_from_footprints(footprints)
-    return Ellipses(
-        index, quats, scales, opacities, points_camera, camera_factors,
-        footprints, means2d, conics, covariances2d,
+        means2d = means2d + screen_offsets[rows].T
+    factors2d = project_factors(points_camera, camera_factors, camera)
+    conics, covariances2d = conics_from_factors2d(factors2d)
+    return VisibleGaussians(
+        rows, quats, scales, opacities, points_camera, camera_factors,
+        factors2d, means2d, conics, covariances2d,
     )  # fmt: skip
 
 
 def project_gaussians_vjp(
-    ellipses: Ellipses,
-    moments: Tensor,  # (6, V) of dL/d ln alpha about the mean, see compositing.exponents_vjp
+    visible: VisibleGaussians,
+    moments: Tensor,  # (6, V) of dL/d ln alpha about the mean, see `moments_vjp`
     v_depths: Tensor,  # (V,)  dL/dz through the depth image
     T_camera_world: Tensor,  # (4, 4)
     camera: Camera,
     needs_shape: bool,  # False where only the pose is asked for
-) -> EllipseGradients:
-    """Pull the gradients of the ellipses back to the Gaussians and to the camera pose."""
-    e = ellipses
-    v_log_opacities, v_means2d, v_conics = ellipse_vjp(e.conics, moments)
-    v_opacities = v_log_opacities / e.opacities * (e.opacities < MAX_OPACITY)
+) -> VisibleGradients:
+    """Pull gradients in the image back to the Gaussians and to the camera pose."""
+    g = visible
+    v_log_opacities, v_means2d, v_conics = moments_vjp(g.conics, moments)
+    v_opacities = v_log_opacities / g.opacities * (g.opacities < MAX_OPACITY)
 
-    v_footprints = conics_from_footprints_vjp(e.footprints, e.conics, v_conics)
+    v_factors2d = conics_from_factors2d_vjp(g.factors2d, g.conics, v_conics)
     v_points, v_camera_factors = project_factors_vjp(
-        e.points_camera, e.camera_factors, e.footprints, camera, v_footprints
+        g.points_camera, g.camera_factors, g.factors2d, camera, v_factors2d
     )
-    v_points += project_means_vjp(e.points_camera, camera, v_means2d)
+    v_points += project_means_vjp(g.points_camera, camera, v_means2d)
     v_points[2] += v_depths
 
-    v_twist = to_camera_twist_vjp(e.points_camera, e.camera_factors, v_points, v_camera_factors)
+    v_twist = to_camera_twist_vjp(g.points_camera, g.camera_factors, v_points, v_camera_factors)
     v_means, v_factors = to_camera_vjp(T_camera_world, v_points, v_camera_factors)
     v_quats = v_scales = None
     if needs_shape:
-        v_quats, v_scales = covariance_factors_vjp(e.quats, e.scales, v_factors)
-    return EllipseGradients(v_means, v_quats, v_scales, v_opacities, v_twist, v_means2d)
+        v_quats, v_scales = covariance_factors_vjp(g.quats, g.scales, v_factors)
+    return VisibleGradients(v_means, v_quats, v_scales, v_opacities, v_twist, v_means2d)
 
 
 def _visible_front_to_back(
     means: Tensor, scales: Tensor, opacities: Tensor, T_camera_world: Tensor, camera: Camera
 ) -> Tensor:  # (V,) int64
-    """Return the rows that may be seen, nearest first; equal depths stay in map order."""
+    """Return the rows that may be visible, nearest first; equal depths stay in map order."""
     x, y, z = torch.addmm(T_camera_world[:3, 3:], T_camera_world[:3, :3], means.T)
     in_front = z > NEAR_DEPTH
     inverse_z = 1 / torch.where(in_front, z, 1)  # what is dropped must not divide by zero
@@ -136,10 +139,10 @@ def _visible_front_to_back(
     radius = _largest_radius(scales, inverse_z, camera)
     near_u = (u + radius >= 0) & (u - radius <= camera.width - 1)
     near_v = (v + radius >= 0) & (v - radius <= camera.height - 1)
-    # A scale that has run away would overflow to NaN, and one NaN spoils the pose gradient.
+    # A diverged scale would overflow to NaN, and one NaN spoils the pose gradient.
     visible = in_front & near_u & near_v & (radius < _MAX_RADIUS) & (opacities > MIN_ALPHA)
-    index = visible.nonzero()[:, 0]
-    return index.index_select(0, _nearest_first(z.index_select(0, index)))
+    rows = visible.nonzero()[:, 0]
+    return rows.index_select(0, _nearest_first(z.index_select(0, rows)))
 
 
 def _nearest_first(depths: Tensor) -> Tensor:  # (V,) positive -> (V,) int64

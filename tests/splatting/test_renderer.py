@@ -7,7 +7,14 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.splatting import GaussianMap, Rendering, render, render_reference
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
-from tests.splatting.scenes import KINDS, one_gaussian, random_camera, random_map, random_pose
+from tests.splatting.scenes import (
+    KINDS,
+    converted,
+    one_gaussian,
+    random_camera,
+    random_map,
+    random_pose,
+)
 
 SCENES_PER_KIND = 25  # times eight kinds: 200 scenes
 
@@ -81,9 +88,8 @@ def test_two_runs_give_the_same_bytes():
 def test_float32_follows_float64():
     gaussians, pose = random_map("ordinary", 300, 3), random_pose(3)
     camera = Camera(70.0, 65.0, 31.0, 25.0, 61, 45)
-    arrays = gaussians.to_arrays()
-    single = GaussianMap.from_arrays(arrays, torch.float32)
-    exact = GaussianMap.from_arrays(arrays, torch.float64)
+    single = converted(gaussians, torch.float32)
+    exact = converted(single, torch.float64)
     twist = torch.zeros(6, dtype=torch.float64)
     ours, our_gradients = gradients(render, single, camera, pose, twist.float(), 3)
     twin, twin_gradients = gradients(render, exact, camera, pose, twist, 3)
@@ -179,14 +185,14 @@ def test_capped_and_invisible_gaussians_have_no_gradient():
 @pytest.mark.parametrize("fault", ["zero quaternion", "infinite scale", "huge scale", "nan mean"])
 def test_one_broken_gaussian_does_not_spoil_the_others(fault: str):
     camera, pose = Camera(60.0, 60.0, 12.0, 9.0, 27, 21), torch.eye(4)
-    arrays = random_map("ordinary", 20, 8).to_arrays()
+    broken = converted(random_map("ordinary", 20, 8), torch.float32)
     if fault == "zero quaternion":
-        arrays["quats_wxyz"][3] = 0
+        broken.quats_wxyz[3] = 0
     elif fault == "nan mean":
-        arrays["means"][3] = float("nan")
+        broken.means[3] = float("nan")
     else:
-        arrays["log_scales"][3] = 100.0 if fault == "infinite scale" else 40.0
-    gaussians = with_leaves(GaussianMap.from_arrays(arrays))
+        broken.log_scales[3] = 100.0 if fault == "infinite scale" else 40.0
+    gaussians = with_leaves(broken)
     twist = torch.zeros(6, requires_grad=True)
     rendering = render(gaussians, camera, pose, twist=twist)
     rendering.color.sum().backward()

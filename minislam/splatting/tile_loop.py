@@ -1,0 +1,113 @@
+"""The loop over the tiles of an image: from projected Gaussians to pixels, and back.
+
+Each turn processes one group of tiles: what one step writes is still in the cache when the next
+step reads it, and no array is as long as all lists together.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.splatting.compositing import (
+    Workspace,
+    composite,
+    composite_vjp,
+    log_alpha_coefficients,
+    log_alpha_coefficients_vjp,
+)
+from minislam.splatting.tiles import PIXELS, build_tile_lists, from_tiles, tile_centres, to_tiles
+from minislam.splatting.visible import VisibleGaussians
+
+# ln of the opacity of a padding slot. Finite, because 0 * inf would be NaN in a matrix product.
+_LOG_OPACITY_OF_PADDING = -1e4
+
+
+class CompositedGroup(NamedTuple):
+    """What the backward needs of a group of tiles."""
+
+    tiles: Tensor  # (B,) int64
+    gaussians: Tensor  # (K * B,) int64
+    offsets: Tensor  # (2, K * B) px, mean minus tile centre
+    coefficients: Tensor  # (6, K * B)
+    channels: Tensor  # (K, B, 4)
+    checkpoints: Tensor  # (chunks, B, P)
+
+
+class CompositedImage(NamedTuple):
+    """The composited image, and what its backward needs."""
+
+    channels: Tensor  # (4, H, W) colour and depth
+    opacity: Tensor  # (H, W)
+    weight_sums: Tensor  # (V,) px, blending weight of a Gaussian summed over all pixels
+    groups: list[CompositedGroup]
+    workspace: Workspace  # reused by the backward, which saves allocating a second one
+
+
+def composite_image(
+    visible: VisibleGaussians,
+    channels: Tensor,  # (V, 4)
+    background: Tensor,  # (4,)
+    camera: Camera,
+) -> CompositedImage:
+    """List the Gaussians of every tile and composite them."""
+    g = visible
+    lists = build_tile_lists(g.means2d, g.conics, g.covariances2d, g.opacities, camera)
+    # Padding slots take their values from an additional last row or column.
+    channels = torch.cat([channels, channels.new_zeros(1, 4)])
+    padding = channels.new_zeros(6, 1)
+    padding[5] = _LOG_OPACITY_OF_PADDING
+    table = torch.cat([g.means2d, g.conics, g.opacities.log()[None]])
+    table = torch.cat([table, padding], 1)
+
+    centres = tile_centres(camera, channels)
+    inside = to_tiles(channels.new_ones(1, camera.height, camera.width), camera)[:, 0]
+    canvas = background[:, None].repeat(len(inside), 1, PIXELS)  # (tiles, 4, P)
+    opacities = torch.zeros_like(inside)
+    weight_sums = channels.new_zeros(len(channels))
+    workspace = Workspace(lists.largest_group, channels)
+    groups = []
+    for tiles, length, span in lists.groups:
+        gaussians = lists.slot_gaussian[span]
+        slots = table.index_select(1, gaussians)
+        offsets = slots[:2].view(2, length, -1) - centres[:, None, tiles]
+        offsets = offsets.view(2, -1)
+        coefficients = log_alpha_coefficients(offsets, slots[2:5], slots[5])
+        group_channels = channels.index_select(0, gaussians).view(length, -1, 4)
+        out = composite(coefficients, group_channels, background, inside[tiles], workspace)
+        canvas[tiles] = out.channels
+        opacities[tiles] = 1 - out.transmittance
+        weight_sums.index_add_(0, gaussians, out.weight_sums.view(-1))
+        groups.append(
+            CompositedGroup(
+                tiles, gaussians, offsets, coefficients, group_channels, out.checkpoints
+            )
+        )
+    opacity = from_tiles(opacities, camera)[0].clone()
+    image = from_tiles(canvas, camera)
+    return CompositedImage(image, opacity, weight_sums[:-1], groups, workspace)
+
+
+def composite_image_vjp(
+    groups: list[CompositedGroup],
+    workspace: Workspace,
+    count: int,  # V
+    background: Tensor,  # (4,)
+    v_channels: Tensor,  # (4, H, W)
+    v_opacity: Tensor,  # (H, W)
+    camera: Camera,
+) -> tuple[Tensor, Tensor]:  # (6, V), (4, V)
+    """Pull image gradients back to the Gaussians: six moments about the mean, four channels."""
+    v_canvas = to_tiles(v_channels, camera)
+    v_transmittances = to_tiles(-v_opacity[None], camera)[:, 0]
+    sums = v_channels.new_zeros(10, count + 1)  # the last column collects the padding
+    for group in groups:
+        v_coefficients, v_group = composite_vjp(
+            group.coefficients, group.channels, background, group.checkpoints,
+            v_canvas[group.tiles], v_transmittances[group.tiles], workspace,
+        )  # fmt: skip
+        moments = log_alpha_coefficients_vjp(group.offsets, v_coefficients)
+        sums[:6].index_add_(1, group.gaussians, moments)
+        sums[6:].index_add_(1, group.gaussians, v_group.view(-1, 4).T)
+    return sums[:6, :-1], sums[6:, :-1]
