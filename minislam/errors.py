@@ -11,7 +11,3 @@ class InputError(MinislamError):
 
 class TrackingLost(MinislamError):
     """The camera could not be followed through any usable part of the sequence."""
-
-
-class NumericalFailure(MinislamError):
-    """A solve produced no usable step; the state it started from is unchanged."""

@@ -3,9 +3,9 @@
     sum_edges || p~_ij - proj(T_j T_i^-1, d_i) ||^2_(Sigma_ij / beta_i^2)
         + sum_i lambda_4 M_i (d_i - 1 / D~_i)^2
 
-Gauss-Newton with Levenberg-Marquardt damping. Each disparity appears in one source frame only,
-so the disparity block of the normal equations is diagonal and is eliminated exactly (Schur
-complement); what is left is a dense system of 6 unknowns per free pose:
+Gauss-Newton with Levenberg-Marquardt damping; the slow twin is reference.py. Each disparity
+appears in one source frame only, so the disparity block C of the normal equations is diagonal.
+Disparities are marginalised (Schur complement), which leaves 6 unknowns per free pose:
 
     [ H   E ] [ xi ]   [ g ]        (H - E C^-1 E^T) xi = g - E C^-1 s
     [ E^T C ] [ dd ] = [ s ]   =>   dd = C^-1 (s - E^T xi)
@@ -25,14 +25,14 @@ from minislam.tracking.reprojection import (
 from minislam.tracking.robust import RobustKernel
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
-DISPARITY_DAMPING = 1e-2  # share of the mean diagonal C that is added to all of it [-]
+DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
 MIN_RAISED_DAMPING = 1e-6  # relative; an undamped solve that fails is tried again with this
-MAX_DAMPING = 1e6  # relative; beyond it a step is no longer worth taking
+MAX_DAMPING = 1e6  # relative; a step damped more than this would not move anything
 
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Everything that stays fixed while poses and disparities move."""
+    """Everything that is constant while poses and disparities are optimised."""
 
     camera: Camera
     rays: Tensor  # (N, 3) of the grid cells, z = 1
@@ -51,7 +51,7 @@ class BundleProblem:
 class BundleReport:
     """What a bundle adjustment did."""
 
-    converged: bool  # the last steps no longer lowered the cost, or all iterations were used well
+    converged: bool  # False only if the normal equations were singular
     cost_before: float  # px^2
     cost_after: float  # px^2, never larger than cost_before
     iterations: int  # accepted steps
@@ -90,46 +90,48 @@ def bundle_adjust(
     state: BundleState,
     iterations: int,
     damping: float = 1e-4,  # relative (Levenberg-Marquardt), raised on failure
-    absolute_damping: float = 1e-6,  # px^2 per squared unit step: holds directions nobody sees
+    absolute_damping: float = 1e-6,  # px^2 per squared unit step: holds unobservable directions
 ) -> tuple[BundleState, BundleReport]:
-    """Minimise Eq. (5) and return the new state with a report.
+    """Minimise over the free poses and disparities; return the new state with a report.
 
-    A step that fails or raises the cost is thrown away and tried again with ten times the
-    damping; if none helps, the state is returned as it was, with the reason.
+    A step that fails or raises the cost is discarded and tried again with ten times the damping.
+    If no step helps, the state is returned unchanged, with the reason. Eq. (5).
     """
-    current, equations = _linearised(problem, state), None
-    cost_before, accepted, reason = current.cost, 0, "all iterations used"
-    converged = True
+    current = _linearised(problem, state)
+    cost_before = current.cost
+    equations = None
+    accepted = 0
     level = damping
+    converged, reason = True, "all iterations used"
     while accepted < iterations:
         if equations is None:
             equations = _normal_equations(problem, state, current)
         candidate = _damped_step(problem, state, equations, level, absolute_damping)
         trial = None if candidate is None else _linearised(problem, candidate)
-        if trial is not None and trial.cost <= current.cost:
+        if candidate is not None and trial is not None and trial.cost <= current.cost:
             settled = current.cost - trial.cost <= 1e-9 * current.cost
-            state, current, equations, accepted = candidate, trial, None, accepted + 1
+            state, current, equations = candidate, trial, None
+            accepted += 1
             level = max(level / 10, damping)
             if settled:
                 reason = "cost settled"
                 break
-            continue
-        level = max(10 * level, MIN_RAISED_DAMPING)
-        if level > MAX_DAMPING:
-            # Already at the minimum no step lowers the cost: that is convergence, not failure.
-            converged = candidate is not None
-            reason = "no step lowers the cost" if converged else "normal equations are singular"
-            break
-    report = BundleReport(converged, cost_before, current.cost, accepted, level, reason)
-    return state, report
+        else:
+            level = max(10 * level, MIN_RAISED_DAMPING)
+            if level > MAX_DAMPING:
+                # At the minimum no step lowers the cost: that is convergence, not failure.
+                converged = candidate is not None
+                reason = "no step lowers the cost" if converged else "normal equations are singular"
+                break
+    return state, BundleReport(converged, cost_before, current.cost, accepted, level, reason)
 
 
 def motion_only_adjust(
-    problem: BundleProblem, state: BundleState, iterations: int, damping: float = 1e-4
+    problem: BundleProblem, state: BundleState, iterations: int
 ) -> tuple[BundleState, BundleReport]:
     """Minimise over the free poses with all disparities held."""
     held = torch.zeros_like(problem.free_disparities)
-    return bundle_adjust(replace(problem, free_disparities=held), state, iterations, damping)
+    return bundle_adjust(replace(problem, free_disparities=held), state, iterations)
 
 
 def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
@@ -139,12 +141,10 @@ def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tenso
 
 
 def _linearised(problem: BundleProblem, state: BundleState) -> _Linearised:
-    dtype = problem.targets.dtype
-    transforms = relative_transforms(
-        state.T_camera_world, problem.edges_source, problem.edges_target
-    )
+    source, dtype = problem.edges_source, problem.targets.dtype
+    transforms = relative_transforms(state.T_camera_world, source, problem.edges_target)
     reprojection = reproject_with_jacobians(
-        transforms.to(dtype), state.disparities[problem.edges_source], problem.rays, problem.camera
+        transforms.to(dtype), state.disparities[source], problem.rays, problem.camera
     )
     residual = problem.targets - reprojection.positions
     weight = problem.weights * reprojection.valid[:, None]
@@ -155,14 +155,14 @@ def _linearised(problem: BundleProblem, state: BundleState) -> _Linearised:
 
 
 def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) float64 px^2
-    """Return what each edge contributes to Eq. (5), the robust loss included."""
+    """Return the reprojection cost of each edge, the robust loss included."""
     at = _linearised(problem, state)
     return _edge_costs(problem, at.residual, at.reprojection.valid)
 
 
 def _edge_costs(problem: BundleProblem, residual: Tensor, valid: Tensor) -> Tensor:
-    # Points behind the target would leave the sum, and the cheapest camera would look away from
-    # all of them: each counts as a miss by the width of the image.
+    # A point behind the target counts as a residual of the image's width. Were it left out, the
+    # cheapest camera would be one that looks away from all points.
     residual = torch.where(valid[:, None], residual, float(problem.camera.width))
     if problem.robust is None:
         return (problem.weights * residual.square()).sum((1, 2), dtype=torch.float64)
@@ -171,7 +171,7 @@ def _edge_costs(problem: BundleProblem, residual: Tensor, valid: Tensor) -> Tens
 
 
 def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
-    """Return Eq. (5) in px^2, with the robust loss if there is one."""
+    """Return the whole cost in px^2, with the robust loss if there is one. Eq. (5)."""
     difference = state.disparities - problem.prior_disparities
     prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
     return float(_edge_costs(problem, residual, valid).sum() + prior_cost)
@@ -189,9 +189,8 @@ def _normal_equations(
     adjoint = se3_adjoint(at.transforms)
     H, g = _assemble_poses(problem, A, b, adjoint)
 
-    held_prior = problem.prior_weights * problem.free_disparities[:, None]
-    C = held_prior.clone()
-    s = held_prior * (problem.prior_disparities - state.disparities)
+    C = problem.prior_weights * problem.free_disparities[:, None]
+    s = C * (problem.prior_disparities - state.disparities)
     if not problem.free_disparities.any():
         return _NormalEquations(H, g, C, s, [])
     free = problem.free_disparities[problem.edges_source].to(J.dtype)
@@ -205,7 +204,7 @@ def _normal_equations(
 
 
 def _pose_slots(problem: BundleProblem) -> Tensor:
-    """Return for every keyframe its position among the free poses, -1 for a fixed one."""
+    """Return the position of every keyframe among the free poses, -1 for a fixed one."""
     slots = torch.cumsum(problem.free_poses.long(), 0) - 1
     return torch.where(problem.free_poses, slots, torch.full_like(slots, -1))
 
@@ -213,20 +212,17 @@ def _pose_slots(problem: BundleProblem) -> Tensor:
 def _assemble_poses(
     problem: BundleProblem, A: Tensor, b: Tensor, adjoint: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Scatter J^T W J = A and J^T W r = b of the targets to the free poses, source parts included.
+    """Sum J^T W J = A and J^T W r = b of all edges over the free poses, targets and sources.
 
     With J_source = -J_target Ad: H_st = -Ad^T A, H_ss = Ad^T A Ad, g_s = -Ad^T b.
     """
     slots = _pose_slots(problem)
     count = int(problem.free_poses.sum())
-    # One extra slot collects what belongs to fixed poses and is cut off afterwards.
-    source, target = (
-        slots[problem.edges_source] % (count + 1),
-        slots[problem.edges_target] % (count + 1),
-    )
+    width = count + 1  # one extra slot collects the fixed poses and is cut off afterwards
+    source = slots[problem.edges_source] % width
+    target = slots[problem.edges_target] % width
     A_source = -adjoint.mT @ A  # rows of the source, columns of the target
-    H = torch.zeros((count + 1) ** 2, 6, 6, dtype=torch.float64)
-    width = count + 1
+    H = torch.zeros(width**2, 6, 6, dtype=torch.float64)
     H.index_add_(0, target * width + target, A)
     H.index_add_(0, source * width + target, A_source)
     H.index_add_(0, target * width + source, A_source.mT)
@@ -274,10 +270,10 @@ def _damped_step(
     damping: float,
     absolute_damping: float,
 ) -> BundleState | None:
-    """Solve the damped normal equations; return the moved state, or None if they are singular."""
+    """Solve the damped normal equations; return the new state, or None if they are singular."""
     C = equations.disparity_diagonal
     observed = C > 0
-    # Cells that hardly any flow constrains would jump to wherever the linearisation points.
+    # Without this, cells that the flow hardly constrains would take steps far too long.
     C = C * (1 + damping) + DISPARITY_DAMPING * C.sum() / observed.sum().clamp_min(1)
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
     S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
@@ -287,21 +283,17 @@ def _damped_step(
         b.index_add_(0, rows, -(scaled @ equations.disparity_gradient[source]).double())
     S.diagonal().mul_(1 + damping).add_(absolute_damping)
     factor, failure = torch.linalg.cholesky_ex(S)
-    if failure:
-        return None
     xi = torch.cholesky_solve(b[:, None], factor).squeeze(1)
-    if not torch.isfinite(xi).all():
+    if failure or not torch.isfinite(xi).all():
         return None
 
     poses = state.T_camera_world.clone()
     moved_poses = se3_exp(xi.reshape(-1, 6)) @ poses[problem.free_poses]
     poses[problem.free_poses] = se3_normalised(moved_poses)
-    if not problem.free_disparities.any():
-        return BundleState(poses, state.disparities)
     step = equations.disparity_gradient.clone()
     for source, rows, E in equations.source_blocks:
         step[source] -= xi[rows].to(E.dtype) @ E
     disparities = state.disparities + inverse_C * step
     clamped = disparities.clamp_min(MIN_DISPARITY)
-    moved = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
-    return BundleState(poses, moved)
+    disparities = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
+    return BundleState(poses, disparities)

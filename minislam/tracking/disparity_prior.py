@@ -1,8 +1,9 @@
 """The mask M of the disparity prior: where other views contradict the depth of a single image.
 
-A depth network is wrong in places, and there the prior of Eq. (5) would bend poses and
-disparities. So every connected keyframe j is carried into keyframe i by its own depth: where
-several arrive and too few agree with D~_i, the prior of i is switched off.
+A depth network is wrong in places, and there the prior of Eq. (5) would distort poses and
+disparities. So every connected keyframe j is warped into keyframe i by its own depth. Where
+several views have a correspondence but too few of them agree with D~_i, the prior of i is
+switched off.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ MIN_DEPTH = 1e-6  # world units: points at or behind the camera are not seen
 
 @dataclass(frozen=True)
 class DepthView:
-    """One keyframe, as far as the consistency of depth is concerned."""
+    """What the consistency of depth needs of one keyframe."""
 
     metric_depth: Tensor  # (H, W) D~, world units, 0 where unknown
     features: Tensor  # (h', w', C)
@@ -30,9 +31,9 @@ class DepthView:
 
 @dataclass(frozen=True)
 class ConsistencyCounts:
-    """How many other views have a word on each cell, and how many of them agree with it."""
+    """Per cell: number of views with a correspondence, and number whose depth agrees."""
 
-    corresponding: Tensor  # (N,) int64, views from which a point arrives that looks like the cell
+    corresponding: Tensor  # (N,) int64, views of which a point with similar features arrives
     consistent: Tensor  # (N,) int64, n_i of Eq. (8)
 
 
@@ -43,24 +44,28 @@ def mask_priors(
     config: TrackingConfig,
     first: int = 0,
 ) -> None:
-    """Set the mask of the keyframes from `first` on, by those that the edges connect them with."""
+    """Set the mask of the keyframes from `first` on, from the keyframes that edges link them to."""
     if not config.prior_mask:
         return
     rows = zip(keyframes.metric_depths, keyframes.features, keyframes.T_camera_world, strict=True)
-    views = [None if depth is None else DepthView(depth, *rest) for depth, *rest in rows]
-    for index in range(first, len(views)):
-        if views[index] is not None:
+    views = {
+        index: DepthView(depth, *rest)
+        for index, (depth, *rest) in enumerate(rows)
+        if depth is not None
+    }
+    for index, view in views.items():
+        if index >= first:
             targets = dict.fromkeys(target for source, target in edges if source == index)
-            others = [views[target] for target in targets if views[target] is not None]
-            keyframes.prior_masks[index] = prior_mask(grid, views[index], others, config)
+            others = [views[target] for target in targets if target in views]
+            keyframes.prior_masks[index] = prior_mask(grid, view, others, config)
 
 
 def prior_mask(
     grid: Grid, view: DepthView, others: list[DepthView], config: TrackingConfig
 ) -> Tensor:  # (N,) bool
-    """Return M: False where enough views have a word on a cell and too few agree with it. Eq. (8).
+    """Return M: False where enough views correspond to a cell and too few of them agree with it.
 
-    A cell of which nothing is known against it keeps its prior.
+    Otherwise the cell keeps its prior.
     """
     counts = depth_consistency(
         grid, view, others, config.mask_max_depth_error, config.mask_min_similarity
@@ -76,9 +81,9 @@ def depth_consistency(
     max_depth_error: float,  # epsilon, relative
     min_similarity: float,  # gamma, cosine
 ) -> ConsistencyCounts:
-    """Count the views whose depth, carried into view i, agrees with that of i.
+    """Count the views whose depth, warped into view i, agrees with that of i.
 
-    n_i = sum_j [ |D~_i - D~_j->i| / D~_j->i < epsilon  and  cos(F_i, F_j) > gamma ]    Eq. (8)
+    n_i = sum_j [ |D~_i - D~_j->i| / D~_j->i < epsilon  and  cos(F_i, F_j) > gamma ]. Eq. (8).
     """
     stride = grid.stride
     depth = view.metric_depth[::stride, ::stride].reshape(-1)
@@ -87,33 +92,33 @@ def depth_consistency(
     consistent = torch.zeros_like(corresponding)
     for other in others:
         T_view_other = view.T_camera_world @ se3_inverse(other.T_camera_world)
-        arrived = carried_depth(grid, cell_features, other, T_view_other, min_similarity)
-        has_word = (depth > 0) & (arrived > 0)
-        corresponding += has_word
-        consistent += has_word & ((depth - arrived).abs() < max_depth_error * arrived)
+        warped = warp_depth(grid, cell_features, other, T_view_other, min_similarity)
+        has_correspondence = (depth > 0) & (warped > 0)
+        corresponding += has_correspondence
+        consistent += has_correspondence & ((depth - warped).abs() < max_depth_error * warped)
     return ConsistencyCounts(corresponding, consistent)
 
 
-def carried_depth(
+def warp_depth(
     grid: Grid,
-    cell_features: Tensor,  # (N, C) of the cells that points are carried to
-    other: DepthView,  # whose pixels are carried
+    cell_features: Tensor,  # (N, C) of this view's cells
+    other: DepthView,  # the view whose pixels are warped
     T_view_other: Tensor,  # (4, 4)
     min_similarity: float,  # gamma
-) -> Tensor:  # (N,) D~_j->i, 0 where nothing arrives that looks like the cell
-    """Carry every pixel of another view to the cells of this one by its own depth.
+) -> Tensor:  # (N,) D~_j->i, 0 where no point with similar features arrives
+    """Warp every pixel of another view to the cells of this one by its own depth.
 
-    Several points may fall on one cell. Those that do not look like it are no correspondences;
-    of the others the nearest counts, because it hides the rest: whichever came last would turn a
-    hidden surface into a contradiction.
+    Several points may fall on one cell. Points whose features differ from the cell's are no
+    correspondences. Of the others the nearest counts, because it hides the rest: otherwise a
+    hidden surface would count as a contradiction.
     """
     camera, stride = grid.camera, grid.stride
     pixels = camera.pixel_grid(dtype=other.metric_depth.dtype).reshape(-1, 2)
     depth = other.metric_depth.reshape(-1)
     points = camera.backproject(pixels, depth)
     points = transform_points(T_view_other.to(points.dtype), points)
-    arrived = points[:, 2]
-    seen = (depth > 0) & (arrived > MIN_DEPTH)
+    warped = points[:, 2]
+    seen = (depth > 0) & (warped > MIN_DEPTH)
     points = torch.where(seen[:, None], points, points.new_ones(3))  # 1/z would not be finite
     column, row = camera.project(points).round().unbind(1)
     seen &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
@@ -122,9 +127,9 @@ def carried_depth(
 
     cell = (row[seen] / stride).long() * grid.shape[1] + (column[seen] / stride).long()
     features = sample_features(other.features, pixels[seen], camera)
-    alike = functional.cosine_similarity(features, cell_features[cell], dim=1) > min_similarity
+    similar = functional.cosine_similarity(features, cell_features[cell], dim=1) > min_similarity
     nearest = depth.new_full((len(cell_features),), torch.inf)
-    nearest.scatter_reduce_(0, cell[alike], arrived[seen][alike], "amin")
+    nearest.scatter_reduce_(0, cell[similar], warped[seen][similar], "amin")
     return torch.where(nearest.isfinite(), nearest, 0)
 
 
@@ -133,7 +138,7 @@ def sample_features(
     pixels: Tensor,  # (N, 2)
     camera: Camera,
 ) -> Tensor:  # (N, C)
-    """Interpolate features bilinearly at pixels; beyond the outermost cells they are held."""
+    """Interpolate features bilinearly at pixels; beyond the outermost cells they are repeated."""
     size = pixels.new_tensor([camera.width, camera.height])
     # The image covers [-0.5, size - 0.5], which grid_sample calls [-1, 1].
     position = ((2 * pixels + 1) / size - 1).to(features.dtype)

@@ -1,4 +1,4 @@
-"""The cells of the tracker: every `stride`-th pixel of the image."""
+"""The grid of cells on which the tracker works."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,10 @@ class Grid:
         return cls(camera, stride, (height, width), flat, camera.rays(flat))
 
     def sample(self, values: Tensor, positions: Tensor) -> Tensor:
-        """Sample cell values (..., N, C) at pixel positions (..., N, 2), bilinear, border held."""
+        """Interpolate cell values (..., N, C) bilinearly at pixels (..., N, 2).
+
+        Beyond the outermost cells their values are repeated.
+        """
         height, width = self.shape
         image = values.reshape(-1, height, width, values.shape[-1]).permute(0, 3, 1, 2)
         extent = positions.new_tensor([width - 1, height - 1]) * self.stride

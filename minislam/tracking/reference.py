@@ -1,8 +1,8 @@
 """One Gauss-Newton step of Eq. (5) as a textbook writes it: dense, differentiated by autograd.
 
-Every pose and every disparity is an unknown of one large system; nothing is eliminated and no
-derivative is written by hand. It is slow and serves two ends: to be read, and to be the truth
-that bundle_adjustment.py is tested against.
+Every pose and every disparity is an unknown of one large system; nothing is marginalised and no
+derivative is written by hand. Read it first; it is slow, and it is also the truth that its fast
+twin, bundle_adjustment.py, is tested against.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ def predicted_positions(problem: BundleProblem, state: BundleState) -> tuple[Ten
 
 
 def moved(problem: BundleProblem, state: BundleState, step: Tensor) -> BundleState:
-    """Return the state after a step (6 P + D,): poses on the left, disparities added."""
+    """Return the state after a step (6 P + D,): exp(xi) T for poses, d + step for disparities."""
     pose_unknowns = 6 * int(problem.free_poses.sum())
     xi = torch.zeros(len(problem.free_poses), 6, dtype=step.dtype)
     xi = xi.index_put((problem.free_poses,), step[:pose_unknowns].reshape(-1, 6))
@@ -54,9 +54,13 @@ def moved(problem: BundleProblem, state: BundleState, step: Tensor) -> BundleSta
 
 
 def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseNormalEquations:
-    """Linearise the predictions in all unknowns at once and weigh them. Eq. (5)."""
-    poses, frames = int(problem.free_poses.sum()), int(problem.free_disparities.sum())
-    standing = torch.zeros(6 * poses + frames * len(problem.rays), dtype=torch.float64)
+    """Return the weighted normal equations of all unknowns at once.
+
+    Fast twin: the blocks of bundle_adjustment._normal_equations. Eq. (5).
+    """
+    poses = int(problem.free_poses.sum())
+    frames = int(problem.free_disparities.sum())
+    no_step = torch.zeros(6 * poses + frames * len(problem.rays), dtype=torch.float64)
 
     def predicted(step: Tensor) -> Tensor:
         return predicted_positions(problem, moved(problem, state, step))[0].reshape(-1)
@@ -70,15 +74,10 @@ def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseN
     if problem.robust is not None:
         weight = weight * problem.robust.weight(residual.square().sum(1, keepdim=True))
     # The flow and the prior are rows of one least-squares problem.
-    J = torch.cat(
-        [
-            torch.func.jacrev(predicted)(standing),
-            torch.func.jacrev(disparities)(standing),
-        ]
-    )
-    r = torch.cat(
-        [residual.reshape(-1), (problem.prior_disparities - state.disparities).reshape(-1)]
-    )
+    jacrev = torch.func.jacrev
+    J = torch.cat([jacrev(predicted)(no_step), jacrev(disparities)(no_step)])
+    prior_residual = problem.prior_disparities - state.disparities
+    r = torch.cat([residual.reshape(-1), prior_residual.reshape(-1)])
     w = torch.cat([weight.reshape(-1), problem.prior_weights.reshape(-1)])
     return DenseNormalEquations(J.mT @ (w[:, None] * J), J.mT @ (w * r), 6 * poses)
 
@@ -86,10 +85,13 @@ def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseN
 def dense_step(
     problem: BundleProblem,
     state: BundleState,
-    damping: float,  # relative, on disparities and on what is left of the poses without them
+    damping: float,  # relative, on disparities and on the marginalised poses
     absolute_damping: float,  # on the poses
 ) -> BundleState:
-    """Return the state after one damped step, all unknowns solved for together. Eq. (5)."""
+    """Return the state after one damped step, all unknowns solved for together.
+
+    Fast twin: one step of bundle_adjustment.bundle_adjust. Eq. (5).
+    """
     equations = dense_normal_equations(problem, state)
     split, matrix = equations.pose_unknowns, equations.matrix.clone()
     diagonal = matrix.diagonal()  # a view: what is written to it is written to the matrix
@@ -98,10 +100,10 @@ def dense_step(
     mean = diagonal[split:].sum() / observed.sum().clamp_min(1)
     diagonal[split:] += damping * diagonal[split:] + DISPARITY_DAMPING * mean
 
-    # The pose damping is relative to the curvature that remains once the disparities follow.
+    # The pose damping is relative to the Schur complement, in which disparities are marginalised.
     H, E, C = matrix[:split, :split], matrix[:split, split:], matrix[split:, split:]
-    remaining = (H - E @ torch.linalg.solve(C, E.mT)).diagonal()
-    diagonal[:split] += damping * remaining + absolute_damping
+    schur = H - E @ torch.linalg.solve(C, E.mT)
+    diagonal[:split] += damping * schur.diagonal() + absolute_damping
 
     after = moved(problem, state, torch.linalg.solve(matrix, equations.vector))
     clamped = after.disparities.clamp_min(MIN_DISPARITY)

@@ -1,12 +1,12 @@
-"""Where a cell of one keyframe is seen in another, and how that position moves.
+"""Reprojection: where a cell of one keyframe is seen in another, with its derivatives.
 
-A cell with ray rho = K^-1 (u, v, 1) and disparity d is the point rho / d. In the target camera,
-multiplied by d (which no projection notices),
+A cell with ray r = K^-1 (u, v, 1) and disparity d is the point r / d. In the target frame, and
+multiplied by d, which does not change its projection, it is
 
-    X = R rho + d t,    T_target_source = (R, t),
+    X = R r + d t,    T_target_source = (R, t).
 
-so a disparity of zero, a point at infinity, needs no special case. X_z is the ratio of the two
-depths.
+So a disparity of zero, a point at infinity, needs no special case. X_z is the depth in the
+target divided by the depth in the source.
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_inverse
 
-# A point four times closer to the target than to the source is seen at a scale where no flow
-# is reliable, and its derivatives explode. [-], as in DROID-SLAM.
+# A point four times closer to the target than to the source changes its scale too much for
+# reliable flow, and its derivatives explode. [-], as in DROID-SLAM.
 MIN_DEPTH_RATIO = 0.25
 
 
@@ -25,9 +25,10 @@ MIN_DEPTH_RATIO = 0.25
 class Linearisation:
     """Reprojections of E edges with N cells each, with derivatives.
 
-    The source pose needs no derivative of its own: T_target_source = T_t T_s^-1 turns a step
-    xi_s of the source into the step -Ad(T_target_source) xi_s of the target, so
-    J_source = -J_target Ad(T_target_source), with one 6x6 matrix for all cells of an edge.
+    The derivative by the source pose follows from J_target: because
+    T_target_source = T_t T_s^-1, a step xi_s of the source acts like the step
+    -Ad(T_target_source) xi_s of the target. So J_source = -J_target Ad(T_target_source), with one
+    6x6 matrix for all cells of an edge.
     """
 
     positions: Tensor  # (E, 2, N) px
@@ -50,7 +51,7 @@ def scaled_points(
     disparities: Tensor,  # (E, N) of the source cells
     rays: Tensor,  # (N, 3) of the source cells, z = 1
 ) -> Tensor:  # (E, 3, N)
-    """Return X = R rho + d t for every cell of every edge."""
+    """Return X = R r + d t for every cell of every edge."""
     rotated = T_target_source[:, :3, :3] @ rays.T
     return rotated + T_target_source[:, :3, 3:] * disparities[:, None]
 
@@ -71,7 +72,7 @@ def reproject(
 
 
 def lengths(vectors: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) px
-    """Return how long image vectors are; norm(dim=1) takes three hundred times as long here."""
+    """Return the lengths of image vectors; norm(dim=1) would take three hundred times as long."""
     return torch.hypot(vectors[:, 0], vectors[:, 1])
 
 
@@ -81,9 +82,9 @@ def mean_parallax(
     rays: Tensor,  # (N, 3)
     camera: Camera,
 ) -> Tensor:  # (E,) px
-    """Return how far the translation alone moves the cells of each edge in the image, on average.
+    """Return the mean parallax of each edge: the flow that its translation causes.
 
-    It is the difference between the flow and the flow of a camera that only turned.
+    It is the flow minus the flow of the rotation alone.
     """
     turned, still_seen = reproject(T_target_source, torch.zeros_like(disparities), rays, camera)
     positions, valid = reproject(T_target_source, disparities, rays, camera)
@@ -106,7 +107,7 @@ def reproject_with_jacobians(
     """
     x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
     valid = z >= MIN_DEPTH_RATIO
-    # Invalid points get zero weight from the caller; one keeps their numbers finite.
+    # Invalid points get zero weight from the caller; z = 1 keeps their numbers finite.
     inverse_z = torch.where(valid, z, torch.ones_like(z)).reciprocal()
     ray_x, ray_y = x * inverse_z, y * inverse_z
     J_target = camera.twist_jacobian(ray_x, ray_y, disparities * inverse_z)

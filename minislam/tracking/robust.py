@@ -1,10 +1,10 @@
-"""The robust weight inside Sigma of Eq. (5), for a flow that brings no learned confidence.
+"""The robust weight inside Sigma of Eq. (5), for a flow without a learned confidence.
 
     weight(r) = (1 + r^2 / c^2)^-p
 
-is the derivative of a loss by r^2. With p = 1 it is Cauchy's, which grows like log r and so never
-stops asking about an outlier; with p = 2 it is that of Geman and McClure, bounded by c^2: beyond
-a few c it does not matter how far away a mover has gone, only how many cells it has.
+is the derivative of a loss by r^2. With p = 1 it is Cauchy's loss, which grows like log r, so
+that even far outliers pull. With p = 2 it is that of Geman and McClure, bounded by c^2: beyond a
+few c only the number of outlier cells counts, not how far a dynamic object has moved.
 """
 
 from dataclasses import dataclass, replace

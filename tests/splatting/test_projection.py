@@ -81,7 +81,7 @@ def test_round_gaussian_on_the_axis_has_a_round_footprint():
 
 
 @pytest.mark.parametrize("kind", ["ordinary", "huge", "needles", "off_screen"])
-def test_footprints_give_the_covariances_of_the_twin(kind: str):
+def test_factors_give_the_covariances_of_the_twin(kind: str):
     gaussians, camera, pose = random_map(kind, 30, 5), random_camera(6), random_pose(7)
     factors = covariance_factors(gaussians.quats_wxyz.T, gaussians.scales.T)
     points, camera_factors = to_camera(gaussians.means.T, factors, pose)
