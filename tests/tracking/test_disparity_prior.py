@@ -11,7 +11,7 @@ from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import (
     ConsistencyCounts,
     DepthView,
-    carried_depth,
+    warp_depth,
     depth_consistency,
     mask_priors,
     prior_mask,
@@ -99,7 +99,7 @@ def test_depth_is_carried_along_the_viewing_direction():
     # We stand 0.5 in front of the other camera: its wall is 1.5 away from us.
     forward = torch.tensor([0, 0, -0.5, 0, 0, 0], dtype=torch.float64)
     looks = WALL_LOOK.expand(len(GRID.pixels), 2)
-    arrived = carried_depth(GRID, looks, view(0.0), se3_exp(forward), GAMMA)
+    arrived = warp_depth(GRID, looks, view(0.0), se3_exp(forward), GAMMA)
     hit = arrived > 0
     assert torch.allclose(arrived[hit], torch.tensor(1.5, dtype=torch.float64))
     # 0.75^2 of our pixels are hit: the other's are spread over a wider image.
@@ -168,7 +168,7 @@ def test_cameras_that_look_away_have_no_word():
     behind = replace(view(0.0), T_camera_world=se3_exp(turned))
     assert not counted(view(0.0), [behind]).corresponding.any()
     looks = WALL_LOOK.expand(len(GRID.pixels), 2)
-    assert (carried_depth(GRID, looks, view(0.0), se3_exp(turned), GAMMA) == 0).all()
+    assert (warp_depth(GRID, looks, view(0.0), se3_exp(turned), GAMMA) == 0).all()
 
 
 # In the back-end
