@@ -35,13 +35,12 @@ COLUMNS = {  # heading: constants, true masks
 }
 
 
-def errors(sequence: Sequence, tracking: TrackingConfig, masks: bool) -> tuple[float, float]:
-    """Return the ATE of the keyframes before and after the final adjustment [cm]."""
+def tracked(sequence: Sequence, tracking: TrackingConfig, masks: bool = False) -> Tracker:
+    """Return a tracker that has followed the camera to the end, before the final adjustment."""
     priors = choose_priors(PriorChoice(depth="simulated"), sequence, SlamConfig())
-    truth = sequence.ground_truth
 
     def static_weight(index: int) -> torch.Tensor:
-        moving = truth.moving_mask(tracker.keyframes.frames[index].frame_index)
+        moving = sequence.ground_truth.moving_mask(tracker.keyframes.frames[index].frame_index)
         stride = tracker.grid.stride
         return 1.0 - float(masks) * torch.from_numpy(moving[::stride, ::stride]).float()
 
@@ -53,16 +52,28 @@ def errors(sequence: Sequence, tracking: TrackingConfig, masks: bool) -> tuple[f
         if is_start and len(tracker.keyframes) >= tracking.warmup_keyframes:
             tracker.initialise()
             tracker.refine_initialisation()
+    return tracker
 
-    def ate() -> float:
-        stamps = [frame.timestamp for frame in tracker.keyframes.frames]
-        poses = se3_inverse(tracker.keyframes.T_camera_world).numpy()
-        found = absolute_trajectory_error(Trajectory(np.array(stamps), poses), truth.trajectory)
-        return 100 * found.statistics["rmse"]
 
-    before = ate()
+def keyframe_error(tracker: Tracker, sequence: Sequence) -> float:
+    """Return the ATE of the keyframes [cm]."""
+    stamps = np.array([frame.timestamp for frame in tracker.keyframes.frames])
+    return ate(stamps, tracker.keyframes.T_camera_world, sequence)
+
+
+def ate(stamps: np.ndarray, T_camera_world: torch.Tensor, sequence: Sequence) -> float:
+    """Return the ATE of poses (N, 4, 4) at given times [cm]."""
+    estimate = Trajectory(stamps, se3_inverse(T_camera_world).numpy())
+    found = absolute_trajectory_error(estimate, sequence.ground_truth.trajectory)
+    return 100 * found.statistics["rmse"]
+
+
+def errors(sequence: Sequence, tracking: TrackingConfig, masks: bool) -> tuple[float, float]:
+    """Return the ATE of the keyframes before and after the final adjustment [cm]."""
+    tracker = tracked(sequence, tracking, masks)
+    before = keyframe_error(tracker, sequence)
     tracker.finish()
-    return before, ate()
+    return before, keyframe_error(tracker, sequence)
 
 
 def main() -> None:

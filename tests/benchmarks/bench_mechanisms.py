@@ -1,0 +1,221 @@
+"""What single mechanisms bring: each sequence with the mechanism on, and with it off.
+
+    python -m tests.benchmarks.bench_mechanisms MECHANISM [NAME:SEED ...]
+
+320x240, simulated depth prior. `culling` and `relocalisation` track alone (about 20 s a row).
+`refinement` (of the poses between the keyframes), `beta` (on a finer grid) and `densification` do
+whole runs (about 100 s each; `--preset test --frames 60` is faster). Without any difference
+between the rows: ATE differs by less than 0.01 cm, PSNR by less than 0.1 dB.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from math import inf
+from unittest import mock
+
+import numpy as np
+import torch
+
+from data_synth.cli import parse_size
+from minislam.config import PRESETS, SlamConfig, preset, with_settings
+from minislam.data import InputOptions, open_sequence
+from minislam.evaluation.metrics import MappedView, measure_run
+from minislam.geometry import se3_inverse
+from minislam.priors.choice import PriorChoice
+from minislam.records import Sequence, Trajectory
+from minislam.runs.run import choose_priors
+from minislam.slam import Slam
+from minislam.tracking.config import TrackingConfig
+from minislam.tracking.relocalisation import Relocaliser
+from minislam.tracking.trajectory import pose_all_frames
+from minislam.uncertainty.resampling import resample
+from tests.benchmarks.bench_movers import ate, keyframe_error, tracked
+from tests.benchmarks.incidents import COVERED, covered_clip, standing_clip
+
+SEQUENCES = ("ball:71", "crowd:71", "table2:71")
+Rows = Iterator[tuple[str, dict[str, float]]]  # what is on or off, and the figures by name
+FAR_BACK = 10  # frame that follows the black images of a camera that is then elsewhere
+REFINEMENTS = {
+    "off": None,
+    "the whole step": {"share": 1.0},
+    "3/4 of the step": {},
+    "3/4, however far": {"farthest": inf},
+}
+MANY_GAUSSIANS = 200_000  # more than densification ever reaches here: no limit
+
+
+@dataclass(frozen=True)
+class Source:
+    """A synthetic sequence: which, and how much of it."""
+
+    name: str
+    seed: int
+    frames: int
+    size: tuple[int, int]  # width, height [px]
+
+    def sequence(self) -> Sequence:
+        """Return its first frames."""
+        options = InputOptions(max_frames=self.frames, size=self.size)
+        return open_sequence(f"synth:{self.name}:{self.seed}", options)
+
+
+def culling(clip: Source, config: SlamConfig) -> Rows:
+    """Track a walk, and a walk with a pause in which only things move."""
+    clips = {
+        "walk": clip.sequence(),
+        "with a pause": standing_clip(clip.name, clip.seed, clip.size),
+    }
+    for heading, sequence in clips.items():
+        for state, share in {"off": 0.0, "on": config.tracking.cull_share}.items():
+            tracker = tracked(sequence, replace(config.tracking, cull_share=share))
+            figures = {"keyframes": len(tracker.keyframes)}
+            figures["ATE before [cm]"] = keyframe_error(tracker, sequence)
+            tracker.finish()
+            figures["ATE after [cm]"] = keyframe_error(tracker, sequence)
+            yield f"{heading}, {state}", figures
+
+
+def relocalisation(clip: Source, config: SlamConfig) -> Rows:
+    """Cover the camera for 20 of 100 frames: it goes on where it was, or where it was long ago."""
+    clips = {"comes back there": COVERED, "turns up elsewhere": FAR_BACK}
+    for heading, first_after in clips.items():
+        sequence = covered_clip(clip.name, clip.seed, clip.size, first_after)
+        yield f"{heading}, on", followed_frames(sequence, config.tracking)
+        with mock.patch.object(Relocaliser, "find", lambda self, image, features: None):
+            yield f"{heading}, off", followed_frames(sequence, config.tracking)
+
+
+def followed_frames(sequence: Sequence, config: TrackingConfig) -> dict[str, float]:
+    """Return how many frames of a clip have a pose, and the error of all of these."""
+    tracker = tracked(sequence, config)
+    tracker.finish()
+    poses = pose_all_frames(tracker, sequence)
+    stamps = np.array([sequence.frame(index).timestamp for index in poses])
+    error = ate(stamps, torch.stack(list(poses.values())), sequence)
+    return {"frames with a pose": len(poses), "ATE [cm]": error}
+
+
+def refinement(clip: Source, config: SlamConfig) -> Rows:
+    """Refine the poses between the keyframes of one run in several ways."""
+    slam = finished(clip, config)
+    start, own = slam.trajectory(), slam.mapper.config
+    for heading, changes in REFINEMENTS.items():
+        trajectory = start
+        if changes is not None:
+            settings = replace(own.pose_refinement, **changes)
+            slam.mapper.config = replace(own, pose_refinement=settings)
+            trajectory = refined(slam, start)
+        found = measured(slam, trajectory, views=[])
+        yield heading, chosen(found, "ate_all_cm", "psnr_novel_db", "psnr_novel_oriented_db")
+    slam.mapper.config = own
+
+
+def refined(slam: Slam, start: Trajectory) -> Trajectory:
+    """Return a trajectory whose poses between the keyframes are refined by re-rendering."""
+    features = choose_priors(SIMULATED, slam.sequence, slam.config).features
+    numbers = {tracked.timestamp: tracked.frame_index for tracked in slam.tracker.tracked}
+    keyframes = {frame.frame_index for frame in slam.tracker.keyframes.frames}
+    poses = torch.from_numpy(start.T_world_camera).clone()
+    for row, timestamp in enumerate(start.timestamps):
+        if numbers[timestamp] in keyframes:
+            continue
+        frame = slam.sequence.frame(numbers[timestamp])
+        beta = slam.mapper.predict_beta(features(frame))
+        pose = slam.mapper.refine_pose(se3_inverse(poses[row]), frame.image, beta)
+        poses[row] = se3_inverse(pose)
+    return Trajectory(start.timestamps, poses.numpy())
+
+
+def beta(clip: Source, config: SlamConfig) -> Rows:
+    """Learn the uncertainty on the grid of the features, and on one twice as fine."""
+    names = "beta_auroc", "psnr_masked_db", "psnr_novel_oriented_db", "ate_all_cm"
+    for factor in (1, 2):
+        changed = with_settings(config, {"uncertainty.grid_factor": factor})
+        slam = finished(clip, changed)
+        yield f"grid factor {factor}", chosen(measured(slam, slam.trajectory()), *names)
+
+
+def densification(clip: Source, config: SlamConfig) -> Rows:
+    """Map without and with cloning and splitting."""
+    names = "psnr_novel_oriented_db", "psnr_input_db", "psnr_masked_db", "ate_all_cm"
+    for heading, most in {"off": 0, "on": MANY_GAUSSIANS}.items():
+        changed = with_settings(config, {"mapping.density.max_gaussians": most})
+        slam = finished(clip, changed)
+        count = {"Gaussians": len(slam.mapper.gaussians)}
+        yield heading, count | chosen(measured(slam, slam.trajectory()), *names)
+
+
+MECHANISMS = {
+    "culling": culling,
+    "relocalisation": relocalisation,
+    "refinement": refinement,
+    "beta": beta,
+    "densification": densification,
+}
+SIMULATED = PriorChoice(depth="simulated")
+
+
+@cache
+def finished(clip: Source, config: SlamConfig) -> Slam:
+    """Return the system after a whole run, but for the refinement of poses between keyframes."""
+    sequence = clip.sequence()
+    config = with_settings(config, {"mapping.pose_refinement.enabled": False})
+    slam = Slam(sequence, config, choose_priors(SIMULATED, sequence, config))
+    slam.run()
+    return slam
+
+
+def measured(
+    slam: Slam, trajectory: Trajectory, views: list[MappedView] | None = None
+) -> dict[str, float | None]:
+    """Return the metrics of a run by name, with the keyframes as views if none are given."""
+    mapper, camera = slam.mapper, slam.sequence.camera
+    if views is None:
+        views = [
+            MappedView(
+                keyframe.frame_index,
+                se3_inverse(keyframe.T_camera_world).numpy(),
+                resample(mapper.beta_of(keyframe), camera.height, camera.width).numpy(),
+            )
+            for keyframe in mapper.keyframes
+        ]
+
+    def render(T_world_camera: np.ndarray) -> np.ndarray:
+        pose = se3_inverse(torch.from_numpy(T_world_camera))
+        return mapper.render(pose).color.clamp(0, 1).numpy()
+
+    truth = slam.sequence.ground_truth
+    return measure_run(truth, trajectory, slam.keyframe_trajectory(), views, render)
+
+
+def chosen(metrics: dict[str, float | None], *names: str) -> dict[str, float]:
+    """Return some of the metrics."""
+    return {name: metrics[name] for name in names}
+
+
+def main() -> None:
+    """Print the rows of one mechanism."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("mechanism", choices=MECHANISMS)
+    parser.add_argument("names", nargs="*", metavar="NAME:SEED", default=SEQUENCES)
+    parser.add_argument("--preset", choices=PRESETS, default="laptop")
+    parser.add_argument("--frames", type=int, default=100, help="of each sequence")
+    parser.add_argument("--size", default="320x240", help="width x height [px]")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    settings = dict(setting.split("=") for setting in given.set)
+    config = with_settings(preset(given.preset), settings)
+    size = parse_size(given.size)
+    for sequence in given.names:
+        name, seed = sequence.split(":")
+        clip = Source(name, int(seed), given.frames, size)
+        for heading, figures in MECHANISMS[given.mechanism](clip, config):
+            cells = ", ".join(f"{figure} {value:.3f}" for figure, value in figures.items())
+            print(f"{sequence:<12}{heading:<26}{cells}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

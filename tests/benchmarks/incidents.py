@@ -1,0 +1,86 @@
+"""Clips in which something happens to the camera: it stands still, or it is covered for a while."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from data_synth import Intrinsics, SyntheticFrame, default_intrinsics, render_frame, scene
+from data_synth.motion import FRAME_RATE
+from data_synth.sequence import in_order
+from minislam.geometry import Camera
+from minislam.records import Frame, Trajectory
+
+FRAMES = 100  # of every clip
+STANDS, MOVES_ON = 40, 70  # frames between which the camera stands while the movers go on
+COVERED, UNCOVERED = 50, 70  # frames between which every image is black
+
+
+class Clip:
+    """Rendered frames, numbered anew, with their truth: a `minislam.records.Sequence`."""
+
+    def __init__(self, name: str, frames: list[SyntheticFrame], k: Intrinsics) -> None:
+        self.name, self.description, self.warnings = name, f"{name}, {len(frames)} frames", []
+        self.camera = Camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height)
+        self.ground_truth = ClipTruth(frames)
+        self._frames = frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self.frame(index) for index in range(len(self)))
+
+    def frame(self, frame_index: int) -> Frame:
+        """Return one frame."""
+        image = torch.from_numpy(self._frames[frame_index].rgb).float() / 255
+        return Frame(frame_index, frame_index / FRAME_RATE, image)
+
+
+class ClipTruth:
+    """The truth of a clip: a `minislam.records.GroundTruth` without held-out views."""
+
+    def __init__(self, frames: list[SyntheticFrame]) -> None:
+        poses = np.array([frame.T_world_camera for frame in frames])
+        self.trajectory = Trajectory(np.arange(len(frames)) / FRAME_RATE, poses)
+        self._frames = frames
+
+    def moving_mask(self, frame_index: int) -> np.ndarray:
+        """Return (H, W) bool, True where a mover is seen."""
+        return self._frames[frame_index].mask
+
+    def static_image(self, frame_index: int) -> np.ndarray:
+        """Return (H, W, 3) float32: the same view without the movers."""
+        return self._frames[frame_index].static_rgb / np.float32(255)
+
+    def depth(self, frame_index: int) -> np.ndarray:
+        """Return (H, W) float32 z-depth [m]."""
+        return self._frames[frame_index].depth
+
+    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return no held-out views."""
+        return []
+
+
+def standing_clip(name: str, seed: int, size: tuple[int, int]) -> Clip:
+    """Return a clip whose camera stands still for a second; what moves goes on moving."""
+    view = scene(name, seed)
+    first, last = STANDS / FRAME_RATE, MOVES_ON / FRAME_RATE
+
+    def path(time: float) -> np.ndarray:  # (4, 4)
+        return view.path(min(time, first) + max(0.0, time - last))
+
+    held, intrinsics = replace(view, path=path), default_intrinsics(size)
+    frames = in_order(lambda i: render_frame(held, intrinsics, i), FRAMES)
+    return Clip(f"standing:{name}:{seed}", list(frames), intrinsics)
+
+
+def covered_clip(name: str, seed: int, size: tuple[int, int], first_after: int) -> Clip:
+    """Return a clip with black images in its middle; frame `first_after` is what follows them."""
+    view, intrinsics = scene(name, seed), default_intrinsics(size)
+    shown = [*range(UNCOVERED), *range(first_after, first_after + FRAMES - UNCOVERED)]
+    frames = list(in_order(lambda i: render_frame(view, intrinsics, shown[i]), FRAMES))
+    for index in range(COVERED, UNCOVERED):
+        frames[index] = replace(frames[index], rgb=np.zeros_like(frames[index].rgb))
+    return Clip(f"covered:{name}:{seed}", frames, intrinsics)
