@@ -1,4 +1,4 @@
-"""Clips in which something happens to the camera: it stands still, or it is covered for a while."""
+"""Clips in which the camera stands still for a second, or sees only black."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,7 +13,7 @@ from minislam.geometry import Camera
 from minislam.records import Frame, Trajectory
 
 FRAMES = 100  # of every clip
-STANDS, MOVES_ON = 40, 70  # frames between which the camera stands while the movers go on
+STANDS, MOVES_ON = 40, 70  # frames between which the camera stands while the dynamic objects go on
 COVERED, UNCOVERED = 50, 70  # frames between which every image is black
 
 
@@ -47,11 +47,11 @@ class ClipTruth:
         self._frames = frames
 
     def moving_mask(self, frame_index: int) -> np.ndarray:
-        """Return (H, W) bool, True where a mover is seen."""
+        """Return (H, W) bool, True on dynamic objects."""
         return self._frames[frame_index].mask
 
     def static_image(self, frame_index: int) -> np.ndarray:
-        """Return (H, W, 3) float32: the same view without the movers."""
+        """Return (H, W, 3) float32: the same view without dynamic objects."""
         return self._frames[frame_index].static_rgb / np.float32(255)
 
     def depth(self, frame_index: int) -> np.ndarray:
@@ -64,7 +64,7 @@ class ClipTruth:
 
 
 def standing_clip(name: str, seed: int, size: tuple[int, int]) -> Clip:
-    """Return a clip whose camera stands still for a second; what moves goes on moving."""
+    """Return a clip whose camera stands still for a second, while the dynamic objects move on."""
     view = scene(name, seed)
     first, last = STANDS / FRAME_RATE, MOVES_ON / FRAME_RATE
 
@@ -77,7 +77,7 @@ def standing_clip(name: str, seed: int, size: tuple[int, int]) -> Clip:
 
 
 def covered_clip(name: str, seed: int, size: tuple[int, int], first_after: int) -> Clip:
-    """Return a clip with black images in its middle; frame `first_after` is what follows them."""
+    """Return a clip with black images in its middle; they are followed by frame `first_after`."""
     view, intrinsics = scene(name, seed), default_intrinsics(size)
     shown = [*range(UNCOVERED), *range(first_after, first_after + FRAMES - UNCOVERED)]
     frames = list(in_order(lambda i: render_frame(view, intrinsics, shown[i]), FRAMES))
