@@ -213,7 +213,7 @@ def main() -> None:
         name, seed = sequence.split(":")
         clip = Source(name, int(seed), given.frames, size)
         for heading, figures in MECHANISMS[given.mechanism](clip, config):
-            cells = ", ".join(f"{figure} {value:.3f}" for figure, value in figures.items())
+            cells = ", ".join(f"{figure} {round(value, 3)}" for figure, value in figures.items())
             print(f"{sequence:<12}{heading:<26}{cells}", flush=True)
 
 

@@ -52,6 +52,9 @@ def tracked(sequence: Sequence, tracking: TrackingConfig, masks: bool = False) -
         if is_start and len(tracker.keyframes) >= tracking.warmup_keyframes:
             tracker.initialise()
             tracker.refine_initialisation()
+    if not tracker.initialised:  # the clip is shorter than the warm-up
+        tracker.initialise()
+        tracker.refine_initialisation()
     return tracker
 
 
