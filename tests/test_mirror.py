@@ -12,6 +12,7 @@ MODULES = sorted(p for p in (ROOT / "minislam").glob("*/**/*.py") if p.stem != "
 TESTED_ELSEWHERE: dict[str, str] = {
     "splatting/constants": "splatting/test_projection.py",
     "splatting/tile_loop": "splatting/test_renderer.py",
+    "tracking/reference": "tracking/test_bundle_adjustment.py",
 }
 
 

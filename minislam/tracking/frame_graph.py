@@ -1,4 +1,4 @@
-"""The frame graph: which keyframes are compared, and what the flow between them measured."""
+"""The frame graph: its edges link covisible keyframes and hold the flow between them."""
 
 from dataclasses import dataclass, field
 
@@ -8,18 +8,13 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowMatches
 from minislam.state.stateful import FrameOf, Stateful, Tree
-from minislam.tracking.reprojection import (
-    lengths,
-    relative_transforms,
-    reproject,
-    scaled_points,
-)
+from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
-# A pair whose cells mostly leave the view has no meaningful distance. [-]; DROID-SLAM: 0.75.
-MIN_VISIBLE_SHARE = 0.5
-# A new measurement must confirm at least this part of what the old one did. [-]
+# Fraction of cells that must stay in view, else a pair has no meaningful distance. DROID-SLAM: 0.75
+MIN_VISIBLE_FRACTION = 0.5
+FAR = 1000.0  # px, the distance of a pair below this fraction
+# New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8
-FAR = 1000.0  # px, the distance of such a pair
 
 
 @dataclass
@@ -49,9 +44,8 @@ class FrameGraph(Stateful):
     def record(self, edges: list[tuple[int, int]], matches: FlowMatches) -> None:
         """Store the matches of these edges, adding the edges that are new.
 
-        An edge keeps what it has if the new measurement confirms clearly less: a flow that
-        started from wrong geometry finds nothing, and would take with it what could repair that
-        geometry.
+        An edge keeps its old flow if the new one matches clearly less: flow that started from a
+        wrong pose fails, and the old flow is needed to correct that pose.
         """
         measured = zip(
             edges,
@@ -73,7 +67,7 @@ class FrameGraph(Stateful):
                 self.matched_ratios[position] = ratio
 
     def remove_newest(self, count: int) -> None:
-        """Forget the `count` edges that were added last."""
+        """Remove the `count` edges that were added last."""
         for _ in range(count):
             del self._position[self.edges_source.pop(), self.edges_target.pop()]
             for column in (self.targets, self.confidences, self.matched_ratios):
@@ -83,7 +77,7 @@ class FrameGraph(Stateful):
         """Return all edges, in the order they were added."""
         return list(zip(self.edges_source, self.edges_target, strict=True))
 
-    def measured_from(self, source: int) -> list[tuple[Tensor, Tensor]]:
+    def flow_from(self, source: int) -> list[tuple[Tensor, Tensor]]:
         """Return targets [px] and confidences, each (N, 2), of the edges that leave a keyframe."""
         leaving = [p for p, edge in enumerate(self.edges()) if edge[0] == source]
         return [(self.targets[p].mT, self.confidences[p].mT) for p in leaving]
@@ -106,7 +100,7 @@ def both_directions(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 def proximity_pairs(
     distances: Tensor,  # (K, K) px, symmetric
-    taken: list[tuple[int, int]],  # edges that exist already
+    existing: list[tuple[int, int]],  # edges of the graph
     candidates: range,  # the newer keyframe of a pair
     max_distance: float,  # px
     limit_per_keyframe: int,
@@ -114,12 +108,12 @@ def proximity_pairs(
 ) -> list[tuple[int, int]]:
     """Pick pairs (newer, older) by increasing flow distance, with non-maximum suppression.
 
-    Around every pair that is taken, the pairs (i + a, j + b) with
-    |a| + |b| <= min(|i - j| - 2, suppression) are passed over: they would repeat what it says,
-    and a longer baseline says more.
+    Around every existing or chosen pair (i, j), the pairs (i + a, j + b) with
+    |a| + |b| <= min(|i - j| - 2, suppression) are skipped, because they would measure nearly the
+    same again.
     """
     free = torch.ones_like(distances, dtype=torch.bool)
-    for i, j in taken:
+    for i, j in existing:
         _suppress(free, max(i, j), min(i, j), suppression)
     order = sorted(
         (float(distances[i, j]), i, j)
@@ -151,31 +145,28 @@ def flow_distances(
     rays: Tensor,  # (N, 3)
     pixels: Tensor,  # (N, 2) px
     camera: Camera,
-    rotation_share: float,  # beta
+    rotation_weight: float,  # beta
     rows: range | None = None,  # keyframes to compare with all others; None: all
 ) -> Tensor:  # (K, K) px, FAR outside the rows and their columns
-    """Return how far apart keyframes are, as the mean flow that their geometry predicts.
+    """Return the distances between keyframes, as the mean flow that their geometry predicts.
 
     D = beta |flow| + (1 - beta) |flow without rotation|, averaged over the visible cells and
-    both directions: a pure rotation brings no parallax, so it should count, but less.
+    both directions. Rotation counts less than translation, because it brings no parallax.
     """
     count = len(T_camera_world)
     distances = torch.full((count, count), FAR, dtype=disparities.dtype)
-    everyone = torch.arange(count)
+    all_keyframes = torch.arange(count)
     for row in range(count) if rows is None else rows:
-        one = torch.full((count,), row)
-        there, back = (
-            _directed_distances(
-                relative_transforms(T_camera_world, *ends).to(disparities.dtype),
-                disparities[ends[0]],
-                rays,
-                pixels,
-                camera,
-                rotation_share,
+        this = torch.full((count,), row)
+        both = []
+        for source, target in ((this, all_keyframes), (all_keyframes, this)):
+            motion = relative_transforms(T_camera_world, source, target).to(disparities.dtype)
+            both.append(
+                _directed_distances(
+                    motion, disparities[source], rays, pixels, camera, rotation_weight
+                )
             )
-            for ends in ((one, everyone), (everyone, one))
-        )
-        distances[row] = distances[:, row] = 0.5 * (there + back)
+        distances[row] = distances[:, row] = 0.5 * (both[0] + both[1])
     return distances
 
 
@@ -185,35 +176,16 @@ def _directed_distances(
     rays: Tensor,  # (N, 3)
     pixels: Tensor,  # (N, 2) px
     camera: Camera,
-    rotation_share: float,
-) -> Tensor:  # (E,) px, FAR where too little of the source is seen
-    translations = torch.eye(4, dtype=T_target_source.dtype).repeat(len(T_target_source), 1, 1)
-    translations[:, :3, 3] = T_target_source[:, :3, 3]
-    total, visible = 0.0, 0.0
-    for motion, share in ((T_target_source, rotation_share), (translations, 1 - rotation_share)):
+    rotation_weight: float,
+) -> Tensor:  # (E,) px, FAR where too little of the source stays in view
+    without_rotation = torch.eye(4, dtype=T_target_source.dtype).repeat(len(T_target_source), 1, 1)
+    without_rotation[:, :3, 3] = T_target_source[:, :3, 3]
+    total, visible = disparities.new_zeros(2, len(T_target_source))
+    motions = (T_target_source, rotation_weight), (without_rotation, 1 - rotation_weight)
+    for motion, weight in motions:
         positions, valid = reproject(motion, disparities, rays, camera)
         length = lengths(positions - pixels.T)
-        total = total + share * (length * valid).sum(1)
-        visible = visible + share * valid.sum(1)
-    is_seen = visible >= MIN_VISIBLE_SHARE * len(rays)
+        total += weight * (length * valid).sum(1)
+        visible += weight * valid.sum(1)
+    is_seen = visible >= MIN_VISIBLE_FRACTION * len(rays)
     return torch.where(is_seen, total / visible.clamp_min(1), FAR)
-
-
-def splat_disparities(
-    T_target_source: Tensor,  # (4, 4)
-    disparities: Tensor,  # (N,) of the source
-    rays: Tensor,  # (N, 3)
-    camera: Camera,
-    grid: tuple[int, int],  # (h, w)
-    stride: int,  # px
-) -> Tensor:  # (N,) of the target, 0 in cells that nothing falls on
-    """Carry disparities to another view; where several points meet, the nearest one wins."""
-    transform = T_target_source[None].to(disparities.dtype)
-    depth_ratio = scaled_points(transform, disparities[None], rays)[0, 2]
-    positions, valid = reproject(transform, disparities[None], rays, camera)
-    cells = (positions[0] / stride).round().long()
-    inside = (cells[0] >= 0) & (cells[0] < grid[1]) & (cells[1] >= 0) & (cells[1] < grid[0])
-    kept = inside & valid[0]
-    index = cells[1][kept] * grid[1] + cells[0][kept]
-    carried = torch.zeros_like(disparities)
-    return carried.scatter_reduce_(0, index, (disparities / depth_ratio)[kept], "amax")

@@ -25,9 +25,9 @@ from minislam.tracking.bundle_adjustment import (
     edge_costs,
     motion_only_adjust,
 )
-from minislam.tracking.frame_graph import splat_disparities
 from minislam.tracking.grid import Grid
 from minislam.tracking.motion_memory import inherited_trust, updated_trust
+from minislam.tracking.reprojection import splat_disparities
 from minislam.tracking.robust import RobustKernel
 
 ESSENTIAL_THRESHOLD = 0.7  # px, RANSAC inlier distance to the epipolar line

@@ -306,5 +306,5 @@ class Tracker(Stateful):
         prior = self.keyframes.prior_disparities[0]
         if bool((prior > 0).any()):
             return [torch.where(prior > 0, prior, prior[prior > 0].median())]
-        from_first = self.backend.graph.measured_from(0)
+        from_first = self.backend.graph.flow_from(0)
         return list(first_disparity_hypotheses(self.grid, from_first))

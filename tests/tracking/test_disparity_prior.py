@@ -11,11 +11,11 @@ from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import (
     ConsistencyCounts,
     DepthView,
-    warp_depth,
     depth_consistency,
     mask_priors,
     prior_mask,
     sample_features,
+    warp_depth,
 )
 from minislam.tracking.grid import Grid
 from tests.tracking.scene import CAMERA, STRIDE, uniform

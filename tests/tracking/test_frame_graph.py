@@ -1,4 +1,4 @@
-"""The frame graph: distances, choice of pairs, and disparities carried between views."""
+"""The frame graph: flow on its edges, distances between keyframes, choice of pairs."""
 
 import pytest
 import torch
@@ -13,7 +13,6 @@ from minislam.tracking.frame_graph import (
     flow_distances,
     neighbourhood_edges,
     proximity_pairs,
-    splat_disparities,
 )
 from minislam.tracking.grid import Grid
 from tests.helpers import random_transforms
@@ -62,10 +61,10 @@ def test_what_a_keyframe_measured_is_that_of_its_own_edges():
     graph = FrameGraph()
     graph.record([(0, 1)], matches_of(1.0, 1))
     graph.record([(1, 0), (0, 2)], matches_of(2.0, 2))
-    measured = graph.measured_from(0)
+    measured = graph.flow_from(0)
     assert [float(targets[0, 0]) for targets, _ in measured] == [1.0, 2.0]
     assert all(t.shape == c.shape == (len(RAYS), 2) for t, c in measured)
-    assert graph.measured_from(2) == []
+    assert graph.flow_from(2) == []
 
 
 def test_recorded_targets_keep_the_order_of_cells():
@@ -118,7 +117,7 @@ def test_a_pair_that_hardly_sees_the_same_is_far(monkeypatch):
     pixels = golden.pixels()
     poses = state.T_camera_world.clone()
     poses[5] = golden.transforms_of(golden.golden()["dist_far_poses5"])
-    monkeypatch.setattr(frame_graph, "MIN_VISIBLE_SHARE", 0.75)
+    monkeypatch.setattr(frame_graph, "MIN_VISIBLE_FRACTION", 0.75)
     actual = flow_distances(poses, state.disparities, camera.rays(pixels), pixels, camera, 0.75)
     assert FAR == 1000.0
     assert actual[0, 5] >= FAR / 2  # far one way at least
@@ -214,57 +213,3 @@ def test_pairs_that_are_too_far_are_left_out():
     distances = 10 * distances_on_a_line(5)
     assert proximity_pairs(distances, [], range(5), 9.0, limit_per_keyframe=5) == []
     assert proximity_pairs(distances[:1, :1], [], range(1), 9.0, limit_per_keyframe=5) == []
-
-
-# Carried disparities
-
-
-def test_splatting_into_the_same_view_changes_nothing():
-    disparities = 0.2 + 0.3 * uniform(0, len(RAYS))
-    identity = torch.eye(4, dtype=torch.float64)
-    carried = splat_disparities(identity, disparities, RAYS, CAMERA, GRID.shape, STRIDE)
-    torch.testing.assert_close(carried, disparities)
-
-
-def test_splatting_moves_by_whole_cells_and_leaves_holes():
-    # 60 px * t * d = 8 px: one cell to the left.
-    disparities = torch.full((len(RAYS),), 0.4, dtype=torch.float64)
-    disparities[:10] = torch.linspace(0.39, 0.41, 10, dtype=torch.float64)
-    transform = torch.eye(4, dtype=torch.float64)
-    transform[0, 3] = -8 / (60 * 0.4)
-    carried = splat_disparities(transform, disparities, RAYS, CAMERA, GRID.shape, STRIDE)
-    before, after = disparities.reshape(GRID.shape), carried.reshape(GRID.shape)
-    torch.testing.assert_close(after[:, :-1], before[:, 1:])
-    assert (after[:, -1] == 0).all()
-
-
-def test_disparities_change_with_the_depth():
-    transform = torch.eye(4, dtype=torch.float64)
-    transform[2, 3] = 1.0  # the camera goes back by 1: depth 2 becomes 3
-    disparities = torch.full((len(RAYS),), 0.5, dtype=torch.float64)
-    carried = splat_disparities(transform, disparities, RAYS, CAMERA, GRID.shape, STRIDE)
-    filled = carried[carried > 0]
-    torch.testing.assert_close(filled, torch.full_like(filled, 1 / 3))
-
-
-@pytest.mark.parametrize("near_first", [True, False])
-def test_the_nearest_point_wins(near_first: bool):
-    # In one row, cells at 16 px and 48 px meet at 0 px: 60 t 0.4 = 16, 60 t 1.2 = 48.
-    disparities = torch.full((len(RAYS),), 1e-3, dtype=torch.float64)
-    far, near = disparities.reshape(GRID.shape)[3, 2:7:4], 1.2
-    far.copy_(torch.tensor([0.4, near]))
-    transform = torch.eye(4, dtype=torch.float64)
-    transform[0, 3] = -16 / (60 * 0.4)
-    order = torch.arange(len(RAYS)) if near_first else torch.arange(len(RAYS)).flip(0)
-    carried = splat_disparities(
-        transform, disparities[order], RAYS[order], CAMERA, GRID.shape, STRIDE
-    ).reshape(GRID.shape)
-    assert float(carried[3, 0]) == pytest.approx(near)
-
-
-def test_points_that_leave_the_image_or_pass_the_camera_are_dropped():
-    transform = torch.eye(4, dtype=torch.float64)
-    transform[2, 3] = -3.0  # beyond everything that is nearer than 3
-    disparities = torch.full((len(RAYS),), 0.5, dtype=torch.float64)
-    carried = splat_disparities(transform, disparities, RAYS, CAMERA, GRID.shape, STRIDE)
-    assert (carried == 0).all()
