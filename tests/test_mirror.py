@@ -1,4 +1,4 @@
-"""`tests/` mirrors `minislam/`: the tests of minislam/ROOM/MODULE.py are in tests/ROOM/test_MODULE*.py."""
+"""`tests/` mirrors `minislam/`: tests/ROOM/test_MODULE*.py belongs to minislam/ROOM/MODULE.py."""
 
 from pathlib import Path
 

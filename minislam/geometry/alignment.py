@@ -37,7 +37,7 @@ def identity_similarity() -> Similarity:
 
 def umeyama(
     source: np.ndarray,  # (N, 3) points to be mapped
-    target: np.ndarray,  # (N, 3) where they should come to lie
+    target: np.ndarray,  # (N, 3) where they should be mapped to
     with_scale: bool = True,  # False keeps the scale at 1
 ) -> Similarity:
     """Return the similarity with the least mean squared distance |target - S(source)|^2.
@@ -48,7 +48,7 @@ def umeyama(
         R = U S V^T,   c = trace(D S) / var(source),   t = mean(target) - c R mean(source),
 
     where S is the identity, or diag(1, 1, -1) where U V^T would be a reflection. The rotation is
-    unique only if D has rank 2 at least: points on one line leave the turn about it open.
+    unique only if D has rank 2 at least, because points on one line do not fix a rotation about it.
     """
     assert source.shape == target.shape and source.shape[1:] == (3,), (source.shape, target.shape)
     if len(source) < 3 or not (np.isfinite(source).all() and np.isfinite(target).all()):

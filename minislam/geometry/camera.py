@@ -15,7 +15,8 @@ REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that thresholds in pixels
 class Camera:
     """A pinhole camera without distortion. The centre of the first pixel is (0, 0).
 
-    Focal lengths and principal point are in pixels of an image of `width` x `height`.
+    Focal lengths and principal point are in pixels of an image of `width` x `height`. It is the
+    only camera model: images of other lenses are undistorted when they are read.
     """
 
     fx: float

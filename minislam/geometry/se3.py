@@ -10,7 +10,7 @@ from torch import Tensor
 
 # Below this angle the Taylor series is exact to float64 round-off and the closed form is not.
 _SMALL_ANGLE = 0.02  # radian
-# Newton's method for the nearest rotation squares the error: three steps make 1 % vanish.
+# Newton's method for the nearest rotation squares the error: three steps remove one of 1 %.
 _ORTHONORMALISING_STEPS = 3
 
 
@@ -43,8 +43,8 @@ def so3_exp(phi: Tensor) -> Tensor:
 def so3_log(rotations: Tensor) -> Tensor:
     """Return the rotation vectors (..., 3) [rad] of rotations (..., 3, 3), angle in [0, pi].
 
-    It goes through the quaternion, whose largest component never vanishes: the matrix formula
-    phi = t / (2 sin t) * vee(R - R^T) loses all digits near t = pi.
+    The quaternion is an intermediate step because its largest component never vanishes. The
+    matrix formula phi = t / (2 sin t) * vee(R - R^T) loses all digits near t = pi.
     """
     q = quaternion_from_rotation(rotations)
     q = torch.where(q[..., :1] < 0, -q, q)
@@ -120,8 +120,8 @@ def se3_inverse(transforms: Tensor) -> Tensor:
 def se3_normalised(transforms: Tensor) -> Tensor:
     """Return transforms (..., 4, 4) with their rotations made orthonormal again.
 
-    Every product leaves a rotation off by one rounding error. That is harmless until transposes
-    stand for inverses in products of products, where the error grows with every further one.
+    Every product adds one rounding error to a rotation. Where the transpose is used as the inverse,
+    in products of products, the error grows with every further product.
     """
     rotation = transforms[..., :3, :3]
     eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
@@ -130,13 +130,13 @@ def se3_normalised(transforms: Tensor) -> Tensor:
     return make_transform(rotation, transforms[..., :3, 3])
 
 
-def se3_interpolate(first: Tensor, second: Tensor, share: float) -> Tensor:
-    """Return the pose (..., 4, 4) at `share` of the way from first to second, on a constant twist.
+def se3_interpolate(first: Tensor, second: Tensor, fraction: float) -> Tensor:
+    """Return the pose (..., 4, 4) at a fraction of the way from first to second, constant twist.
 
-    A share of 2 continues the motion by as much again.
+    A fraction of 2 extrapolates: it repeats the motion once more.
     """
     motion = se3_log(second @ se3_inverse(first))
-    return se3_normalised(se3_exp(share * motion) @ first)
+    return se3_normalised(se3_exp(fraction * motion) @ first)
 
 
 def se3_adjoint(transforms: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ def so3_left_jacobian(phi: Tensor) -> Tensor:
 
 
 def _rotation_and_left_jacobian(phi: Tensor) -> tuple[Tensor, Tensor]:
-    """Return exp(phi) and V(phi), (..., 3, 3) each: three coefficients serve both."""
+    """Return exp(phi) and V(phi), (..., 3, 3) each, because they share their coefficients."""
     a, b, c = (x[..., None, None] for x in _rotation_coefficients(_safe_norm(phi)))
     skew = hat(phi)
     squared = skew @ skew

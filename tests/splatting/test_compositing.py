@@ -71,7 +71,7 @@ def test_exponent_at_the_mean_is_the_log_opacity():
     assert value.item() == pytest.approx(-0.3, abs=1e-14)
 
 
-def test_contribution_is_the_blending_weight_of_each_slot():
+def test_weight_sums_add_up_the_blending_weight_of_each_slot():
     coefficients, channels, background = block(1, slots=2)
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
     out = composite(coefficients, channels, background, inside, Workspace(TILES, channels))
@@ -146,7 +146,7 @@ def test_composite_vjp(slots: int, seed: int):
 # Degenerate input
 
 
-def test_light_blocked_by_many_opaque_slots_gives_finite_gradients():
+def test_many_opaque_slots_give_finite_gradients():
     slots = 40
     coefficients = torch.zeros(6, slots * TILES, dtype=torch.float32)
     coefficients[0] = -0.01  # alpha 0.99 everywhere: T falls to 1e-80, below any float32

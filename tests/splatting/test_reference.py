@@ -1,4 +1,4 @@
-"""Known answers of Eqs. (1) and (2), asked of the readable twin and of the fast renderer alike."""
+"""Known answers of Eqs. (1) and (2), asked of the slow twin and of the fast renderer."""
 
 from collections.abc import Callable
 

@@ -97,14 +97,21 @@ def test_neighbourhood_by_hand():
 # Distances
 
 
-@pytest.mark.parametrize(("share", "name"), [(0.75, "dist_oneway_b75"), (0.25, "dist_oneway_b25")])
-def test_distances_are_the_official_ones(share: float, name: str):
+@pytest.mark.parametrize(
+    ("rotation_weight", "name"), [(0.75, "dist_oneway_b75"), (0.25, "dist_oneway_b25")]
+)
+def test_distances_are_the_official_ones(rotation_weight: float, name: str):
     # In cells there, in px here: the cells of the stored problem are px of its camera. In all of
-    # its pairs most cells are in view, so that the share that must be (0.75 there) plays no part.
+    # its pairs most cells are in view, so that the fraction that must be (0.75 there) plays no part.
     state, camera = golden.state(), golden.camera()
     pixels = golden.pixels()
     actual = flow_distances(
-        state.T_camera_world, state.disparities, camera.rays(pixels), pixels, camera, share
+        state.T_camera_world,
+        state.disparities,
+        camera.rays(pixels),
+        pixels,
+        camera,
+        rotation_weight,
     )
     one_way = golden.golden()[name]
     expected = 0.5 * (one_way + one_way.T)
@@ -112,7 +119,7 @@ def test_distances_are_the_official_ones(share: float, name: str):
 
 
 def test_a_pair_that_hardly_sees_the_same_is_far(monkeypatch):
-    # With the official share of 0.75 the stored pose is far; ours tolerates more.
+    # With the official fraction of 0.75 the stored pose is far; ours tolerates more.
     state, camera = golden.state(), golden.camera()
     pixels = golden.pixels()
     poses = state.T_camera_world.clone()
@@ -140,8 +147,8 @@ def test_a_pure_rotation_counts_by_its_share():
     poses[1, 0, 2], poses[1, 2, 0] = 0.05, -0.05
     disparities = 0.2 + 0.3 * uniform(0, 2, len(RAYS))
     whole, none, some = (
-        flow_distances(poses, disparities, RAYS, PIXELS, CAMERA, share)[0, 1]
-        for share in (1.0, 0.0, 0.75)
+        flow_distances(poses, disparities, RAYS, PIXELS, CAMERA, weight)[0, 1]
+        for weight in (1.0, 0.0, 0.75)
     )
     assert none < 1e-12 < 1 < whole
     torch.testing.assert_close(some, 0.75 * whole)
