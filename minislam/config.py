@@ -1,4 +1,4 @@
-"""Every constant of the system in one tree, the presets, and their way in and out of JSON."""
+"""All settings in one tree of dataclasses, the presets, and the conversion from and to JSON."""
 
 import dataclasses
 import difflib
@@ -17,16 +17,18 @@ from minislam.priors.networks.table import NetworksConfig
 from minislam.tracking.config import TrackingConfig
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 
+OTHER_PARTS = ("sequence", "input", "priors")  # of config.json, beside the settings
+
 
 @dataclass(frozen=True)
 class SlamConfig:
     """The whole configuration. Names with dots reach every part: `tracking.window`."""
 
-    seed: int = parameter(0, "of every random draw: same seed, same bytes")
-    checkpoint_share: float = parameter(
-        0.01, "of a run's time, how much writing checkpoints may take [-]; 0 writes none"
+    seed: int = parameter(0, "seed of every random draw: same seed, same bytes")
+    checkpoint_fraction: float = parameter(
+        0.01, "fraction of a run's time that writing checkpoints may take [-]; 0 writes none"
     )
-    threads: int = parameter(1, "of torch; more are slower on a busy machine")
+    threads: int = parameter(1, "threads of torch; more are slower on a busy machine")
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
@@ -37,12 +39,12 @@ class SlamConfig:
 
 
 def settings_of(config: Any) -> dict[str, Any]:
-    """Return all values of a configuration under their names with dots."""
+    """Return all values of a configuration, by their names with dots."""
     return {name: value for name, value, _ in _leaves(config)}
 
 
 def _leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
-    """Yield name, value and meaning of every constant in a tree of dataclasses."""
+    """Yield name, value and meaning of every setting in a tree of dataclasses."""
     for entry in fields(config):
         value = getattr(config, entry.name)
         if is_dataclass(value):
@@ -52,7 +54,7 @@ def _leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
 
 
 def _paper_settings() -> dict[str, Any]:
-    """Return what the paper and the official code choose differently from the default tree."""
+    """Return the values in which the paper and the official code differ from the default tree."""
     paper = replace(SlamConfig(), mapping=paper_mapping(), uncertainty=paper_uncertainty())
     default = settings_of(SlamConfig())
     return {name: value for name, value in settings_of(paper).items() if value != default[name]}
@@ -97,12 +99,12 @@ def preset(name: str) -> SlamConfig:
 
 
 def meanings_of(config: Any) -> dict[str, str]:
-    """Return what each value of a configuration means, under its name with dots."""
+    """Return the meaning of each value of a configuration, by its name with dots."""
     return {name: meaning for name, _, meaning in _leaves(config)}
 
 
 def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
-    """Return the configuration with values replaced, each given under its name with dots."""
+    """Return the configuration with values replaced; they are given by their names with dots."""
     known = settings_of(config)
     for name, value in settings.items():
         if name not in known:
@@ -119,7 +121,7 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
 
 
 def _converted(name: str, value: Any, present: Any) -> Any:
-    """Return a value, from JSON or as text of the command line, in the type of the present one."""
+    """Convert a value from JSON or from the command line to the type of the present value."""
     kind = type(present)
     try:
         if kind is bool:
@@ -129,7 +131,7 @@ def _converted(name: str, value: Any, present: Any) -> Any:
             parts = value.split(",") if isinstance(value, str) else value
             return tuple(type(present[0])(part) for part in parts)
         converted = kind(value)
-        # int(2.5) and float("nan") succeed, but nobody means them.
+        # int(2.5) and float("nan") succeed, but are always mistakes.
         is_wrong = isinstance(value, bool) or not math.isfinite(converted)
         if is_wrong or (not isinstance(value, str) and converted != value):
             raise ValueError
@@ -146,12 +148,18 @@ def as_json(config: SlamConfig) -> dict[str, Any]:
 
 
 def from_json(tree: dict[str, Any]) -> SlamConfig:
-    """Return the configuration written by `as_json`; what is left out keeps its default."""
-    return with_settings(SlamConfig(), flattened(tree))
+    """Return the configuration in a config.json; values left out keep their defaults."""
+    return with_settings(SlamConfig(), settings_in(tree))
+
+
+def settings_in(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings in a config.json by their names with dots, without its other parts."""
+    flat = flattened(tree)
+    return {name: flat[name] for name in flat if name.partition(".")[0] not in OTHER_PARTS}
 
 
 def flattened(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested dictionaries as one, under names with dots."""
+    """Return nested dictionaries as a single one, with names that contain dots."""
     if not isinstance(tree, dict):
         raise InputError(
             f"expected settings as a JSON object, found {type(tree).__name__}; write "

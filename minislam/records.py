@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from torch import Tensor
@@ -70,6 +70,8 @@ class Sequence(Protocol):
     camera: Camera  # of the undistorted images at the working size
     warnings: list[str]  # what the user must know, for instance that the focal length is guessed
     ground_truth: GroundTruth | None
+    depth_scale: float  # units of a stored depth image per metre
+    opened_as: dict[str, Any]  # "sequence" and "input", the part of config.json that opens it
 
     def __len__(self) -> int:
         """Return the number of frames."""

@@ -1,16 +1,16 @@
-"""The whole system (paper Fig. 2) on one screen: one process, one loop.
+"""The whole system (paper Fig. 2): one process, one loop. `Slam.run` shows it on one screen.
 
     frame -> tracker -> keyframe (pose, disparity) -> mapper -> Gaussian map
                 ^                                       |
                 |  beta: what the MLP has learnt        |
                 +---------------------------------------+
 
-The two arrows that go back are two calls: the tracker asks `_static_weight` for what the MLP has
-learnt of each cell, and `_move_map` carries the map along when an adjustment moves keyframes.
+The two arrows that go back are two calls. The tracker calls `_static_weight` to turn the MLP's
+beta into the weight of each cell. `_move_map` deforms the map when an adjustment moves keyframes.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from minislam.priors.high_resolution import HighResolutionFeatures
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
-from minislam.state.steps import Report, Steps, silent
+from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.tracking.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
@@ -34,13 +34,12 @@ from minislam.uncertainty import (
     beta_of_mask,
     tracking_weight,
 )
-
-Keep = Callable[["Slam", bool], None]  # a checkpoint; True: at all events, not if it is time
+from minislam.uncertainty.resampling import resample
 
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of an image before any geometry."""
+    """The three estimators that see single images or pairs, without any geometry."""
 
     flow: FlowEstimator
     features: FeatureExtractor
@@ -48,13 +47,13 @@ class Priors:
 
 
 class Slam(Stateful):
-    """Monocular SLAM in a scene with moving things. Its parts can be read at any time."""
+    """Monocular SLAM in a scene with moving objects. Its parts can be read at any time."""
 
     tracker: Tracker
     mapper: Mapper
     snapshots: MlpSnapshots  # by frame index
     steps: Steps
-    focal_length: FocalLengthFit | None = None  # which one the flow wants, at the end
+    focal_length: FocalLengthFit | None = None  # the one that fits the flow best, at the end
     _poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
@@ -62,11 +61,12 @@ class Slam(Stateful):
         sequence: Sequence,
         config: SlamConfig,
         priors: Priors,
-        report: Report = silent,
-        keep: Keep = lambda slam, at_all_events: None,
+        observer: Observer | None = None,
+        save_checkpoint: Callable[[bool], None] = lambda force: None,
     ) -> None:
-        self.sequence, self.config = sequence, config
-        self.steps = Steps(report, lambda at_all_events: keep(self, at_all_events))
+        self.sequence = sequence
+        self.config = config
+        self.steps = Steps(observer or SilentObserver(), save_checkpoint)
         self._features = priors.features
         if config.uncertainty.grid_factor > 1:
             self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
@@ -78,12 +78,12 @@ class Slam(Stateful):
             config.seed,
         )
         self.snapshots = MlpSnapshots(self.mapper.mlp)
-        tracking = config.tracking
-        if config.uncertainty.given_masks:  # they stand on no map, so they need no depth prior
-            tracking = replace(tracking, beta_without_prior=True)
+        # The tracker calls `_static_weight` for a new keyframe, for all keyframes at the end of
+        # the warm-up, and for all again in the final adjustment. In between a keyframe keeps its
+        # beta, although the MLP goes on learning.
         self.tracker = Tracker(
             sequence.camera,
-            tracking,
+            config.tracking,
             priors.flow,
             self._features,
             priors.depth,
@@ -113,23 +113,22 @@ class Slam(Stateful):
             self.steps.once("photometric refinement", self._refine_other_poses)
 
     def _frames_left(self) -> Iterator[Frame]:
-        """Walk through the frames to come. One that cannot be read costs none before it."""
+        """Yield the frames to come. If one cannot be read, the state before it is saved."""
         for index in range(self.steps.done("tracking and mapping"), len(self.sequence)):
             try:
                 frame = self.sequence.frame(index)
             except MinislamError:
-                self.steps.keep(True)
+                self.steps.save_checkpoint(True)
                 raise
             yield frame
 
     def _initialise(self) -> None:
-        """Start in two stages (paper Sec. 3.3): without beta, then with what it has learnt."""
+        """Start in two stages (paper Sec. 3.3): first without beta, then with beta."""
         with self.steps.timed("initialisation"):
             self.tracker.initialise()
         with self.steps.timed("mapping"):
-            everyone = range(len(self.tracker.keyframes))
-            progress = self.steps.progress("first map")
-            self.mapper.initialise([self._keyframe(index) for index in everyone], progress)
+            all_keyframes = [self._keyframe(k) for k in range(len(self.tracker.keyframes))]
+            self.mapper.initialise(all_keyframes, self.steps.on_progress("first map"))
             self._record_mlp()
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
@@ -143,7 +142,7 @@ class Slam(Stateful):
             self._record_mlp()
 
     def _adjust_all(self) -> None:
-        self.tracker.finish(self.steps.progress("final adjustment"))
+        self.tracker.finish(self.steps.on_progress("final adjustment"))
         self.focal_length = check_focal_length(self.tracker.backend)
 
     def _refine_map(self) -> None:
@@ -152,18 +151,18 @@ class Slam(Stateful):
         if done == 0:
             self._move_map(first_changed=0)
         iterations = self.config.mapping.refine_iterations
-        self.mapper.refine(iterations, self.steps.finishing(stage), done)
+        self.mapper.refine(iterations, self.steps.on_step(stage), done)
         self.snapshots.record(len(self.sequence) - 1)
 
     def _pose_all_frames(self) -> None:
-        progress = self.steps.progress("posing all frames")
-        self._poses = pose_all_frames(self.tracker, self.sequence, progress)
+        on_progress = self.steps.on_progress("posing all frames")
+        self._poses = pose_all_frames(self.tracker, self.sequence, on_progress)
 
     def _record_mlp(self) -> None:
         self.snapshots.record(self.tracker.keyframes.frames[-1].frame_index)
 
     def _move_map(self, first_changed: int) -> None:
-        """Carry the map along with keyframes that an adjustment has moved."""
+        """Deform the map to follow the keyframes that an adjustment has moved."""
         mapped = len(self.mapper.keyframes)
         depths: list[Tensor | None] | None = None
         if not self.tracker.keyframes.has_prior:
@@ -172,34 +171,40 @@ class Slam(Stateful):
         self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped], depths)
 
     def _refine_other_poses(self) -> None:
-        """Refine the frames between the keyframes: the map from there must look like them."""
+        """Refine the poses between the keyframes until the rendered map matches the images."""
         stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
         others = [index for index in self._poses if index not in keyframes]
         for done in range(self.steps.done(stage), len(others)):
             frame = self.sequence.frame(others[done])
-            pose, beta = self._poses[frame.frame_index], self._beta(frame, None)
+            pose = self._poses[frame.frame_index]
+            beta = self._beta(frame, None)
             self._poses[frame.frame_index] = self.mapper.refine_pose(pose, frame.image, beta)
             self.steps.finish(stage, done + 1, len(others))
 
     def _static_weight(self, index: int) -> Tensor:
-        """Return how far each cell of a keyframe (h, w) can be trusted, in (0, 1]."""
-        if not self.config.uncertainty.enabled or not self.mapper.keyframes:
-            height, width = self.tracker.grid.shape
-            return torch.ones(height, width)
+        """Return the static weight (h, w) of each cell of a keyframe, in (0, 1], from its beta.
+
+        Without a depth prior the map stands on the tracker's own structure, and where that is poor,
+        the MLP's beta is high on everything with texture. Then only given masks are used.
+        """
         keyframes = self.tracker.keyframes
+        uncertainty = self.config.uncertainty
+        is_usable = uncertainty.given_masks or keyframes.has_prior
+        if not (uncertainty.enabled and is_usable and self.mapper.keyframes):
+            return torch.ones(self.tracker.grid.shape)
         beta = self._beta(keyframes.frames[index], keyframes.features[index])
         return tracking_weight(beta, self.sequence.camera, self._stride)
 
     def _beta(self, frame: Frame, features: Tensor | None) -> Tensor:
-        """Return the raw beta (h', w') of a frame: of its given mask, or what the MLP says."""
+        """Return the raw beta (h', w') of a frame: from its given mask, or from the MLP."""
         mask = self._given_mask(frame.frame_index)
         if mask is not None:
             return beta_of_mask(mask)
         return self.mapper.predict_beta(self._features(frame) if features is None else features)
 
     def _given_mask(self, frame_index: int) -> Tensor | None:
-        """Return the mask of movers (H, W) that the sequence gives, if they are asked for."""
+        """Return the sequence's mask of dynamic objects (H, W), if given masks are used."""
         if not self.config.uncertainty.given_masks:
             return None
         truth = self.sequence.ground_truth
@@ -212,7 +217,7 @@ class Slam(Stateful):
         return torch.from_numpy(mask)
 
     def _keyframe(self, index: int) -> Keyframe:
-        """Return a keyframe as the mapper wants it."""
+        """Return a keyframe of the tracker in the form that the mapper takes."""
         keyframes = self.tracker.keyframes
         frame = keyframes.frames[index]
         return Keyframe(
@@ -227,16 +232,16 @@ class Slam(Stateful):
         )
 
     def _depth(self, index: int) -> Tensor:
-        """Return the mapper's reference depth (H, W): the prior, or else our own structure."""
+        """Return the mapper's reference depth (H, W): the prior, or else the tracker's depth."""
         metric_depth = self.tracker.keyframes.metric_depths[index]
         if metric_depth is not None:
             return metric_depth
         return depth_from_disparities(self.tracker.backend, index)
 
-    # What came out ------------------------------------------------------------------------------
+    # Results ------------------------------------------------------------------------------
 
     def trajectory(self) -> Trajectory:
-        """Return the poses of all frames that were not lost; before the end, of the keyframes."""
+        """Return the poses of all frames that were not lost; before the end, those of keyframes."""
         if not self._poses:
             return self.keyframe_trajectory()
         stamps = {t.frame_index: t.timestamp for t in self.tracker.tracked}
@@ -248,11 +253,24 @@ class Slam(Stateful):
         stamps = [frame.timestamp for frame in keyframes.frames]
         return _trajectory(stamps, list(keyframes.T_camera_world))
 
+    def render(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the colours (H, W, 3) in [0, 1] of the map, seen from a pose (4, 4)."""
+        pose = se3_inverse(torch.from_numpy(T_world_camera))
+        return self.mapper.render(pose).color.clamp(0, 1).numpy()
+
+    def beta_image(self, keyframe_index: int) -> np.ndarray:
+        """Return beta (H, W) of a keyframe; without uncertainty it is 1 everywhere."""
+        camera = self.sequence.camera
+        if not self.config.uncertainty.enabled:
+            return np.ones((camera.height, camera.width), np.float32)
+        beta = self.mapper.beta_of(self.mapper.keyframes[keyframe_index])
+        return resample(beta, camera.height, camera.width).numpy()
+
     def online_beta(self, frame_index: int, trained_until: list[int]) -> list[Tensor]:
-        """Return beta (h', w') of one frame, by the MLP as it was after each of these frames."""
+        """Return beta (h', w') of one frame from the MLP's weights after each of these frames."""
         keyframes = self.tracker.keyframes
         numbers = [frame.frame_index for frame in keyframes.frames]
-        if frame_index in numbers:  # a network must not look twice
+        if frame_index in numbers:  # its features are known, and a network is slow
             features = keyframes.features[numbers.index(frame_index)]
         else:
             features = self._features(self.sequence.frame(frame_index))

@@ -1,8 +1,4 @@
-"""The command line: `minislam demo | run | priors | eval | doctor`.
-
-Exit codes: 0 all is well, 1 a known error (one sentence), 2 wrong usage, 3 finished but part of
-the sequence was lost, 130 interrupted with everything so far written.
-"""
+"""The command line: `minislam demo | run | priors | eval | doctor`. Start reading at `main`."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from functools import partial
 
 import minislam
 from minislam.cli.doctor import add_doctor_parser
@@ -28,21 +24,52 @@ from minislam.cli.options import (
     prior_choice,
     resumed_settings,
     settings,
+    source_of,
 )
 from minislam.cli.priors import add_priors_parser
-from minislam.cli.progress import ProgressLine, StopRequest
+from minislam.cli.progress import ProgressLine
 from minislam.errors import InputError, MinislamError
-
-if TYPE_CHECKING:
-    from minislam.data import InputOptions
 
 DEMO_SEQUENCE, DEMO_FRAMES = "synth:crowd", 60
 FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
+RUN_EPILOG = """\
+files of a run folder:
+  trajectory.txt, keyframe_trajectory.txt  poses in TUM format, timestamps of the source
+  lost_frames.txt                          frames without a pose, and why
+  map.ply                                  Gaussians for any 3DGS viewer; y points down
+  uncertainty_mlp.pt                       weights of the uncertainty MLP
+  metrics.json                             accuracy, null where unknown
+  run.json                                 timings, warnings, how the run ended
+  config.json                              sequence, input, priors and settings
+  report.html, plots/, keyframes/          pictures; report.html shows most of them
+  checkpoint.npz                           until the run is finished: arrays, no pickle
+
+minislam run --config FOLDER/config.json -o NEW_FOLDER
+  repeats a run, on the same CPU to the same bytes. Other flags replace values of the file.
+
+minislam run --resume -o FOLDER
+  continues after Ctrl-C, a power cut, a full disk or a damaged image from the last checkpoint
+  to the same bytes. Other settings are refused. Checkpoints are written before each of the
+  last stages, on Ctrl-C, and between steps in --checkpoint_fraction of the time (1 %).
+
+exit codes: 0 finished, 1 known error in one sentence, 2 wrong usage, 3 finished but part of the
+  sequence was lost, 130 interrupted with everything so far written
+
+ablations of the paper:
+  --no-uncertainty                       the same weight for every pixel
+  --uncertainty.lambda_depth 0           no depth term in L_uncer, Eq. (4)
+  --uncertainty.given_masks on           the sequence's own masks instead of the learnt beta
+  --tracking.lambda_disparity_prior 0    no disparity prior in Eq. (5)
+  --tracking.prior_mask off              no mask M
+  --tracking.final_prior on              disparity prior also in the final adjustment
+  --mapping.pose_refinement.enabled off  no photometric refinement of the other frames
+  --mapping.keyframe_stride 5            map optimised every 5 keyframes (fast mode)
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
-    # What OpenCV and FFmpeg would print about a damaged file, our own sentence says better.
+    # OpenCV and FFmpeg would print messages about a damaged file beside our own error message.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -83,7 +110,11 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     )
     demo.add_argument("-o", "--output", default="output/demo", help="run folder, output/demo")
     demo.set_defaults(
-        run=_demo, sequence=DEMO_SEQUENCE, overwrite=True, resume=False, depth="simulated"
+        run=_run,
+        sequence=DEMO_SEQUENCE,
+        max_frames=DEMO_FRAMES,
+        overwrite=True,
+        resume=False,
     )
 
     run = commands.add_parser(
@@ -91,6 +122,8 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         help="run SLAM on a video, an image folder or a benchmark",
         usage="minislam run SEQUENCE [-o OUTPUT] [options]",
         allow_abbrev=False,  # half a setting's name might be another setting tomorrow
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=RUN_EPILOG,
     )
     run.add_argument("-o", "--output", help="run folder, default output/NAME_TIME")
     earlier = run.add_mutually_exclusive_group()
@@ -98,66 +131,51 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     earlier.add_argument(
         "--resume", action="store_true", help="go on with the interrupted run in OUTPUT"
     )
-    add_input(run)
-    add_priors(run, default_depth="simulated for synth:, else none")
-    add_flow(run)
-    add_lpips(run)
     run.set_defaults(run=_run)
     priors = add_priors_parser(commands)
-    for command in (demo, run, priors):
-        # Settings need torch, which takes seconds to import: only who runs something waits.
-        if arguments and arguments[0] in ("run", "demo", "priors"):
-            add_settings(command)
+    # These options need torch, which takes seconds to import: only their own command waits for it.
+    command = arguments[0] if arguments else ""
+    if command == "demo":
+        add_settings(demo)
+    elif command == "run":
+        add_input(run)
+        add_priors(run, default_depth="simulated for synth:, else none")
+        add_flow(run)
+        add_lpips(run)
+        add_settings(run)
+    elif command == "priors":
+        add_input(priors)
+        add_priors(priors, default_depth="none")
+        add_settings(priors)
     add_eval_parser(commands)
     add_doctor_parser(commands)
     return parser
 
 
-def _demo(args: argparse.Namespace) -> int:
-    from minislam.data import InputOptions
-
-    return _run_with(args, InputOptions(max_frames=DEMO_FRAMES), args.output)
-
-
 def _run(args: argparse.Namespace) -> int:
-    return _run_with(args, input_options(args), args.output)
-
-
-def _run_with(args: argparse.Namespace, options: InputOptions, output: str | None) -> int:
-    with StopRequest() as stop:
-        return _run_until(stop, args, options, output)
-
-
-def _run_until(
-    stop: StopRequest, args: argparse.Namespace, options: InputOptions, output: str | None
-) -> int:
     from minislam.data import RunFolder, open_sequence
     from minislam.runs.run import choose_priors, run_sequence
 
-    if args.resume and output is None:
+    if args.resume and args.output is None:
         raise InputError(
             "expected --output FOLDER with --resume, found none; give that of the interrupted run"
         )
-    config = resumed_settings(args, output) if args.resume else settings(args)
+    config = resumed_settings(args) if args.resume else settings(args)
+    source = source_of(args)
     progress = ProgressLine()
-
-    def report(stage: str, done: int, of_all: int) -> None:
-        progress.show(stage, done, of_all)
-        stop.check()
-
-    sequence = open_sequence(
-        args.sequence, options, lambda done, of_all: report("making frames", done, of_all)
-    )
-    synthetic = args.sequence.startswith("synth:")
-    choice = prior_choice(args, default_depth="simulated" if synthetic else "none")
-    output = output or f"output/{sequence.name}_{time.strftime('%Y%m%d-%H%M%S')}"
+    sequence = open_sequence(source, input_options(args), partial(progress.show, "making frames"))
+    choice = prior_choice(args, "simulated" if source.startswith("synth:") else "none")
+    output = args.output or f"output/{sequence.name}_{time.strftime('%Y%m%d-%H%M%S')}"
     print(sequence.description)
     for warning in sequence.warnings:
         print(f"WARNING: {warning}", file=sys.stderr)
-    # First what may be wrong: it must not cost an earlier run its files.
+    # Everything that may be wrong is checked before the files of an earlier run are removed.
     priors, lpips = choose_priors(choice, sequence, config), lpips_of(args, sequence.camera)
     folder = RunFolder(output) if args.resume else RunFolder.create(output, args.overwrite)
-    outcome = run_sequence(sequence, config, choice, priors, folder, report, lpips, args.resume)
+    with progress:
+        outcome = run_sequence(
+            sequence, config, choice, priors, folder, progress, lpips, args.resume
+        )
     print(f"{outcome.state}:")
     for name, value in outcome.metrics.items():
         print(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
@@ -166,7 +184,7 @@ def _run_until(
             print(f"WARNING: {warning}", file=sys.stderr)
     print(f"results in {folder.path}; open {folder.path}/report.html")
     if outcome.state == "interrupted":
-        print(f"to go on, repeat the command with -o {folder.path} --resume")
+        print(f"to go on: minislam run --resume -o {folder.path}")
     return outcome.exit_code
 
 

@@ -1,12 +1,15 @@
-"""What several commands can be told: which frames, which priors, which settings.
+"""Options that several commands share: which frames, which priors, which settings.
 
-Whatever needs torch is imported where it is used: `--help` answers at once.
+Whatever needs torch is imported where it is used: `minislam --help` answers at once.
 """
 
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+
+from minislam.errors import InputError
 
 if TYPE_CHECKING:
     from minislam.config import SlamConfig
@@ -15,37 +18,34 @@ if TYPE_CHECKING:
     from minislam.geometry import Camera
     from minislam.priors.choice import PriorChoice
 
-_INPUT = ("stride", "start", "max_frames", "size", "fx", "fy", "cx", "cy", "calibration")
-_PRIORS = (
-    "flow", "flow_weights", "features", "features_weights", "depth", "depth_weights", "device"
-)  # fmt: skip
-
 
 def add_input(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which frames to read, with which camera."""
+    """Add the sequence, and a flag for every field of InputOptions. This needs torch."""
+    from minislam.data import InputOptions
+
     parser.add_argument(
-        "sequence", help="video file, image folder, TUM folder or synth:NAME[:SEED]"
+        "sequence",
+        nargs="?",
+        help="video file, image folder, TUM folder or synth:NAME[:SEED]; default: that of --config",
     )
     group = parser.add_argument_group("input")
-    group.add_argument("--stride", type=int, default=1, help="use every n-th frame, 1")
-    group.add_argument("--start", type=int, default=0, help="first frame to use, 0")
-    group.add_argument("--max-frames", type=int, help="number of frames at most, all")
-    group.add_argument("--size", type=_size, help="working size WIDTHxHEIGHT, about 320x240")
-    for name in ("fx", "fy", "cx", "cy"):
-        group.add_argument(f"--{name}", type=float, help="of the raw images [px]")
-    group.add_argument("--calibration", help="file: fx fy cx cy [width height [k1 k2 p1 p2 k3]]")
-    group.add_argument(
-        "--depth-scale", type=float, default=5000, help="depth units per metre, 5000"
-    )
+    types = _field_types(InputOptions)
+    for option in fields(InputOptions):
+        shown = "" if option.default is None else f"; {option.default}"
+        group.add_argument(
+            f"--{option.name.replace('_', '-')}",
+            type=_size if types[option.name] is tuple else types[option.name],
+            metavar="WIDTHxHEIGHT" if option.name == "size" else "VALUE",
+            help=option.metadata["meaning"] + shown,
+        )
 
 
 def add_priors(parser: argparse.ArgumentParser, default_depth: str) -> None:
-    """Add the options that say what is known of an image before any geometry.
-
-    Names are checked later, with the weights: what is wrong is then one sentence.
-    """
+    """Add the options that choose features and depth. Their names are checked with the weights."""
     group = parser.add_argument_group(
-        "priors", "networks need their official checkpoints, see README.md for where to get them"
+        "priors",
+        "networks need their official checkpoints: minislam/priors/networks/README.md says where "
+        "to get them",
     )
     group.add_argument(
         "--features", help="classical, dinov2, fit3d or files:FOLDER; default classical"
@@ -77,16 +77,16 @@ def add_lpips(parser: argparse.ArgumentParser) -> None:
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add presets, and every constant of the system under its name. This needs torch."""
+    """Add the presets and a flag for every setting. This needs torch."""
     from minislam.config import PRESETS, SlamConfig, meanings_of, settings_of
 
     parser.add_argument("--preset", help=f"{', '.join(PRESETS)}; laptop")
-    parser.add_argument("--config", help="JSON file of settings, like config.json of a run")
-    parser.add_argument("--seed", type=int, help="of every random draw, 0")
+    parser.add_argument("--config", help="JSON file of settings; config.json of a run repeats it")
+    parser.add_argument("--seed", type=int, help="seed of every random draw, 0")
     parser.add_argument(
-        "--no-uncertainty", action="store_true", help="trust every pixel alike (ablation)"
+        "--no-uncertainty", action="store_true", help="give every pixel the same weight (ablation)"
     )
-    group = parser.add_argument_group("settings", "every constant by its name, with its default")
+    group = parser.add_argument_group("settings", "every setting by its name, with its default")
     meanings = meanings_of(SlamConfig())
     for name, value in settings_of(SlamConfig()).items():
         if name == "seed":
@@ -103,26 +103,83 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def config_file(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the file given with --config, or config.json of the run that --resume goes on with."""
+    from minislam.data import RunFolder
+    from minislam.data.files import read_json
+
+    if args.config:
+        tree = read_json(args.config)
+    elif getattr(args, "resume", False):
+        tree = RunFolder(args.output).read_config()
+    else:
+        return {}
+    if not isinstance(tree, dict):
+        raise InputError(
+            f"expected settings as a JSON object in {args.config}, found {type(tree).__name__}; "
+            "write it like config.json of a run"
+        )
+    return tree
+
+
+def source_of(args: argparse.Namespace) -> str:
+    """Return the name of the sequence, from the command line or from the file of --config."""
+    source = args.sequence or config_file(args).get("sequence")
+    if not source:
+        raise InputError("expected a SEQUENCE, or --config FILE that names one, found neither")
+    return str(source)
+
+
 def input_options(args: argparse.Namespace) -> InputOptions:
-    """Return what `add_input` was told."""
+    """Return the input options: those of the file of --config, replaced by what is given."""
     from minislam.data import InputOptions
 
-    given = {name: getattr(args, name) for name in _INPUT}
-    return InputOptions(depth_scale=args.depth_scale, **given)
+    return InputOptions(**_section(args, "input", InputOptions))
 
 
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
-    """Return what `add_priors` and `add_flow` were told; a command may lack some of it."""
+    """Return the priors: those of the file of --config, replaced by what is given."""
     from minislam.priors.choice import PriorChoice
 
-    given = {name: getattr(args, name, None) for name in (*_PRIORS, "depth_scale")}
-    given["depth"] = given["depth"] or default_depth
-    return PriorChoice(**{name: value for name, value in given.items() if value is not None})
+    return PriorChoice(**{"depth": default_depth, **_section(args, "priors", PriorChoice)})
+
+
+def _section(args: argparse.Namespace, name: str, kind: type) -> dict[str, Any]:
+    """Return the fields of a dataclass that the file of --config or a flag gives."""
+    types = _field_types(kind)
+    values = config_file(args).get(name, {})
+    try:
+        given = {
+            key: _converted(value, types[key]) for key, value in values.items() if value is not None
+        }
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise InputError(
+            f"expected {name} in {args.config} to hold some of {', '.join(types)}, found {values}"
+        ) from None
+    flags = {key: getattr(args, key, None) for key in types}
+    return given | {key: value for key, value in flags.items() if value is not None}
+
+
+def _field_types(kind: type) -> dict[str, type]:
+    """Return the plain type of each field of a dataclass: int, float, str or tuple."""
+    types = {}
+    for name, hint in get_type_hints(kind).items():
+        first = (get_args(hint) or (hint,))[0]  # int of `int | None`
+        types[name] = get_origin(first) or first
+    return types
+
+
+def _converted(value: Any, kind: type) -> Any:
+    if kind is tuple:
+        width, height = value
+        return int(width), int(height)
+    if kind(value) != value:
+        raise ValueError
+    return kind(value)
 
 
 def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
     """Return the measure whose files were given, if it can be taken at this size of images."""
-    from minislam.errors import InputError
     from minislam.runs.run import load_lpips
 
     trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
@@ -138,17 +195,35 @@ def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
     return lpips
 
 
-def settings(args: argparse.Namespace, then: SlamConfig | None = None) -> SlamConfig:
-    """Return the configuration: preset, then file, then single settings, each over the last.
+def settings(args: argparse.Namespace) -> SlamConfig:
+    """Return the settings: the preset, over it the file of --config, over both single flags."""
+    from minislam.config import preset
 
-    Of a run that goes on, `then` is its configuration: in the place of a preset that is not given.
-    """
-    from minislam.config import flattened, preset, with_settings
+    return _with_given(args, preset(args.preset or "laptop"))
+
+
+def resumed_settings(args: argparse.Namespace) -> SlamConfig:
+    """Return the settings of an interrupted run, which the options must not contradict."""
+    from minislam.config import from_json, preset, settings_of
+    from minislam.data import RunFolder
+
+    then = from_json(RunFolder(args.output).read_config())
+    now = settings_of(_with_given(args, preset(args.preset) if args.preset else then))
+    for name, value in settings_of(then).items():
+        if now[name] != value:
+            raise InputError(
+                f"expected {name} = {value} like the interrupted run in {args.output}, found "
+                f"{now[name]}; leave the settings out, or start anew in another folder"
+            )
+    return then
+
+
+def _with_given(args: argparse.Namespace, base: SlamConfig) -> SlamConfig:
+    from minislam.config import settings_in, with_settings
     from minislam.data.files import read_json
 
-    config = then if then and args.preset is None else preset(args.preset or "laptop")
     if args.config:
-        config = with_settings(config, flattened(read_json(args.config)))
+        base = with_settings(base, settings_in(read_json(args.config)))
     given = {
         name.removeprefix("set:"): value
         for name, value in vars(args).items()
@@ -158,21 +233,4 @@ def settings(args: argparse.Namespace, then: SlamConfig | None = None) -> SlamCo
         given["seed"] = args.seed
     if args.no_uncertainty:
         given["uncertainty.enabled"] = False
-    return with_settings(config, given)
-
-
-def resumed_settings(args: argparse.Namespace, output: str) -> SlamConfig:
-    """Return the configuration of an interrupted run, which the options must not contradict."""
-    from minislam.config import from_json, settings_of
-    from minislam.data import RunFolder
-    from minislam.errors import InputError
-
-    then = from_json(RunFolder(output).read_config())
-    now = settings_of(settings(args, then))
-    for name, value in settings_of(then).items():
-        if now[name] != value:
-            raise InputError(
-                f"expected {name} = {value} like the interrupted run in {output}, found "
-                f"{now[name]}; leave the settings out, or start anew in another folder"
-            )
-    return then
+    return with_settings(base, given)

@@ -1,7 +1,7 @@
 """The sub-command `minislam priors`: features and depth of every frame, written to files.
 
-Heavy networks then run once, where there is a GPU, and `minislam run --features files:DIR --depth
-files:DIR` reads what they said, anywhere.
+Heavy networks then run once, on a machine with a GPU, and `minislam run --features files:DIR
+--depth files:DIR` reads their results on any machine.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import argparse
 import io
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minislam.cli.options import add_input, add_priors, input_options, prior_choice, settings
-from minislam.cli.progress import ProgressLine, StopRequest
+from minislam.cli.options import input_options, prior_choice, settings, source_of
+from minislam.cli.progress import ProgressLine
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,11 +36,9 @@ def add_priors_parser(subparsers: argparse._SubParsersAction) -> argparse.Argume
         usage="minislam priors SEQUENCE --out DIR [--features NAME] [--depth NAME] [options]",
         allow_abbrev=False,
     )
-    add_input(parser)
     parser.add_argument(
         "--out", required=True, metavar="DIR", help="gets the folders features and depth"
     )
-    add_priors(parser, default_depth="none")
     parser.set_defaults(run=run_priors)
     return parser
 
@@ -53,26 +52,18 @@ def run_priors(args: argparse.Namespace) -> int:
     config, choice = settings(args), prior_choice(args, default_depth="none")
     if args.features is None and choice.depth == "none":
         raise InputError(
-            "expected --features or --depth, found neither; name what is to be written"
+            "expected --features or --depth, found neither; name at least one to write"
         )
     torch.set_num_threads(config.threads)
     progress = ProgressLine()
-    with StopRequest() as stop:
-
-        def report(stage: str, done: int, of_all: int) -> None:
-            progress.show(stage, done, of_all)
-            stop.check()
-
-        sequence = open_sequence(
-            args.sequence,
-            input_options(args),
-            lambda done, of_all: report("making frames", done, of_all),
-        )
-        print(sequence.description)
-        out = Path(args.out).expanduser()
-        kinds = _kinds(choice, args.features is not None, sequence, config)
-        for kind, (origin, compute) in kinds.items():
-            write_kind(out / kind, origin, sequence, compute, report)
+    sequence = open_sequence(
+        source_of(args), input_options(args), partial(progress.show, "making frames")
+    )
+    print(sequence.description)
+    out = Path(args.out).expanduser()
+    kinds = _kinds(choice, args.features is not None, sequence, config)
+    for kind, (origin, compute) in kinds.items():
+        write_kind(out / kind, origin, sequence, compute, progress.show)
     print(f"use them with {' '.join(f'--{kind} files:{out}' for kind in kinds)}")
     return 0
 
@@ -80,13 +71,13 @@ def run_priors(args: argparse.Namespace) -> int:
 def _kinds(
     choice: PriorChoice, with_features: bool, sequence: RecordedSequence, config: SlamConfig
 ) -> dict[str, tuple[str, Callable[[Frame], Tensor | None]]]:
-    """Return what to write: folder name, where it comes from, and how to compute it."""
+    """Return for each folder to write: a line that identifies its content, and a function."""
     from minislam.config import as_json
     from minislam.priors.choice import choose_depth, choose_features
     from minislam.priors.files import DEPTH, FEATURES
     from minislam.priors.high_resolution import HighResolutionFeatures
 
-    # Whatever the result depends on: files of another command must not be taken for ours.
+    # Everything the result depends on, so that files of another command are not taken for these.
     tree = as_json(config)
     constants = {name: tree[name] for name in ("seed", FEATURES, "simulated_depth", "networks")}
     conditions = f"{sequence.description}; {sequence.camera}; {constants}"
@@ -109,9 +100,9 @@ def write_kind(
     origin: str,  # one line
     sequence: RecordedSequence,
     compute: Callable[[Frame], Tensor | None],
-    report: Callable[[str, int, int], None],
+    show: Callable[[str, int, int], None],  # stage, done, total
 ) -> None:
-    """Write one .npy file per frame. What an interrupted run has written is not made again."""
+    """Write one .npy file per frame. Files of an interrupted call are kept and not made again."""
     import numpy as np
 
     from minislam.data.files import atomic_write
@@ -126,7 +117,7 @@ def write_kind(
             buffer = io.BytesIO()
             np.save(buffer, values.float().cpu().numpy())
             atomic_write(path, buffer.getvalue())
-        report(f"writing {folder.name}", frame.frame_index + 1, len(sequence))
+        show(f"writing {folder.name}", frame.frame_index + 1, len(sequence))
 
 
 def _claim(folder: Path, index: str) -> None:

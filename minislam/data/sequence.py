@@ -1,7 +1,7 @@
 """Open a folder, a video, or a synthetic sequence by its name."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,22 +37,23 @@ def open_sequence(
         last = None
         if options.max_frames is not None:
             last = options.start + options.stride * (options.max_frames - 1) + 1
-        return RecordedSequence(read_video(path, last), options)
+        return RecordedSequence(read_video(path, last), options, source)
     if not path.is_dir():
         raise InputError(
             f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
             f"{source} does not exist; check the path"
         )
     recording = read_tum_folder(path) if is_tum_folder(path) else read_image_folder(path)
-    return RecordedSequence(recording, options)
+    return RecordedSequence(recording, options, source)
 
 
 class RecordedSequence:
     """The chosen frames of a recording at the working size: a `minislam.records.Sequence`."""
 
-    def __init__(self, recording: Recording, options: InputOptions) -> None:
+    def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
         self._recording = recording
-        self._depth_scale = options.depth_scale
+        self.depth_scale = options.depth_scale
+        self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
         self._chosen = chosen[: options.max_frames]
         if len(self._chosen) == 0:
@@ -109,7 +110,7 @@ class RecordedSequence:
         path = path_of(self._recording.depth_paths, self.source_index(frame_index))
         if path is None:
             return None
-        return self._prepare.nearest(read_depth(path, self._depth_scale), str(path))
+        return self._prepare.nearest(read_depth(path, self.depth_scale), str(path))
 
 
 def _calibration(
@@ -161,4 +162,4 @@ def _open_synthetic(
     recording = replace(
         read_tum_folder(folder), name=f"{name}-{seed or 0}", kind=f"synthetic sequence {name}"
     )
-    return RecordedSequence(recording, options)
+    return RecordedSequence(recording, options, source)

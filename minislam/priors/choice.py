@@ -36,7 +36,6 @@ class PriorChoice:
     features_weights: str | None = None
     depth: str = "none"
     depth_weights: str | None = None
-    depth_scale: float = 5000.0  # counts of a 16-bit depth .png per world unit
     device: str = "cpu"  # where networks run, cpu or cuda; everything else stays on the CPU
 
     def __post_init__(self) -> None:
@@ -94,7 +93,7 @@ def choose_depth(
     if name == "sensor":
         return SensorDepth(sequence.sensor_depth)
     if name.startswith(FILES):
-        return FileDepth(folder_of(name.removeprefix(FILES), DEPTH), 1 / choice.depth_scale)
+        return FileDepth(folder_of(name.removeprefix(FILES), DEPTH), 1 / sequence.depth_scale)
     known = ["none", "simulated", "sensor", *_names("depth"), "files:FOLDER"]
     raise _unknown("depth", name, known)
 

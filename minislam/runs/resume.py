@@ -1,4 +1,4 @@
-"""Go on with an interrupted run: when its state is written, and when it is accepted."""
+"""Checkpoints of a run: when they are saved, and which of them a run may go on from."""
 
 import functools
 import json
@@ -17,28 +17,35 @@ from minislam.slam import Slam
 
 
 class Checkpoints:
-    """Keeps the state of a run in its folder, as often as a small share of the time allows."""
+    """Saves the state of a run in its folder; saving takes a small fraction of the time."""
 
     def __init__(
         self, folder: RunFolder, sequence: Sequence, config: SlamConfig, choice: PriorChoice
     ) -> None:
         self.seconds = 0.0  # spent on writing
-        self.problem: str | None = None  # why the last one could not be written
-        self._folder, self._share = folder, config.checkpoint_share
+        self.problem: str | None = None  # why the last checkpoint could not be written
+        self._folder = folder
+        self._fraction = config.checkpoint_fraction
         self._origin = _origin(sequence, config, choice)
-        self._start = self._last = time.perf_counter()
-        self._cost = 0.0  # of the last one [s]
+        self._start = time.perf_counter()
+        self._last = self._start  # time of the last checkpoint
+        self._cost = 0.0  # of the last checkpoint [s]
 
     @property
     def run_seconds(self) -> float:
         """Return how long the run has taken, interrupted parts included."""
         return time.perf_counter() - self._start
 
-    def keep(self, slam: Slam, at_all_events: bool) -> None:
-        """Write a checkpoint if it is time for one; a disk that is full ends no run."""
+    def save(self, slam: Slam, force: bool) -> None:
+        """Save a checkpoint if one is due; with `force`, always. A full disk does not end the run.
+
+        With a checkpoint_fraction of 0 none is saved, forced or not.
+        """
+        if self._fraction <= 0:
+            return
         begun = time.perf_counter()
-        is_due = begun - self._last >= self._cost / self._share if self._share > 0 else False
-        if self._share <= 0 or not (is_due or at_all_events):
+        is_due = begun - self._last >= self._cost / self._fraction
+        if not (is_due or force):
             return
         times = {"run_seconds": self.run_seconds, "checkpoint_seconds": self.seconds}
         try:
@@ -51,7 +58,7 @@ class Checkpoints:
         self.seconds += self._cost
 
     def restore(self, slam: Slam) -> None:
-        """Take up the state in the folder, if it belongs to the same run."""
+        """Restore the state in the folder, if it belongs to the same run."""
         found = self._folder.read_checkpoint()
         then = flattened({name: found.get(name) for name in self._origin})
         for name, now in flattened(self._origin).items():

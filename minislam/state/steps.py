@@ -1,30 +1,47 @@
-"""What of a run is done, how long it took, and who is told: reports, interruptions, checkpoints."""
+"""Progress of a run: finished steps and seconds per stage, reports, checkpoints."""
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 from minislam.state.stateful import Stateful
 
-Report = Callable[[str, int, int], None]  # stage, done, of all; KeyboardInterrupt stops the run
+
+class Observer(Protocol):
+    """Follows a run: it is told the progress, and it may end the run between two steps."""
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Take note of the progress of a stage."""
+
+    def should_stop(self) -> bool:
+        """Tell whether the run should end after the present step."""
 
 
-def silent(stage: str, done: int, of_all: int) -> None:
-    """Report nothing."""
+class SilentObserver:
+    """Shows nothing and never ends a run."""
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Show nothing."""
+
+    def should_stop(self) -> bool:
+        """Return False."""
+        return False
 
 
 class Steps(Stateful):
-    """Counts steps and seconds per stage."""
+    """Counts finished steps and seconds per stage. Between steps a run is saved and can stop."""
 
     seconds: dict[str, float]  # spent per stage
     _done: dict[str, int]  # steps per stage
 
-    def __init__(self, report: Report, keep: Callable[[bool], None]) -> None:
+    def __init__(self, observer: Observer, save_checkpoint: Callable[[bool], None]) -> None:
         self.seconds = {}
-        self.keep = keep  # a checkpoint, where nothing is half done; True: at all events
-        self._report = report
+        # Called between steps, when the state is consistent; True saves even if none is due.
+        self.save_checkpoint = save_checkpoint
         self._done = {}
-        self._stage: str | None = None  # that the time since the last lap is counted for
+        self._observer = observer
+        self._stage: str | None = None  # the stage that is being timed
         self._since = 0.0
 
     def done(self, stage: str) -> int:
@@ -32,44 +49,47 @@ class Steps(Stateful):
         return self._done.get(stage, 0)
 
     def once(self, stage: str, work: Callable[[], None]) -> None:
-        """Do a stage as one step, unless it is done."""
+        """Do a stage that is a single step, unless it is done already."""
         if not self.done(stage):
-            self.keep(True)
+            self._save_and_stop_if_asked(force=True)
             with self.timed(stage):
                 work()
             self._done[stage] = 1
 
-    def finish(self, stage: str, done: int, of_all: int) -> None:
-        """Report a step after which nothing is half done: from here a run can go on later."""
+    def finish(self, stage: str, done: int, total: int) -> None:
+        """Record that a step is finished. A resumed run begins with the next step."""
         self._done[stage] = done
         self._lap(self._stage)
-        try:
-            self._report(stage, done, of_all)
-        except KeyboardInterrupt:
-            self.keep(True)
-            raise
-        self.keep(False)
+        self._observer.show(stage, done, total)
+        self._save_and_stop_if_asked()
 
-    def finishing(self, stage: str) -> Callable[[int, int], None]:
-        """Return what to call after each step of a stage that can go on later."""
-        return lambda done, of_all: self.finish(stage, done, of_all)
+    def on_step(self, stage: str) -> Callable[[int, int], None]:
+        """Return a callback (done, total) for after each step of a stage."""
+        return lambda done, total: self.finish(stage, done, total)
 
-    def progress(self, stage: str) -> Callable[[int, int], None]:
-        """Return what to call where a stage is in the middle of something."""
-        return lambda done, of_all: self._report(stage, done, of_all)
+    def on_progress(self, stage: str) -> Callable[[int, int], None]:
+        """Return a callback (done, total) for progress within a step, where nothing is saved."""
+        return lambda done, total: self._observer.show(stage, done, total)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Count the time of what is inside for a stage."""
+        """Add the time spent inside to a stage."""
         self._lap(stage)
         try:
             yield
         finally:
             self._lap(None)
 
+    def _save_and_stop_if_asked(self, force: bool = False) -> None:
+        should_stop = self._observer.should_stop()
+        self.save_checkpoint(force or should_stop)
+        if should_stop:
+            raise KeyboardInterrupt
+
     def _lap(self, next_stage: str | None) -> None:
-        """Count the time since the last lap for the stage that it was spent on."""
+        """Add the time since the last lap to the stage being timed, and go on with the next."""
         now = time.perf_counter()
         if self._stage is not None:
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
-        self._stage, self._since = next_stage, now
+        self._stage = next_stage
+        self._since = now

@@ -49,11 +49,6 @@ class TrackingConfig:
         "residual at which a cell no longer follows the camera; what has moved is trusted less "
         "from then on; needs a depth prior; 0: nothing is remembered [px]",
     )
-    beta_without_prior: bool = parameter(
-        False,
-        "weigh by beta also without a depth prior: the map then stands on the tracker's own "
-        "structure, and where that is poor beta is high on all that has texture",
-    )
     lambda_disparity_prior: float = parameter(
         0.0005,
         "lambda_4: disparity prior, times fx^2, so that it weighs a disparity error by the pixels "

@@ -279,8 +279,6 @@ class Tracker(Stateful):
 
     def update_static_weights(self, first: int = 0) -> None:
         """Ask beta again how far each cell of the keyframes from `first` on can be trusted."""
-        if not (self.keyframes.has_prior or self.config.beta_without_prior):
-            return
         for index in range(first, len(self.keyframes)):
             weight = self._predict_static_weight(index)
             self.keyframes.static_weights[index] = weight.reshape(-1)

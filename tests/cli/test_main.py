@@ -13,7 +13,6 @@ import pytest
 
 import minislam
 from minislam.cli.main import main
-from minislam.cli.progress import ProgressLine, StopRequest
 from tests.recordings import picture, save, tum_folder, video
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (20, 27, 3)).astype(np.uint8)
@@ -255,39 +254,9 @@ def test_an_unknown_option_names_the_nearest_setting_and_is_wrong_usage(capsys):
     assert "see minislam COMMAND --help" in the_sentence(capsys)
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["run"], ["run", "a", "--size", "big"]])
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["run", "a", "--size", "big"]])
 def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys):
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
     assert len(capsys.readouterr().err) < 500
-
-
-# Progress and Ctrl-C
-
-
-def test_off_a_terminal_a_stage_prints_a_line_every_tenth(capsys):
-    progress = ProgressLine()
-    for done in range(1, 201):
-        progress.show("walking", done, 200)
-        if done == 100:
-            progress.show("resting", 1, 1)  # another stage in between
-    lines = capsys.readouterr().err.splitlines()
-    walking = [line for line in lines if line.startswith("walking: ")]
-    assert len(walking) == 10 and "resting: 1/1 (0 s)" in lines
-    assert re.fullmatch(r"walking: 40/200 \([\d.]+/s, \d+ s left\)", walking[1])
-    assert re.fullmatch(r"walking: 200/200 \(\d+ s\)", walking[-1])
-
-
-def test_ctrl_c_waits_for_the_end_of_a_step_and_a_second_does_not():
-    import signal
-
-    before = signal.getsignal(signal.SIGINT)
-    with StopRequest() as stop:
-        stop.check()
-        signal.raise_signal(signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
-            stop.check()
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before

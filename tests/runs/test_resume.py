@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,18 +35,28 @@ class PowerCut(BaseException):
     """Nothing is written any more."""
 
 
+def power_cut() -> None:
+    raise PowerCut
+
+
+def ctrl_c() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
 def run(source: object, out: Path, *more: str, inputs: list[str] = INPUT) -> int:
     return main(["run", str(source), *inputs, *SETTINGS, "-o", str(out), *more])
 
 
-def run_until(event: BaseException, stage: str, step: int, source: object, out: Path, *more: str):
-    """Run until a step of a stage has been reported, and then meet with an event."""
+def run_until(
+    event: Callable[[], None], stage: str, step: int, source: object, out: Path, *more: str
+):
+    """Run, and let an event happen when a step of a stage is reported."""
     usual = ProgressLine.show
 
-    def show(line: ProgressLine, name: str, done: int, of_all: int) -> None:
-        usual(line, name, done, of_all)
+    def show(line: ProgressLine, name: str, done: int, total: int) -> None:
+        usual(line, name, done, total)
         if (name, done) == (stage, step):
-            raise event
+            event()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ProgressLine, "show", show)
@@ -85,7 +96,7 @@ def test_a_run_interrupted_in_every_stage_goes_on_to_the_same_bytes(whole: Path,
         ("refining the map", 7),
         ("refining the poses", 2),
     ]:
-        assert run_until(KeyboardInterrupt(), stage, step, "synth:person", out, *again) == 130
+        assert run_until(ctrl_c, stage, step, "synth:person", out, *again) == 130
         assert RunFolder(out).read_run()["state"] == "interrupted"
         again = ["--resume"]
     before = RunFolder(out).read_run()["seconds"]
@@ -98,9 +109,9 @@ def test_a_run_interrupted_in_every_stage_goes_on_to_the_same_bytes(whole: Path,
 @pytest.mark.parametrize("step", [5, 10])
 def test_after_a_power_cut_the_last_checkpoint_serves(step: int, whole: Path, root: Path):
     out = root / f"cut{step}"
-    often = ("--checkpoint_share", "1e9")  # one after every step
+    often = ("--checkpoint_fraction", "1e9")  # one after every step
     with pytest.raises(PowerCut):
-        run_until(PowerCut(), TRACKING, step, "synth:person", out, *often)
+        run_until(power_cut, TRACKING, step, "synth:person", out, *often)
     assert not (out / "run.json").exists()
     state = RunFolder(out).read_checkpoint()["slam"]
     assert state["steps"]["_done"] == {TRACKING: step - 1}
@@ -132,10 +143,10 @@ def test_without_a_depth_prior_after_a_damaged_image_was_replaced(photos: Path, 
     assert_same_results(root / "photos_whole", root / "photos_broken")
 
 
-def test_settings_come_from_the_folder(whole: Path, root: Path):
+def test_sequence_input_and_settings_come_from_the_folder(whole: Path, root: Path):
     out = root / "short"
-    assert run_until(KeyboardInterrupt(), TRACKING, 3, "synth:person", out) == 130
-    assert main(["run", "synth:person", *INPUT, "-o", str(out), "--resume"]) == 0
+    assert run_until(ctrl_c, TRACKING, 3, "synth:person", out) == 130
+    assert main(["run", "-o", str(out), "--resume"]) == 0
     assert_same_results(whole, out)
 
 
@@ -151,7 +162,7 @@ def test_a_finished_run_keeps_no_checkpoint(whole: Path, capsys):
 @pytest.fixture(scope="module")
 def interrupted(whole: Path, root: Path) -> Path:
     out = root / "interrupted"
-    assert run_until(KeyboardInterrupt(), TRACKING, 2, "synth:person", out) == 130
+    assert run_until(ctrl_c, TRACKING, 2, "synth:person", out) == 130
     return out
 
 
@@ -270,8 +281,8 @@ class Folder:
         self.written += 1
 
 
-def checkpoints(folder: Folder, share: str) -> resume.Checkpoints:
-    config = with_settings(preset("test"), {"checkpoint_share": share})
+def checkpoints(folder: Folder, fraction: str) -> resume.Checkpoints:
+    config = with_settings(preset("test"), {"checkpoint_fraction": fraction})
     sequence = open_sequence(
         "synth:person", InputOptions(stride=3, max_frames=FRAMES, size=(96, 72))
     )
@@ -281,22 +292,22 @@ def checkpoints(folder: Folder, share: str) -> resume.Checkpoints:
 SLAM = SimpleNamespace(saved_state=dict)
 
 
-def test_checkpoints_take_no_larger_share_of_the_time(whole: Path, clock: SimpleNamespace):
+def test_checkpoints_take_no_larger_fraction_of_the_time(whole: Path, clock: SimpleNamespace):
     folder = Folder(clock)
     kept = checkpoints(folder, "0.01")
     for _ in range(1000):
         clock.now += 1
-        kept.keep(SLAM, False)
+        kept.save(SLAM, False)
     assert folder.written == 5 and kept.seconds == 10  # at 1, 201, 401, ... seconds
-    kept.keep(SLAM, True)
+    kept.save(SLAM, True)
     assert folder.written == 6
 
 
-def test_a_share_of_zero_writes_none(whole: Path, clock: SimpleNamespace):
+def test_a_fraction_of_zero_writes_none(whole: Path, clock: SimpleNamespace):
     folder = Folder(clock)
     kept = checkpoints(folder, "0")
-    kept.keep(SLAM, False)
-    kept.keep(SLAM, True)
+    kept.save(SLAM, False)
+    kept.save(SLAM, True)
     assert folder.written == 0
 
 
@@ -304,8 +315,8 @@ def test_a_full_disk_ends_no_run(whole: Path, clock: SimpleNamespace):
     folder = Folder(clock)
     kept = checkpoints(folder, "0.01")
     folder.is_full = True
-    kept.keep(SLAM, True)
+    kept.save(SLAM, True)
     assert "the last checkpoint is older" in kept.problem and "the disk is full" in kept.problem
     folder.is_full = False
-    kept.keep(SLAM, True)
+    kept.save(SLAM, True)
     assert kept.problem is None

@@ -1,0 +1,125 @@
+"""What a run tells about itself: run.json with its warnings, and metrics.json."""
+
+import sys
+from dataclasses import asdict
+from typing import Any
+
+import minislam
+from minislam.evaluation.lpips import Lpips
+from minislam.evaluation.metrics import MappedView, measure_run
+from minislam.geometry import se3_inverse
+from minislam.mapping.views import surface_depth
+from minislam.priors.choice import PriorChoice
+from minislam.runs.resume import Checkpoints
+from minislam.slam import Slam
+
+
+def run_facts(
+    slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int
+) -> dict[str, Any]:
+    """Return the content of run.json: the command, how long the run took, and how it ended."""
+    failed, adjustments = failed_adjustments(slam)
+    return {
+        "version": minislam.__version__,
+        "command": sys.argv,
+        "sequence": slam.sequence.description,
+        "priors": asdict(choice),
+        "seed": slam.config.seed,
+        "state": state,
+        "exit_code": exit_code,
+        "warnings": _warnings(slam) + ([checkpoints.problem] if checkpoints.problem else []),
+        "seconds": {"total": checkpoints.run_seconds, **slam.steps.seconds},
+        "checkpoint_seconds": checkpoints.seconds,
+        "frames": len(slam.tracker.tracked),
+        "keyframes": len(slam.tracker.keyframes),
+        "lost_frames": len(slam.lost_frames()),
+        "adjustments": adjustments,
+        "failed_adjustments": failed,
+        "gaussians": len(slam.mapper.gaussians),
+        "focal_length": asdict(slam.focal_length) if slam.focal_length else None,
+        "health": [asdict(health) for health in slam.tracker.health],
+    }
+
+
+def failed_adjustments(slam: Slam) -> tuple[int, int]:
+    """Return how many bundle adjustments failed, and how many there were."""
+    reports = slam.tracker.backend.reports
+    return sum(not report.converged for report in reports), len(reports)
+
+
+def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
+    """Return the content of metrics.json."""
+    views = [
+        MappedView(
+            keyframe.frame_index,
+            se3_inverse(keyframe.T_camera_world).numpy(),
+            slam.beta_image(index) if slam.config.uncertainty.is_learnt else None,
+            surface_depth(slam.mapper.render(keyframe.T_camera_world)).numpy(),
+        )
+        for index, keyframe in enumerate(slam.mapper.keyframes)
+    ]
+    metrics: dict[str, Any] = measure_run(
+        slam.sequence.ground_truth,
+        slam.trajectory(),
+        slam.keyframe_trajectory(),
+        views,
+        slam.render,
+        lpips,
+    )
+    metrics["seconds_total"] = seconds
+    metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds
+    metrics["peak_memory_mb"] = peak_memory_mb()
+    return metrics
+
+
+def peak_memory_mb() -> float | None:
+    """Return the most memory this process has used so far [MB], or None on Windows."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes, Linux: kB
+
+
+def _warnings(slam: Slam) -> list[str]:
+    warnings = list(slam.sequence.warnings)
+    lost = len(slam.lost_frames())
+    if lost:
+        warnings.append(
+            f"{lost} of {len(slam.tracker.tracked)} frames could not be tracked and have no "
+            "pose; lost_frames.txt lists them"
+        )
+    failed, adjustments = failed_adjustments(slam)
+    if failed:
+        warnings.append(
+            f"{failed} of {adjustments} bundle adjustments failed and changed nothing: poses and "
+            "depths there are those of the start"
+        )
+    warnings += _focal_length_warnings(slam) + _parallax_warnings(slam)
+    if not slam.tracker.keyframes.has_prior:
+        warnings.append("without a depth prior the unit of length is arbitrary")
+    return warnings
+
+
+def _focal_length_warnings(slam: Slam) -> list[str]:
+    fit = slam.focal_length
+    if fit is None or not fit.is_doubtful:
+        return []
+    factor = f"{fit.factor:.2f}"
+    return [
+        f"the flow fits {factor} times the present focal length better, with {fit.saved:.0%} less "
+        f"cost: check the calibration, or give {factor} times the present --fx and --fy"
+    ]
+
+
+def _parallax_warnings(slam: Slam) -> list[str]:
+    health = slam.tracker.health
+    least = slam.config.tracking.min_parallax * slam.tracker.backend.pixel_scale
+    without = sum(keyframe.parallax < least for keyframe in health)
+    if not without or 2 * without < len(health):
+        return []
+    return [
+        f"{without} of {len(health)} keyframes show hardly any parallax: the camera turned or "
+        "stood still, so the distances it moved are not determined"
+    ]

@@ -1,0 +1,94 @@
+"""The pictures of a run folder: keyframe images, plots and the report."""
+
+import numpy as np
+
+from minislam.data import RunFolder
+from minislam.evaluation import absolute_trajectory_error
+from minislam.evaluation.metrics import MAX_DIFFERENCE
+from minislam.slam import Slam
+from minislam.viz import (
+    ate_over_time,
+    beta_to_rgb,
+    build_report,
+    depth_to_rgb,
+    figure_png,
+    keyframe_strip,
+    loss_curves,
+    map_growth,
+    online_uncertainty,
+    overview,
+    trajectory_plot,
+)
+
+MAX_STRIPS = 6  # keyframes shown in the report
+
+
+def write_pictures(
+    folder: RunFolder, slam: Slam, metrics: dict[str, float | None], warnings: list[str]
+) -> None:
+    """Write keyframe images, plots and the report."""
+    estimate, true_path, unit = slam.trajectory(), None, "world units"
+    plots: dict[str, tuple[str, bytes]] = {}  # caption and PNG, by name
+    truth = slam.sequence.ground_truth
+    if metrics["ate_all_cm"] is not None and truth is not None and truth.trajectory is not None:
+        error = absolute_trajectory_error(estimate, truth.trajectory, max_difference=MAX_DIFFERENCE)
+        estimate, true_path, unit = error.estimate, error.truth, "m"
+        over_time = figure_png(ate_over_time(estimate.timestamps, error.errors, unit))
+        plots["ate_over_time"] = "Error over time", over_time
+    plots["trajectory"] = "Trajectory", figure_png(trajectory_plot(estimate, true_path, unit))
+    history = slam.mapper.history
+    curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
+    plots["losses"] = "Losses", figure_png(loss_curves(curves))
+    plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
+    if slam.config.uncertainty.is_learnt and slam.snapshots.moments:
+        plots["online_uncertainty"] = "What the MLP had learnt by then", _online_beta(slam)
+    for name, (_, png) in plots.items():
+        folder.write_plot(name, png)
+
+    strips = _write_keyframes(folder, slam)
+    middle = len(slam.mapper.keyframes) // 2
+    keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
+    color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).numpy()
+    picture = overview(keyframe.image.numpy(), beta, color, estimate, true_path, unit)
+    folder.write_plot("overview", figure_png(picture))
+    summary = {name: _shown(value) for name, value in metrics.items()}
+    figures = [plots.pop("trajectory"), *strips, *plots.values()]
+    title = f"minislam: {slam.sequence.name}"
+    folder.write_report(build_report(title, summary, warnings, figures))
+
+
+def _write_keyframes(folder: RunFolder, slam: Slam) -> list[tuple[str, bytes]]:
+    """Write the pictures of all keyframes; return some of them as strips with captions."""
+    strips: list[tuple[str, bytes]] = []
+    count = len(slam.mapper.keyframes)
+    shown = set(np.linspace(0, count - 1, min(MAX_STRIPS, count)).round().astype(int).tolist())
+    for index, keyframe in enumerate(slam.mapper.keyframes):
+        rendering = slam.mapper.render(keyframe.T_camera_world)
+        image, beta = keyframe.image.numpy(), slam.beta_image(index)
+        color, depth = rendering.color.clamp(0, 1).numpy(), rendering.depth.numpy()
+        number = keyframe.frame_index
+        folder.write_keyframe_image(number, "input", image)
+        folder.write_keyframe_image(number, "render", color)
+        folder.write_keyframe_image(number, "depth", depth_to_rgb(depth))
+        folder.write_keyframe_image(number, "beta", beta_to_rgb(beta))
+        if index in shown:
+            strip = figure_png(keyframe_strip(image, depth, beta, color, f"frame {number}"))
+            strips.append((f"Keyframe {index}, frame {number}", strip))
+    return strips
+
+
+def _online_beta(slam: Slam) -> bytes:
+    """Draw beta of the keyframe with most movement at three times: first, then, and at the end."""
+    count = len(slam.mapper.keyframes)
+    index = max(range(count), key=lambda k: float(slam.beta_image(k).mean()))
+    number, moments = slam.mapper.keyframes[index].frame_index, slam.snapshots.moments
+    later = [moment for moment in moments if moment >= number]
+    chosen = sorted({moments[0], later[0] if later else moments[-1], moments[-1]})
+    betas = slam.online_beta(number, chosen)
+    named = {f"learnt until frame {k}": b.numpy() for k, b in zip(chosen, betas, strict=True)}
+    image = slam.mapper.keyframes[index].image.numpy()
+    return figure_png(online_uncertainty(image, named, f"uncertainty of frame {number}"))
+
+
+def _shown(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f}"

@@ -1,0 +1,102 @@
+"""Flags, and the file of --config under them."""
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from minislam.cli.options import (
+    add_flow,
+    add_input,
+    add_priors,
+    add_settings,
+    input_options,
+    prior_choice,
+    settings,
+    source_of,
+)
+from minislam.config import SlamConfig, as_json, with_settings
+from minislam.data import InputOptions
+from minislam.errors import InputError
+from minislam.priors.choice import PriorChoice
+
+FILE = {
+    "sequence": "synth:ball:3",
+    "input": {"stride": 3, "size": [96, 72], "fx": 80, "max_frames": None},
+    "priors": {"depth": "sensor"},
+    "tracking": {"window": 4},
+    "seed": 7,
+}
+
+
+def parse(*arguments: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_input(parser)
+    add_priors(parser, default_depth="none")
+    add_flow(parser)
+    add_settings(parser)
+    return parser.parse_args(arguments)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> str:
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(FILE))
+    return str(path)
+
+
+def test_without_flags_all_is_default():
+    args = parse("a.mp4")
+    assert source_of(args) == "a.mp4" and input_options(args) == InputOptions()
+    assert prior_choice(args, "none") == PriorChoice() and settings(args) == SlamConfig()
+
+
+def test_a_file_says_sequence_input_priors_and_settings(file: str):
+    args = parse("--config", file)
+    assert source_of(args) == "synth:ball:3"
+    assert input_options(args) == InputOptions(stride=3, size=(96, 72), fx=80.0)
+    assert prior_choice(args, "simulated") == PriorChoice(depth="sensor")
+    assert settings(args) == with_settings(SlamConfig(), {"seed": 7, "tracking.window": 4})
+
+
+def test_flags_replace_values_of_the_file(file: str):
+    args = parse(
+        "b.mp4", "--config", file, "--stride", "2", "--size", "64x48", "--depth", "none",
+        "--tracking.window", "5",
+    )  # fmt: skip
+    assert source_of(args) == "b.mp4" and prior_choice(args, "simulated").depth == "none"
+    assert input_options(args) == InputOptions(stride=2, size=(64, 48), fx=80.0)
+    assert as_json(settings(args))["tracking"]["window"] == 5 and settings(args).seed == 7
+
+
+def test_every_input_option_is_a_flag_with_its_meaning_and_default(capsys):
+    with pytest.raises(SystemExit):
+        parse("--help")
+    text = " ".join(capsys.readouterr().out.split())
+    assert "--stride VALUE use every n-th frame of the source [frame]; 1" in text
+    assert "--depth-scale VALUE units of a depth image per metre" in text
+
+
+def test_without_any_sequence_nothing_can_run():
+    with pytest.raises(InputError, match="expected a SEQUENCE, or --config FILE .* found neither"):
+        source_of(parse())
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("input", {"strid": 3}),
+        ("input", {"stride": 2.5}),
+        ("input", {"stride": "two"}),
+        ("input", {"size": [96]}),
+        ("input", 3),
+        ("priors", {"depth": 3}),
+    ],
+)
+def test_a_wrong_value_in_the_file_is_named(part: str, value: object, tmp_path: Path):
+    (tmp_path / "a.json").write_text(json.dumps({part: value}))
+    args = parse("--config", str(tmp_path / "a.json"))
+    with pytest.raises(InputError, match=f"expected {part} in .*a.json to hold some of"):
+        input_options(args)
+        prior_choice(args, "none")

@@ -1,0 +1,35 @@
+"""A run from its name to its folder, and again from the config.json of that folder alone."""
+
+from pathlib import Path
+
+from minislam.cli.main import main
+from minislam.data import RunFolder
+from minislam.tracking import bundle_adjustment
+
+COMMAND = [
+    "run", "synth:person", "--stride", "3", "--max-frames", "10", "--size", "96x72", "--preset",
+    "test", "--seed", "3", "--uncertainty.given_masks", "on", "--depth", "none",
+]  # fmt: skip
+SAME = ("trajectory.txt", "keyframe_trajectory.txt", "map.ply", "config.json")
+
+
+def test_config_json_alone_gives_the_same_bytes_again(root: Path):
+    assert main([*COMMAND, "-o", str(root / "first")]) == 0
+    config = str(root / "first/config.json")
+    assert main(["run", "--config", config, "-o", str(root / "again")]) == 0
+    for name in SAME:
+        first, again = (root / run / name for run in ("first", "again"))
+        assert first.read_bytes() == again.read_bytes(), name
+    facts = RunFolder(root / "again").read_run()
+    assert facts["failed_adjustments"] == 0 < facts["adjustments"]
+
+
+def test_a_run_whose_every_adjustment_fails_says_so(root: Path, monkeypatch, capsys):
+    monkeypatch.setattr(bundle_adjustment, "_damped_step", lambda *arguments: None)
+    out = root / "failed"
+    main([*COMMAND, "-o", str(out)])
+    facts = RunFolder(out).read_run()
+    assert facts["failed_adjustments"] == facts["adjustments"] > 0
+    warning = f"{facts['adjustments']} of {facts['adjustments']} bundle adjustments failed"
+    assert any(warning in text for text in facts["warnings"])
+    assert warning in capsys.readouterr().err and facts["state"] != "finished"
