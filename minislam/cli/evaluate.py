@@ -1,6 +1,6 @@
 """The sub-command `minislam eval`, in the grammar of `evo_ape tum`.
 
-Nothing heavy is imported before a comparison is really asked for: `--help` answers at once.
+Heavy modules are imported only for a comparison: `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from minislam.errors import InputError
 
 if TYPE_CHECKING:
     from minislam.evaluation import Alignment, TrajectoryError
@@ -18,9 +20,9 @@ def add_eval_parser(subparsers: argparse._SubParsersAction) -> argparse.Argument
     parser = subparsers.add_parser(
         "eval",
         help="compare an estimated trajectory with the truth",
-        description="Absolute trajectory error (ATE) of an estimate, both files in TUM format. "
-        "Without -a, -s and --no_align a Sim(3) is fitted first, since a monocular estimate has "
-        "no scale of its own.",
+        description="Absolute trajectory error (ATE) of an estimate, or with --rpe its relative "
+        "pose error (RPE); both files in TUM format. Without -a, -s and --no_align a Sim(3) is "
+        "fitted first, since a monocular estimate has no scale of its own.",
     )
     parser.add_argument("reference", help="ground truth, TUM format")
     parser.add_argument("estimate", help="estimated trajectory, TUM format")
@@ -32,6 +34,15 @@ def add_eval_parser(subparsers: argparse._SubParsersAction) -> argparse.Argument
     )
     parser.add_argument(
         "--t_offset", type=float, default=0.0, help="added to the estimate's timestamps [s], 0"
+    )
+    parser.add_argument(
+        "--rpe", action="store_true", help="relative pose error: the drift over --delta"
+    )
+    parser.add_argument(
+        "--delta", type=float, default=1.0, help="length of each motion for --rpe, 1"
+    )
+    parser.add_argument(
+        "--delta_unit", choices=("s", "f"), default="s", help="of --delta: seconds or frames, s"
     )
     parser.add_argument("-p", "--plot", action="store_true", help="show the trajectories")
     parser.add_argument("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
@@ -52,18 +63,22 @@ def run_eval(args: argparse.Namespace) -> int:
     result = absolute_trajectory_error(
         estimate, truth, alignment, args.t_max_diff, offset=args.t_offset
     )
+    tables = {"APE w.r.t. translation part (m)": result.statistics}
+    if args.rpe:
+        tables = _relative_errors(args, result)
+    if args.verbose and not args.silent:
+        print(_fit(result, len(estimate), len(truth)))
     if not args.silent:
-        print(_printout(args, result, alignment, len(estimate), len(truth)))
+        print("\n\n".join(_table(args, alignment, title, tables[title]) for title in tables))
     if args.save_results:
-        _save_results(args, result, alignment)
+        _save_results(args, result, alignment, tables)
     if args.plot or args.save_plot:
         _plot(args, result)
     return 0
 
 
 def _alignment(args: argparse.Namespace) -> Alignment:
-    """Return what the flags ask to fit; nothing asked means Sim(3)."""
-    from minislam.errors import InputError
+    """Return what the flags ask to fit; without such a flag, Sim(3)."""
     from minislam.evaluation.trajectory import Alignment
 
     if args.no_align and (args.align or args.correct_scale):
@@ -75,31 +90,59 @@ def _alignment(args: argparse.Namespace) -> Alignment:
     return Alignment.SE3 if args.align else Alignment.SCALE
 
 
-def _printout(
+def _relative_errors(
+    args: argparse.Namespace, result: TrajectoryError
+) -> dict[str, dict[str, float]]:
+    """Return the statistics of the relative pose error after alignment, by title."""
+    import numpy as np
+
+    from minislam.evaluation.trajectory import relative_pose_error, statistics
+
+    step = args.delta
+    if args.delta_unit == "s":
+        step = max(1, round(step / float(np.median(np.diff(result.truth.timestamps)))))
+    if not (args.delta > 0 and step == int(step)):
+        raise InputError(
+            f"expected a --delta of seconds or of whole frames, found {args.delta:g} "
+            f"{args.delta_unit}; give a positive one"
+        )
+    shifts, angles = relative_pose_error(
+        result.estimate, result.truth, int(step), args.t_max_diff, args.t_offset
+    )
+    over = f"over {args.delta:g} {args.delta_unit} ({int(step)} poses)"
+    return {
+        f"RPE w.r.t. translation part (m) {over}": statistics(shifts),
+        f"RPE w.r.t. rotation angle (deg) {over}": statistics(np.rad2deg(angles)),
+    }
+
+
+def _fit(result: TrajectoryError, estimate_poses: int, truth_poses: int) -> str:
+    """Return the number of pairs and the fitted similarity as text."""
+    similarity = result.similarity
+    rows = "\n".join("  " + " ".join(f"{x: .6f}" for x in row) for row in similarity.rotation)
+    shift = " ".join(f"{x:.6f}" for x in similarity.translation)
+    return (
+        f"{len(result.errors)} pairs ({estimate_poses} estimated, {truth_poses} true poses)\n"
+        f"scale {similarity.scale:.6f}, translation {shift}, rotation\n{rows}\n"
+    )
+
+
+def _table(
+    args: argparse.Namespace, alignment: Alignment, title: str, statistics: dict[str, float]
+) -> str:
+    """Return one table as evo prints it, with the alignment named above it."""
+    by_default = not (args.align or args.correct_scale or args.no_align)
+    reason = ", the default for monocular estimates" if by_default else ""
+    rows = [f"{name:>10}\t{statistics[name]:.6f}" for name in sorted(statistics)]
+    return "\n".join([title, f"(with {alignment.value}{reason})", "", *rows])
+
+
+def _save_results(
     args: argparse.Namespace,
     result: TrajectoryError,
     alignment: Alignment,
-    estimate_poses: int,
-    truth_poses: int,
-) -> str:
-    """Return the table as evo prints it, with the alignment named above it."""
-    by_default = not (args.align or args.correct_scale or args.no_align)
-    reason = ", the default for monocular estimates" if by_default else ""
-    lines = ["APE w.r.t. translation part (m)", f"(with {alignment.value}{reason})", ""]
-    if args.verbose:
-        similarity = result.similarity
-        rows = "\n".join("  " + " ".join(f"{x: .6f}" for x in row) for row in similarity.rotation)
-        shift = " ".join(f"{x:.6f}" for x in similarity.translation)
-        lines += [
-            f"{len(result.errors)} pairs ({estimate_poses} estimated, {truth_poses} true poses)",
-            f"scale {similarity.scale:.6f}, translation {shift}, rotation\n{rows}",
-            "",
-        ]
-    lines += [f"{name:>10}\t{result.statistics[name]:.6f}" for name in sorted(result.statistics)]
-    return "\n".join(lines)
-
-
-def _save_results(args: argparse.Namespace, result: TrajectoryError, alignment: Alignment) -> None:
+    tables: dict[str, dict[str, float]],
+) -> None:
     from minislam.data.files import write_json
 
     write_json(
@@ -113,6 +156,7 @@ def _save_results(args: argparse.Namespace, result: TrajectoryError, alignment: 
             "rotation": result.similarity.rotation.tolist(),
             "translation": result.similarity.translation.tolist(),
             "ate_translation": result.statistics,
+            "rpe": tables if args.rpe else None,
             "timestamps_seconds": result.truth.timestamps.tolist(),
             "errors": result.errors.tolist(),
         },

@@ -81,7 +81,57 @@ def test_verbose_names_pairs_and_scale(files, capsys):
     assert "20 pairs (20 estimated, 20 true poses)" in out and "scale" in out
 
 
+def test_relative_errors_are_those_of_a_drift_that_is_known(tmp_path: Path, capsys):
+    # Two poses a second; the estimate drifts 1 cm and 0.1 degrees per pose.
+    times, steps = np.arange(0, 10, 0.5), np.arange(20)
+    truth, estimate = (np.tile(np.eye(4), (20, 1, 1)) for _ in range(2))
+    truth[:, 0, 3], estimate[:, 0, 3] = 1.0 * steps, 1.01 * steps
+    angles = np.deg2rad(0.1 * steps)
+    estimate[:, 1, 1] = estimate[:, 2, 2] = np.cos(angles)  # about x, the direction of travel
+    estimate[:, 2, 1], estimate[:, 1, 2] = np.sin(angles), -np.sin(angles)
+    names = str(tmp_path / "gt.txt"), str(tmp_path / "est.txt")
+    write_trajectory(names[0], Trajectory(times, truth))
+    write_trajectory(names[1], Trajectory(times, estimate))
+    for flags, over, poses in [
+        ([], "1 s (2 poses)", 2),
+        (["--delta", "3", "--delta_unit", "f"], "3 f (3 poses)", 3),
+    ]:
+        results = tmp_path / "rpe.json"
+        run_eval(parse(*names, "--rpe", "--no_align", "--save_results", str(results), *flags))
+        out = capsys.readouterr().out
+        shift, angle = json.loads(results.read_text())["rpe"].values()
+        assert f"RPE w.r.t. translation part (m) over {over}" in out
+        assert f"RPE w.r.t. rotation angle (deg) over {over}" in out and "APE" not in out
+        assert shift["rmse"] == pytest.approx(0.01 * poses, abs=1e-6)
+        assert angle["mean"] == pytest.approx(0.1 * poses, abs=1e-4)
+
+
+def test_relative_errors_are_those_of_evo(files, tmp_path: Path):
+    pytest.importorskip("evo")
+    from evo.core import metrics, sync
+    from evo.tools import file_interface
+
+    truth, estimate = (file_interface.read_tum_trajectory_file(file) for file in files)
+    truth, estimate = sync.associate_trajectories(truth, estimate)
+    estimate.align(truth, correct_scale=True)
+    results = tmp_path / "rpe.json"
+    flags = ["--rpe", "--delta", "1", "--delta_unit", "f", "--silent", "--save_results"]
+    run_eval(parse(*files, *flags, str(results)))
+    found = json.loads(results.read_text())["rpe"].values()
+    kinds = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg
+    for kind, statistics in zip(kinds, found, strict=True):
+        rpe = metrics.RPE(kind, delta=1, delta_unit=metrics.Unit.frames)
+        rpe.process_data((truth, estimate))
+        assert statistics["rmse"] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse))
+
+
 # Errors
+
+
+@pytest.mark.parametrize("flags", [["--delta", "0"], ["--delta", "1.5", "--delta_unit", "f"]])
+def test_a_motion_of_no_length_or_of_half_a_frame_is_refused(files, flags: list[str]):
+    with pytest.raises(InputError, match="a --delta of seconds or of whole frames"):
+        run_eval(parse(*files, "--rpe", *flags))
 
 
 def test_contradicting_flags_and_strange_clocks(files):

@@ -79,7 +79,7 @@ def test_every_input_option_is_a_flag_with_its_meaning_and_default(capsys):
 
 
 def test_without_any_sequence_nothing_can_run():
-    with pytest.raises(InputError, match="expected a SEQUENCE, or --config FILE .* found neither"):
+    with pytest.raises(InputError, match=r"expected a SEQUENCE, or --config FILE .* found neither"):
         source_of(parse())
 
 
