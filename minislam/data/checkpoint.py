@@ -43,8 +43,9 @@ def write_checkpoint(path: Path | str, tree: Any) -> None:
         return {_TENSOR: [known, list(value.shape), list(value.stride()), str(value.device)]}
 
     text = json.dumps(plain(tree, "")).encode()
+    named: dict[str, Any] = {_TREE: np.frombuffer(text, np.uint8), **arrays}
     with atomic_file(path) as file:
-        np.savez(file, **{_TREE: np.frombuffer(text, np.uint8)}, **arrays)
+        np.savez(file, **named)
 
 
 def read_checkpoint(path: Path | str) -> Any:

@@ -15,7 +15,7 @@ from minislam.data.preparation import ImagePreparation
 from minislam.data.recording import RecordedTruth, Recording, path_of
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
-from minislam.records import Frame
+from minislam.records import Frame, GroundTruth
 
 _SYNTHETIC_SIZE = (320, 240)  # px
 
@@ -79,7 +79,7 @@ class RecordedSequence:
         counts = f"{len(self)} of {len(recording.images)} images"
         parts = [counts, *recording.notes, size, calibration.origin]
         self.description = f"{recording.kind}: {', '.join(parts)}"
-        self.ground_truth: RecordedTruth | None = None
+        self.ground_truth: GroundTruth | None = None
         if recording.has_truth():
             self.ground_truth = RecordedTruth(
                 recording, self._prepare, self.source_index, self.sensor_depth

@@ -86,7 +86,7 @@ def from_tree(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
         return frame_of(tree)
     if hasattr(kind, "from_state"):
         return kind.from_state(tree, frame_of)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         hints = get_type_hints(kind)
         return kind(**{name: from_tree(hints[name], tree[name], frame_of) for name in hints})
     return kind(tree) if issubclass(kind, Enum) else tree

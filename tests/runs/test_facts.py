@@ -1,0 +1,65 @@
+"""What a run tells about itself: warnings, and the memory it took."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from minislam.runs import facts
+
+
+def slam(**parts: object) -> SimpleNamespace:
+    """Return a finished run of four frames without anything to warn of, but for these parts."""
+    converged = SimpleNamespace(converged=True)
+    backend = SimpleNamespace(
+        reports=[converged] * 2 + [SimpleNamespace(converged=False)] * parts.pop("failed", 0),
+        pixel_scale=1.0,
+    )
+    tracker = SimpleNamespace(
+        tracked=[None] * 4,
+        backend=backend,
+        health=[SimpleNamespace(parallax=parallax) for parallax in parts.pop("parallax", [5.0])],
+        keyframes=SimpleNamespace(has_prior=parts.pop("has_prior", True)),
+    )
+    lost = parts.pop("lost", 0)
+    return SimpleNamespace(
+        sequence=SimpleNamespace(warnings=[]),
+        lost_frames=lambda: [None] * lost,
+        tracker=tracker,
+        config=SimpleNamespace(tracking=SimpleNamespace(min_parallax=1.0)),
+        focal_length=parts.pop("focal_length", None),
+    )
+
+
+DOUBTFUL = SimpleNamespace(is_doubtful=True, factor=1.1, saved=0.25)
+WARNINGS = [
+    ({"lost": 1}, "1 of 4 frames could not be tracked"),
+    ({"failed": 3}, "3 of 5 bundle adjustments failed"),
+    ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
+    ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
+    ({"has_prior": False}, "the unit of length is arbitrary"),
+]
+
+
+@pytest.mark.parametrize(("parts", "words"), WARNINGS)
+def test_each_fault_is_one_warning(parts: dict, words: str):
+    assert facts._warnings(slam()) == []
+    (warning,) = facts._warnings(slam(**parts))
+    assert words in warning
+
+
+def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
+    on_linux = facts.peak_memory_mb()
+    assert 30 < on_linux < 30_000
+    monkeypatch.setattr(facts.sys, "platform", "darwin")  # there the system counts bytes
+    assert facts.peak_memory_mb() == pytest.approx(on_linux / 1024, rel=0.1)
+
+
+def test_without_the_counter_of_unix_the_package_still_imports():
+    program = (
+        "import sys; sys.modules['resource'] = None\n"
+        "from minislam.runs import facts, run\nprint(facts.peak_memory_mb())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "None\n", done.stderr
