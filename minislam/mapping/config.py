@@ -88,7 +88,7 @@ class MappingConfig:
     color_weight: float = parameter(
         0.8, "alpha: lambda_5 = alpha / 2, lambda_6 = (1 - alpha) / 2; official 0.5 or 0.8"
     )
-    lambda_ssim: float = parameter(0.2, "weight of SSIM in L_color (Eq. 7), official")
+    lambda_ssim: float = parameter(0.2, "weight of SSIM in L_color, Eq. (7), official")
     lambda_isotropic: float = parameter(10.0, "lambda_7: weight of L_iso [1 per m], official")
     mean_background: bool = parameter(
         True,

@@ -108,8 +108,8 @@ def test_depth_is_carried_along_the_viewing_direction():
 
 @pytest.mark.parametrize("offset", [STEP, -STEP])
 def test_an_occluded_surface_is_not_counted_as_inconsistent(offset: float):
-    # The neighbour sees wall that the box hides from us, and all features are equal. If the last point
-    # written counted instead of the nearest, one of the two directions would fail.
+    # The neighbour sees wall that the box hides from us, and all features are equal. If the last
+    # point written counted instead of the nearest, one of the two directions would fail.
     box = (0.005, 0.305)
     ours, other = (view(x, box, look=WALL_LOOK) for x in (0.0, offset))
     counts = counted(ours, [other])

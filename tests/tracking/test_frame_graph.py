@@ -102,7 +102,7 @@ def test_neighbourhood_by_hand():
 )
 def test_distances_are_the_official_ones(rotation_weight: float, name: str):
     # In cells there, in px here: the cells of the stored problem are px of its camera. In all of
-    # its pairs most cells are in view, so that the fraction that must be (0.75 there) plays no part.
+    # its pairs most cells are in view, so the minimal fraction (0.75 there) plays no part.
     state, camera = golden.state(), golden.camera()
     pixels = golden.pixels()
     actual = flow_distances(
