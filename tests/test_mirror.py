@@ -14,6 +14,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "splatting/constants": "splatting/test_projection.py",
     "splatting/tile_loop": "splatting/test_renderer.py",
     "tracking/reference": "tracking/test_bundle_adjustment.py",
+    "priors/interfaces": "priors/test_flow.py",  # protocols and one record
 }
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from minislam.checks.grading import Case, Hints, Verdict, check_function
-from minislam.evaluation.separability import auroc
+from minislam.evaluation.images import auroc
 from minislam.geometry.alignment import umeyama
 
 

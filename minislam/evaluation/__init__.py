@@ -1,15 +1,13 @@
 """Compare a run with the ground truth: trajectory, images, depth, separation by beta."""
 
-from minislam.evaluation.depth import depth_l1
-from minislam.evaluation.images import psnr, ssim
-from minislam.evaluation.novel_views import truth_to_estimate
-from minislam.evaluation.separability import auroc
+from minislam.evaluation.images import auroc, depth_l1, psnr, ssim
 from minislam.evaluation.trajectory import (
     Alignment,
     TrajectoryError,
     absolute_trajectory_error,
     relative_pose_error,
     straight_line_error,
+    truth_to_estimate,
 )
 
 __all__ = [

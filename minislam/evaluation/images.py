@@ -1,12 +1,13 @@
-"""Similarity of two images: PSNR and SSIM. LPIPS is in lpips.py.
+"""Measures over pixels: PSNR and SSIM of images, L1 of depths, AUROC of the uncertainty.
 
-SSIM is written here in numpy on purpose and shares nothing with minislam/images.py: a mistake
-there would be optimised as a loss, and the metric must not repeat it.
+LPIPS is in lpips.py. SSIM is written here in numpy on purpose and shares nothing with
+minislam/images.py: a mistake there would be optimised as a loss, and the metric must not repeat it.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import convolve1d
+from scipy.stats import rankdata
 
 from minislam.errors import InputError
 
@@ -53,6 +54,53 @@ def ssim(
     luminance = (2 * mean_x * mean_y + _SSIM_C1) / (mean_x**2 + mean_y**2 + _SSIM_C1)
     structure = (2 * covariance + _SSIM_C2) / (variance_x + variance_y + _SSIM_C2)
     return float((luminance * structure).mean())
+
+
+def depth_l1(
+    depth: ArrayLike,  # (H, W) world units of the map, 0 where unknown
+    reference: ArrayLike,  # (H, W) world units of the truth, 0 where unknown
+    scale: float,  # units of the truth per unit of the map, from a Sim(3) of the trajectories
+    moving: ArrayLike | None = None,  # (H, W) bool, True where a dynamic object hides the scene
+) -> float | None:  # units of the truth
+    """Return the mean |scale D^ - D| over static pixels known to both; None if there is none.
+
+    The scale is that of the trajectory, not fitted to the depths: a map too large for its
+    trajectory is an error.
+    """
+    depth, reference = np.asarray(depth, np.float64), np.asarray(reference, np.float64)
+    hidden = np.zeros(depth.shape, bool) if moving is None else np.asarray(moving, bool)
+    if not depth.shape == reference.shape == hidden.shape:
+        raise InputError(
+            f"expected depths and mask of one size, found {depth.shape}, {reference.shape} and "
+            f"{hidden.shape}; render at the size of the reference"
+        )
+    known = (depth > 0) & (reference > 0) & ~hidden
+    if not known.any():
+        return None
+    return float(np.abs(scale * depth - reference)[known].mean())
+
+
+def auroc(
+    scores: ArrayLike,  # any shape, for instance beta; larger means "moving"
+    mask: ArrayLike,  # the same shape, True on dynamic objects
+) -> float:  # 1: perfect, 0.5: chance, 0: inverted
+    """Return the area under the ROC curve, from ranks (Mann and Whitney's U).
+
+    It is the probability that a random moving pixel scores higher than a random static one;
+    equal scores count half. No threshold is needed.
+    """
+    scores = np.asarray(scores, dtype=np.float64).ravel()
+    mask = np.asarray(mask, dtype=bool).ravel()
+    positives, negatives = int(mask.sum()), int((~mask).sum())
+    if scores.shape != mask.shape or positives == 0 or negatives == 0:
+        raise InputError(
+            f"expected one score per pixel and pixels of both kinds, found {scores.size} scores, "
+            f"{positives} moving and {negatives} static pixels; choose frames with dynamic objects"
+        )
+    if not np.isfinite(scores).all():
+        raise InputError("expected finite scores, found NaN or infinity; check the uncertainty")
+    u = rankdata(scores)[mask].sum() - positives * (positives + 1) / 2
+    return float(u / (positives * negatives))
 
 
 def _window_mean(values: np.ndarray) -> np.ndarray:

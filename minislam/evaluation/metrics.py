@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from minislam.errors import InputError
-from minislam.evaluation.depth import depth_l1
-from minislam.evaluation.images import psnr, ssim
-from minislam.evaluation.novel_views import oriented_truth_to_estimate, truth_to_estimate
-from minislam.evaluation.separability import auroc
-from minislam.evaluation.trajectory import absolute_trajectory_error, straight_line_error
+from minislam.evaluation.images import auroc, depth_l1, psnr, ssim
+from minislam.evaluation.trajectory import (
+    absolute_trajectory_error,
+    oriented_truth_to_estimate,
+    straight_line_error,
+    truth_to_estimate,
+)
 from minislam.records import GroundTruth, Trajectory
 
 MAX_DIFFERENCE = 0.02  # second between a frame and its true pose; TUM stamps differ by 0.005

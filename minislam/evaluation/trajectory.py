@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity, identity_similarity, umeyama
@@ -143,6 +144,37 @@ def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     if alignment is Alignment.SCALE:
         return Similarity(fitted.scale, np.eye(3), np.zeros(3))
     return fitted
+
+
+def truth_to_estimate(
+    estimate: Trajectory, truth: Trajectory, max_difference: float = DEFAULT_MAX_DIFFERENCE
+) -> Similarity:
+    """Return the Sim(3) that maps true camera centres to estimated ones with least error.
+
+    It brings the poses of held-out views into the world of the map; fitted in this direction, the
+    error is least there. The error of the trajectory enters every measure taken at these views.
+    """
+    estimate, truth = paired(estimate, truth, max_difference)
+    return fit_alignment(truth, estimate, Alignment.SIM3)
+
+
+def oriented_truth_to_estimate(
+    estimate: Trajectory, truth: Trajectory, max_difference: float = DEFAULT_MAX_DIFFERENCE
+) -> Similarity:
+    """Return the Sim(3) from truth to estimate with the mean rotation between the cameras.
+
+    If the camera moves nearly along a line, its centres hardly determine the rotation about that
+    line, and 3 mrad of it move a held-out view by a pixel. The orientations determine it.
+    Scale and translation come from the centres.
+    """
+    estimate, truth = paired(estimate, truth, max_difference)
+    turned = estimate.T_world_camera[:, :3, :3] @ truth.T_world_camera[:, :3, :3].mT
+    rotation = Rotation.from_matrix(turned).mean().as_matrix()
+    source, target = centres(truth), centres(estimate)
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    source_turned = (source - source_mean) @ rotation.T
+    scale = float((source_turned * (target - target_mean)).sum() / (source_turned**2).sum())
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
 def statistics(errors: np.ndarray) -> dict[str, float]:

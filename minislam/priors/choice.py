@@ -123,7 +123,7 @@ def _load(
     if weights is None:
         raise InputError(
             f"expected --{kind}-weights FILE with --{kind} {name}, found none; give the official "
-            "checkpoint, README.md says where to get it"
+            "checkpoint, minislam/priors/networks/README.md says where to get it"
         )
     if choice.device == "cuda" and not torch.cuda.is_available():
         raise InputError(

@@ -6,18 +6,15 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
-from minislam.errors import InputError
 from minislam.records import Trajectory
 from minislam.viz import (
     ate_over_time,
-    build_report,
     figure_png,
     keyframe_strip,
     loss_curves,
     map_growth,
     online_uncertainty,
     overview,
-    show_figure,
     trajectory_plot,
 )
 
@@ -81,31 +78,3 @@ def test_online_betas_share_their_colours():
 def test_figures_do_not_touch_the_state_of_pyplot():
     FIGURES["overview"]()
     assert pyplot.get_fignums() == []
-
-
-def test_without_a_display_the_user_is_told_what_to_do(monkeypatch):
-    monkeypatch.setattr(pyplot, "get_backend", lambda: "agg")
-    with pytest.raises(InputError, match="--save_plot"):
-        show_figure(FIGURES["ate"]())
-
-
-def test_with_a_display_the_figure_is_shown(monkeypatch):
-    shown = []
-    monkeypatch.setattr(pyplot, "get_backend", lambda: "QtAgg")
-    monkeypatch.setattr(pyplot, "show", lambda: shown.extend(pyplot.get_fignums()))
-    show_figure(FIGURES["ate"]())
-    assert len(shown) == 1
-    pyplot.close("all")
-
-
-def test_a_report_needs_no_other_file():
-    png = figure_png(FIGURES["ate"](), dpi=20)
-    html = build_report("run <1>", {"ATE": "1 & 2"}, ["focal length guessed"], [("a < b", png)])
-    assert html.startswith("<!DOCTYPE html>")
-    assert "run &lt;1&gt;" in html and "1 &amp; 2" in html and "a &lt; b" in html
-    assert '<p class="warning">focal length guessed</p>' in html
-    assert html.count("data:image/png;base64,") == 1
-    assert "<script" not in html and "http" not in html
-    assert html == build_report(
-        "run <1>", {"ATE": "1 & 2"}, ["focal length guessed"], [("a < b", png)]
-    )

@@ -6,7 +6,7 @@ Therefore one run on a tiny image checks a file completely: a missing tensor is 
 tensor that was never asked for is unexpected.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -98,6 +98,19 @@ class Weights:
         """Normalise over the last dimension."""
         weight, bias = self[f"{name}.weight"], self[f"{name}.bias"]
         return functional.layer_norm(x, weight.shape, weight, bias, epsilon)
+
+    def gru(
+        self,
+        hidden: Tensor,  # (B, C, h, w)
+        inputs: Tensor,  # (B, C', h, w)
+        offsets: Sequence[Tensor],  # three, added to the gates z and r and to the proposal q
+    ) -> Tensor:
+        """Blend the hidden state with a proposal, by a gate per channel (gated recurrent unit)."""
+        both = torch.cat([hidden, inputs], 1)
+        z = torch.sigmoid(self.conv("convz", both) + offsets[0])
+        r = torch.sigmoid(self.conv("convr", both) + offsets[1])
+        q = torch.tanh(self.conv("convq", torch.cat([r * hidden, inputs], 1)) + offsets[2])
+        return (1 - z) * hidden + z * q
 
     def _bias(self, name: str, wanted: bool) -> Tensor | None:
         # Not "the bias if there is one": an incomplete file would go unnoticed.

@@ -143,9 +143,4 @@ def _gru(weights: Weights, hidden: Tensor, inputs: Tensor) -> Tensor:
     """Update the hidden state; every cell also gets a gated mean over the whole image."""
     gated = weights.conv("w", hidden).sigmoid() * hidden
     whole = gated.mean((2, 3), keepdim=True)  # (E, 128, 1, 1)
-    both = torch.cat([hidden, inputs], 1)
-    z = torch.sigmoid(weights.conv("convz", both) + weights.conv("convz_glo", whole))
-    r = torch.sigmoid(weights.conv("convr", both) + weights.conv("convr_glo", whole))
-    proposal = torch.cat([r * hidden, inputs], 1)
-    q = torch.tanh(weights.conv("convq", proposal) + weights.conv("convq_glo", whole))
-    return (1 - z) * hidden + z * q
+    return weights.gru(hidden, inputs, [weights.conv(f"conv{gate}_glo", whole) for gate in "zrq"])

@@ -117,7 +117,8 @@ def _recurrent_round(
     fine, middle, coarse = hidden
 
     def gru(level: int, h: Tensor, *inputs: Tensor) -> Tensor:
-        return _gru(weights.below(f"{_GRU_NAMES[level]}."), h, gates[level], torch.cat(inputs, 1))
+        unit = weights.below(f"{_GRU_NAMES[level]}.")
+        return unit.gru(h, torch.cat(inputs, 1), gates[level].chunk(3, 1))
 
     coarse = gru(2, coarse, _halved(middle))
     for _ in range(2):
@@ -125,17 +126,6 @@ def _recurrent_round(
         middle = gru(1, middle, _resized(_halved(fine), middle), _resized(coarse, middle))
     fine = gru(0, fine, state, _resized(middle, fine))
     return [fine, middle, coarse]
-
-
-def _gru(weights: Weights, hidden: Tensor, gate_offsets: Tensor, inputs: Tensor) -> Tensor:
-    """Blend the hidden state with a proposal, by a gate per channel."""
-    offset_z, offset_r, offset_q = gate_offsets.chunk(3, 1)
-    both = torch.cat([hidden, inputs], 1)
-    z = torch.sigmoid(weights.conv("convz", both) + offset_z)
-    r = torch.sigmoid(weights.conv("convr", both) + offset_r)
-    proposal = torch.cat([r * hidden, inputs], 1)
-    q = torch.tanh(weights.conv("convq", proposal) + offset_q)
-    return (1 - z) * hidden + z * q
 
 
 def _halved(x: Tensor) -> Tensor:

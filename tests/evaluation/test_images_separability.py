@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from minislam.errors import InputError
-from minislam.evaluation.separability import auroc
+from minislam.evaluation.images import auroc
 
 # Known answers
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from minislam.evaluation.novel_views import oriented_truth_to_estimate, truth_to_estimate
+from minislam.evaluation.trajectory import oriented_truth_to_estimate, truth_to_estimate
 from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
