@@ -1,9 +1,10 @@
-"""Local statistics of images: Gaussian blur, and the constants and moments of SSIM."""
+"""Images and grids: Gaussian blur, the constants and moments of SSIM, resampling."""
 
 from functools import lru_cache
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 SSIM_SIGMA = 1.5  # px, standard deviation of the window (Wang et al. 2004)
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # keep flat patches of images in [0, 1] from 0/0 (the same)
@@ -54,3 +55,18 @@ def _blur_strips(
         blur = torch.exp(-0.5 * (distance / sigma) ** 2) * (distance <= reach) / total
         strips.append((seen, blur))
     return strips
+
+
+def resample(
+    values: Tensor,  # (h, w)
+    height: int,  # rows wanted
+    width: int,  # columns wanted
+) -> Tensor:  # (height, width)
+    """Interpolate a grid bilinearly at the cell centres of another one over the same area.
+
+    Both cover the image evenly: on an image of W px, the centre of column j of w' columns lies at
+    (j + 0.5) W / w' - 0.5. Nothing is smoothed before a resampling to fewer cells.
+    """
+    batch = values[None, None]
+    resampled = functional.interpolate(batch, (height, width), mode="bilinear", align_corners=False)
+    return resampled[0, 0]

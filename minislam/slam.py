@@ -34,7 +34,7 @@ from minislam.uncertainty import (
     beta_of_mask,
     tracking_weight,
 )
-from minislam.uncertainty.resampling import resample
+from minislam.images import resample
 
 
 @dataclass(frozen=True)
@@ -183,10 +183,12 @@ class Slam(Stateful):
             self.steps.finish(stage, done + 1, len(others))
 
     def _static_weight(self, index: int) -> Tensor:
-        """Return the static weight (h, w) of each cell of a keyframe, in (0, 1], from its beta.
+        """Return the static weight (h, w) of each cell of a keyframe, in (0, 1], by the present MLP.
 
-        Without a depth prior the map stands on the tracker's own structure, and where that is poor,
-        the MLP's beta is high on everything with texture. Then only given masks are used.
+        The tracker asks for it when a keyframe comes, at the end of the warm-up and in the final
+        adjustment, so online a keyframe keeps the beta that it had when it came. Without a depth
+        prior the map stands on the tracker's own structure, and where that is poor, the MLP's beta
+        is high on everything with texture. Then only given masks are used.
         """
         keyframes = self.tracker.keyframes
         uncertainty = self.config.uncertainty

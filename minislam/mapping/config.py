@@ -54,9 +54,6 @@ class PoseRefinementConfig:
         "fraction of the way from the pose by flow to the pose by re-rendering [0, 1]; official 1."
         " Their errors are independent, so a mean is better than either (measured)",
     )
-    rounding: float = parameter(
-        0.01, "colour difference below which the L1 loss is rounded off [1], one step of noise"
-    )
 
 
 @dataclass(frozen=True)

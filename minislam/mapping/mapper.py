@@ -8,8 +8,6 @@ import torch
 from torch import Tensor
 
 from minislam.errors import InputError
-from minislam.geometry import Camera
-from minislam.mapping.config import MappingConfig
 from minislam.mapping.deformation import deform_rigidly, rescale_to_depths
 from minislam.mapping.density import ScreenGradients
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
@@ -18,26 +16,12 @@ from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import MappedKeyframe, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
-from minislam.uncertainty import UncertaintyConfig
 
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
 
 
 class Mapper(JointOptimisation):
     """Grow the map of the static scene keyframe by keyframe, and train the MLP on the way."""
-
-    window: list[int]  # positions in `keyframes`, newest first
-
-    def __init__(
-        self,
-        camera: Camera,  # of the keyframe images
-        config: MappingConfig,
-        uncertainty: UncertaintyConfig,
-        feature_dimension: int,  # C
-        seed: int,
-    ) -> None:
-        super().__init__(camera, config, uncertainty, feature_dimension, seed)
-        self.window = []
 
     def initialise(self, keyframes: list[Keyframe], progress: Progress | None = None) -> None:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
@@ -61,8 +45,11 @@ class Mapper(JointOptimisation):
             raise InputError("expected an initialised map, found none; call initialise first")
         self.keyframes.append(MappedKeyframe.from_record(keyframe))
         new = len(self.keyframes) - 1
-        seen = {position: self._seen(position) for position in [new, *self.window]}
         poses = torch.stack([k.T_camera_world for k in self.keyframes])
+        seen = {
+            position: self.render(poses[position], self._online_camera).weight_sums > VISIBLE
+            for position in [new, *self.window]
+        }
         self.window = update_window(self.window, new, seen, poses, self.config.window_size)
         self._remove_dynamic_gaussians()
         self._insert(self.keyframes[new])
@@ -135,11 +122,6 @@ class Mapper(JointOptimisation):
             anchors.new_tensor([keyframe.keyframe_index for keyframe in self.keyframes]), anchors
         )
 
-    def _seen(self, position: int) -> Tensor:
-        """Return (N,) bool, the Gaussians that a keyframe sees."""
-        pose = self.keyframes[position].T_camera_world
-        return self.render(pose, self._online_camera).weight_sums > VISIBLE
-
     @torch.no_grad()
     def _insert(self, keyframe: MappedKeyframe) -> None:
         """Add Gaussians for what a keyframe sees and the map does not show."""
@@ -147,7 +129,7 @@ class Mapper(JointOptimisation):
             keyframe,
             self.camera,
             self.render(keyframe.T_camera_world) if len(self.gaussians) else None,
-            self._keyframe_weight(keyframe, self.camera),
+            self.static_weight(self.beta_of(keyframe), self.camera),
             self.median_depth,
             self.config.insertion,
             self._generator,
@@ -161,7 +143,7 @@ class Mapper(JointOptimisation):
         keep = torch.ones_like(rows, dtype=torch.bool)
         for position, keyframe in enumerate(self.keyframes):
             anchored = (rows == position).nonzero().squeeze(-1)
-            weight = self._keyframe_weight(keyframe, self._online_camera)
+            weight = self.static_weight(self.beta_of(keyframe), self._online_camera)
             keep[anchored] = ~is_on_dynamic_object(
                 gaussians.means[anchored], self._online_camera, keyframe.T_camera_world, weight
             )

@@ -24,9 +24,13 @@ Progress = Callable[[int, int], None]  # called with the iterations done and the
 
 
 class JointOptimisation(Stateful):
-    """The Gaussian map, the MLP and the keyframes, and the iterations that optimise both."""
+    """The map, the MLP and the keyframes, and the iterations that optimise map and MLP.
+
+    Which Gaussians there are, and when an optimisation runs, is decided in `mapper.py`.
+    """
 
     keyframes: list[MappedKeyframe]
+    window: list[int]  # positions in `keyframes`, newest first
     median_depth: float = 1.0  # world units; set by the first keyframes, then fixed
     background: Tensor  # RGB of what no keyframe sees
     history: MappingHistory
@@ -49,6 +53,7 @@ class JointOptimisation(Stateful):
         self.config = config
         self.uncertainty = uncertainty
         self.keyframes = []
+        self.window = []
         self.background = torch.zeros(3)
         self.history = MappingHistory()
         self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed)
@@ -91,10 +96,6 @@ class JointOptimisation(Stateful):
             return torch.ones(camera.height, camera.width, device=beta.device)
         return mapping_weight(beta, camera)
 
-    def _keyframe_weight(self, keyframe: MappedKeyframe, camera: Camera) -> Tensor:
-        """Return the static weight (H, W) of a keyframe."""
-        return self.static_weight(self.beta_of(keyframe), camera)
-
     def _optimise(
         self,
         cameras: list[Camera],  # size at which each iteration renders
@@ -122,7 +123,7 @@ class JointOptimisation(Stateful):
         offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         pose = keyframe.T_camera_world.float()
         rendering = render(gaussians, camera, pose, self.background, screen_offsets=offsets)
-        weight = self._keyframe_weight(keyframe, camera)
+        weight = self.static_weight(self.beta_of(keyframe), camera)
         loss = render_loss(
             gaussians, rendering, view.image, view.depth, weight, self.median_depth, self.config
         )

@@ -19,6 +19,7 @@ from minislam.uncertainty.losses import SURFACE_OPACITY
 # Levenberg-Marquardt: the first damping, as a fraction of the curvature's diagonal, and its
 # factors after a step that failed and after one that succeeded.
 _FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 1e-3, 10.0, 0.3
+ROUNDING = 0.01  # colour difference below which |r| is rounded off to a parabola, about the noise
 
 
 def refine_pose(
@@ -60,7 +61,7 @@ def _optimise_pose(
     for steps_done in range(config.iterations + 1):
         twist = torch.zeros(6, dtype=gaussians.means.dtype, device=image.device, requires_grad=True)
         rendering = render(gaussians, camera, candidate, background, twist=twist)
-        loss = rerendering_loss(rendering, image, weight, config.rounding)
+        loss = rerendering_loss(rendering, image, weight)
         improved = float(loss.detach()) < lowest
         if improved:
             if _motion(se3_log(candidate @ se3_inverse(start)), rendering, camera) > farthest:
@@ -70,7 +71,7 @@ def _optimise_pose(
             break
         if improved:
             (gradient,) = torch.autograd.grad(loss, twist)
-            hessian = curvature(rendering, image, weight, camera, config.rounding)
+            hessian = curvature(rendering, image, weight, camera)
             if not hessian.diagonal().min() > 0:
                 return pose  # The picture does not depend on the pose: it is empty or uniform.
         else:
@@ -87,15 +88,14 @@ def rerendering_loss(
     rendering: Rendering,
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
     weight: Tensor,  # (H, W) static weight
-    rounding: float,  # colour difference below which |r| becomes a parabola
 ) -> Tensor:  # ()
-    """Return the mean of weight * opacity * |I^ - I|, with |r| as sqrt(r^2 + rounding^2).
+    """Return the mean of weight * opacity * |I^ - I|, with |r| as sqrt(r^2 + 0.01^2).
 
     The opacity is a constant, as in the official code. With its gradient the camera would turn to
     where the map is empty, because the loss is 0 there.
     """
     residual = rendering.color - image
-    absolute = (residual.square() + rounding**2).sqrt().mean(-1)
+    absolute = (residual.square() + ROUNDING**2).sqrt().mean(-1)
     return (weight * rendering.opacity.detach() * absolute).mean()
 
 
@@ -105,7 +105,6 @@ def curvature(
     image: Tensor,  # (H, W, 3)
     weight: Tensor,  # (H, W)
     camera: Camera,
-    rounding: float,
 ) -> Tensor:  # (6, 6) float64
     """Return the Gauss-Newton matrix of the loss: the mean of w J^T J / |I^ - I|.
 
@@ -116,7 +115,7 @@ def curvature(
         sum_c w J_c^T J_c / |r_c| = A^T G A,        G = sum_c w g_c g_c^T / |r_c|   (2x2).
     """
     solid = rendering.opacity > SURFACE_OPACITY
-    absolute = ((rendering.color - image).square() + rounding**2).sqrt()
+    absolute = ((rendering.color - image).square() + ROUNDING**2).sqrt()
     factor = (weight * rendering.opacity * solid)[..., None] / absolute / absolute.numel()
     slope_u, slope_v = image_slope(rendering.color)
     weighted_u, weighted_v = factor * slope_u, factor * slope_v

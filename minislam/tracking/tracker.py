@@ -58,6 +58,12 @@ class Tracker(Stateful):
         depth_prior: DepthPrior,
         predict_static_weight: Callable[[int], Tensor],  # keyframe index -> (h, w) in [0, 1]
     ) -> None:
+        """Start without any frame.
+
+        `predict_static_weight` is called for a new keyframe, and for all keyframes at the end of
+        the warm-up and in the final adjustment. So online, a keyframe keeps the beta it had when
+        it came, although the MLP learns on.
+        """
         self.config = config
         self.backend = BackEnd(camera, config, flow)
         self.keyframes = self.backend.keyframes

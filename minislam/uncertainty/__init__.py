@@ -6,7 +6,6 @@ Read the files in this order:
     weights       the only place where beta becomes a weight, of tracking or of mapping
     losses        the terms of L_uncer: modified SSIM, L_depth, Eq. (3), and the regularisers
     training      L_uncer itself, Eq. (4), and the Adam that lowers it
-    resampling    between the image and the feature grid
     snapshots     copies of the MLP at earlier moments, for the report
     config        the settings
 """

@@ -84,11 +84,6 @@ def median_filter(
     return windows.reshape(*values.shape, size * size).median(-1).values
 
 
-def log_regulariser(beta: Tensor) -> Tensor:
-    """Return L_reg_U = log beta; without it an infinite beta would be the minimum of L_uncer."""
-    return beta.log()
-
-
 def variance_regulariser(
     beta_raw: Tensor,  # (n,) unclipped, so that cells under the floor get a gradient too
     features: Tensor,  # (n, C)
@@ -122,9 +117,10 @@ def cell_loss(
 ) -> Tensor:  # (h', w')
     """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell.
 
-    With lambda_3 = 0.5 and rendering error L it is smallest at beta = 2 sqrt(L). Cells that the
-    map does not cover yet give 0, because a hole is not a dynamic object.
+    Without L_reg_U = log beta an infinite beta would be the minimum. With lambda_3 = 0.5 and
+    rendering error L, the minimum is at beta = 2 sqrt(L). Cells that the map does not cover yet
+    give 0, because a hole is not a dynamic object.
     """
     beta = clipped_beta(beta_raw)
-    loss = error.detach() / beta**2 + config.lambda_log * log_regulariser(beta)
+    loss = error.detach() / beta**2 + config.lambda_log * beta.log()
     return torch.where(opacity >= SURFACE_OPACITY, loss, 0)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from minislam.images import resample
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import (
@@ -16,7 +17,6 @@ from minislam.uncertainty.losses import (
     variance_regulariser,
 )
 from minislam.uncertainty.mlp import UncertaintyMLP
-from minislam.uncertainty.resampling import resample
 
 
 @dataclass(frozen=True)

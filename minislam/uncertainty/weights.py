@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.uncertainty.resampling import resample
+from minislam.images import resample
 
 BETA_FLOOR = 0.1  # smallest beta, official: keeps 1 / beta^2 and log beta finite
 BETA_OFFSET = 1e-3  # added to the clipped beta, official

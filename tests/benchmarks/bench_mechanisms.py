@@ -30,7 +30,7 @@ from minislam.slam import Slam
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.relocalisation import Relocaliser
 from minislam.tracking.trajectory import pose_all_frames
-from minislam.uncertainty.resampling import resample
+from minislam.images import resample
 from tests.benchmarks.bench_movers import ate, keyframe_error, tracked
 from tests.benchmarks.incidents import COVERED, covered_clip, standing_clip
 

@@ -133,7 +133,7 @@ def test_given_masks_take_the_place_of_the_mlp():
     mapper.initialise(keyframes[:2])
     mapper.integrate(keyframes[2])
     assert all(torch.equal(a, b) for a, b in zip(before, mapper.mlp.parameters(), strict=True))
-    weight = mapper._keyframe_weight(mapper.keyframes[0], CAMERA)
+    weight = mapper.static_weight(mapper.beta_of(mapper.keyframes[0]), CAMERA)
     assert torch.equal(weight == 0, keyframes[0].moving_mask)
     assert (mapper.gaussians.means[:, 2] < 1.5).sum() == 0
     empty = wall_keyframe(0)

@@ -62,5 +62,6 @@ def test_each_loss_trains_only_its_own_side():
 def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
     mapper = make_mapper(replace(CONFIG, init_iterations=3), UncertaintyConfig(enabled=False))
     mapper.initialise([wall_keyframe(0)])
-    assert torch.equal(mapper._keyframe_weight(mapper.keyframes[0], CAMERA), torch.ones(24, 32))
+    weight = mapper.static_weight(mapper.beta_of(mapper.keyframes[0]), CAMERA)
+    assert torch.equal(weight, torch.ones(24, 32))
     assert all(parameter.grad is None for parameter in mapper.mlp.parameters())

@@ -126,11 +126,10 @@ def test_a_pose_that_is_right_stays():
 
 def test_no_step_raises_the_rendering_error():
     weight = torch.ones(24, 32)
-    rounding = CONFIG.rounding
 
     def loss(pose: torch.Tensor) -> float:
         rendering = render(textured_wall(), CAMERA, pose, BLACK)
-        return float(rerendering_loss(rendering, TRUE_IMAGE, weight, rounding))
+        return float(rerendering_loss(rendering, TRUE_IMAGE, weight))
 
     far = se3_exp(8 * se3_log(OFF))
     assert loss(refined(TRUE_IMAGE, weight, far)) <= loss(far)
@@ -154,12 +153,12 @@ def test_loss_gradient_agrees_with_finite_differences_and_opacity_is_held():
     weight = random_rendering(2).depth
 
     def loss(color: torch.Tensor) -> torch.Tensor:
-        return rerendering_loss(rendering._replace(color=color), image, weight, 0.01)
+        return rerendering_loss(rendering._replace(color=color), image, weight)
 
     color = rendering.color.clone().requires_grad_()
     opacity = rendering.opacity.clone().requires_grad_()
     held = rendering._replace(color=color, opacity=opacity)
-    rerendering_loss(held, image, weight, 0.01).backward()
+    rerendering_loss(held, image, weight).backward()
     assert opacity.grad is None
     assert_gradients_close(color.grad, numerical_gradient(loss, rendering.color), relative=1e-6)
 
@@ -176,7 +175,7 @@ def test_the_curvature_is_that_of_the_rendering(principal_point: tuple[float, fl
     inner[4:-4, 4:-4] = 1  # at the border the slope is unknown
     here = render(wall, camera, TRUE_POSE.float(), BLACK)
     image = here.color + 0.05
-    found = curvature(here, image, inner, camera, 0.01)
+    found = curvature(here, image, inner, camera)
     columns = []
     for axis in range(6):
         xi = torch.zeros(6, dtype=torch.float64)
