@@ -19,6 +19,7 @@ from torch import Tensor
 from minislam.config import SlamConfig
 from minislam.errors import InputError, MinislamError, TrackingLost
 from minislam.geometry import se3_inverse
+from minislam.images import resample
 from minislam.mapping import Mapper
 from minislam.priors.high_resolution import HighResolutionFeatures
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
@@ -34,7 +35,6 @@ from minislam.uncertainty import (
     beta_of_mask,
     tracking_weight,
 )
-from minislam.images import resample
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Slam(Stateful):
             self.steps.finish(stage, done + 1, len(others))
 
     def _static_weight(self, index: int) -> Tensor:
-        """Return the static weight (h, w) of each cell of a keyframe, in (0, 1], by the present MLP.
+        """Return the static weight (h, w) of the cells of a keyframe, in (0, 1], by the MLP.
 
         The tracker asks for it when a keyframe comes, at the end of the warm-up and in the final
         adjustment, so online a keyframe keeps the beta that it had when it came. Without a depth

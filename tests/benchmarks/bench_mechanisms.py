@@ -23,6 +23,7 @@ from minislam.config import PRESETS, SlamConfig, preset, with_settings
 from minislam.data import InputOptions, open_sequence
 from minislam.evaluation.metrics import MappedView, measure_run
 from minislam.geometry import se3_inverse
+from minislam.images import resample
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence, Trajectory
 from minislam.runs.run import choose_priors
@@ -30,7 +31,6 @@ from minislam.slam import Slam
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.relocalisation import Relocaliser
 from minislam.tracking.trajectory import pose_all_frames
-from minislam.images import resample
 from tests.benchmarks.bench_movers import ate, keyframe_error, tracked
 from tests.benchmarks.incidents import COVERED, covered_clip, standing_clip
 
