@@ -1,3 +1,6 @@
-"""minislam: monocular Gaussian-splatting SLAM for scenes with moving objects (WildGS-SLAM)."""
+"""WildGS-SLAM in plain Python: monocular Gaussian-splatting SLAM for scenes with moving objects.
+
+Begin with `Slam.run` in slam.py, the whole system on one screen.
+"""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""Named constants: the form every configuration dataclass is written in."""
+"""The form of a setting: a dataclass field with a default and a meaning."""
 
 from dataclasses import field
 from typing import Any

@@ -34,7 +34,7 @@ ALLOWED = {
     "checks": [*FOUNDATION, *ALGORITHMS, "evaluation"],
 }
 # ... but these, which put the system together.
-TOP = ["allocator", "slam", "runs", "cli", "__main__"]
+TOP = ["slam", "runs", "cli", "__main__"]
 RUN_TIME_LIBRARIES = {"numpy", "scipy", "torch", "matplotlib", "cv2"}
 
 

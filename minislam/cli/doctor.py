@@ -1,4 +1,4 @@
-"""The sub-command `minislam doctor`: what is installed, does it work, which files are these."""
+"""The sub-command `minislam doctor`: checks the installation, and recognises checkpoint files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BYTES_PER_MEGABYTE = 1e6
 
 def add_doctor_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
     """Add `doctor` to the sub-commands of a parser."""
-    parser = subparsers.add_parser("doctor", help="say what is installed and whether it works")
+    parser = subparsers.add_parser("doctor", help="show what is installed and check that it works")
     parser.add_argument(
         "--weights", metavar="DIR", help="recognise the checkpoint files in a folder instead"
     )
@@ -38,7 +38,7 @@ def run_doctor(args: argparse.Namespace) -> int:
 
 
 def _print_installation() -> int:
-    """Print versions and threads, and measure a flow that is known."""
+    """Print versions and threads, and compare an estimated flow with the known one."""
     import platform
 
     import torch
@@ -96,7 +96,7 @@ def _print_checkpoints(folder: Path) -> int:
 
 
 def _verdict(file: Path) -> str:
-    """Say which network a file belongs to, and whether it is complete."""
+    """Return which network a file belongs to, and whether it is complete."""
     from minislam.priors.networks.checkpoints import load_checkpoint
     from minislam.priors.networks.table import describe
 

@@ -1,4 +1,4 @@
-"""What the user may say about the input."""
+"""Input options: which frames to read, at which size, with which camera."""
 
 import math
 from dataclasses import dataclass, fields

@@ -1,4 +1,4 @@
-"""The folder of one run: what is in it, under which names, written whole or not at all."""
+"""The folder of one run: names and formats of its files. Each file is written atomically."""
 
 import io
 import re
@@ -72,7 +72,7 @@ class RunFolder:
         return cls(path)
 
     def write_config(self, config: dict[str, Any]) -> None:
-        """Write the resolved configuration."""
+        """Write sequence, input, priors and settings."""
         write_json(self.path / CONFIG, config)
 
     def write_run(self, facts: dict[str, Any]) -> None:
@@ -80,7 +80,7 @@ class RunFolder:
         write_json(self.path / RUN, facts)
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Write the comparison with the truth."""
+        """Write the errors against the ground truth."""
         write_json(self.path / METRICS, metrics)
 
     def write_trajectory(self, trajectory: Trajectory) -> None:
@@ -122,11 +122,11 @@ class RunFolder:
         write_text(self.path / REPORT, html)
 
     def write_checkpoint(self, tree: dict[str, Any]) -> None:
-        """Write what an interrupted run needs to go on."""
+        """Write the state from which an interrupted run can continue."""
         write_checkpoint(self.path / CHECKPOINT, tree)
 
     def read_checkpoint(self) -> dict[str, Any]:
-        """Return what an interrupted run needs to go on."""
+        """Return the state from which an interrupted run can continue."""
         if not (self.path / CHECKPOINT).exists():
             raise InputError(
                 f"expected {CHECKPOINT} of an interrupted run in {self.path}, found none; give the "
@@ -135,11 +135,11 @@ class RunFolder:
         return read_checkpoint(self.path / CHECKPOINT)
 
     def remove_checkpoint(self) -> None:
-        """Remove what a finished run no longer needs."""
+        """Remove the checkpoint, which a finished run does not need."""
         (self.path / CHECKPOINT).unlink(missing_ok=True)
 
     def read_config(self) -> dict[str, Any]:
-        """Return the resolved configuration of the run."""
+        """Return sequence, input, priors and settings."""
         return read_json(self.path / CONFIG)
 
     def read_run(self) -> dict[str, Any]:
@@ -147,7 +147,7 @@ class RunFolder:
         return read_json(self.path / RUN)
 
     def read_metrics(self) -> dict[str, Any]:
-        """Return the comparison with the truth."""
+        """Return the errors against the ground truth."""
         return read_json(self.path / METRICS)
 
     def read_trajectory(self) -> Trajectory:

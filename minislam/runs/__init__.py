@@ -1,1 +1,5 @@
-"""One run, from the name of a sequence to a folder of results, and how it goes on later."""
+"""One run, from a sequence to a folder of results (files: see the end of `minislam run --help`).
+
+run.py does a run from its start to its folder; facts.py says what run.json and metrics.json hold;
+pictures.py draws; resume.py saves checkpoints and restores them.
+"""

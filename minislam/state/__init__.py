@@ -1,1 +1,1 @@
-"""What an interrupted run needs to go on: the state of its parts, and the steps it has done."""
+"""A resumed run needs the state of its parts (stateful.py) and its finished steps (steps.py)."""
