@@ -78,7 +78,7 @@ def culling(clip: Source, config: SlamConfig) -> Rows:
 
 
 def relocalisation(clip: Source, config: SlamConfig) -> Rows:
-    """Cover the camera for 20 of 100 frames; then it is where it was, or at an earlier place."""
+    """Cover the camera for 15 frames; then it is where it was, or at an earlier place."""
     clips = {"same place": COVERED, "earlier place": FAR_BACK}
     for heading, first_after in clips.items():
         sequence = covered_clip(clip.name, clip.seed, clip.size, first_after)
@@ -191,8 +191,8 @@ def measured(
 
 
 def chosen(metrics: dict[str, float | None], *names: str) -> dict[str, float]:
-    """Return some of the metrics."""
-    return {name: metrics[name] for name in names}
+    """Return some of the metrics, without those that are unknown."""
+    return {name: metrics[name] for name in names if metrics[name] is not None}
 
 
 def main() -> None:

@@ -12,9 +12,10 @@ from data_synth.sequence import in_order
 from minislam.geometry import Camera
 from minislam.records import Frame, Trajectory
 
-FRAMES = 100  # of every clip
+FRAMES = 100  # of a clip with a pause
 STANDS, MOVES_ON = 40, 70  # frames between which the camera stands while the dynamic objects go on
-COVERED, UNCOVERED = 50, 70  # frames between which every image is black
+COVERED, UNCOVERED = 75, 90  # frames between which every image is black; the warm-up is over
+FRAMES_AFTER = 25  # that follow the black ones
 
 
 class Clip:
@@ -79,8 +80,8 @@ def standing_clip(name: str, seed: int, size: tuple[int, int]) -> Clip:
 def covered_clip(name: str, seed: int, size: tuple[int, int], first_after: int) -> Clip:
     """Return a clip with black images in its middle; they are followed by frame `first_after`."""
     view, intrinsics = scene(name, seed), default_intrinsics(size)
-    shown = [*range(UNCOVERED), *range(first_after, first_after + FRAMES - UNCOVERED)]
-    frames = list(in_order(lambda i: render_frame(view, intrinsics, shown[i]), FRAMES))
+    shown = [*range(UNCOVERED), *range(first_after, first_after + FRAMES_AFTER)]
+    frames = list(in_order(lambda i: render_frame(view, intrinsics, shown[i]), len(shown)))
     for index in range(COVERED, UNCOVERED):
         frames[index] = replace(frames[index], rgb=np.zeros_like(frames[index].rgb))
     return Clip(f"covered:{name}:{seed}", frames, intrinsics)
