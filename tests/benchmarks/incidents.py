@@ -12,8 +12,8 @@ from data_synth.sequence import in_order
 from minislam.geometry import Camera
 from minislam.records import Frame, Trajectory
 
-FRAMES = 100  # of a clip with a pause
-STANDS, MOVES_ON = 40, 70  # frames between which the camera stands while the dynamic objects go on
+FRAMES = 115  # of a clip with a pause
+STANDS, MOVES_ON = 70, 100  # frames between which the camera stands, after the warm-up
 COVERED, UNCOVERED = 75, 90  # frames between which every image is black; the warm-up is over
 FRAMES_AFTER = 25  # that follow the black ones
 
