@@ -16,11 +16,10 @@ from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid_network import (
     LEVELS,
     STRIDE,
-    Context,
+    EncodedFrames,
     cell_grid,
     correlation_pyramid,
-    encode_context,
-    encode_features,
+    encode,
     look_up,
     update,
 )
@@ -45,14 +44,6 @@ class DroidFlowConfig:
 
 
 @dataclass(frozen=True)
-class EncodedFrame:
-    """What the network knows about one frame."""
-
-    features: Tensor  # (1, 128, h, w)
-    context: Context
-
-
-@dataclass(frozen=True)
 class _EdgeState:
     hidden: Tensor  # (128, h, w)
     target: Tensor  # (h, w, 2) cells
@@ -66,7 +57,7 @@ class DroidFlow(Stateful):
     def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
         self.weights = weights
         self.config = config or DroidFlowConfig()
-        self._frames: dict[int, EncodedFrame] = {}
+        self._frames: dict[int, EncodedFrames] = {}
         self._edges: dict[tuple[int, int], _EdgeState] = {}
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
@@ -120,15 +111,18 @@ class DroidFlow(Stateful):
         targets = torch.cat([self._frames[target].features for _, target in edges])
         known = [self._edges.get(edge) for edge in edges]
         hidden = [
-            state.hidden[None] if state else source.context.hidden
+            state.hidden[None] if state else source.hidden
             for state, source in zip(known, sources, strict=True)
         ]
         last = [
             state.target if state else where for state, where in zip(known, expected, strict=True)
         ]
         refined = self.refine(
-            torch.cat([source.features for source in sources]),
-            Context(torch.cat(hidden), torch.cat([s.context.features for s in sources])),
+            EncodedFrames(
+                torch.cat([source.features for source in sources]),
+                torch.cat(hidden),
+                torch.cat([source.context for source in sources]),
+            ),
             targets,
             expected,
             torch.stack(last),
@@ -138,33 +132,33 @@ class DroidFlow(Stateful):
 
     def refine(
         self,
-        source_features: Tensor,  # (E, 128, h, w)
-        source_context: Context,  # of E frames
+        source: EncodedFrames,  # of E edges
         target_features: Tensor,  # (E, 128, h, w)
         expected: Tensor,  # (E, h, w, 2) cells
         last_target: Tensor,  # (E, h, w, 2) cells
         updates: int,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Run updates; return hidden states, targets [cells] and confidences."""
-        pyramid = correlation_pyramid(source_features, target_features)
-        hidden, context = source_context.hidden, source_context.features
+        pyramid = correlation_pyramid(source.features, target_features)
+        hidden = source.hidden
         for _ in range(updates):
             correlation = look_up(pyramid, expected)
-            answer = update(self.weights, hidden, context, correlation, expected, last_target)
+            answer = update(
+                self.weights, hidden, source.context, correlation, expected, last_target
+            )
             hidden, last_target = answer.hidden, expected + answer.revision
             expected = last_target  # the best guess until the geometry is updated
         return hidden, last_target, answer.confidence
 
     @torch.no_grad()
-    def encode(self, image: Tensor) -> EncodedFrame:
+    def encode(self, image: Tensor) -> EncodedFrames:
         """Return features and context of an image (H, W, 3)."""
         if min(image.shape[:2]) <= STRIDE * (_SMALLEST_GRID - 1):
             raise InputError(
                 f"expected images of more than {STRIDE * (_SMALLEST_GRID - 1)} px per side for "
                 f"DROID, found {image.shape[1]}x{image.shape[0]}; give a larger working size"
             )
-        seen = normalise(image, self.weights.device)
-        return EncodedFrame(encode_features(self.weights, seen), encode_context(self.weights, seen))
+        return encode(self.weights, normalise(image, self.weights.device))
 
     def as_matches(self, targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatches:
         """Return targets [cells] and confidences (E, h, w, 2) as matches in px, like a tensor."""
@@ -183,15 +177,15 @@ class DroidFlow(Stateful):
 class DroidChain(Stateful):
     """The flow from one reference frame to the newest; a `FlowChain` that never changes."""
 
-    _reference: EncodedFrame
-    _newest: EncodedFrame
+    _reference: EncodedFrames
+    _newest: EncodedFrames
     _target: Tensor | None  # (1, h, w, 2) cells, None: nothing has moved yet
 
     def __init__(
         self,
         flow: DroidFlow,
-        reference: EncodedFrame,
-        newest: EncodedFrame | None,
+        reference: EncodedFrames,
+        newest: EncodedFrames | None,
         target: Tensor | None,
     ) -> None:
         self._flow = flow
@@ -208,13 +202,9 @@ class DroidChain(Stateful):
         if expected is None:
             height, width = reference.features.shape[2:]
             expected = cell_grid(reference.features.new_zeros(1, height, width, 2))[None]
+        updates = self._flow.config.chain_updates
         _, target, confidence = self._flow.refine(
-            reference.features,
-            reference.context,
-            newest.features,
-            expected,
-            expected,
-            self._flow.config.chain_updates,
+            reference, newest.features, expected, expected, updates
         )
         matches = self._flow.as_matches(target, confidence, image)
         return DroidChain(self._flow, reference, newest, target), matches

@@ -23,11 +23,12 @@ _MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
 
 
 @dataclass(frozen=True)
-class Context:
-    """Input of the recurrent unit from the source frame."""
+class EncodedFrames:
+    """What the network knows of B frames."""
 
-    hidden: Tensor  # (B, 128, h, w) initial hidden state
-    features: Tensor  # (B, 128, h, w) input of every update
+    features: Tensor  # (B, 128, h, w) compared between frames
+    hidden: Tensor  # (B, 128, h, w) initial hidden state of the recurrent unit
+    context: Tensor  # (B, 128, h, w) input of every update
 
 
 @dataclass(frozen=True)
@@ -39,15 +40,11 @@ class Update:
     confidence: Tensor  # (E, h, w, 2) in (0, 1), for u and v
 
 
-def encode_features(weights: Weights, image: Tensor) -> Tensor:  # (B, 128, h, w)
-    """Return the features that frames are compared by, of normalised images (B, 3, H, W)."""
-    return _encode(weights.below("fnet."), image, normalised=True)
-
-
-def encode_context(weights: Weights, image: Tensor) -> Context:
-    """Return the start of the hidden state and the context of normalised images (B, 3, H, W)."""
+def encode(weights: Weights, image: Tensor) -> EncodedFrames:
+    """Return features, hidden state and context of normalised images (B, 3, H, W)."""
+    features = _encode(weights.below("fnet."), image, normalised=True)
     both = _encode(weights.below("cnet."), image, normalised=False)
-    return Context(both[:, :CHANNELS].tanh(), both[:, CHANNELS:].relu())
+    return EncodedFrames(features, both[:, :CHANNELS].tanh(), both[:, CHANNELS:].relu())
 
 
 def _encode(weights: Weights, x: Tensor, normalised: bool) -> Tensor:

@@ -65,8 +65,8 @@ def test_matches_are_the_networks_answer_in_pixels():
     pyramid = correlation_pyramid(source.features, target.features)
     answer = update(
         weights(),
-        source.context.hidden,
-        source.context.features,
+        source.hidden,
+        source.context,
         look_up(pyramid, expected),
         expected,
         expected,

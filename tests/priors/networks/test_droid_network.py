@@ -9,12 +9,11 @@ import torch
 
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid_network import (
-    Context,
+    EncodedFrames,
     Update,
     cell_grid,
     correlation_pyramid,
-    encode_context,
-    encode_features,
+    encode,
     look_up,
     update,
 )
@@ -62,20 +61,20 @@ def assert_golden(actual: torch.Tensor, name: str) -> None:
 
 @cache
 @torch.inference_mode()
-def encoded() -> tuple[torch.Tensor, Context]:
+def encoded() -> EncodedFrames:
     images = torch.cat([normalise(moving_image(f), torch.device("cpu")) for f in range(3)])
-    return encode_features(weights(), images), encode_context(weights(), images)
+    return encode(weights(), images)
 
 
 @cache
 @torch.inference_mode()
 def updated(iteration: int) -> Update:
     """Return the update of the stored protocol, each iteration from the official state."""
-    features, context = encoded()
-    pyramid = correlation_pyramid(features[SOURCES], features[TARGETS])
+    frames = encoded()
+    pyramid = correlation_pyramid(frames.features[SOURCES], frames.features[TARGETS])
     expected = stored()[f"coords_it{iteration}"]
     if iteration == 1:
-        hidden = context.hidden[SOURCES]
+        hidden = frames.hidden[SOURCES]
         last_target = expected + torch.tensor([0.25, -0.5])
     else:
         hidden = updated(1).hidden
@@ -83,17 +82,17 @@ def updated(iteration: int) -> Update:
     correlation = look_up(pyramid, expected)
     if iteration == 1:
         assert_golden(correlation, "corr_it1")
-    return update(weights(), hidden, context.features[SOURCES], correlation, expected, last_target)
+    return update(weights(), hidden, frames.context[SOURCES], correlation, expected, last_target)
 
 
 # Known answers
 
 
 def test_encoders_are_those_of_the_official_code():
-    features, context = encoded()
-    assert_golden(features, "fmap")
-    assert_golden(context.hidden, "net0")
-    assert_golden(context.features, "inp")
+    frames = encoded()
+    assert_golden(frames.features, "fmap")
+    assert_golden(frames.hidden, "net0")
+    assert_golden(frames.context, "inp")
 
 
 @pytest.mark.parametrize("iteration", [1, 2])
@@ -106,11 +105,11 @@ def test_updates_are_those_of_the_official_code(iteration: int):
 
 @torch.inference_mode()
 def test_the_first_look_between_frames_is_that_of_the_official_code():
-    features, context = encoded()
-    pyramid = correlation_pyramid(features[:1], features[1:2])
+    frames = encoded()
+    pyramid = correlation_pyramid(frames.features[:1], frames.features[1:2])
     still = cell_grid(torch.zeros(1, 16, 20, 2))[None]
     correlation = look_up(pyramid, still)
-    hidden, seen = context.hidden[:1], context.features[:1]
+    hidden, seen = frames.hidden[:1], frames.context[:1]
     found = update(weights(), hidden, seen, correlation, still, still)
     assert_golden(found.revision, "mf_delta")
     assert_golden(found.confidence, "mf_weight")
@@ -146,10 +145,10 @@ def test_a_wider_head_of_a_checkpoint_is_cut():
 
 def test_edges_do_not_influence_each_other():
     found = updated(1)
-    features, context = encoded()
-    pyramid = correlation_pyramid(features[[2]], features[[1]])
+    frames = encoded()
+    pyramid = correlation_pyramid(frames.features[[2]], frames.features[[1]])
     expected = stored()["coords_it1"][3:]
     last_target = expected + torch.tensor([0.25, -0.5])
-    hidden, seen = context.hidden[[2]], context.features[[2]]
+    hidden, seen = frames.hidden[[2]], frames.context[[2]]
     alone = update(weights(), hidden, seen, look_up(pyramid, expected), expected, last_target)
     torch.testing.assert_close(alone.revision[0], found.revision[3], atol=1e-4, rtol=0)
