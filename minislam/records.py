@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
@@ -42,6 +43,38 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+
+class TrackingStatus(Enum):
+    """What the tracker knows about one frame."""
+
+    INITIALISING = "initialising"  # followed, but there is no map yet
+    OK = "ok"
+    RECENTLY_LOST = "recently lost"  # the view is expected back where it was lost
+    LOST = "lost"  # the view may come back anywhere
+
+    @property
+    def is_followed(self) -> bool:
+        """Tell whether the frame gets a pose."""
+        return self in (TrackingStatus.INITIALISING, TrackingStatus.OK)
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Tracking result of one frame."""
+
+    frame_index: int
+    timestamp: float  # second
+    status: TrackingStatus
+    matched_ratio: float  # of the last keyframe, [-]
+
+
+@dataclass(frozen=True)
+class TrackingStep:
+    """What one frame changed among the keyframes."""
+
+    has_new_keyframes: bool
+    first_moved: int  # first keyframe that moved since the last new keyframe; their number: none
 
 
 class GroundTruth(Protocol):

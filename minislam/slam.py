@@ -26,8 +26,8 @@ from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimat
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.tracking.focal_length import FocalLengthFit, check_focal_length
-from minislam.tracking.structure import depth_from_disparities
+from minislam.tracking.safeguards.focal_length import FocalLengthFit, check_focal_length
+from minislam.tracking.safeguards.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty import (
@@ -97,10 +97,10 @@ class Slam(Stateful):
         warmup = self.config.tracking.warmup_keyframes
         for frame in self._frames_left():
             with self.steps.timed("tracking"):
-                is_keyframe = self.tracker.track(frame)
-            if is_keyframe and self.tracker.initialised:
-                self._map_new_keyframes()
-            elif is_keyframe and len(self.tracker.keyframes) >= warmup:
+                step = self.tracker.track(frame)
+            if step.has_new_keyframes and self.tracker.initialised:
+                self._map_new_keyframes(step.first_moved)
+            elif step.has_new_keyframes and len(self.tracker.keyframes) >= warmup:
                 self._initialise()
             self.steps.finish("tracking and mapping", frame.frame_index + 1, len(self.sequence))
         if not self.tracker.initialised:
@@ -133,17 +133,17 @@ class Slam(Stateful):
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
 
-    def _map_new_keyframes(self) -> None:
+    def _map_new_keyframes(self, first_moved: int) -> None:
         with self.steps.timed("mapping"):
             mapped = len(self.mapper.keyframes)
-            self._move_map(first_changed=min(mapped, self.tracker.backend.take_first_moved()))
+            self._move_map(first_changed=min(mapped, first_moved))
             for index in range(mapped, len(self.tracker.keyframes)):
                 self.mapper.integrate(self._keyframe(index))
             self._record_mlp()
 
     def _adjust_all(self) -> None:
         self.tracker.finish(self.steps.on_progress("final adjustment"))
-        self.focal_length = check_focal_length(self.tracker.backend)
+        self.focal_length = check_focal_length(self.tracker.graph)
 
     def _refine_map(self) -> None:
         stage = "refining the map"
@@ -238,7 +238,7 @@ class Slam(Stateful):
         metric_depth = self.tracker.keyframes.metric_depths[index]
         if metric_depth is not None:
             return metric_depth
-        return depth_from_disparities(self.tracker.backend, index)
+        return depth_from_disparities(self.tracker.graph, index)
 
     # Results ------------------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """Checkpoint files: a tree of plain values as named arrays and one text, in a .npz file.
 
 Nothing in such a file is ever executed. `numpy.load` opens it, and the name of an array is its
-path in the tree: "slam/tracker/backend/keyframes/disparities".
+path in the tree: "slam/tracker/graph/keyframes/disparities".
 """
 
 import io

@@ -128,6 +128,11 @@ class ClassicalFlow(Stateful):
         standing = np.zeros((*gray.shape, 2), np.float32)
         return FlowChain(gray, gray, standing, standing, self.config)
 
+    def restore_chain(self, state: Tree, frame_of: FrameOf) -> "FlowChain":
+        """Return the chain whose saved state this is."""
+        arrays = (state[name] for name in ("_reference", "_newest", "_flow", "_increment"))
+        return FlowChain(*arrays, self.config)
+
 
 class FlowChain(Stateful):
     """The flow from one reference frame to the newest frame, updated frame by frame.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.records import Frame
+from minislam.state.stateful import FrameOf, Tree
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,9 @@ class FlowEstimator(Protocol):
 
     def start_chain(self, image: Tensor) -> FlowChain:
         """Return a chain whose reference is this image (H, W, 3)."""
+
+    def restore_chain(self, state: Tree, frame_of: FrameOf) -> FlowChain:
+        """Return the chain whose saved state this is."""
 
 
 class FeatureExtractor(Protocol):

@@ -37,14 +37,14 @@ def run_facts(
         "failed_adjustments": failed,
         "gaussians": len(slam.mapper.gaussians),
         "focal_length": asdict(slam.focal_length) if slam.focal_length else None,
-        "health": [asdict(health) for health in slam.tracker.health],
+        "keyframe_diagnostics": [asdict(d) for d in slam.tracker.diagnostics],
     }
 
 
 def failed_adjustments(slam: Slam) -> tuple[int, int]:
     """Return how many bundle adjustments failed, and how many there were."""
-    reports = slam.tracker.backend.reports
-    return sum(not report.converged for report in reports), len(reports)
+    adjustments = slam.tracker.graph.adjustments
+    return adjustments.failed, adjustments.count
 
 
 def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
@@ -114,12 +114,12 @@ def _focal_length_warnings(slam: Slam) -> list[str]:
 
 
 def _parallax_warnings(slam: Slam) -> list[str]:
-    health = slam.tracker.health
-    least = slam.config.tracking.min_parallax * slam.tracker.backend.pixel_scale
-    without = sum(keyframe.parallax < least for keyframe in health)
-    if not without or 2 * without < len(health):
+    diagnostics = slam.tracker.diagnostics
+    least = slam.config.tracking.min_parallax * slam.tracker.graph.pixel_scale
+    without = sum(keyframe.parallax < least for keyframe in diagnostics)
+    if not without or 2 * without < len(diagnostics):
         return []
     return [
-        f"{without} of {len(health)} keyframes show hardly any parallax: the camera turned or "
+        f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera turned or "
         "stood still, so the distances it moved are not determined"
     ]

@@ -1,0 +1,22 @@
+"""Tracking (paper Sec. 3.3): poses and disparities of keyframes from optical flow.
+
+Reading order:
+
+    grid                the cells of the image on which everything is measured
+    reprojection        where a cell of one keyframe is seen in another, with derivatives
+    robust              the robust weight inside Sigma
+    bundle_adjustment   dense bundle adjustment, Eq. (5); reference.py is its slow twin
+    disparity_prior     the mask M of the disparity prior, Eq. (8)
+    keyframes           the store: all that is known of each keyframe
+    frame_graph         the edges between keyframes and the flow along them; the flow distance
+    pose_from_flow      pose and disparities of a new image
+    keyframe_graph      keyframes and links together: matching, covisibility
+    optimisation        local BA, online global BA, final global BA
+    initialisation      the first geometry, from flow alone
+    keyframe_selection  which frames become keyframes
+    loop_closure        global BA when the camera is back at a place
+    tracker             the whole: one frame after the other, from warm-up to final BA
+    trajectory          poses of the frames between the keyframes
+    safeguards/         what real footage needs and the paper does not have
+    config              the settings
+"""

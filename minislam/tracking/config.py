@@ -16,12 +16,6 @@ class TrackingConfig:
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement"
     )
-    cull_fraction: float = parameter(
-        0.3,
-        "a keyframe nearer to the last than this part of the flow that made it is culled [-]; "
-        "official code: 3 of 24 px",
-    )
-    max_culled_in_a_row: int = parameter(2, "keyframes culled one after the other, official code")
     recently_lost_frames: int = parameter(
         15, "a camera lost for longer is expected anywhere [frames]"
     )
@@ -29,9 +23,6 @@ class TrackingConfig:
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     window: int = parameter(10, "newest keyframes that the local BA moves")
-    neighbourhood: int = parameter(5, "every keyframe is linked with so many predecessors")
-    proximity_edges: int = parameter(2, "further links of a new keyframe, nearest by flow distance")
-    proximity_distance: float = parameter(120.0, "largest flow distance of a proximity link [px]")
     min_link_ratio: float = parameter(
         0.1, "a link beyond the neighbourhood needs this much of its flow confirmed [-]"
     )
@@ -74,28 +65,9 @@ class TrackingConfig:
     global_interval: int = parameter(
         20, "keyframes between two online global BAs; 0: none [keyframes], paper supplement"
     )
-    global_iterations: int = parameter(4, "Gauss-Newton steps of an online global BA")
     loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
     loop_min_gap: int = parameter(20, "keyframes between the ends of a loop, official code")
     loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")
     loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
-    loop_suppression: int = parameter(10, "no second loop so near to another [keyframes], official")
-    max_loop_residual: float = parameter(3.0, "a loop that stays worse than this is undone [px]")
     final_rounds: int = parameter(2, "rounds of the final global BA, paper supplement")
-    final_iterations: int = parameter(4, "Gauss-Newton steps per round of the final global BA")
-    final_edges: int = parameter(6, "further links per keyframe in the final global BA")
-    final_distance: float = parameter(45.0, "largest flow distance of such a link [px]")
     final_prior: bool = parameter(False, "keep the disparity prior in the final BA (an ablation)")
-    rotation_weight: float = parameter(
-        0.75,
-        "beta of the flow distance: weight of the full motion, the rest is without rotation [-]",
-    )
-    keyframe_matched_ratio: float = parameter(
-        0.2, "less of the last keyframe matched than this makes a new one [-]"
-    )
-    min_matched_ratio: float = parameter(
-        0.1, "a frame in which less of the last keyframe is matched is lost [-]"
-    )
-    max_disparity_error: float = parameter(
-        0.05, "relative disagreement of two views of a point that still counts as agreement [-]"
-    )

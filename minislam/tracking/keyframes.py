@@ -1,4 +1,4 @@
-"""The tracker's memory: one row per keyframe, growing as long as the sequence does."""
+"""The tracker's store of keyframes: one row each, growing as long as the sequence does."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from minislam.state.stateful import Stateful
 
 
 class KeyframeStore(Stateful):
-    """Everything the tracker knows of its keyframes."""
+    """Everything the tracker knows of its keyframes. Only its methods write to its columns."""
 
     frames: list[Frame]
     features: list[Tensor]  # (h', w', C); saved, because a network takes long to compute them
@@ -17,8 +17,8 @@ class KeyframeStore(Stateful):
     disparities: Tensor  # (K, N) 1/world unit
     prior_disparities: Tensor  # (K, N) 1/D~, 0 where unknown
     prior_masks: Tensor  # (K, N) M; False: prior off
-    static_weights: Tensor  # (K, N) what beta leaves of a cell's weight
-    motion_trust: Tensor  # (K, N) how well a cell has followed the camera
+    static_weights: Tensor  # (K, N) in [0, 1], from beta
+    motion_weights: Tensor  # (K, N) in [0, 1], how well a cell has followed the camera
 
     def __init__(self, cells: int) -> None:
         self.frames = []
@@ -29,7 +29,7 @@ class KeyframeStore(Stateful):
         self.prior_disparities = torch.zeros(0, cells)
         self.prior_masks = torch.zeros(0, cells, dtype=torch.bool)
         self.static_weights = torch.zeros(0, cells)
-        self.motion_trust = torch.zeros(0, cells)
+        self.motion_weights = torch.zeros(0, cells)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -40,9 +40,9 @@ class KeyframeStore(Stateful):
         return any(depth is not None for depth in self.metric_depths)
 
     @property
-    def trust(self) -> Tensor:  # (K, N) in [0, 1]
-        """How far each cell counts as static, by what it looks like and by what it did."""
-        return self.static_weights * self.motion_trust
+    def cell_weights(self) -> Tensor:  # (K, N) in [0, 1]
+        """Return the weight of each cell: by its appearance (beta) and by its motion so far."""
+        return self.static_weights * self.motion_weights
 
     def append(
         self,
@@ -53,17 +53,17 @@ class KeyframeStore(Stateful):
         disparities: Tensor,  # (N,)
         prior_disparities: Tensor,  # (N,)
     ) -> None:
-        """Add one keyframe, at first with full trust in every cell."""
+        """Add one keyframe. Every cell starts with weight one."""
         self.frames.append(frame)
         self.features.append(features)
         self.metric_depths.append(metric_depth)
         self.T_camera_world = torch.cat([self.T_camera_world, T_camera_world[None].double()])
         self.disparities = torch.cat([self.disparities, disparities[None]])
         self.prior_disparities = torch.cat([self.prior_disparities, prior_disparities[None]])
-        trusted = torch.ones_like(disparities)
-        self.prior_masks = torch.cat([self.prior_masks, trusted[None].bool()])
-        self.static_weights = torch.cat([self.static_weights, trusted[None]])
-        self.motion_trust = torch.cat([self.motion_trust, trusted[None]])
+        ones = torch.ones_like(disparities)[None]
+        self.prior_masks = torch.cat([self.prior_masks, ones.bool()])
+        self.static_weights = torch.cat([self.static_weights, ones])
+        self.motion_weights = torch.cat([self.motion_weights, ones])
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
@@ -74,4 +74,27 @@ class KeyframeStore(Stateful):
         self.prior_disparities = self.prior_disparities[:-1]
         self.prior_masks = self.prior_masks[:-1]
         self.static_weights = self.static_weights[:-1]
-        self.motion_trust = self.motion_trust[:-1]
+        self.motion_weights = self.motion_weights[:-1]
+
+    def set_geometry(self, T_camera_world: Tensor, disparities: Tensor) -> None:
+        """Replace the poses (K, 4, 4) and disparities (K, N) of all keyframes."""
+        self.T_camera_world = T_camera_world
+        self.disparities = disparities
+
+    def set_prior_mask(self, index: int, mask: Tensor) -> None:
+        """Replace the mask M (N,) bool of a keyframe."""
+        self.prior_masks[index] = mask
+
+    def set_static_weight(self, index: int, weight: Tensor) -> None:
+        """Replace the static weight (N,) of a keyframe, after beta was predicted again."""
+        self.static_weights[index] = weight
+
+    def set_motion_weight(self, index: int, weight: Tensor) -> None:
+        """Replace the motion weight (N,) of a keyframe."""
+        self.motion_weights[index] = weight
+
+    def normalise_scale(self) -> None:
+        """Set the unit of length so that the median disparity is one: nothing else fixes it."""
+        scale = self.disparities.median()
+        self.disparities /= scale
+        self.T_camera_world[:, :3, 3] *= float(scale)

@@ -1,17 +1,26 @@
-"""Loop closure: the camera is back at a place, and what has drifted since is set right.
+"""Loop closure: when the camera is back at a place, the drift since then is corrected.
 
-A loop is looked for where the present geometry predicts it (as in the paper), so it is found
-while the drift is small against the image. Its flow must be matched in both directions, and the
-adjustment must bring its residuals down, or all is as it was before.
+A loop is searched where the present geometry predicts it (as in the paper), so it is found while
+the drift is small against the image. Its flow must be matched in both directions, and the global
+BA must bring its residuals down; otherwise the BA is undone.
 """
 
 import torch
 from torch import Tensor
 
-from minislam.tracking.backend import FIRST_WIDENING, BackEnd
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import FAR, both_directions, proximity_pairs
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import (
+    FIRST_WIDENING,
+    GLOBAL_ITERATIONS,
+    adjust,
+    bundle_problem,
+)
 from minislam.tracking.reprojection import lengths
+
+LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code
+MAX_LOOP_RESIDUAL = 3.0  # px at 320x240: a loop that stays worse than this is undone
 
 
 def loop_pairs(
@@ -32,41 +41,41 @@ def loop_pairs(
     return proximity_pairs(candidates, far_edges, newer, max_distance, limit, suppression)
 
 
-def close_loops(backend: BackEnd) -> bool:
+def close_loops(graph: KeyframeGraph) -> bool:
     """Close the loops that end at the newest keyframe; return whether there were any.
 
-    All keyframes move, on the flow that is stored: only the new links are measured.
+    All keyframes move. Stored flow is used again; only the flow of new links is measured.
     """
-    config, newest = backend.config, len(backend.keyframes) - 1
+    config, newest = graph.config, len(graph.keyframes) - 1
     if newest < config.loop_min_gap:
         return False
     pairs = loop_pairs(
-        backend.distances(rows=range(newest, newest + 1)),
-        backend.graph.edges(),
+        graph.distances(rows=range(newest, newest + 1)),
+        graph.links.edges(),
         newest,
-        config.loop_distance * backend.pixel_scale,
+        config.loop_distance * graph.pixel_scale,
         config.loop_min_gap,
         config.loop_edges,
-        config.loop_suppression,
+        LOOP_SUPPRESSION,
     )
-    edges = backend.confirmed(both_directions(pairs))
+    edges = graph.filter_confirmed(both_directions(pairs))
     if not edges:
         return False
-    before, known = backend.state, len(backend.graph)
-    backend.match(edges)
-    backend.adjust(0, config.global_iterations, widening=FIRST_WIDENING)
-    backend.match(edges)
-    backend.adjust(0, config.global_iterations)
-    if _residual(backend, known) <= config.max_loop_residual * backend.pixel_scale:
+    before, known = graph.state, len(graph.links)
+    graph.match(edges)
+    adjust(graph, 0, GLOBAL_ITERATIONS, widening=FIRST_WIDENING)
+    graph.match(edges)
+    adjust(graph, 0, GLOBAL_ITERATIONS)
+    if _residual(graph, known) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
         return True
-    backend.state = before
-    backend.graph.remove_newest(len(backend.graph) - known)
+    graph.keyframes.set_geometry(before.T_camera_world, before.disparities)
+    graph.links.remove_newest(len(graph.links) - known)
     return False
 
 
-def _residual(backend: BackEnd, first_edge: int) -> float:
+def _residual(graph: KeyframeGraph, first_edge: int) -> float:
     """Return the weighted mean length of the residuals of the edges from a position on [px]."""
-    problem = backend.problem(range(first_edge, len(backend.graph)), first_free=0)
-    residual, _ = residuals(problem, backend.state)
+    problem = bundle_problem(graph, range(first_edge, len(graph.links)), first_free=0)
+    residual, _ = residuals(problem, graph.state)
     weight = problem.weights.mean(1)
     return float((weight * lengths(residual)).sum() / weight.sum().clamp_min(1e-6))

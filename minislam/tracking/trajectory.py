@@ -7,14 +7,14 @@ from torch import Tensor
 
 from minislam.geometry import se3_interpolate
 from minislam.records import Sequence
-from minislam.tracking.backend import BackEnd
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, motion_only_adjust
-from minislam.tracking.initialisation import start_pose
+from minislam.tracking.bundle_adjustment import BundleState, motion_only_adjust
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.pose_from_flow import motion_only_problem, start_pose
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.tracker import Tracker
 
 ITERATIONS = 8  # Gauss-Newton steps of six unknowns
-ROBUST_NARROWING = 0.5  # the structure is known by now: a narrower robust weight [-]
+ROBUST_NARROWING = 0.5  # of the robust scale, because the structure is known by now [-]
 
 
 def pose_all_frames(
@@ -22,8 +22,8 @@ def pose_all_frames(
 ) -> dict[int, Tensor]:
     """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
 
-    A keyframe keeps its pose. Another frame starts from the interpolated one and is adjusted on
-    the flow from the keyframe before and the keyframe after it, their structure held.
+    A keyframe keeps its pose. Another frame starts from the interpolated pose and is adjusted on
+    the flow from the keyframe before it and the keyframe after it. Their disparities are held.
     """
     frames, known = tracker.keyframes.frames, tracker.keyframes.T_camera_world
     poses = {frame.frame_index: T for frame, T in zip(frames, known, strict=True)}
@@ -31,20 +31,20 @@ def pose_all_frames(
     for done, tracked in enumerate(others):
         following = sum(f.frame_index < tracked.frame_index for f in frames)
         around = [following - 1]
-        if following < len(frames) and not tracker.follows_a_loss(following):
+        if following < len(frames) and not tracker.graph.follows_a_loss(following):
             around.append(following)
         image = sequence.frame(tracked.frame_index).image
-        poses[tracked.frame_index] = _pose_between(
-            tracker.backend, around, tracked.timestamp, image
-        )
+        poses[tracked.frame_index] = _pose_between(tracker.graph, around, tracked.timestamp, image)
         if progress:
             progress(done + 1, len(others))
     return dict(sorted(poses.items()))
 
 
-def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: Tensor) -> Tensor:
-    """Return T_camera_world of a frame beside one keyframe or between two."""
-    keyframes, grid = backend.keyframes, backend.grid
+def _pose_between(
+    graph: KeyframeGraph, around: list[int], timestamp: float, image: Tensor
+) -> Tensor:
+    """Return T_camera_world (4, 4) of a frame after one keyframe or between two."""
+    keyframes, grid = graph.keyframes, graph.grid
     known = keyframes.T_camera_world[around]
     start = known[0]
     if len(around) == 2:
@@ -57,40 +57,37 @@ def _pose_between(backend: BackEnd, around: list[int], timestamp: float, image: 
 
     transforms = relative_transforms(poses, sources, targets).float()
     predicted, _ = reproject(transforms, disparities, grid.rays, grid.camera)
-    backend.flow.add_frame(newest, image)
-    matches = backend.flow.match(around, [newest] * count, predicted)
-    backend.flow.remove_frame(newest)
+    graph.flow.add_frame(newest, image)
+    matches = graph.flow.match(around, [newest] * count, predicted)
+    graph.flow.remove_frame(newest)
 
-    empty = torch.zeros(count + 1, len(grid.rays))
-    problem = BundleProblem(
-        camera=grid.camera,
-        rays=grid.rays,
-        edges_source=sources,
-        edges_target=targets,
-        targets=matches.targets,
-        weights=matches.confidences * keyframes.trust[around, None],
-        prior_disparities=empty,
-        prior_weights=empty,
+    cell_weights = keyframes.cell_weights[around]
+    problem = motion_only_problem(
+        grid,
+        sources,
+        targets,
+        matches.targets,
+        matches.confidences * cell_weights[:, None],
         free_poses=torch.arange(count + 1) == count,
-        free_disparities=torch.zeros(count + 1, dtype=torch.bool),
-        robust=backend.robust and backend.robust.widened(ROBUST_NARROWING),
+        robust=graph.robust and graph.robust.widened(ROBUST_NARROWING),
     )
     if count == 1:
-        # Nothing holds it from the other side, so it could follow a mover as a keyframe could.
-        trust = keyframes.trust[around[0]]
-        starts = [start, _continued(backend, around[0], timestamp)]
+        # No later keyframe holds it, so it could follow a dynamic object, as a keyframe could.
+        starts = [start, _extrapolate_pose(graph, around[0], timestamp)]
         poses[-1] = start_pose(
-            grid, matches, disparities[0], trust, known[0], starts, backend.robust
+            grid, matches, disparities[0], cell_weights[0], known[0], starts, graph.robust
         )
-    state = BundleState(poses, torch.cat([disparities, empty[:1]]))
-    state, _ = motion_only_adjust(problem, state, ITERATIONS)
+    unused = torch.zeros(1, len(grid.rays))  # disparities of the frame itself
+    state = BundleState(poses, torch.cat([disparities, unused]))
+    state, report = motion_only_adjust(problem, state, ITERATIONS)
+    graph.count_failure(report)
     return state.T_camera_world[-1]
 
 
-def _continued(backend: BackEnd, keyframe: int, timestamp: float) -> Tensor:
-    """Return the pose (4, 4) to which the motion up to a keyframe would have led by now."""
-    before, last = max(keyframe - 1, 0), keyframe
-    poses, frames = backend.keyframes.T_camera_world, backend.keyframes.frames
-    elapsed = frames[last].timestamp - frames[before].timestamp
-    share = (timestamp - frames[before].timestamp) / elapsed if elapsed > 0 else 1.0
-    return se3_interpolate(poses[before], poses[last], share)
+def _extrapolate_pose(graph: KeyframeGraph, keyframe: int, timestamp: float) -> Tensor:
+    """Return the pose (4, 4) at a later time if the motion up to a keyframe goes on."""
+    before = max(keyframe - 1, 0)
+    poses, frames = graph.keyframes.T_camera_world, graph.keyframes.frames
+    elapsed = frames[keyframe].timestamp - frames[before].timestamp
+    fraction = (timestamp - frames[before].timestamp) / elapsed if elapsed > 0 else 1.0
+    return se3_interpolate(poses[before], poses[keyframe], fraction)

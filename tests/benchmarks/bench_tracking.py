@@ -129,10 +129,9 @@ def bench_keyframes() -> None:
     for index, image in enumerate(clip.rgb):
         frame = Frame(index, float(clip.timestamps[index]), torch.from_numpy(image))
         start = time.process_time()
-        is_keyframe = tracker.track(frame)
+        step = tracker.track(frame)
         elapsed = time.process_time() - start
-        everyone_moved = tracker.backend.take_first_moved() == 0  # a loop was closed
-        if is_keyframe and tracker.initialised and not everyone_moved:
+        if step.has_new_keyframes and tracker.initialised and step.first_moved > 0:
             times.append(1e3 * elapsed)
         if not tracker.initialised and len(tracker.keyframes) == tracker.config.warmup_keyframes:
             tracker.initialise()

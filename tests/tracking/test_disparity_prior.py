@@ -18,8 +18,9 @@ from minislam.tracking.disparity_prior import (
     warp_depth,
 )
 from minislam.tracking.grid import Grid
+from minislam.tracking.optimisation import bundle_problem
 from tests.tracking.scene import CAMERA, STRIDE, uniform
-from tests.tracking.wall import back_end
+from tests.tracking.wall import true_graph
 
 CONFIG = TrackingConfig(prior_mask=True)
 EPSILON, GAMMA = 0.02, 0.9  # paper
@@ -174,12 +175,12 @@ def test_cameras_that_look_away_have_no_word():
 # In the back-end
 
 
-def back_end_with_depths(config: TrackingConfig):
+def graph_with_depths(config: TrackingConfig):
     """Return four keyframes in front of the wall; the depth of the last is wrong on the left."""
-    backend = back_end([0, 1, 2, 3], config)
-    keyframes = backend.keyframes
+    graph = true_graph([0, 1, 2, 3], config)
+    keyframes = graph.keyframes
     for index in range(4):
-        disparities = keyframes.disparities[index].reshape(backend.grid.shape)
+        disparities = keyframes.disparities[index].reshape(graph.grid.shape)
         fine = torch.nn.functional.interpolate(
             disparities[None, None], (49, 73), mode="bilinear", align_corners=True
         )
@@ -191,34 +192,34 @@ def back_end_with_depths(config: TrackingConfig):
         keyframes.features[index] = 1.0 + uniform(index, 3, 4, 2).float() / 100
         cells = depth[::STRIDE, ::STRIDE].reshape(-1)
         keyframes.prior_disparities[index] = cells.reciprocal()
-    return backend
+    return graph
 
 
 EDGES = [(3, 0), (0, 3), (3, 1), (1, 3), (3, 2), (2, 3)]
 
 
 def test_the_prior_of_a_masked_cell_has_no_weight():
-    backend = back_end_with_depths(CONFIG)
-    backend.match(EDGES)
-    mask_priors(backend.keyframes, backend.grid, EDGES, CONFIG, first=3)
-    mask = backend.keyframes.prior_masks
+    graph = graph_with_depths(CONFIG)
+    graph.match(EDGES)
+    mask_priors(graph.keyframes, graph.grid, EDGES, CONFIG, first=3)
+    mask = graph.keyframes.prior_masks
     assert mask[:3].all(), "only the keyframes from `first` on are judged"
-    last = mask[3].reshape(backend.grid.shape)
+    last = mask[3].reshape(graph.grid.shape)
     assert last[:, 5:].all() and not last[2:5, 2:5].any()
-    weights = backend.problem(range(len(EDGES)), first_free=0).prior_weights
+    weights = bundle_problem(graph, range(len(EDGES)), first_free=0).prior_weights
     strength = CONFIG.lambda_disparity_prior * CAMERA.fx**2
     assert torch.allclose(weights, strength * mask.float())
 
 
 def test_the_mask_can_be_switched_off():
     off = replace(CONFIG, prior_mask=False)
-    backend = back_end_with_depths(off)
-    mask_priors(backend.keyframes, backend.grid, EDGES, off)
-    assert backend.keyframes.prior_masks.all()
+    graph = graph_with_depths(off)
+    mask_priors(graph.keyframes, graph.grid, EDGES, off)
+    assert graph.keyframes.prior_masks.all()
 
 
 def test_keyframes_without_depth_are_passed_over():
-    backend = back_end_with_depths(CONFIG)
-    backend.keyframes.metric_depths[0] = backend.keyframes.metric_depths[3] = None
-    mask_priors(backend.keyframes, backend.grid, EDGES, CONFIG)
-    assert backend.keyframes.prior_masks.all()
+    graph = graph_with_depths(CONFIG)
+    graph.keyframes.metric_depths[0] = graph.keyframes.metric_depths[3] = None
+    mask_priors(graph.keyframes, graph.grid, EDGES, CONFIG)
+    assert graph.keyframes.prior_masks.all()

@@ -1,5 +1,6 @@
 """The keyframe store: rows that belong together."""
 
+import pytest
 import torch
 
 from minislam.records import Frame
@@ -44,10 +45,35 @@ def test_poses_are_float64_and_cells_float32():
     assert store.disparities.dtype == store.static_weights.dtype == torch.float32
 
 
-def test_a_new_keyframe_is_trusted_and_leaves_the_others_alone():
+def test_a_new_keyframe_has_full_weights_and_leaves_the_others_alone():
     store = filled(2)
-    store.static_weights[0] = 0.25
+    store.set_static_weight(0, torch.full((CELLS,), 0.25))
     frame = Frame(9, 1.0, torch.zeros(6, 8, 3))
     row = torch.ones(CELLS)
     store.append(frame, normal(0, 2, 2, 5), None, torch.eye(4), row, row)
     assert (store.static_weights[0] == 0.25).all() and (store.static_weights[1:] == 1).all()
+
+
+def test_the_weight_of_a_cell_is_the_product_of_appearance_and_motion():
+    store = filled(2)
+    store.set_static_weight(1, torch.full((CELLS,), 0.5))
+    store.set_motion_weight(1, torch.full((CELLS,), 0.25))
+    assert (store.cell_weights[0] == 1).all() and (store.cell_weights[1] == 0.125).all()
+
+
+def test_the_newest_keyframe_can_be_removed():
+    store, before = filled(3), filled(3)
+    store.remove_newest()
+    assert len(store) == 2
+    assert torch.equal(store.T_camera_world, before.T_camera_world[:2])
+    assert torch.equal(store.disparities, before.disparities[:2])
+
+
+def test_a_normalised_store_has_median_disparity_one_and_the_same_view():
+    store, before = filled(3), filled(3)
+    store.normalise_scale()
+    assert float(store.disparities.median()) == pytest.approx(1)
+    scale = before.disparities.median()
+    torch.testing.assert_close(store.disparities * scale, before.disparities)
+    moved = store.T_camera_world[:, :3, 3] / scale
+    torch.testing.assert_close(moved, before.T_camera_world[:, :3, 3])

@@ -2,17 +2,15 @@
 
 from collections.abc import Iterable
 
-import pytest
 import torch
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
-from minislam.tracking.health import health_of
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.loop_closure import close_loops, loop_pairs
-from tests.tracking.wall import TrueFlow, back_end, true_poses
+from tests.tracking.wall import TrueFlow, true_graph, true_poses
 
 ROUND = [0, 1, 2, 3, 4, 3, 2, 1, 0]  # frames: there and back again
 CONFIG = TrackingConfig(loop_min_gap=6, loop_distance=1e3, loop_edges=1, robust_scale=3.0)
@@ -36,18 +34,18 @@ def seeded() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def drifted(flow: TrueFlow, frames: Iterable[int] = tuple(ROUND)) -> BackEnd:
-    backend = back_end(list(frames), CONFIG, flow)
-    count = len(backend.keyframes)
-    backend.match(neighbourhood_edges(0, count, 1))
-    poses = backend.keyframes.T_camera_world
+def drifted(flow: TrueFlow, frames: Iterable[int] = tuple(ROUND)) -> KeyframeGraph:
+    graph = true_graph(list(frames), CONFIG, flow)
+    count = len(graph.keyframes)
+    graph.match(neighbourhood_edges(0, count, 1))
+    poses = graph.keyframes.T_camera_world
     for index in range(1, count):
         poses[index] = se3_exp(index * SLIP) @ poses[index]
-    return backend
+    return graph
 
 
-def end_error(backend: BackEnd) -> float:
-    pose = backend.keyframes.T_camera_world[-1]
+def end_error(graph: KeyframeGraph) -> float:
+    pose = graph.keyframes.T_camera_world[-1]
     return float(se3_log(pose @ se3_inverse(true_poses()[ROUND[-1]])).norm())
 
 
@@ -69,21 +67,21 @@ def test_a_loop_that_is_closed_already_is_not_closed_again():
 
 
 def test_closing_a_loop_takes_the_drift_away():
-    backend = drifted(TrueFlow())
-    before = end_error(backend)
-    assert close_loops(backend)
-    assert (8, 0) in backend.graph and (0, 8) in backend.graph
-    assert end_error(backend) < 0.2 * before
-    assert backend.take_first_moved() == 0  # the map has to follow
+    graph = drifted(TrueFlow())
+    before = end_error(graph)
+    assert close_loops(graph)
+    assert (8, 0) in graph.links and (0, 8) in graph.links
+    assert end_error(graph) < 0.2 * before
+    assert graph.first_moved == 0  # the map has to follow
 
 
 def test_a_loop_that_does_not_fit_leaves_everything_as_it_was():
-    backend = drifted(FlowThatNeverFits())
-    state, edges = backend.state, backend.graph.edges()
-    assert not close_loops(backend)
-    assert torch.equal(backend.state.T_camera_world, state.T_camera_world)
-    assert torch.equal(backend.state.disparities, state.disparities)
-    assert backend.graph.edges() == edges
+    graph = drifted(FlowThatNeverFits())
+    state, edges = graph.state, graph.links.edges()
+    assert not close_loops(graph)
+    assert torch.equal(graph.state.T_camera_world, state.T_camera_world)
+    assert torch.equal(graph.state.disparities, state.disparities)
+    assert graph.links.edges() == edges
 
 
 def test_a_loop_whose_flow_is_not_confirmed_is_no_loop():
@@ -93,39 +91,3 @@ def test_a_loop_whose_flow_is_not_confirmed_is_no_loop():
 
 def test_a_short_sequence_has_no_loops():
     assert not close_loops(drifted(TrueFlow(), ROUND[:4]))
-
-
-# Health
-
-
-def test_health_at_the_truth():
-    backend = back_end([0, 1, 2])
-    backend.match(neighbourhood_edges(0, 3, 2))
-    health = health_of(backend, 2)
-    assert health.keyframe_index == 2 and health.matched_ratio == 1
-    assert health.median_residual < 1e-3 and health.parallax > 3
-
-
-def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
-    backend = back_end([0, 1, 2], TrackingConfig(robust_scale=0))
-    poses = backend.keyframes.T_camera_world
-    poses[2] = se3_exp(torch.tensor([0, 0, 0, 0.01, 0.02, 0], dtype=torch.float64)) @ poses[1]
-    backend.match([(2, 1), (1, 2)])
-    assert health_of(backend, 2).parallax < 0.1
-    before = backend.keyframes.disparities.clone()
-    backend.adjust(first_free=2, iterations=3)
-    assert torch.equal(backend.keyframes.disparities, before)
-
-
-def test_a_keyframe_without_links_is_reported_as_such():
-    health = health_of(back_end([0, 1]), 1)
-    assert health.matched_ratio == 0 and health.parallax == 0
-
-
-@pytest.mark.parametrize("moved", [0.0, 0.05])
-def test_distance_to_the_newest_keyframe(moved: float):
-    backend = back_end([0, 1])
-    slide = torch.tensor([moved, 0, 0, 0, 0, 0], dtype=torch.float64)
-    pose = se3_exp(slide) @ backend.keyframes.T_camera_world[-1]
-    expected = moved * 60.0 * float(backend.keyframes.disparities[-1].mean())  # fx t d
-    assert backend.distance_to_newest(pose) == pytest.approx(expected, rel=0.05, abs=1e-6)

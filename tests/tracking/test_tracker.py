@@ -1,76 +1,28 @@
 """The tracker from the first frame to the last adjustment, on a small synthetic sequence."""
 
-from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from minislam.tracking.status import TrackingStatus
 
-from data_synth import SyntheticSequence, generate
 from minislam.errors import TrackingLost
 from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error, centres
-from minislam.geometry import Camera, se3_inverse
-from minislam.priors.depth import NoDepth, SensorDepth
-from minislam.priors.features import ClassicalFeatures
-from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame, Trajectory
-from minislam.tracking.config import TrackingConfig
-from minislam.tracking.status import TrackingStatus
-from minislam.tracking.tracker import Tracker
-
-SIZE = (160, 120)
-FRAMES = 30
-# Five keyframes in thirty frames; the flow is that of a 320x240 image.
-CONFIG = TrackingConfig(warmup_keyframes=3, keyframe_flow=8.0, keyframe_flow_without_prior=8.0)
-WHERE_LOST = 17  # a frame after the warm-up
-
-
-@cache
-def recording() -> SyntheticSequence:
-    return generate("static", seed=1, frames=FRAMES, size=SIZE)
-
-
-def frames() -> list[Frame]:
-    rgb, times = recording().rgb, recording().timestamps
-    return [Frame(i, float(times[i]), torch.from_numpy(rgb[i])) for i in range(FRAMES)]
-
-
-def new_tracker(with_depth: bool, shown: Sequence[int] = range(FRAMES)) -> Tracker:
-    """Return a tracker for a sequence whose frame k shows what the recording shows in shown[k]."""
-    k = recording().intrinsics
-    camera = Camera(k.fx, k.fy, k.cx, k.cy, *SIZE)
-    depth = SensorDepth(lambda index: recording().depth[shown[index]]) if with_depth else NoDepth()
-
-    def everything_is_static(keyframe_index: int) -> torch.Tensor:
-        return torch.ones(15, 20)
-
-    return Tracker(
-        camera, CONFIG, ClassicalFlow(), ClassicalFeatures(), depth, everything_is_static
-    )
-
-
-def run(tracker: Tracker, images: list[Frame]) -> None:
-    for frame in images:
-        tracker.track(frame)
-        if not tracker.initialised and len(tracker.keyframes) == CONFIG.warmup_keyframes:
-            tracker.initialise()
-            tracker.refine_initialisation()
-    if not tracker.initialised:
-        tracker.initialise()
-    tracker.finish()
-
-
-def lost_frames(tracker: Tracker) -> list[int]:
-    return [frame.frame_index for frame in tracker.tracked if not frame.status.is_followed]
-
-
-def trajectories(tracker: Tracker) -> tuple[Trajectory, Trajectory]:
-    """Return the estimated and the true trajectory of the keyframes."""
-    chosen = [frame.frame_index for frame in tracker.keyframes.frames]
-    times = recording().timestamps[chosen]
-    estimate = se3_inverse(tracker.keyframes.T_camera_world).numpy()
-    return Trajectory(times, estimate), Trajectory(times, recording().T_world_camera[chosen])
+from minislam.tracking.keyframe_graph import FailedAdjustments
+from minislam.tracking.tracker import Mode, Tracker
+from tests.tracking.recording import (
+    CONFIG,
+    SIZE,
+    WHERE_LOST,
+    frames,
+    lost_frames,
+    new_tracker,
+    recording,
+    run,
+    trajectories,
+)
 
 
 @cache
@@ -118,10 +70,35 @@ def test_the_first_pose_is_the_world():
     assert torch.equal(finished(with_depth=True).keyframes.T_camera_world[0], identity)
 
 
-def test_every_adjustment_lowered_its_cost():
-    reports = finished(with_depth=True).backend.reports
-    assert reports and all(report.cost_after <= report.cost_before for report in reports)
-    assert all(report.converged for report in reports)
+def test_no_adjustment_failed():
+    assert finished(with_depth=True).graph.failed_adjustments == FailedAdjustments()
+
+
+def test_the_modes_follow_each_other():
+    tracker, images = new_tracker(with_depth=True), frames()
+    assert tracker.mode is Mode.WAITING and not tracker.initialised
+    step = tracker.track(images[0])
+    assert step.has_new_keyframes and tracker.mode is Mode.WARMING_UP
+    step = tracker.track(images[1])
+    assert not step.has_new_keyframes and step.first_moved == len(tracker.keyframes) == 1
+    tracker.initialise()
+    assert tracker.mode is Mode.TRACKING and len(tracker.keyframes) == 2
+    tracker.track(Frame(2, 2 / 30, torch.zeros_like(images[0].image)))
+    assert tracker.mode is Mode.LOST and tracker.initialised
+    tracker.track(images[3])
+    assert tracker.mode is Mode.TRACKING
+
+
+def test_the_first_keyframe_after_the_warm_up_reports_that_all_have_moved():
+    tracker = new_tracker(with_depth=True)
+    for frame in frames():
+        step = tracker.track(frame)
+        if tracker.initialised and step.has_new_keyframes:
+            break
+        if not tracker.initialised and len(tracker.keyframes) == CONFIG.warmup_keyframes:
+            tracker.initialise()
+            tracker.refine_initialisation()
+    assert step.first_moved == 0
 
 
 def test_two_runs_are_the_same_to_the_bit():

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_interpolate, se3_inverse, se3_log
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.status import TrackedFrame, TrackingStatus
+from minislam.records import TrackedFrame, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
 from tests.helpers import random_transforms
-from tests.tracking.wall import FRAMES, GRID, TrueFlow, back_end, true_poses, wall_frame
+from tests.tracking.wall import FRAMES, GRID, TrueFlow, true_graph, true_poses, wall_frame
 
 KEYFRAMES = [0, 3, 5, 8]
 LOST = 6
@@ -19,7 +19,7 @@ LOST = 6
 
 def posed(progress=None, flow: TrueFlow | None = None) -> dict[int, Tensor]:
     """Return the poses of twelve frames, four of which are keyframes and one of which is lost."""
-    backend = back_end(KEYFRAMES, flow=flow)
+    graph = true_graph(KEYFRAMES, flow=flow)
     tracked = [
         TrackedFrame(
             number, 0.1 * number, TrackingStatus.LOST if number == LOST else TrackingStatus.OK, 1.0
@@ -27,13 +27,12 @@ def posed(progress=None, flow: TrueFlow | None = None) -> dict[int, Tensor]:
         for number in range(FRAMES)
     ]
     tracker = SimpleNamespace(
-        keyframes=backend.keyframes,
-        backend=backend,
+        keyframes=graph.keyframes,
+        graph=graph,
         tracked=tracked,
-        follows_a_loss=lambda keyframe_index: False,
     )
     poses = pose_all_frames(tracker, SimpleNamespace(frame=wall_frame), progress)
-    assert set(backend.flow.numbers) == set(range(len(KEYFRAMES)))  # nothing left behind
+    assert set(graph.flow.numbers) == set(range(len(KEYFRAMES)))  # nothing left behind
     return poses
 
 

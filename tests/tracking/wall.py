@@ -10,9 +10,9 @@ from torch import Tensor
 from minislam.geometry import se3_inverse
 from minislam.priors.interfaces import FlowChain, FlowMatches
 from minislam.records import Frame
-from minislam.tracking.backend import BackEnd
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.grid import Grid
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import relative_transforms, reproject
 from tests.tracking.scene import CAMERA, STRIDE, poses_on_an_arc
 
@@ -69,12 +69,12 @@ class TrueFlow:
         raise NotImplementedError
 
 
-def back_end(
+def true_graph(
     numbers: list[int], config: TrackingConfig | None = None, flow: TrueFlow | None = None
-) -> BackEnd:
-    """Return a back-end whose keyframes are these frames, all of them where they truly are."""
+) -> KeyframeGraph:
+    """Return a keyframe graph of these frames, all of them where they truly are."""
     config = config or TrackingConfig()
-    result = BackEnd(CAMERA, config, flow or TrueFlow())
+    result = KeyframeGraph(CAMERA, config, flow or TrueFlow())
     for index, number in enumerate(numbers):
         frame, pose = wall_frame(number), true_poses()[number]
         disparities = disparities_at(pose, GRID.rays).float()
@@ -82,4 +82,6 @@ def back_end(
         unknown = torch.zeros_like(disparities)
         result.keyframes.append(frame, features, None, pose, disparities, unknown)
         result.flow.add_frame(index, frame.image)
+        if index > 0:
+            result.flow_to_next.append(result.flow.match([index - 1], [index], GRID.pixels.T[None]))
     return result

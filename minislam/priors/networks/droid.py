@@ -24,7 +24,7 @@ from minislam.priors.networks.droid_network import (
     update,
 )
 from minislam.priors.networks.vit import normalise
-from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
+from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
 
 _SMALLEST_GRID = 2 ** (LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
 
@@ -172,6 +172,12 @@ class DroidFlow(Stateful):
     def start_chain(self, image: Tensor) -> "DroidChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
         return DroidChain(self, self.encode(image), None, None)
+
+    def restore_chain(self, state: Tree, frame_of: FrameOf) -> "DroidChain":
+        """Return the chain whose saved state this is."""
+        reference = from_tree(EncodedFrame, state["_reference"], frame_of)
+        newest = from_tree(EncodedFrame, state["_newest"], frame_of)
+        return DroidChain(self, reference, newest, state["_target"])
 
 
 class DroidChain(Stateful):

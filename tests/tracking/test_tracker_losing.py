@@ -5,10 +5,9 @@ import pytest
 import torch
 
 from minislam.geometry import se3_inverse
-from minislam.records import Frame
-from minislam.tracking.status import TrackingStatus
+from minislam.records import Frame, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
-from tests.tracking.test_tracker import (
+from tests.tracking.recording import (
     CONFIG,
     FRAMES,
     frames,

@@ -16,7 +16,7 @@ from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame
 from minislam.tracking.tracker import Tracker
-from tests.tracking.test_tracker import CONFIG, SIZE, lost_frames, run
+from tests.tracking.recording import CONFIG, SIZE, lost_frames, run
 
 TURNED = 20  # frames of a turn
 TURN = 0.3  # rad, the most that the camera turns to the side
@@ -79,7 +79,7 @@ def test_a_camera_that_only_turns_is_followed_and_known_to_stand(with_depth: boo
         distance = np.median(turning()[0].depth)
         assert np.linalg.norm(estimate[:, :3, 3], axis=1).max() < MAX_DRIFT * distance
     # That is what the run warns of: the distances that the camera covered are unknown.
-    least = CONFIG.min_parallax * tracker.backend.pixel_scale
+    least = CONFIG.min_parallax * tracker.graph.pixel_scale
     assert len(tracker.health) == len(tracker.keyframes) > 4
     assert all(health.parallax < least for health in tracker.health)
 

@@ -1,12 +1,12 @@
-"""Trust in cells: lost where they do not follow the camera, carried along, regained slowly."""
+"""Trust in cells: lost where they do not follow the camera, warped along, regained slowly."""
 
 import torch
 
 from minislam.geometry import se3_exp
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.grid import Grid
-from minislam.tracking.motion_memory import inherited_trust, updated_trust
 from minislam.tracking.reprojection import reproject
+from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, update_motion_weight
 from tests.tracking.scene import CAMERA, STRIDE
 
 GRID = Grid.of(CAMERA, STRIDE)
@@ -24,8 +24,8 @@ def matches_of(shift: torch.Tensor, confidence: float = 1.0) -> FlowMatches:
     return FlowMatches(targets, torch.full_like(targets, confidence), torch.ones(1))
 
 
-def test_what_follows_the_camera_keeps_its_trust():
-    kept = updated_trust(
+def test_what_follows_the_camera_keeps_its_weight():
+    kept = update_motion_weight(
         GRID, matches_of(torch.zeros(CELLS, 2)), DISPARITIES, MOTION, torch.ones(CELLS), SCALE
     )
     torch.testing.assert_close(kept, torch.ones(CELLS), atol=1e-4, rtol=0)
@@ -34,44 +34,50 @@ def test_what_follows_the_camera_keeps_its_trust():
 def test_a_mover_loses_it_at_once_and_regains_it_slowly():
     moves = torch.zeros(CELLS, 2)
     moves[: CELLS // 2] = torch.tensor([30.0, 0.0])
-    lost = updated_trust(GRID, matches_of(moves), DISPARITIES, MOTION, torch.ones(CELLS), SCALE)
+    lost = update_motion_weight(
+        GRID, matches_of(moves), DISPARITIES, MOTION, torch.ones(CELLS), SCALE
+    )
     assert lost[: CELLS // 2].max() < 0.15
     assert lost[CELLS // 2 :].min() > 0.99
     rests = matches_of(torch.zeros(CELLS, 2))
-    regained = updated_trust(GRID, rests, DISPARITIES, MOTION, lost, SCALE)
+    regained = update_motion_weight(GRID, rests, DISPARITIES, MOTION, lost, SCALE)
     assert 0.15 < float(regained[0]) < 0.25
 
 
 def test_the_agreement_halves_where_the_kernel_says():
     # (1 + r^2 / c^2)^-2 = 1/4 at r = c, and nine tenths of the way are gone at once.
     off = torch.tensor([SCALE, 0.0]).expand(CELLS, 2)
-    trust = updated_trust(GRID, matches_of(off), DISPARITIES, MOTION, torch.ones(CELLS), SCALE)
-    torch.testing.assert_close(trust, torch.full((CELLS,), 0.1 + 0.9 / 4), atol=1e-4, rtol=0)
+    weight = update_motion_weight(
+        GRID, matches_of(off), DISPARITIES, MOTION, torch.ones(CELLS), SCALE
+    )
+    torch.testing.assert_close(weight, torch.full((CELLS,), 0.1 + 0.9 / 4), atol=1e-4, rtol=0)
 
 
 def test_cells_without_a_match_keep_what_they_had():
-    trust = torch.linspace(0, 1, CELLS)
+    weight = torch.linspace(0, 1, CELLS)
     off = torch.full((CELLS, 2), 50.0)
     unseen = matches_of(off, confidence=0.0)
-    assert torch.equal(updated_trust(GRID, unseen, DISPARITIES, MOTION, trust, SCALE), trust)
-    assert torch.equal(inherited_trust(GRID, unseen, trust), torch.ones(CELLS))
+    assert torch.equal(
+        update_motion_weight(GRID, unseen, DISPARITIES, MOTION, weight, SCALE), weight
+    )
+    assert torch.equal(inherit_motion_weight(GRID, unseen, weight), torch.ones(CELLS))
 
 
-def test_trust_moves_with_the_flow():
+def test_the_weight_moves_with_the_flow():
     height, width = GRID.shape
-    trust = torch.ones(height, width)
-    trust[2:4, 1:3] = 0.1
+    weight = torch.ones(height, width)
+    weight[2:4, 1:3] = 0.1
     right = GRID.pixels.float().T[None] + torch.tensor([[2.0 * STRIDE], [0.0]])
     matches = FlowMatches(right, torch.ones_like(right), torch.ones(1))
-    carried = inherited_trust(GRID, matches, trust.reshape(-1)).reshape(height, width)
+    warped = inherit_motion_weight(GRID, matches, weight.reshape(-1)).reshape(height, width)
     expected = torch.ones(height, width)
     expected[2:4, 3:5] = 0.1
-    assert torch.equal(carried[:, 2:], expected[:, 2:])
-    assert torch.equal(carried[:, :2], expected[:, 2:3].expand(-1, 2))  # nothing flowed there
+    assert torch.equal(warped[:, 2:], expected[:, 2:])
+    assert torch.equal(warped[:, :2], expected[:, 2:3].expand(-1, 2))  # nothing flowed there
 
 
-def test_where_two_cells_meet_the_less_trusted_one_counts():
+def test_where_two_cells_meet_the_lower_weight_counts():
     everything_to_one = torch.zeros(1, 2, CELLS)
     matches = FlowMatches(everything_to_one, torch.ones(1, 2, CELLS), torch.ones(1))
-    carried = inherited_trust(GRID, matches, torch.linspace(0.2, 1, CELLS))
-    torch.testing.assert_close(carried, torch.full((CELLS,), 0.2))
+    warped = inherit_motion_weight(GRID, matches, torch.linspace(0.2, 1, CELLS))
+    torch.testing.assert_close(warped, torch.full((CELLS,), 0.2))

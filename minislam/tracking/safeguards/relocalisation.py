@@ -1,8 +1,7 @@
-"""Relocalisation: a camera that was lost finds its place again.
+"""Relocalisation: find a lost camera among the keyframes.
 
-The keyframes whose features are most like the frame's are tried. Keypoints matched between the
-images carry the structure of the keyframe to the frame, and the pose follows from points and
-pixels (PnP with RANSAC). No geometry of the lost time is needed.
+The keyframes with the most similar features are tried. Keypoints are matched between the two
+images; the disparities of the keyframe make them 3D points, and PnP with RANSAC gives the pose.
 """
 
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ MIN_STATIC_WEIGHT = 0.5  # a point on something that may move says nothing about
 
 @dataclass(frozen=True)
 class Place:
-    """Where a frame was recognised."""
+    """The pose of a frame, found from one keyframe."""
 
     keyframe_index: int
     T_camera_world: Tensor  # (4, 4) float64 of the frame
@@ -37,7 +36,7 @@ class Place:
 
 
 class Relocaliser:
-    """Finds frames again among the keyframes; remembers the keypoints of those it has tried."""
+    """Finds frames among the keyframes; keeps the keypoints of the keyframes it has tried."""
 
     def __init__(self, grid: Grid, keyframes: KeyframeStore, pixel_scale: float) -> None:
         self._grid, self._keyframes = grid, keyframes
@@ -47,28 +46,28 @@ class Relocaliser:
     def find(self, image: Tensor, features: Tensor) -> Place | None:
         """Return the best supported place of an image (H, W, 3) with features (h', w', C)."""
         seen = _keypoints(image)
-        places = [self._place(seen, index) for index in self._most_alike(features)]
+        places = [self._place(seen, index) for index in self._most_similar(features)]
         found = [place for place in places if place is not None]
         return max(found, key=lambda place: place.inliers, default=None)
 
-    def _most_alike(self, features: Tensor) -> list[int]:
+    def _most_similar(self, features: Tensor) -> list[int]:
         known = torch.stack([_summary(f) for f in self._keyframes.features])
-        likeness = known @ _summary(features)
-        return likeness.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
+        similarity = known @ _summary(features)
+        return similarity.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
 
     def _place(self, seen: tuple[np.ndarray, np.ndarray | None], index: int) -> Place | None:
-        """Return the pose from the keypoints shared with one keyframe, if there are enough."""
+        """Return the pose from keypoint matches with one keyframe, if there are enough."""
         if index not in self._keypoints:
             self._keypoints[index] = _keypoints(self._keyframes.frames[index].image)
-        pixels, matched = _shared(self._keypoints[index], seen)
+        pixels, matched = _keypoint_matches(self._keypoints[index], seen)
         if len(pixels) < MIN_INLIERS:
             return None
         positions = torch.from_numpy(pixels)[None]
         structure = torch.stack(
-            [self._keyframes.disparities[index], self._keyframes.trust[index]], -1
+            [self._keyframes.disparities[index], self._keyframes.cell_weights[index]], -1
         )
-        disparities, trust = self._grid.sample(structure[None], positions)[0].unbind(-1)
-        usable = (disparities > 0) & (trust > MIN_STATIC_WEIGHT)
+        disparities, cell_weights = self._grid.sample(structure[None], positions)[0].unbind(-1)
+        usable = (disparities > 0) & (cell_weights > MIN_STATIC_WEIGHT)
         if int(usable.sum()) < MIN_INLIERS:
             return None
         points = self._grid.camera.rays(positions[0]) / disparities[:, None]
@@ -102,14 +101,15 @@ def _summary(features: Tensor) -> Tensor:  # (h', w', C) -> (C,)
 
 def _keypoints(image: Tensor) -> tuple[np.ndarray, np.ndarray | None]:
     """Return SIFT positions (P, 2) [px] and descriptors (P, 128) of an image (H, W, 3)."""
-    keypoints, descriptors = cv2.SIFT_create().detectAndCompute(grayscale(image), None)
-    return np.float32([keypoint.pt for keypoint in keypoints]).reshape(-1, 2), descriptors
+    keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grayscale(image), None)
+    positions = np.array([keypoint.pt for keypoint in keypoints], np.float32)
+    return positions.reshape(-1, 2), descriptors
 
 
-def _shared(
+def _keypoint_matches(
     first: tuple[np.ndarray, np.ndarray | None], second: tuple[np.ndarray, np.ndarray | None]
 ) -> tuple[np.ndarray, np.ndarray]:  # (M, 2) and (M, 2) px
-    """Return the positions of the keypoints whose best match is clearly better than the next."""
+    """Return the positions of keypoints whose best match is clearly better than the second."""
     if first[1] is None or second[1] is None or min(len(first[1]), len(second[1])) < 2:
         return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first[1], second[1], k=2)

@@ -7,10 +7,14 @@ import torch
 
 from minislam.geometry import se3_exp
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
-from minislam.tracking.focal_length import FocalLengthFit, check_focal_length, fit_focal_length
 from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.safeguards.focal_length import (
+    FocalLengthFit,
+    check_focal_length,
+    fit_focal_length,
+)
 from tests.tracking.scene import CAMERA, RAYS, known_problem, noisy, normal, poses_on_an_arc
-from tests.tracking.wall import back_end
+from tests.tracking.wall import true_graph
 
 NOISE = 0.1  # px
 FOUND = 0.005  # relative
@@ -55,9 +59,9 @@ def test_a_camera_that_does_not_turn_tells_nothing(factor: float):
 
 def test_residuals_below_what_any_flow_can_do_tell_nothing():
     # One keyframe twice: whatever the focal length, all residuals are zero up to rounding.
-    backend = back_end([0, 0])
-    backend.match([(0, 1), (1, 0)])
-    assert check_focal_length(backend).factor is None
+    graph = true_graph([0, 0])
+    graph.match([(0, 1), (1, 0)])
+    assert check_focal_length(graph).factor is None
 
 
 def test_a_focal_length_out_of_reach_is_no_estimate():
@@ -67,12 +71,12 @@ def test_a_focal_length_out_of_reach_is_no_estimate():
 
 
 def test_the_check_changes_nothing():
-    backend = back_end([0, 3, 6])
-    backend.match([(0, 1), (1, 0), (1, 2), (2, 1)])
-    poses, disparities = backend.state.T_camera_world.clone(), backend.state.disparities.clone()
-    check_focal_length(backend)
-    assert torch.equal(backend.state.T_camera_world, poses)
-    assert torch.equal(backend.state.disparities, disparities)
+    graph = true_graph([0, 3, 6])
+    graph.match([(0, 1), (1, 0), (1, 2), (2, 1)])
+    poses, disparities = graph.state.T_camera_world.clone(), graph.state.disparities.clone()
+    check_focal_length(graph)
+    assert torch.equal(graph.state.T_camera_world, poses)
+    assert torch.equal(graph.state.disparities, disparities)
 
 
 @pytest.mark.parametrize(

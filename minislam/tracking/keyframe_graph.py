@@ -1,0 +1,252 @@
+"""The keyframe graph: which keyframes are linked, and the optical flow along each link.
+
+The links of a new keyframe lead to its predecessors (neighbourhood) and to older keyframes that
+see the same (covisibility, measured by the flow distance). A link that spans more than the
+neighbourhood is added only if the flow confirms it in both directions.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera, se3_interpolate, se3_inverse
+from minislam.geometry.camera import pixel_scale
+from minislam.priors.interfaces import FlowEstimator, FlowMatches
+from minislam.records import Frame
+from minislam.state.stateful import Stateful
+from minislam.tracking.bundle_adjustment import BundleReport, BundleState
+from minislam.tracking.config import TrackingConfig
+from minislam.tracking.frame_graph import (
+    FrameGraph,
+    both_directions,
+    flow_distances,
+    neighbourhood_edges,
+    proximity_pairs,
+)
+from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.pose_from_flow import compose_matches, start_pose, warp_disparities
+from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
+from minislam.tracking.robust import RobustKernel
+
+Edge = tuple[int, int]  # keyframe index of source and target
+
+NEIGHBOURHOOD = 5  # predecessors that every keyframe is linked with
+PROXIMITY_EDGES = 2  # further links of a new keyframe, nearest by flow distance
+PROXIMITY_DISTANCE = 120.0  # px at 320x240, largest flow distance of such a link
+HORIZON = 3  # BA windows of keyframes among which a new one looks for such links
+GLOBAL_EDGES = 6  # further links per keyframe in a global BA
+GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
+ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [-]
+
+
+@dataclass(frozen=True)
+class FailedAdjustments:
+    """The adjustments that left the state as it was, because no step could be computed."""
+
+    count: int = 0
+    last_reason: str = ""
+
+
+class KeyframeGraph(Stateful):
+    """The keyframes, the links between them, and the estimator of the flow along the links."""
+
+    keyframes: KeyframeStore
+    flow_to_next: list[FlowMatches | None]  # keyframe k to k + 1 (E = 1), None across a loss
+    links: FrameGraph
+    flow: FlowEstimator
+    failed_adjustments: FailedAdjustments = FailedAdjustments()
+    first_moved: int = 0  # first keyframe that moved since the tracker reported it last
+
+    def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
+        self.config = config
+        self.grid = Grid.of(camera, flow.stride)
+        self.keyframes = KeyframeStore(len(self.grid.rays))
+        self.flow_to_next = []
+        self.links = FrameGraph()
+        self.flow = flow
+        self.pixel_scale = pixel_scale(camera)
+
+    @property
+    def robust(self) -> RobustKernel | None:
+        """Return the robust weight inside Sigma, None for plain least squares."""
+        scale, power = self.config.robust_scale, self.config.robust_power
+        # Matching is no more precise in a smaller image: there the scale stays as it is.
+        return RobustKernel(scale * max(self.pixel_scale, 1.0), power) if scale > 0 else None
+
+    @property
+    def state(self) -> BundleState:
+        """Return poses and disparities of all keyframes."""
+        return BundleState(self.keyframes.T_camera_world, self.keyframes.disparities)
+
+    def count_failure(self, report: BundleReport) -> None:
+        """Count an adjustment that failed; a run warns of them at its end."""
+        if not report.converged:
+            count = self.failed_adjustments.count + 1
+            self.failed_adjustments = FailedAdjustments(count, report.reason)
+
+    # The newest keyframe ------------------------------------------------------------------------
+
+    def append(
+        self,
+        frame: Frame,
+        features: Tensor,  # (h', w', C)
+        metric_depth: Tensor | None,  # (H, W)
+        T_camera_world: Tensor,  # (4, 4)
+        disparities: Tensor,  # (N,), used where there is no metric depth
+    ) -> None:
+        """Add a keyframe and register its image with the flow estimator."""
+        prior = torch.zeros_like(disparities)
+        if metric_depth is not None:
+            depth = metric_depth[:: self.grid.stride, :: self.grid.stride].reshape(-1)
+            prior = torch.where(depth > 0, depth.clamp_min(1e-6).reciprocal(), prior)
+        disparities = torch.where(prior > 0, prior, disparities)
+        self.flow.add_frame(len(self.keyframes), frame.image)
+        self.keyframes.append(frame, features, metric_depth, T_camera_world, disparities, prior)
+
+    def remove_newest(self) -> None:
+        """Forget the newest keyframe, which has no links yet."""
+        self.flow_to_next.pop()
+        self.keyframes.remove_newest()
+        self.flow.remove_frame(len(self.keyframes))
+
+    def follows_a_loss(self, keyframe: int) -> bool:
+        """Tell whether the camera was lost between a keyframe and the one before it."""
+        return keyframe > 0 and self.flow_to_next[keyframe - 1] is None
+
+    def start_pose(self, matches: FlowMatches) -> Tensor:  # (4, 4)
+        """Return T_camera_world of a frame from its flow (E = 1) from the newest keyframe.
+
+        It starts from the pose of that keyframe, and from the motion that led to it going on.
+        """
+        keyframes, newest = self.keyframes, len(self.keyframes) - 1
+        last = keyframes.T_camera_world[newest]
+        starts = [last]
+        if newest > 0 and not self.follows_a_loss(newest):
+            starts.append(se3_interpolate(keyframes.T_camera_world[newest - 1], last, 2.0))
+        weights, robust = keyframes.cell_weights[newest], self.robust
+        disparities = keyframes.disparities[newest]
+        return start_pose(self.grid, matches, disparities, weights, last, starts, robust)
+
+    def warp_disparities(self, keyframe: int, T_camera_world: Tensor) -> Tensor:  # (N,)
+        """Return the disparities of a keyframe as a camera at another pose (4, 4) sees them."""
+        motion = T_camera_world @ se3_inverse(self.keyframes.T_camera_world[keyframe])
+        return warp_disparities(self.grid, motion, self.keyframes.disparities[keyframe])
+
+    # Flow along links ---------------------------------------------------------------------------
+
+    def match(self, edges: list[Edge]) -> None:
+        """Measure the flow of these edges, started from the present geometry, and store it."""
+        self.links.record(edges, self._flow_from_geometry(edges))
+
+    def match_composed(self, target: int) -> None:
+        """Measure the flow from the predecessors of a keyframe, since the last loss.
+
+        It starts from the flow between neighbours, composed. No pose is needed, so a wrong pose of
+        the target does no harm.
+        """
+        edges: list[Edge] = []
+        predictions, composed = [], None
+        for source in range(target - 1, max(-1, target - 1 - NEIGHBOURHOOD), -1):
+            matches = self.flow_to_next[source]
+            if matches is None:
+                break
+            composed = compose_matches(matches, composed, self.grid) if composed else matches
+            edges.append((source, target))
+            predictions.append(composed.targets)
+        sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
+        self.links.record(edges, self.flow.match(sources, targets, torch.cat(predictions)))
+
+    def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
+        """Return those of these new edges whose flow is matched in both directions."""
+        if not edges:
+            return []
+        matches = self._flow_from_geometry(edges)
+        ratio = dict(zip(edges, matches.matched_ratios.tolist(), strict=True))
+        least = self.config.min_link_ratio
+        return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= least]
+
+    def _flow_from_geometry(self, edges: list[Edge]) -> FlowMatches:
+        """Return the flow of these edges, started from what the present geometry predicts."""
+        sources, targets = torch.tensor(edges).unbind(1)
+        transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
+        predicted, _ = reproject(
+            transforms, self.keyframes.disparities[sources], self.grid.rays, self.grid.camera
+        )
+        # Points near the camera plane project to anywhere; a flow started there finds nothing.
+        size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
+        predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
+        return self.flow.match(sources.tolist(), targets.tolist(), predicted)
+
+    # Which keyframes to link --------------------------------------------------------------------
+
+    def neighbour_edges(self, keyframe: int) -> list[Edge]:
+        """Return the edges to the predecessors since the camera was last lost."""
+        since = max((k for k in range(keyframe + 1) if self.follows_a_loss(k)), default=0)
+        edges = neighbourhood_edges(keyframe, keyframe + 1, NEIGHBOURHOOD)
+        return [edge for edge in edges if min(edge) >= since]
+
+    def proximity_edges(self, keyframe: int) -> list[Edge]:
+        """Return edges from a new keyframe to older ones that see the same, if confirmed.
+
+        A far link starts from geometry that may have drifted. A wrong one pulls harder than all
+        right ones together, so its flow must be confirmed before it is added.
+        """
+        start = max(0, keyframe + 1 - HORIZON * self.config.window)
+        limit = PROXIMITY_DISTANCE * self.pixel_scale
+        near = neighbourhood_edges(keyframe, keyframe + 1, NEIGHBOURHOOD)
+        newest = range(keyframe, keyframe + 1)
+        pairs = self._proximity_pairs(start, newest, near, limit, PROXIMITY_EDGES)
+        return self.filter_confirmed(both_directions(pairs))
+
+    def global_edges(self) -> list[Edge]:
+        """Return further edges among all keyframes, over many baselines."""
+        all_keyframes = range(len(self.keyframes))
+        limit = GLOBAL_DISTANCE * self.pixel_scale
+        pairs = self._proximity_pairs(0, all_keyframes, [], limit, GLOBAL_EDGES)
+        return self.filter_confirmed(both_directions(pairs))
+
+    def _proximity_pairs(
+        self,
+        start: int,  # first keyframe to look at
+        newer: range,  # keyframes that want links
+        planned: list[Edge],  # edges about to be added, treated as existing
+        limit: float,  # px
+        links: int,  # per keyframe
+    ) -> list[Edge]:
+        """Return pairs of keyframes that see the same from different places."""
+        shifted = range(newer.start - start, newer.stop - start)
+        distances = self.distances(start, shifted)
+        existing = self.links.edges() + planned
+        taken = [(i - start, j - start) for i, j in existing if min(i, j) >= start]
+        pairs = proximity_pairs(distances, taken, shifted, limit, links)
+        return [(i + start, j + start) for i, j in pairs]
+
+    # How far apart keyframes are ----------------------------------------------------------------
+
+    def distances(self, start: int = 0, rows: range | None = None) -> Tensor:  # (K', K') px
+        """Return the flow distances between the keyframes from `start` on, of some rows or all."""
+        poses, disparities = self.keyframes.T_camera_world, self.keyframes.disparities
+        return self._flow_distances(poses[start:], disparities[start:], rows)
+
+    def distance_to_newest(self, T_camera_world: Tensor) -> float:  # px
+        """Return the flow distance of a pose (4, 4) from the newest keyframe."""
+        pair = torch.stack([self.keyframes.T_camera_world[-1], T_camera_world])
+        return float(
+            self._flow_distances(pair, self.keyframes.disparities[-1:].expand(2, -1))[0, 1]
+        )
+
+    def _flow_distances(
+        self, poses: Tensor, disparities: Tensor, rows: range | None = None
+    ) -> Tensor:
+        grid = self.grid
+        return flow_distances(
+            poses, disparities, grid.rays, grid.pixels, grid.camera, ROTATION_WEIGHT, rows
+        )
+
+    def parallaxes(self, sources: Tensor, targets: Tensor) -> Tensor:  # (E,), (E,) -> (E,) px
+        """Return the mean parallax of edges, as the present geometry has it."""
+        transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
+        disparities = self.keyframes.disparities[sources]
+        return mean_parallax(transforms, disparities, self.grid.rays, self.grid.camera)

@@ -1,0 +1,59 @@
+"""Which frames become keyframes."""
+
+from torch import Tensor
+
+from minislam.priors.interfaces import FlowMatches
+from minislam.records import Frame
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.reprojection import lengths
+
+KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyframe is needed [-]
+# A keyframe must be this far from the last, relative to the flow that makes a keyframe. [-];
+# official code: 3 of 24 px.
+CULL_FRACTION = 0.3
+
+
+def keyframe_flow(graph: KeyframeGraph) -> float:
+    """Return the mean flow that makes a keyframe [px]."""
+    config = graph.config
+    known = graph.keyframes.has_prior
+    flow = config.keyframe_flow if known else config.keyframe_flow_without_prior
+    return flow * graph.pixel_scale
+
+
+def needs_keyframe(
+    graph: KeyframeGraph,
+    frame: Frame,
+    matches: FlowMatches,  # E = 1, newest keyframe to this frame
+    is_initialised: bool,
+) -> bool:
+    """Tell whether a frame should become a keyframe.
+
+    It should if the mean flow is large, if few cells are matched, or if the last keyframe was
+    `keyframe_interval` frames ago.
+    """
+    length = lengths(matches.targets - graph.grid.pixels.T)[0]
+    confidence = matches.confidences[0, 0]
+    mean_flow = float((confidence * length).sum() / confidence.sum())
+    if mean_flow > keyframe_flow(graph):
+        return True
+    if float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
+        return True
+    # Without a depth prior the first keyframes need parallax, so none is forced.
+    may_force = is_initialised or graph.keyframes.has_prior
+    return may_force and _is_due(graph, frame)
+
+
+def is_redundant(graph: KeyframeGraph, frame: Frame, T_camera_world: Tensor) -> bool:
+    """Tell whether a frame with this pose would repeat the newest keyframe.
+
+    Then only dynamic objects made the flow, and two keyframes from one place measure no depth.
+    """
+    if _is_due(graph, frame):
+        return False
+    return graph.distance_to_newest(T_camera_world) < CULL_FRACTION * keyframe_flow(graph)
+
+
+def _is_due(graph: KeyframeGraph, frame: Frame) -> bool:
+    elapsed = frame.frame_index - graph.keyframes.frames[-1].frame_index
+    return elapsed >= graph.config.keyframe_interval

@@ -1,0 +1,157 @@
+"""Bundle adjustment, Eq. (5), over parts of the keyframe graph: local BA and global BA."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
+from minislam.tracking.disparity_prior import mask_priors
+from minislam.tracking.frame_graph import both_directions
+from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, Edge, KeyframeGraph
+
+# A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
+# correct would look like outliers. So the weight is wide at first. [-]
+FIRST_WIDENING = 8.0
+GLOBAL_ITERATIONS = 4  # Gauss-Newton steps of an online global BA
+FINAL_ITERATIONS = 4  # Gauss-Newton steps per round of the final global BA
+
+
+def local_ba(graph: KeyframeGraph) -> None:
+    """Link the newest keyframe, then adjust the newest `window` keyframes together.
+
+    First comes a BA on flow from its predecessors that was found without its pose, because that
+    pose may still be wrong. Then edges to its neighbourhood and to
+    nearby older keyframes are added, and flow and BA alternate for some rounds.
+    """
+    config, newest = graph.config, len(graph.keyframes) - 1
+    first_free = max(0, newest + 1 - config.window)
+    graph.match_composed(newest)
+    adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
+    edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
+    mask_priors(graph.keyframes, graph.grid, edges, config, first=newest)
+    for _ in range(config.rounds):
+        graph.match(edges)
+        adjust(graph, first_free, config.iterations)
+
+
+def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
+    """Link a relocalised keyframe, the newest, with a similar one and the neighbours of that one.
+
+    Only the newest keyframe moves. Return False, and link nothing, if the flow does not confirm
+    that both show the same place.
+    """
+    newest = len(graph.keyframes) - 1
+    around = range(max(0, similar - NEIGHBOURHOOD), min(newest, similar + NEIGHBOURHOOD + 1))
+    edges = graph.filter_confirmed(both_directions([(newest, index) for index in around]))
+    if (newest, similar) not in edges:
+        return False
+    for _ in range(graph.config.rounds):
+        graph.match(edges)
+        adjust(graph, newest, graph.config.iterations, widening=FIRST_WIDENING)
+    return True
+
+
+def online_global_ba(graph: KeyframeGraph) -> None:
+    """Adjust all keyframes together while the sequence goes on.
+
+    Stored flow is used again; only the flow of new links is measured.
+    """
+    edges = graph.global_edges()
+    if edges:
+        graph.match(edges)
+    adjust(graph, 0, GLOBAL_ITERATIONS)
+
+
+def final_global_ba(
+    graph: KeyframeGraph, progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Adjust all keyframes together on fresh flow, after the last frame.
+
+    The disparity prior is off, because the depth of a single image is worse than that of many
+    views.
+    """
+    config = graph.config
+    edges = graph.links.edges() + graph.global_edges()
+    lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
+    for done in range(config.final_rounds):
+        graph.match(edges)
+        adjust(graph, 0, FINAL_ITERATIONS, lambda_prior)
+        if progress:
+            progress(done + 1, config.final_rounds)
+
+
+def warm_up_ba(graph: KeyframeGraph, edges: list[Edge], rounds: int) -> None:
+    """Adjust the keyframes of the warm-up together: rounds of flow and BA."""
+    for _ in range(rounds):
+        graph.match(edges)
+        adjust(graph, 0, 2 * graph.config.iterations)
+
+
+def adjust(
+    graph: KeyframeGraph,
+    first_free: int,  # keyframes from here on move
+    iterations: int,
+    lambda_prior: float | None = None,  # None: as configured
+    widening: float = 1.0,  # of the robust weight
+) -> None:
+    """Run a bundle adjustment over the links that touch the free keyframes."""
+    problem = bundle_problem(graph, graph.links.select(first_free), first_free, lambda_prior)
+    if problem.robust:
+        problem = replace(problem, robust=problem.robust.widened(widening))
+    if first_free > 0:
+        # While a camera only turns, its flow says nothing about depth: the depths it started with
+        # hold the scale until it moves again.
+        known = problem.free_disparities & _has_parallax(graph, problem)
+        problem = replace(problem, free_disparities=known)
+    state, report = bundle_adjust(problem, graph.state, iterations)
+    graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
+    graph.first_moved = min(graph.first_moved, first_free)
+    graph.count_failure(report)
+
+
+def bundle_problem(
+    graph: KeyframeGraph,
+    positions: Sequence[int],  # of links in the graph
+    first_free: int,
+    lambda_prior: float | None = None,  # None: as configured
+) -> BundleProblem:
+    """Collect links of the graph into the bundle problem of Eq. (5)."""
+    keyframes, links, grid = graph.keyframes, graph.links, graph.grid
+    sources = torch.tensor([links.edges_source[p] for p in positions])
+    edges_target = torch.tensor([links.edges_target[p] for p in positions])
+    targets = torch.stack([links.targets[p] for p in positions])
+    confidences = torch.stack([links.confidences[p] for p in positions])
+    # Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a
+    # dynamic object covers; a classical one does not, so the weight of the target counts as well.
+    cell_weights = keyframes.cell_weights
+    seen = grid.sample(cell_weights[edges_target][..., None], targets.mT)[..., 0]
+    prior = keyframes.prior_disparities
+    if lambda_prior is None:
+        lambda_prior = graph.config.lambda_disparity_prior
+    strength = lambda_prior * grid.camera.fx**2
+    free = torch.arange(len(keyframes)) >= first_free
+    free_poses = free.clone()
+    free_poses[0] = False  # the first camera is the world
+    return BundleProblem(
+        camera=grid.camera,
+        rays=grid.rays,
+        edges_source=sources,
+        edges_target=edges_target,
+        targets=targets,
+        weights=confidences * (cell_weights[sources] * seen)[:, None],
+        prior_disparities=prior,
+        prior_weights=strength * (prior > 0) * keyframes.prior_masks,
+        free_poses=free_poses,
+        free_disparities=free,
+        robust=graph.robust,
+    )
+
+
+def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool
+    """Tell which keyframes are linked with another place, not only with another direction."""
+    most = torch.zeros(len(graph.keyframes))
+    seen = graph.parallaxes(problem.edges_source, problem.edges_target)
+    most.scatter_reduce_(0, problem.edges_source, seen, "amax")
+    return most >= graph.config.min_parallax * graph.pixel_scale

@@ -1,0 +1,8 @@
+"""What real footage needs and the paper does not have.
+
+motion_memory    remembers which cells have moved, so that a growing dynamic object stays excluded
+relocalisation   finds a lost camera among the keyframes
+structure        depth images from the tracker's disparities, for footage without a depth prior
+diagnostics      how well each keyframe is tied to the others
+focal_length     tells at the end whether the given focal length was wrong
+"""

@@ -1,0 +1,104 @@
+"""Motion memory: the motion weight of each cell, handed on along the flow.
+
+While a dynamic object is small, the robust weight alone excludes it. Once it fills half of the
+image, the pose follows the object instead of the static scene, and beta, which learns from the
+poses, learns the wrong thing. But the object was seen to move while it was still small. Therefore
+each cell has a motion weight, which says how well it has followed the camera so far, and the cell
+it flows to inherits that weight.
+"""
+
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from minislam.geometry import se3_inverse
+from minislam.priors.interfaces import FlowMatches
+from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.reprojection import reproject
+
+MIN_CONFIDENCE = 0.1  # of a match that counts [-]
+# Smoothing factors: the weight falls fast and recovers slowly, since a moving object may pause. [-]
+LOSS_RATE = 0.9
+RECOVERY_RATE = 0.1
+
+
+class MotionMemory:
+    """Updates the motion weights of the newest keyframe."""
+
+    def __init__(self, grid: Grid, keyframes: KeyframeStore, scale: float) -> None:
+        self._grid, self._keyframes = grid, keyframes
+        self._scale = scale  # px, of the residuals that still count; 0: nothing is remembered
+
+    @property
+    def scale(self) -> float | None:
+        """Return the scale of the residuals [px], None while nothing is remembered."""
+        # Without a depth prior structure and motion are estimated together, so neither can judge
+        # the other.
+        return self._scale if self._scale > 0 and self._keyframes.has_prior else None
+
+    def remember(self, matches: FlowMatches, T_camera_world: Tensor) -> None:
+        """Lower the weight of cells of the newest keyframe that do not follow the camera.
+
+        The camera moves on to `T_camera_world` (4, 4).
+        """
+        keyframes, scale = self._keyframes, self.scale
+        if scale is None:
+            return
+        weight = update_motion_weight(
+            self._grid,
+            matches,
+            keyframes.disparities[-1],
+            T_camera_world @ se3_inverse(keyframes.T_camera_world[-1]),
+            keyframes.motion_weights[-1],
+            scale,
+        )
+        keyframes.set_motion_weight(-1, weight)
+
+    def inherit(self, matches: FlowMatches) -> None:
+        """Give the newest keyframe the motion weights of the cells that flow to its own."""
+        if self.scale is not None:
+            before = self._keyframes.motion_weights[-2]
+            weight = inherit_motion_weight(self._grid, matches, before)
+            self._keyframes.set_motion_weight(-1, weight)
+
+
+def update_motion_weight(
+    grid: Grid,
+    matches: FlowMatches,  # E = 1, source to target
+    disparities: Tensor,  # (N,) of the source
+    T_target_source: Tensor,  # (4, 4)
+    weight: Tensor,  # (N,) of the source cells so far, in [0, 1]
+    scale: float,  # px, of the residuals that still count as following the camera
+) -> Tensor:  # (N,)
+    """Return the motion weight of the source cells after one more step of the camera."""
+    motion = T_target_source[None].to(disparities.dtype)
+    positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
+    squared = (positions[0] - matches.targets[0]).square().sum(0)
+    agreement = (1 + squared / scale**2) ** -2
+    rate = torch.where(agreement < weight, LOSS_RATE, RECOVERY_RATE)
+    return torch.where(valid[0] & _is_matched(matches), weight.lerp(agreement, rate), weight)
+
+
+def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> Tensor:  # (N,)
+    """Return the motion weight of the target cells: that of the source cells that flow there.
+
+    Where several cells meet, the lowest weight counts; where none arrives, that of the nearest
+    cell where one does.
+    """
+    cells = (matches.targets[0].mT / grid.stride).round().long()
+    height, width = grid.shape
+    inside = (cells >= 0).all(1) & (cells[:, 0] < width) & (cells[:, 1] < height)
+    arrives = inside & _is_matched(matches)
+    if not bool(arrives.any()):
+        return torch.ones_like(weight)
+    index = cells[arrives, 1] * width + cells[arrives, 0]
+    unknown = torch.full_like(weight, torch.inf)
+    inherited = unknown.scatter_reduce(0, index, weight[arrives], "amin").reshape(grid.shape)
+    empty = inherited.isinf().numpy()
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return inherited[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])].reshape(-1)
+
+
+def _is_matched(matches: FlowMatches) -> Tensor:  # (N,) bool
+    return matches.confidences[0].mean(0) > MIN_CONFIDENCE

@@ -1,0 +1,138 @@
+"""Adjustments of the keyframe graph on exact flow: what enters a problem, and what moves."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from minislam.geometry import se3_exp, se3_inverse, se3_log
+from minislam.tracking.bundle_adjustment import BundleState, residuals
+from minislam.tracking.config import TrackingConfig
+from minislam.tracking.frame_graph import neighbourhood_edges
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import adjust, bundle_problem, final_global_ba, local_ba
+from tests.tracking.scene import CAMERA, assert_same_bits
+from tests.tracking.wall import true_graph, true_poses
+
+XI = torch.tensor([0.03, -0.02, 0.02, 0.01, -0.01, 0.015], dtype=torch.float64)
+
+
+def matched(count: int = 4, **settings: float) -> KeyframeGraph:
+    """Return a graph at the truth whose neighbours are linked."""
+    graph = true_graph(list(range(count)), TrackingConfig(**settings))
+    graph.match(neighbourhood_edges(0, count, 2))
+    return graph
+
+
+def pose_error(graph: KeyframeGraph, keyframe: int) -> float:
+    estimate = graph.keyframes.T_camera_world[keyframe]
+    return float(se3_log(estimate @ se3_inverse(true_poses()[keyframe])).norm())
+
+
+def move(graph: KeyframeGraph, keyframe: int) -> None:
+    poses = graph.keyframes.T_camera_world
+    poses[keyframe] = se3_exp(XI) @ poses[keyframe]
+
+
+# What enters a problem
+
+
+def test_at_the_truth_all_residuals_are_zero():
+    graph = matched()
+    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    residual, valid = residuals(problem, graph.state)
+    assert bool(valid.any()) and float((residual * problem.weights).abs().max()) < 1e-4
+
+
+def test_weights_are_confidence_times_the_cell_weights_of_both_ends():
+    graph = matched(2)
+    graph.keyframes.static_weights[0] = 0.5
+    graph.keyframes.static_weights[1] = 0.25
+    problem = bundle_problem(graph, [0, 1], first_free=0)
+    confidences = torch.stack(graph.links.confidences)
+    torch.testing.assert_close(problem.weights, 0.125 * confidences)
+
+
+def test_the_first_pose_never_moves_and_older_keyframes_stay():
+    problem = bundle_problem(matched(), range(4), first_free=0)
+    assert problem.free_poses.tolist() == [False, True, True, True]
+    assert problem.free_disparities.tolist() == [True] * 4
+    problem = bundle_problem(matched(), range(4), first_free=2)
+    assert problem.free_poses.tolist() == [False, False, True, True]
+    assert problem.free_disparities.tolist() == [False, False, True, True]
+
+
+def test_the_prior_weighs_where_it_is_known_and_grows_with_the_focal_length():
+    graph = matched(lambda_disparity_prior=0.01)
+    graph.keyframes.prior_disparities[1, 3] = 0.2
+    weights = bundle_problem(graph, range(4), first_free=0).prior_weights
+    assert float(weights[1, 3]) == torch.tensor(0.01 * CAMERA.fx**2)
+    assert int((weights > 0).sum()) == 1
+    assert float(bundle_problem(graph, range(4), 0, lambda_prior=0.0).prior_weights.sum()) == 0
+
+
+# What moves
+
+
+def test_a_displaced_keyframe_finds_its_place():
+    # The two keyframes before it are held: they fix the unit of length.
+    graph = matched(rounds=1)
+    move(graph, 3)
+    graph.first_moved = 4
+    assert pose_error(graph, 3) > 0.03
+    adjust(graph, first_free=3, iterations=8)
+    assert pose_error(graph, 3) < 1e-3
+    assert max(pose_error(graph, keyframe) for keyframe in range(3)) < 1e-12
+    assert graph.failed_adjustments.count == 0 and graph.first_moved == 3
+
+
+def test_a_new_keyframe_is_linked_and_adjusted_without_knowing_where_it_is():
+    graph = matched()
+    everything = graph.links.edges()
+    fresh = true_graph(list(range(4)))
+    fresh.match([edge for edge in everything if 3 not in edge])
+    move(fresh, 3)
+    local_ba(fresh)
+    assert {(0, 3), (1, 3), (2, 3), (3, 2)} <= set(fresh.links.edges())
+    first, last = fresh.keyframes.T_camera_world[0], fresh.keyframes.T_camera_world[3]
+    assert torch.equal(first, true_poses()[0])
+    # The unit of length may drift: it is the direction of the path that flow fixes.
+    found, truth = (T[:3, 3] / T[:3, 3].norm() for T in (last, true_poses()[3]))
+    assert float((found - truth).norm()) < 1e-2
+    assert float((last[:3, :3] - true_poses()[3][:3, :3]).norm()) < 1e-3
+
+
+def test_the_last_adjustment_keeps_the_truth():
+    graph, calls = matched(), []
+    final_global_ba(graph, lambda done, of_all: calls.append((done, of_all)))
+    rounds = graph.config.final_rounds
+    assert calls == [(done, rounds) for done in range(1, rounds + 1)]
+    assert max(pose_error(graph, keyframe) for keyframe in range(4)) < 1e-3
+
+
+def test_the_unit_of_length_is_chosen_without_changing_any_image():
+    graph = matched()
+    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    before, _ = residuals(problem, graph.state)
+    graph.keyframes.normalise_scale()
+    assert float(graph.keyframes.disparities.median()) == 1.0
+    after, _ = residuals(problem, graph.state)
+    torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
+
+
+# What fails
+
+
+def test_adjustments_that_all_fail_are_counted_and_keep_the_state(monkeypatch: pytest.MonkeyPatch):
+    graph = matched()
+    move(graph, 3)
+    before = BundleState(graph.state.T_camera_world.clone(), graph.state.disparities.clone())
+
+    def singular(S: Tensor) -> tuple[Tensor, bool]:
+        return S, True
+
+    monkeypatch.setattr(torch.linalg, "cholesky_ex", singular)
+    adjust(graph, first_free=2, iterations=3)
+    final_global_ba(graph)
+    assert graph.failed_adjustments.count == 1 + graph.config.final_rounds
+    assert "singular" in graph.failed_adjustments.last_reason
+    assert_same_bits(graph.state, before)
