@@ -130,8 +130,8 @@ class ClassicalFlow(Stateful):
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "FlowChain":
         """Return the chain whose saved state this is."""
-        arrays = (state[name] for name in ("_reference", "_newest", "_flow", "_increment"))
-        return FlowChain(*arrays, self.config)
+        images, flow = (state["_reference"], state["_newest"]), state["_flow"]
+        return FlowChain(*images, flow, state["_increment"], self.config)
 
 
 class FlowChain(Stateful):

@@ -5,11 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from minislam.tracking.status import TrackingStatus
 
 from minislam.errors import TrackingLost
 from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error, centres
-from minislam.records import Frame, Trajectory
+from minislam.records import Frame, TrackingStatus, Trajectory
 from minislam.tracking.keyframe_graph import FailedAdjustments
 from minislam.tracking.tracker import Mode, Tracker
 from tests.tracking.recording import (

@@ -21,8 +21,8 @@ def test_a_known_place_is_found():
     frame = frames()[10]
     place = relocaliser.find(frame.image, tracker._features(frame))
     assert place is not None and place.inliers >= 20
-    T_world_first = recording().T_world_camera[0]
-    truth = torch.linalg.inv(torch.from_numpy(recording().T_world_camera[10])) @ T_world_first
+    T_world_camera = torch.from_numpy(recording().T_world_camera)
+    truth = se3_inverse(T_world_camera[10]) @ T_world_camera[0]
     assert float(se3_log(place.T_camera_world @ se3_inverse(truth)).norm()) < 0.02
 
 
