@@ -1,4 +1,4 @@
-"""Constants of the tracker."""
+"""Settings of the tracker."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from minislam.parameters import parameter
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Lengths in px belong to a 320x240 image and are scaled with the image diagonal."""
+    """Settings of the tracker. Lengths in px hold for 320x240 and grow with the image diagonal."""
 
     keyframe_flow: float = parameter(10.0, "mean flow since the last keyframe that makes one [px]")
     keyframe_flow_without_prior: float = parameter(
@@ -16,8 +16,13 @@ class TrackingConfig:
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement"
     )
+    cull_fraction: float = parameter(
+        0.3,
+        "a keyframe nearer to the last than this part of the flow that made it is left out [-]; "
+        "official code: 3 of 24 px",
+    )
     recently_lost_frames: int = parameter(
-        15, "a camera lost for longer is expected anywhere [frames]"
+        15, "a camera lost for longer counts as lost, no longer as recently lost [frames]"
     )
     warmup_keyframes: int = parameter(12, "keyframes of the two-stage start, paper Sec. 3.3")
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
@@ -37,8 +42,8 @@ class TrackingConfig:
     )
     motion_memory: float = parameter(
         3.0,
-        "residual at which a cell no longer follows the camera; what has moved is trusted less "
-        "from then on; needs a depth prior; 0: nothing is remembered [px]",
+        "residual at which a cell no longer follows the camera; its motion weight falls and is "
+        "handed on along the flow; needs a depth prior; 0: off [px]",
     )
     lambda_disparity_prior: float = parameter(
         0.0005,

@@ -8,9 +8,6 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import lengths
 
 KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyframe is needed [-]
-# A keyframe must be this far from the last, relative to the flow that makes a keyframe. [-];
-# official code: 3 of 24 px.
-CULL_FRACTION = 0.3
 
 
 def keyframe_flow(graph: KeyframeGraph) -> float:
@@ -51,7 +48,9 @@ def is_redundant(graph: KeyframeGraph, frame: Frame, T_camera_world: Tensor) -> 
     """
     if _is_due(graph, frame):
         return False
-    return graph.distance_to_newest(T_camera_world) < CULL_FRACTION * keyframe_flow(graph)
+    return graph.distance_to_newest(T_camera_world) < graph.config.cull_fraction * keyframe_flow(
+        graph
+    )
 
 
 def _is_due(graph: KeyframeGraph, frame: Frame) -> bool:

@@ -29,7 +29,7 @@ from minislam.records import Sequence, Trajectory
 from minislam.runs.run import choose_priors
 from minislam.slam import Slam
 from minislam.tracking.config import TrackingConfig
-from minislam.tracking.relocalisation import Relocaliser
+from minislam.tracking.safeguards.relocalisation import Relocaliser
 from minislam.tracking.trajectory import pose_all_frames
 from tests.benchmarks.bench_movers import ate, keyframe_error, tracked
 from tests.benchmarks.incidents import COVERED, covered_clip, standing_clip

@@ -8,7 +8,6 @@ from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.keyframe_selection import (
-    CULL_FRACTION,
     KEYFRAME_MATCHED_RATIO,
     is_redundant,
     keyframe_flow,
@@ -60,7 +59,7 @@ def test_a_frame_near_the_last_keyframe_is_redundant(relative: float, expected: 
     last = graph.keyframes.T_camera_world[-1]
     slide = torch.tensor([0.05, 0, 0, 0, 0, 0], dtype=torch.float64)
     per_slide = graph.distance_to_newest(se3_exp(slide) @ last)
-    factor = relative * CULL_FRACTION * keyframe_flow(graph) / per_slide
+    factor = relative * CONFIG.cull_fraction * keyframe_flow(graph) / per_slide
     pose = se3_exp(factor * slide) @ last
     assert is_redundant(graph, wall_frame(1), pose) is expected
     assert not is_redundant(graph, wall_frame(CONFIG.keyframe_interval), pose)
