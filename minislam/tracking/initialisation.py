@@ -176,5 +176,5 @@ def first_geometry(
             keyframes.set_motion_weight(index, weight)
     problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
     state, report = best_hypothesis(problem, [state for state, _ in hypotheses])
-    graph.count_failure(report)
+    graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)

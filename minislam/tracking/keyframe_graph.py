@@ -42,11 +42,12 @@ ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [
 
 
 @dataclass(frozen=True)
-class FailedAdjustments:
-    """The adjustments that left the state as it was, because no step could be computed."""
+class AdjustmentCount:
+    """How many adjustments ran, and how many failed, which left the state as it was."""
 
     count: int = 0
-    last_reason: str = ""
+    failed: int = 0
+    last_reason: str = ""  # of the last failure
 
 
 class KeyframeGraph(Stateful):
@@ -56,7 +57,7 @@ class KeyframeGraph(Stateful):
     flow_to_next: list[FlowMatches | None]  # keyframe k to k + 1 (E = 1), None across a loss
     links: FrameGraph
     flow: FlowEstimator
-    failed_adjustments: FailedAdjustments = FailedAdjustments()
+    adjustments: AdjustmentCount = AdjustmentCount()
     first_moved: int = 0  # first keyframe that moved since the tracker reported it last
 
     def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
@@ -80,11 +81,12 @@ class KeyframeGraph(Stateful):
         """Return poses and disparities of all keyframes."""
         return BundleState(self.keyframes.T_camera_world, self.keyframes.disparities)
 
-    def count_failure(self, report: BundleReport) -> None:
-        """Count an adjustment that failed; a run warns of them at its end."""
-        if not report.converged:
-            count = self.failed_adjustments.count + 1
-            self.failed_adjustments = FailedAdjustments(count, report.reason)
+    def count_adjustment(self, report: BundleReport) -> None:
+        """Count an adjustment; a run warns at its end of those that failed."""
+        before = self.adjustments
+        failed = before.failed + (not report.converged)
+        reason = before.last_reason if report.converged else report.reason
+        self.adjustments = AdjustmentCount(before.count + 1, failed, reason)
 
     # The newest keyframe ------------------------------------------------------------------------
 

@@ -108,7 +108,7 @@ def adjust(
     state, report = bundle_adjust(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.first_moved = min(graph.first_moved, first_free)
-    graph.count_failure(report)
+    graph.count_adjustment(report)
 
 
 def bundle_problem(

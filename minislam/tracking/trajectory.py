@@ -80,7 +80,7 @@ def _pose_between(
     unused = torch.zeros(1, len(grid.rays))  # disparities of the frame itself
     state = BundleState(poses, torch.cat([disparities, unused]))
     state, report = motion_only_adjust(problem, state, ITERATIONS)
-    graph.count_failure(report)
+    graph.count_adjustment(report)
     return state.T_camera_world[-1]
 
 

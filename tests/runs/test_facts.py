@@ -7,19 +7,20 @@ from types import SimpleNamespace
 import pytest
 
 from minislam.runs import facts
+from minislam.tracking.keyframe_graph import AdjustmentCount
 
 
 def slam(**parts: object) -> SimpleNamespace:
     """Return a finished run of four frames without anything to warn of, but for these parts."""
-    converged = SimpleNamespace(converged=True)
-    backend = SimpleNamespace(
-        reports=[converged] * 2 + [SimpleNamespace(converged=False)] * parts.pop("failed", 0),
+    failed = parts.pop("failed", 0)
+    graph = SimpleNamespace(
+        adjustments=AdjustmentCount(2 + failed, failed, "singular" if failed else ""),
         pixel_scale=1.0,
     )
     tracker = SimpleNamespace(
         tracked=[None] * 4,
-        backend=backend,
-        health=[SimpleNamespace(parallax=parallax) for parallax in parts.pop("parallax", [5.0])],
+        graph=graph,
+        diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
         keyframes=SimpleNamespace(has_prior=parts.pop("has_prior", True)),
     )
     lost = parts.pop("lost", 0)

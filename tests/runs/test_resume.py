@@ -73,7 +73,8 @@ def assert_same_results(whole: Path, out: Path, names: tuple[str, ...] = SAME) -
     expected, found = (folder.read_mlp() for folder in runs)
     assert all(bool((expected[name] == found[name]).all()) for name in expected)
     expected, found = (folder.read_run() for folder in runs)
-    assert found["health"] == expected["health"] and found["state"] == expected["state"]
+    assert found["keyframe_diagnostics"] == expected["keyframe_diagnostics"]
+    assert found["state"] == expected["state"]
     assert list(found["seconds"]) == list(expected["seconds"])
     pictures = sorted(path.name for path in (whole / "keyframes").iterdir())
     assert sorted(path.name for path in (out / "keyframes").iterdir()) == pictures
