@@ -4,11 +4,11 @@ Read the files in this order, the slow twin first:
 
     constants.py    what both renderers share
     gaussians.py    the map, and the Adam that optimises it
-    reference.py    the slow twin: Eqs. (1) and (2) and Sigma' as the paper writes them
+    reference.py    the slow twin: Eq. (1), Eq. (2) and Sigma' as the paper writes them
     covariance.py   Sigma = L L^T from quaternion and scales
     projection.py   mean and covariance from the world to the image
     visible.py      all steps of projection.py in a row, for the visible Gaussians, nearest first
-    compositing.py  Eqs. (1) and (2) for a group of tiles
+    compositing.py  Eq. (1), Eq. (2) for a group of tiles
     tiles.py        which Gaussians touch which tile
     tile_loop.py    compositing over all tiles of an image
     renderer.py     `render`: the whole chain as one differentiable function

@@ -1,4 +1,4 @@
-"""Eqs. (1) and (2) for a group of tiles: colour and depth of each pixel, front to back.
+"""Eq. (1) and Eq. (2) for a group of tiles: colour and depth of each pixel, front to back.
 
 A group of B tiles with P pixels each and K slots per tile is one dense block; a slot holds one
 Gaussian. With the channels f_k = (red, green, blue, z) of slot k, per pixel

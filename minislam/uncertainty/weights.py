@@ -1,7 +1,7 @@
 """The only place where beta becomes a weight.
 
-The paper weights residuals by 1 / beta^2, Eqs. (5) and (6). The official code, which we follow
-here, first stretches beta, then caps the weight in tracking and cuts it in mapping:
+The paper weights residuals by 1 / beta^2 in Eq. (5) and Eq. (6). The official code, which we
+follow here, first stretches beta, then caps the weight in tracking and cuts it in mapping:
 
     beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
     tracking: w capped at 1,        mapping: w below 0.1 set to 0.
