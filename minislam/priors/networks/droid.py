@@ -175,8 +175,8 @@ class DroidFlow(Stateful):
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "DroidChain":
         """Return the chain whose saved state this is."""
-        reference = from_tree(EncodedFrame, state["_reference"], frame_of)
-        newest = from_tree(EncodedFrame, state["_newest"], frame_of)
+        reference = from_tree(EncodedFrames, state["_reference"], frame_of)
+        newest = from_tree(EncodedFrames, state["_newest"], frame_of)
         return DroidChain(self, reference, newest, state["_target"])
 
 
