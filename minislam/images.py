@@ -1,4 +1,4 @@
-"""Images and grids: Gaussian blur, the constants and moments of SSIM, resampling."""
+"""Images and grids: Gaussian blur, the constants and moments of SSIM, resampling and shrinking."""
 
 from functools import lru_cache
 
@@ -70,3 +70,24 @@ def resample(
     batch = values[None, None]
     resampled = functional.interpolate(batch, (height, width), mode="bilinear", align_corners=False)
     return resampled[0, 0]
+
+
+def shrink_image(image: Tensor, height: int, width: int) -> Tensor:
+    """Return the image (height, width, 3) whose pixels are means over the areas they cover."""
+    if image.shape[:2] == (height, width):
+        return image
+    return _area_mean(image.permute(2, 0, 1), height, width).permute(1, 2, 0).contiguous()
+
+
+def shrink_depth(depth: Tensor, height: int, width: int) -> Tensor:
+    """Return the depth (height, width) of means over the KNOWN pixels, 0 where there are none."""
+    if depth.shape == (height, width):
+        return depth
+    known = (depth > 0).to(depth)
+    total, fraction = _area_mean(torch.stack([depth * known, known]), height, width)
+    smallest = torch.finfo(depth.dtype).eps  # where no pixel is known, 0 / 0 is not taken
+    return torch.where(fraction > 0, total / fraction.clamp_min(smallest), 0)
+
+
+def _area_mean(channels: Tensor, height: int, width: int) -> Tensor:
+    return functional.adaptive_avg_pool2d(channels[None], (height, width))[0]

@@ -31,7 +31,6 @@ from minislam.tracking.safeguards.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty import (
-    MlpSnapshots,
     beta_of_mask,
     tracking_weight,
 )
@@ -51,7 +50,6 @@ class Slam(Stateful):
 
     tracker: Tracker
     mapper: Mapper
-    snapshots: MlpSnapshots  # by frame index
     steps: Steps
     focal_length: FocalLengthFit | None = None  # the one that fits the flow best, at the end
     _poses: dict[int, Tensor]  # T_camera_world of every frame, once known
@@ -77,10 +75,6 @@ class Slam(Stateful):
             priors.features.dimension,
             config.seed,
         )
-        self.snapshots = MlpSnapshots(self.mapper.mlp)
-        # The tracker calls `_static_weight` for a new keyframe, for all keyframes at the end of
-        # the warm-up, and for all again in the final adjustment. In between a keyframe keeps its
-        # beta, although the MLP goes on learning.
         self.tracker = Tracker(
             sequence.camera,
             config.tracking,
@@ -129,7 +123,6 @@ class Slam(Stateful):
         with self.steps.timed("mapping"):
             all_keyframes = [self._keyframe(k) for k in range(len(self.tracker.keyframes))]
             self.mapper.initialise(all_keyframes, self.steps.on_progress("first map"))
-            self._record_mlp()
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
 
@@ -139,7 +132,6 @@ class Slam(Stateful):
             self._move_map(first_changed=min(mapped, first_moved))
             for index in range(mapped, len(self.tracker.keyframes)):
                 self.mapper.integrate(self._keyframe(index))
-            self._record_mlp()
 
     def _adjust_all(self) -> None:
         self.tracker.finish(self.steps.on_progress("final adjustment"))
@@ -152,14 +144,10 @@ class Slam(Stateful):
             self._move_map(first_changed=0)
         iterations = self.config.mapping.refine_iterations
         self.mapper.refine(iterations, self.steps.on_step(stage), done)
-        self.snapshots.record(len(self.sequence) - 1)
 
     def _pose_all_frames(self) -> None:
         on_progress = self.steps.on_progress("posing all frames")
         self._poses = pose_all_frames(self.tracker, self.sequence, on_progress)
-
-    def _record_mlp(self) -> None:
-        self.snapshots.record(self.tracker.keyframes.frames[-1].frame_index)
 
     def _move_map(self, first_changed: int) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""
@@ -267,16 +255,6 @@ class Slam(Stateful):
             return np.ones((camera.height, camera.width), np.float32)
         beta = self.mapper.beta_of(self.mapper.keyframes[keyframe_index])
         return resample(beta, camera.height, camera.width).numpy()
-
-    def online_beta(self, frame_index: int, trained_until: list[int]) -> list[Tensor]:
-        """Return beta (h', w') of one frame from the MLP's weights after each of these frames."""
-        keyframes = self.tracker.keyframes
-        numbers = [frame.frame_index for frame in keyframes.frames]
-        if frame_index in numbers:  # its features are known, and a network is slow
-            features = keyframes.features[numbers.index(frame_index)]
-        else:
-            features = self._features(self.sequence.frame(frame_index))
-        return [self.snapshots.predict(moment, features) for moment in trained_until]
 
     def lost_frames(self) -> list[tuple[int, float, str]]:
         """Return frame index, timestamp and reason of every frame without a pose."""

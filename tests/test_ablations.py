@@ -114,14 +114,6 @@ def test_only_the_poses_between_the_keyframes_are_refined(sequence: Sequence, us
     assert different and not different & keyframes
 
 
-def test_beta_of_a_frame_is_known_for_earlier_states_of_the_mlp(usual: Slam):
-    moments = usual.snapshots.moments
-    assert moments[-1] == FRAMES - 1 and len(moments) > 2
-    first, last = usual.online_beta(7, [moments[0], moments[-1]])
-    assert first.shape == last.shape == (48 // 7, 64 // 7)
-    assert not np.allclose(first.numpy(), last.numpy())
-
-
 def test_masks_are_asked_of_a_sequence_that_has_them(sequence: Sequence, monkeypatch):
     monkeypatch.setattr(sequence.ground_truth, "moving_mask", lambda frame_index: None)
     config = with_settings(SlamConfig(), SHORT | ABLATIONS["given masks instead of beta (c)"])

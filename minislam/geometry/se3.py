@@ -98,6 +98,19 @@ def rotation_from_quaternion(quats_wxyz: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(*quats_wxyz.shape[:-1], 3, 3)
 
 
+def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
+    """Return the quaternion (..., 4) wxyz of rotation a after rotation b."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    rows = [
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ]
+    return torch.stack(rows, -1)
+
+
 def se3_exp(xi: Tensor) -> Tensor:
     """Return the transforms (..., 4, 4) of tangent vectors xi = (rho, phi) (..., 6)."""
     rotation, V = _rotation_and_left_jacobian(xi[..., 3:])

@@ -6,21 +6,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_inverse, transform_points
-from minislam.geometry.se3 import quaternion_from_rotation
+from minislam.geometry.se3 import quaternion_from_rotation, quaternion_product
 from minislam.splatting import GaussianMap
-
-
-def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """Return the quaternion (..., 4) wxyz of rotation a after rotation b."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    rows = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-    return torch.stack(rows, -1)
 
 
 def deform_rigidly(

@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.images import shrink_depth, shrink_image
 from minislam.records import Keyframe
 from minislam.splatting import Rendering
 from minislam.state.stateful import FrameOf, Tree
@@ -123,24 +123,3 @@ def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
     """Return the depth of the visible surface [world units], 0 where the map is transparent."""
     depth = rendering.depth / rendering.opacity.clamp_min(_OPAQUE)
     return torch.where(rendering.opacity > _OPAQUE, depth, 0)
-
-
-def shrink_image(image: Tensor, height: int, width: int) -> Tensor:
-    """Return the image (height, width, 3) whose pixels are means over the areas they cover."""
-    if image.shape[:2] == (height, width):
-        return image
-    return _area_mean(image.permute(2, 0, 1), height, width).permute(1, 2, 0).contiguous()
-
-
-def shrink_depth(depth: Tensor, height: int, width: int) -> Tensor:
-    """Return the depth (height, width) of means over the KNOWN pixels, 0 where there are none."""
-    if depth.shape == (height, width):
-        return depth
-    known = (depth > 0).to(depth)
-    total, fraction = _area_mean(torch.stack([depth * known, known]), height, width)
-    smallest = torch.finfo(depth.dtype).eps  # where no pixel is known, 0 / 0 is not taken
-    return torch.where(fraction > 0, total / fraction.clamp_min(smallest), 0)
-
-
-def _area_mean(channels: Tensor, height: int, width: int) -> Tensor:
-    return functional.adaptive_avg_pool2d(channels[None], (height, width))[0]

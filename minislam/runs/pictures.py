@@ -15,7 +15,6 @@ from minislam.viz import (
     keyframe_strip,
     loss_curves,
     map_growth,
-    online_uncertainty,
     overview,
     trajectory_plot,
 )
@@ -40,8 +39,6 @@ def write_pictures(
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
     plots["losses"] = "Losses", figure_png(loss_curves(curves))
     plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
-    if slam.config.uncertainty.is_learnt and slam.snapshots.moments:
-        plots["online_uncertainty"] = "What the MLP had learnt by then", _online_beta(slam)
     for name, (_, png) in plots.items():
         folder.write_plot(name, png)
 
@@ -75,19 +72,6 @@ def _write_keyframes(folder: RunFolder, slam: Slam) -> list[tuple[str, bytes]]:
             strip = figure_png(keyframe_strip(image, depth, beta, color, f"frame {number}"))
             strips.append((f"Keyframe {index}, frame {number}", strip))
     return strips
-
-
-def _online_beta(slam: Slam) -> bytes:
-    """Draw beta of the keyframe with most movement at three times: first, then, and at the end."""
-    count = len(slam.mapper.keyframes)
-    index = max(range(count), key=lambda k: float(slam.beta_image(k).mean()))
-    number, moments = slam.mapper.keyframes[index].frame_index, slam.snapshots.moments
-    later = [moment for moment in moments if moment >= number]
-    chosen = sorted({moments[0], later[0] if later else moments[-1], moments[-1]})
-    betas = slam.online_beta(number, chosen)
-    named = {f"learnt until frame {k}": b.numpy() for k, b in zip(chosen, betas, strict=True)}
-    image = slam.mapper.keyframes[index].image.numpy()
-    return figure_png(online_uncertainty(image, named, f"uncertainty of frame {number}"))
 
 
 def _shown(value: float | None) -> str:

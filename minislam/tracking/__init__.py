@@ -4,7 +4,6 @@ Reading order:
 
     grid                the cells of the image on which everything is measured
     reprojection        where a cell of one keyframe is seen in another, with derivatives
-    robust              the robust weight inside Sigma
     bundle_adjustment   dense bundle adjustment, Eq. (5); reference.py is its slow twin
     disparity_prior     the mask M of the disparity prior, Eq. (8)
     keyframes           the store: all that is known of each keyframe

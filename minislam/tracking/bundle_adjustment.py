@@ -22,7 +22,7 @@ from minislam.tracking.reprojection import (
     relative_transforms,
     reproject_with_jacobians,
 )
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]

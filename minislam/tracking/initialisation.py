@@ -9,13 +9,10 @@ lowest cost is kept.
 
 from dataclasses import replace
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.geometry import se3_interpolate, se3_inverse
-from minislam.geometry.distortion import camera_matrix
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.bundle_adjustment import (
     BundleProblem,
@@ -27,63 +24,11 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.first_depth import essential_disparities
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, update_motion_weight
+from minislam.tracking.safeguards.robust import RobustKernel
 
-ESSENTIAL_THRESHOLD = 0.7  # px, RANSAC inlier distance to the epipolar line
-MIN_CELLS_FOR_ESSENTIAL = 40  # confident cells; five define the matrix, noise wants many more
 HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps per width before hypotheses are compared
-DISPARITY_SPREAD = 20.0  # largest ratio of a triangulated disparity to the median, both ways
-
-
-def triangulate(
-    grid: Grid,
-    T_target_source: Tensor,  # (4, 4)
-    targets: Tensor,  # (N, 2) px
-    confident: Tensor,  # (N,) bool
-) -> Tensor:  # (N,)
-    """Return the disparities that best explain matches under a known motion.
-
-    With the matched ray (a, b, 1), (R rho + d t) must be parallel to it: two equations that are
-    linear in d, solved by least squares.
-    """
-    rotated = grid.rays @ T_target_source[:3, :3].T.to(grid.rays.dtype)
-    t = T_target_source[:3, 3].to(grid.rays.dtype)
-    seen = grid.camera.rays(targets)[:, :2]
-    factor = t[:2] - seen * t[2]
-    value = seen * rotated[:, 2:] - rotated[:, :2]
-    disparities = (factor * value).sum(1) / factor.square().sum(1).clamp_min(1e-12)
-    usable = confident & (disparities > 0)
-    if not usable.any():
-        return torch.ones_like(disparities)
-    typical = disparities[usable].median()
-    usable &= disparities < DISPARITY_SPREAD * typical
-    usable &= disparities > typical / DISPARITY_SPREAD
-    return torch.where(usable, disparities, typical) / typical
-
-
-def essential_disparities(
-    grid: Grid,
-    targets: Tensor,  # (N, 2) px
-    confidences: Tensor,  # (N, 2)
-) -> Tensor | None:  # (N,)
-    """Return disparities of the source from an essential matrix, median 1, or None."""
-    confident = confidences[:, 0] > 0.5
-    if int(confident.sum()) < MIN_CELLS_FOR_ESSENTIAL:
-        return None
-    source = grid.pixels[confident].double().numpy()
-    target = targets[confident].double().numpy()
-    matrix = camera_matrix(grid.camera)
-    cv2.setRNGSeed(0)
-    essential, inliers = cv2.findEssentialMat(
-        source, target, matrix, cv2.RANSAC, 0.999, ESSENTIAL_THRESHOLD
-    )
-    if essential is None or essential.shape != (3, 3):
-        return None
-    _, rotation, translation, _ = cv2.recoverPose(essential, source, target, matrix, mask=inliers)
-    T_target_source = np.eye(4)
-    T_target_source[:3, :3], T_target_source[:3, 3] = rotation, translation[:, 0]
-    return triangulate(grid, torch.from_numpy(T_target_source), targets, confident)
 
 
 def first_disparity_hypotheses(

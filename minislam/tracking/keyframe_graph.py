@@ -28,7 +28,7 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.pose_from_flow import compose_matches, start_pose, warp_disparities
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 
 Edge = tuple[int, int]  # keyframe index of source and target
 

@@ -22,8 +22,8 @@ def local_ba(graph: KeyframeGraph) -> None:
     """Link the newest keyframe, then adjust the newest `window` keyframes together.
 
     First comes a BA on flow from its predecessors that was found without its pose, because that
-    pose may still be wrong. Then edges to its neighbourhood and to
-    nearby older keyframes are added, and flow and BA alternate for some rounds.
+    pose may still be wrong. Then edges to its neighbourhood and to nearby older keyframes are
+    added, and flow and BA alternate for some rounds.
     """
     config, newest = graph.config, len(graph.keyframes) - 1
     first_free = max(0, newest + 1 - config.window)

@@ -13,7 +13,7 @@ from minislam.tracking.bundle_adjustment import (
 )
 from minislam.tracking.grid import Grid
 from minislam.tracking.reprojection import splat_disparities
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
 # A start that is off by 10 degrees is off by 50 px, where a narrow robust weight sees only

@@ -75,10 +75,7 @@ class Tracker(Stateful):
         flow: FlowEstimator,
         features: FeatureExtractor,
         depth_prior: DepthPrior,
-        # Keyframe index -> (h, w) in [0, 1], from beta. It is called for every new keyframe, at
-        # the end of the warm-up and before the final global BA. In between a keyframe keeps the
-        # weight that it started with.
-        predict_static_weight: Callable[[int], Tensor],
+        predict_static_weight: Callable[[int], Tensor],  # keyframe index -> (h, w) in [0, 1]
     ) -> None:
         """Start without any frame.
 

@@ -6,18 +6,15 @@ Read the files in this order:
     weights       the only place where beta becomes a weight, of tracking or of mapping
     losses        the terms of L_uncer: modified SSIM, L_depth, Eq. (3), and the regularisers
     training      L_uncer itself, Eq. (4), and the Adam that lowers it
-    snapshots     copies of the MLP at earlier moments, for the report
     config        the settings
 """
 
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 from minislam.uncertainty.mlp import UncertaintyMLP
-from minislam.uncertainty.snapshots import MlpSnapshots
 from minislam.uncertainty.training import RenderingError, UncertaintyTrainer, rendering_error
 from minislam.uncertainty.weights import beta_of_mask, mapping_weight, tracking_weight
 
 __all__ = [
-    "MlpSnapshots",
     "RenderingError",
     "UncertaintyConfig",
     "UncertaintyMLP",

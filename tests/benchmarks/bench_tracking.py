@@ -25,7 +25,7 @@ from minislam.tracking.config import TrackingConfig
 from minislam.tracking.grid import Grid
 from minislam.tracking.reference import dense_step
 from minislam.tracking.reprojection import relative_transforms, reproject
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.tracking.tracker import Tracker
 
 CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)

@@ -23,6 +23,7 @@ from minislam.geometry import (
 from minislam.geometry.se3 import (
     hat,
     quaternion_from_rotation,
+    quaternion_product,
     rotation_from_quaternion,
     so3_left_jacobian,
 )
@@ -257,3 +258,9 @@ def test_float32_keeps_float32_accuracy(angle: float):
 def test_empty_batches_stay_empty():
     assert se3_exp(torch.zeros(0, 6)).shape == (0, 4, 4)
     assert se3_log(torch.zeros(0, 4, 4)).shape == (0, 6)
+
+
+def test_quaternion_product_is_the_product_of_rotations():
+    a, b = torch.randn(2, 5, 4, generator=generator(1), dtype=torch.float64)
+    product = rotation_from_quaternion(quaternion_product(a, b))
+    torch.testing.assert_close(product, rotation_from_quaternion(a) @ rotation_from_quaternion(b))

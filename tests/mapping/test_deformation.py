@@ -3,7 +3,7 @@ import torch
 
 from minislam.geometry import se3_exp, so3_log
 from minislam.geometry.se3 import rotation_from_quaternion
-from minislam.mapping.deformation import deform_rigidly, quaternion_product, rescale_to_depths
+from minislam.mapping.deformation import deform_rigidly, rescale_to_depths
 from minislam.splatting import GaussianMap, render
 from tests.helpers import generator, random_transforms
 from tests.mapping.plane_scene import CAMERA
@@ -25,12 +25,6 @@ def random_map(count: int, dtype: torch.dtype = torch.float64) -> GaussianMap:
 
 
 # Known answers
-
-
-def test_quaternion_product_is_the_product_of_rotations():
-    a, b = torch.randn(2, 5, 4, generator=generator(1), dtype=torch.float64)
-    product = rotation_from_quaternion(quaternion_product(a, b))
-    torch.testing.assert_close(product, rotation_from_quaternion(a) @ rotation_from_quaternion(b))
 
 
 def test_a_doubled_reference_depth_doubles_the_distance_along_the_ray():

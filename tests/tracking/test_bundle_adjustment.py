@@ -16,7 +16,7 @@ from minislam.tracking.bundle_adjustment import (
     residuals,
 )
 from minislam.tracking.reference import dense_normal_equations, dense_step
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 from tests.tracking.scene import (
     CELLS,
     assert_same_bits,

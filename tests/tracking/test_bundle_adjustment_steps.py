@@ -16,7 +16,7 @@ from minislam.tracking.bundle_adjustment import (
     bundle_adjust,
     residuals,
 )
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 from tests.tracking.scene import (
     assert_same_bits,
     distance,

@@ -5,7 +5,7 @@ import torch
 
 from minislam.geometry import se3_exp
 from minislam.tracking.pose_from_flow import compose_matches, start_pose, warp_disparities
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 from tests.tracking.matches import CELLS, GRID, matches_to, room_disparities, seen_matches, sideways
 from tests.tracking.scene import CAMERA, normal
 

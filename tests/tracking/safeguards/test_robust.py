@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from minislam.tracking.robust import RobustKernel
+from minislam.tracking.safeguards.robust import RobustKernel
 from tests.helpers import numerical_jacobian
 
 SQUARED = torch.tensor([0.0, 0.01, 0.3, 1.0, 4.0, 100.0], dtype=torch.float64)
