@@ -35,6 +35,15 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
+class AdjustmentCount:
+    """How many adjustments ran, and how many failed, which left the state as it was."""
+
+    count: int = 0
+    failed: int = 0
+    last_reason: str = ""  # of the last failure
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """Stamped camera poses, in the order of their timestamps."""
 

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = sorted((ROOT / "minislam").rglob("*.py"))
 SYNTHETIC = sorted((ROOT / "data_synth").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
-LONGEST_MODULE = 320  # lines
+LONGEST_MODULE = 300  # lines
 
 # A part may import what stands before it and nothing that stands after it.
 FOUNDATION = ["errors", "parameters", "geometry", "images", "records", "state"]

@@ -13,6 +13,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "runs/pictures": "test_slam.py",
     "splatting/constants": "splatting/test_projection.py",
     "splatting/tile_loop": "splatting/test_renderer.py",
+    "tracking/config": "test_config.py",
     "tracking/reference": "tracking/test_bundle_adjustment.py",
     "priors/interfaces": "priors/test_flow.py",  # protocols and one record
 }

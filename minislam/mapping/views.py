@@ -18,8 +18,6 @@ from minislam.uncertainty import (
     rendering_error,
 )
 
-_OPAQUE = 0.5  # a less opaque pixel shows a gap rather than a surface
-
 
 @dataclass(frozen=True)
 class View:
@@ -117,9 +115,3 @@ def keyframe_rendering_error(
         depth_unit,
         config,
     )
-
-
-def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
-    """Return the depth of the visible surface [world units], 0 where the map is transparent."""
-    depth = rendering.depth / rendering.opacity.clamp_min(_OPAQUE)
-    return torch.where(rendering.opacity > _OPAQUE, depth, 0)

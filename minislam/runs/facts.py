@@ -4,14 +4,19 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
+import torch
+from torch import Tensor
+
 import minislam
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MappedView, measure_run
 from minislam.geometry import se3_inverse
-from minislam.mapping.views import surface_depth
 from minislam.priors.choice import PriorChoice
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Slam
+from minislam.splatting import Rendering
+
+_OPAQUE = 0.5  # a less opaque pixel shows a gap rather than a surface
 
 
 def run_facts(
@@ -70,6 +75,12 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds
     metrics["peak_memory_mb"] = peak_memory_mb()
     return metrics
+
+
+def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
+    """Return the depth of the visible surface [world units], 0 where the map is transparent."""
+    depth = rendering.depth / rendering.opacity.clamp_min(_OPAQUE)
+    return torch.where(rendering.opacity > _OPAQUE, depth, 0)
 
 
 def peak_memory_mb() -> float | None:

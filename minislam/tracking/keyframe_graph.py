@@ -5,15 +5,13 @@ see the same (covisibility, measured by the flow distance). A link that spans mo
 neighbourhood is added only if the flow confirms it in both directions.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_interpolate, se3_inverse
 from minislam.geometry.camera import pixel_scale
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
-from minislam.records import Frame
+from minislam.records import AdjustmentCount, Frame
 from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import BundleReport, BundleState
 from minislam.tracking.config import TrackingConfig
@@ -39,15 +37,6 @@ HORIZON = 3  # BA windows of keyframes among which a new one looks for such link
 GLOBAL_EDGES = 6  # further links per keyframe in a global BA
 GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
 ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [-]
-
-
-@dataclass(frozen=True)
-class AdjustmentCount:
-    """How many adjustments ran, and how many failed, which left the state as it was."""
-
-    count: int = 0
-    failed: int = 0
-    last_reason: str = ""  # of the last failure
 
 
 class KeyframeGraph(Stateful):

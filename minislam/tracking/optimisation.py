@@ -8,8 +8,7 @@ from torch import Tensor
 
 from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
 from minislam.tracking.disparity_prior import mask_priors
-from minislam.tracking.frame_graph import both_directions
-from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, Edge, KeyframeGraph
+from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 
 # A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
 # correct would look like outliers. So the weight is wide at first. [-]
@@ -34,23 +33,6 @@ def local_ba(graph: KeyframeGraph) -> None:
     for _ in range(config.rounds):
         graph.match(edges)
         adjust(graph, first_free, config.iterations)
-
-
-def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
-    """Link a relocalised keyframe, the newest, with a similar one and the neighbours of that one.
-
-    Only the newest keyframe moves. Return False, and link nothing, if the flow does not confirm
-    that both show the same place.
-    """
-    newest = len(graph.keyframes) - 1
-    around = range(max(0, similar - NEIGHBOURHOOD), min(newest, similar + NEIGHBOURHOOD + 1))
-    edges = graph.filter_confirmed(both_directions([(newest, index) for index in around]))
-    if (newest, similar) not in edges:
-        return False
-    for _ in range(graph.config.rounds):
-        graph.match(edges)
-        adjust(graph, newest, graph.config.iterations, widening=FIRST_WIDENING)
-    return True
 
 
 def online_global_ba(graph: KeyframeGraph) -> None:

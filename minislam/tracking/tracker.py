@@ -25,7 +25,6 @@ from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframe_selection import is_redundant, needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import (
-    attach_newest,
     final_global_ba,
     local_ba,
     online_global_ba,
@@ -33,7 +32,7 @@ from minislam.tracking.optimisation import (
 )
 from minislam.tracking.safeguards.diagnostics import KeyframeDiagnostics, diagnose
 from minislam.tracking.safeguards.motion_memory import MotionMemory
-from minislam.tracking.safeguards.relocalisation import Place, Relocaliser
+from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 MAX_CULLED_IN_A_ROW = 2  # keyframes, official code

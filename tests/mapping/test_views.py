@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from minislam.errors import InputError
-from minislam.mapping.views import MappedKeyframe, median_depth, surface_depth
-from minislam.splatting import Rendering
+from minislam.mapping.views import MappedKeyframe, median_depth
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
 
 HALF = CAMERA.resized(16, 12)
@@ -25,13 +24,6 @@ def test_shrinking_depth_averages_known_pixels_only():
     record.depth[:2, 2:4] = 0
     depth = MappedKeyframe.from_record(record).view(HALF).depth
     assert float(depth[0, 0]) == pytest.approx(2.0) and depth[0, 1] == 0
-
-
-def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():
-    # Rendered depth is a sum over blending weights: 1.8 at an opacity of 0.9 is a surface at 2.
-    depth, opacity = torch.tensor([[1.8, 0.4]]), torch.tensor([[0.9, 0.2]])
-    rendering = Rendering(torch.zeros(1, 2, 3), depth, opacity, torch.ones(1), torch.ones(1))
-    torch.testing.assert_close(surface_depth(rendering), torch.tensor([[2.0, 0.0]]))
 
 
 # Identities

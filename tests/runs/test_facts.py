@@ -5,9 +5,11 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+import torch
 
+from minislam.records import AdjustmentCount
 from minislam.runs import facts
-from minislam.tracking.keyframe_graph import AdjustmentCount
+from minislam.splatting import Rendering
 
 
 def slam(**parts: object) -> SimpleNamespace:
@@ -64,3 +66,10 @@ def test_without_the_counter_of_unix_the_package_still_imports():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout == "None\n", done.stderr
+
+
+def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():
+    # Rendered depth is a sum over blending weights: 1.8 at an opacity of 0.9 is a surface at 2.
+    depth, opacity = torch.tensor([[1.8, 0.4]]), torch.tensor([[0.9, 0.2]])
+    rendering = Rendering(torch.zeros(1, 2, 3), depth, opacity, torch.ones(1), torch.ones(1))
+    torch.testing.assert_close(facts.surface_depth(rendering), torch.tensor([[2.0, 0.0]]))

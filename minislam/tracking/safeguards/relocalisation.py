@@ -15,8 +15,11 @@ from torch.nn.functional import normalize
 from minislam.geometry.distortion import camera_matrix
 from minislam.geometry.se3 import make_transform, so3_exp
 from minislam.priors.dense_flow import grayscale
+from minislam.tracking.frame_graph import both_directions
 from minislam.tracking.grid import Grid
+from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.optimisation import FIRST_WIDENING, adjust
 
 CANDIDATES = 3  # keyframes that are tried for one frame
 MAX_RATIO = 0.8  # of the distance to the best over the second-best descriptor (Lowe)
@@ -118,3 +121,20 @@ def _keypoint_matches(
         first[0][[match.queryIdx for match in clear]],
         second[0][[match.trainIdx for match in clear]],
     )
+
+
+def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
+    """Link a relocalised keyframe, the newest, with a similar one and the neighbours of that one.
+
+    Only the newest keyframe moves. Return False, and link nothing, if the flow does not confirm
+    that both show the same place.
+    """
+    newest = len(graph.keyframes) - 1
+    around = range(max(0, similar - NEIGHBOURHOOD), min(newest, similar + NEIGHBOURHOOD + 1))
+    edges = graph.filter_confirmed(both_directions([(newest, index) for index in around]))
+    if (newest, similar) not in edges:
+        return False
+    for _ in range(graph.config.rounds):
+        graph.match(edges)
+        adjust(graph, newest, graph.config.iterations, widening=FIRST_WIDENING)
+    return True
