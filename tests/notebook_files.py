@@ -19,6 +19,15 @@ def source(cell: dict) -> str:
     return "".join(cell["source"])
 
 
+def is_exercise(cell: dict) -> bool:
+    return cell["cell_type"] == "code" and SOLUTION.search(source(cell)) is not None
+
+
+def prose(text: str) -> str:
+    """Return the sentences of a text cell: no code blocks, displayed formulas and tables."""
+    return re.sub(r"```.*?```|\$\$.*?\$\$|^\|.*?$", "", text, flags=re.S | re.M)
+
+
 def cleaned(notebook: dict) -> dict:
     """Return the notebook without what differs from run to run: timings, versions, random ids."""
     result = copy.deepcopy(notebook)
