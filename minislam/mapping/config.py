@@ -29,7 +29,7 @@ class DensityConfig:
     max_gaussians: int = parameter(
         0,
         "no cloning or splitting beyond this size of the map, 0 switches both off; paper: no limit."
-        " In a few hundred iterations they gain nothing over a dense insertion (measured)",
+        " Over a dense insertion they gain nothing in novel views (tests/benchmarks/RESULTS.md)",
     )
 
 
@@ -52,7 +52,7 @@ class PoseRefinementConfig:
     fraction: float = parameter(
         0.75,
         "fraction of the way from the pose by flow to the pose by re-rendering [0, 1]; official 1."
-        " Their errors are independent, so a mean is better than either (measured)",
+        " Both are measurements with errors of their own, so a mean is kept",
     )
 
 
