@@ -286,19 +286,3 @@ def test_the_given_state_is_left_alone():
     copy = BundleState(start.T_camera_world.clone(), start.disparities.clone())
     bundle_adjust(known.problem, start, iterations=3)
     assert_same_bits(start, copy)
-
-
-def test_float32_cells_with_float64_poses():
-    known = two_fixed_poses(known_problem())
-    problem = replace(
-        known.problem,
-        **{
-            name: getattr(known.problem, name).float()
-            for name in ("rays", "targets", "weights", "prior_disparities", "prior_weights")
-        },
-    )
-    start = perturbed(known, 0.02)
-    start = BundleState(start.T_camera_world, start.disparities.float())
-    end, _ = bundle_adjust(problem, start, iterations=10)
-    assert end.T_camera_world.dtype == torch.float64 and end.disparities.dtype == torch.float32
-    assert distance(end, known.truth) < 1e-4

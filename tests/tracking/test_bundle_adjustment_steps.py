@@ -189,3 +189,19 @@ def test_looking_away_does_not_pay(robust):
     assert not residuals(problem, away)[1].any()
     cost_away = bundle_adjust(problem, away, iterations=0)[1].cost_after
     assert cost_away > bundle_adjust(problem, perturbed(known, 0.1), 0)[1].cost_after > 0
+
+
+def test_float32_cells_with_float64_poses():
+    known = two_fixed_poses(known_problem())
+    problem = replace(
+        known.problem,
+        **{
+            name: getattr(known.problem, name).float()
+            for name in ("rays", "targets", "weights", "prior_disparities", "prior_weights")
+        },
+    )
+    start = perturbed(known, 0.02)
+    start = BundleState(start.T_camera_world, start.disparities.float())
+    end, _ = bundle_adjust(problem, start, iterations=10)
+    assert end.T_camera_world.dtype == torch.float64 and end.disparities.dtype == torch.float32
+    assert distance(end, known.truth) < 1e-4
