@@ -1,4 +1,4 @@
-"""The frozen things that the stages hand to each other."""
+"""The data that one stage gives to another (frozen), and the protocols of the input."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ class TrackingStep:
 
 
 class GroundTruth(Protocol):
-    """What a benchmark knows and the system must not see. Any answer may be None."""
+    """The ground truth of a benchmark, which the system must not see. Each part may be None."""
 
     trajectory: Trajectory | None  # in the benchmark's own world and at its own timestamps
 

@@ -175,8 +175,8 @@ class Slam(Stateful):
 
         The tracker asks for it when a keyframe comes, at the end of the warm-up and in the final
         adjustment, so online a keyframe keeps the beta that it had when it came. Without a depth
-        prior the map stands on the tracker's own structure, and where that is poor, the MLP's beta
-        is high on everything with texture. Then only given masks are used.
+        prior the map is built from the tracker's own disparities. Where they are poor, the MLP's
+        beta is high on everything with texture. Then only given masks are used.
         """
         keyframes = self.tracker.keyframes
         uncertainty = self.config.uncertainty

@@ -79,7 +79,7 @@ def _self_test() -> float:
 
 
 def _print_checkpoints(folder: Path) -> int:
-    """Print one line for each checkpoint file: which network, how large, whole or not, its flag."""
+    """Print one line per checkpoint file: which network, how large, complete or not, its flag."""
     files = []
     if folder.is_dir():
         files = sorted(p for p in folder.iterdir() if p.suffix.lower() in CHECKPOINT_ENDINGS)

@@ -45,7 +45,7 @@ def path_of(paths: list[Path | None], index: int) -> Path | None:
 
 
 class RecordedTruth:
-    """What a benchmark knows and the system must not see: a `minislam.records.GroundTruth`."""
+    """The ground truth of a recording, which the system must not see: a `GroundTruth`."""
 
     def __init__(
         self,

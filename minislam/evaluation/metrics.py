@@ -17,7 +17,7 @@ from minislam.records import GroundTruth, Trajectory
 
 MAX_DIFFERENCE = 0.02  # second between a frame and its true pose; TUM stamps differ by 0.005
 ImageDistance = Callable[[np.ndarray, np.ndarray], float]  # rendered, true (H, W, 3) RGB
-MIN_MASK = 20  # px of dynamic objects below which a view says nothing about ghosts
+MIN_MASK = 20  # px of dynamic objects below which a view does not measure ghosts
 CENTIMETRES = 100.0  # per world unit of the truth, which is metric
 
 

@@ -123,7 +123,7 @@ class Camera:
 
 
 def pixel_scale(camera: Camera) -> float:
-    """Return how many pixels stand for one pixel of a 320x240 image.
+    """Return how many pixels correspond to one pixel of a 320x240 image.
 
     Thresholds in pixels are given for that size and are multiplied by this factor.
     """

@@ -155,10 +155,10 @@ class MappingConfig:
 
 
 def paper_mapping() -> MappingConfig:
-    """Return the paper's and the official constants.
+    """Return the constants of the paper and of the official code, in our units.
 
-    The official learning rate of the means, 9.6e-4 m, is given in median depths of 2 m; the
-    official first scale, 0.22 of the distance between neighbours, in cells.
+    The official learning rate of the means is 9.6e-4 m, here divided by a median depth of 2 m. The
+    official first scale is 0.22 of the distance between neighbours, here 0.22 cells.
     """
     return MappingConfig(
         image_scale=1.0,
@@ -178,6 +178,6 @@ def paper_mapping() -> MappingConfig:
         refine_rate_end=1.0,
         insertion=InsertionConfig(cell=4, footprint=0.22, opacity=0.5),
         density=DensityConfig(max_gaussians=1_000_000),
-        # The official 100 steps of Adam go as far as a few of ours: these are for hard frames.
+        # A few of our steps do as much as the official 100 of Adam; ten are for hard frames.
         pose_refinement=PoseRefinementConfig(iterations=10, tolerance=0.01, fraction=1.0),
     )

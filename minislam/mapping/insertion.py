@@ -50,7 +50,7 @@ def insertable_pixels(
 
     The reference depth must be known and not too far, the static weight positive, and the map
     transparent there. Where the map shows a surface at another depth, nothing is added either. A
-    nearer reference may be a dynamic object that the MLP does not know yet. A farther one means
+    nearer reference may be a dynamic object that the MLP has not learnt yet. A farther one means
     that the map still holds a dynamic object, which `is_on_dynamic_object` finds, or the blurred
     edge of a static one.
     """
@@ -67,8 +67,8 @@ def draw_pixels(
 ) -> Tensor:  # (M, 2) int64, column and row
     """Draw one random known pixel in each cell x cell square of the image that has any.
 
-    Unlike the random subset of the paper, such a stratified one has no clumps and no holes, and
-    where the depth is sparse it is no smaller.
+    The paper draws a random subset of the whole image. One pixel per square leaves no clumps and
+    no holes, and it draws no fewer pixels where the depth is sparse.
     """
     height, width = known.shape
     priority = torch.rand(height, width, generator=generator).to(known.device)
@@ -91,8 +91,8 @@ def gaussians_at_pixels(
 ) -> GaussianMap:
     """Back-project pixels to round Gaussians that just cover their cells.
 
-    Neighbouring Gaussians are about one cell apart. Its size at the depth of the pixel gives the
-    first scale, so no search for neighbours in space is needed.
+    The first scale is `config.footprint` times the side of a cell at the depth of the pixel. No
+    search for neighbours in space is needed, because neighbours are about one cell apart.
     """
     column, row = pixels.unbind(-1)
     z = depth[row, column]
@@ -121,8 +121,8 @@ def is_on_dynamic_object(
 ) -> Tensor:  # (N,) bool
     """Tell which Gaussians project to pixels of static weight 0 in their own keyframe.
 
-    The MLP had not learnt yet that the object there moves when they were inserted; today
-    `insertable_pixels` would refuse them.
+    They were inserted before the MLP had learnt that the object there moves. With the present
+    static weight `insertable_pixels` would exclude their pixels.
     """
     points = transform_points(T_camera_world, means.double())
     in_front = points[:, 2] > 0

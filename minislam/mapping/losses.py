@@ -13,7 +13,7 @@ from minislam.uncertainty.losses import FAR_FACTOR, SURFACE_OPACITY, depth_loss
 
 SSIM_WINDOW = 11  # px, the usual window of SSIM, as in 3DGS
 BLACK = 0.01  # summed RGB; darker pixels are the border that undistortion leaves, official
-METRIC_MEDIAN = 2.0  # m, median depth of a scene for which official metres hold, our assumption
+METRIC_MEDIAN = 2.0  # m, our assumption: median depth of a scene that the official constants fit
 FLOATER_MARGIN = 0.5  # median depths between a floater and the reference behind it
 
 
@@ -49,7 +49,7 @@ class MappingHistory:
 
 
 def metre(median_depth: float) -> float:
-    """Return how many world units stand for a metre of the official constants."""
+    """Return the world units that replace one metre of the official constants."""
     return median_depth / METRIC_MEDIAN
 
 
@@ -132,10 +132,10 @@ def weighted_depth_loss(
 ) -> Tensor:  # (H, W) world units
     """Return the weighted |D^ - D~|; the loss of floaters is not weighted.
 
-    A floater is a Gaussian surface far in front of the reference depth. Beta does not excuse it: a
-    dynamic object can only make the reference too near, never too far. The test of opacity
-    excludes holes in the map. Their rendered depth is small too, but with this loss the depth of
-    the dynamic object in front of a hole would fill it.
+    A floater is a Gaussian surface far in front of the reference depth. A high beta is no reason
+    to keep it, because a dynamic object makes the reference too near, never too far. The test of
+    opacity excludes holes in the map: their rendered depth is small too, but with this loss the
+    depth of the dynamic object in front of a hole would fill it.
     """
     loss = depth_loss(rendered_depth, reference_depth, far_limit)
     in_front = reference_depth > rendered_depth.detach() + floater_margin

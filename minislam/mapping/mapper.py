@@ -92,7 +92,7 @@ class Mapper(JointOptimisation):
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size.
 
-        Another process can go on after the iterations that are done.
+        A resumed run continues after the iterations that are done.
         """
         if done == 0:
             self._replace_dynamic_gaussians()
@@ -151,7 +151,7 @@ class Mapper(JointOptimisation):
         self._gradients = ScreenGradients(len(self.gaussians))
 
     def _replace_dynamic_gaussians(self) -> None:
-        """Remove Gaussians on dynamic objects; fill the holes from keyframes that see behind."""
+        """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""
         self._remove_dynamic_gaussians()
         for keyframe in self.keyframes:
             self._insert(keyframe)

@@ -33,7 +33,7 @@ def refine_pose(
 ) -> Tensor:  # (4, 4) float64
     """Move a pose a fraction of the way to the one of least rendering error.
 
-    The rest of the way is left to the pose by flow, which is a measurement too.
+    Only a fraction, because the pose from flow is a measurement too.
     """
     start = T_camera_world.double()
     best = _optimise_pose(gaussians, camera, start, image, weight, background, config)

@@ -98,8 +98,8 @@ def keyframe_rendering_error(
 ) -> RenderingError:
     """Compare a rendering with its keyframe at the size of `camera`.
 
-    It must be one size throughout a run: the windows of the SSIM are in pixels, so the error of
-    the same rendering, and with it beta, is different at another size.
+    All calls of a run must use one size, because the windows of the SSIM are in pixels: at another
+    size the same rendering has another error, and beta learns another value.
     """
     size = (camera.height, camera.width)
     view = keyframe.view(camera)

@@ -1,7 +1,7 @@
 """Metric depth of single images without a network: simulated, from files, from a sensor, none.
 
 All are a `DepthPrior`: called with a frame and its camera they return z-depth (H, W) in world
-units, 0 where it is unknown, or None for a frame they know nothing about.
+units, 0 where it is unknown, or None for a frame without depth.
 """
 
 from collections.abc import Callable

@@ -84,7 +84,7 @@ class ClassicalFlow(Stateful):
         edges = list(zip(edges_source, edges_target, strict=True))
         starts = dict(zip(edges, predicted_targets.numpy().astype(np.float32), strict=True))
         moved = {edge for edge, start in starts.items() if self._has_moved(edge, start)}
-        # Either direction is the check of the other: both are measured anew, or none.
+        # Each direction checks the other, so both are measured anew, or none.
         self._measure({(i, j): starts[i, j] for i, j in edges if {(i, j), (j, i)} & moved})
         measured = [self._measured[edge] for edge in edges]
         return as_matches(

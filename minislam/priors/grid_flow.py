@@ -16,7 +16,7 @@ from minislam.priors.interfaces import FlowMatches
 SIMILARITY_WINDOW = (9, 9)  # px
 LK_WINDOW = (9, 9)  # px
 LK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.003)  # steps, px
-MAX_REMAINDER = 1.0  # px: what DIS leaves over is less, or the window sees something else
+MAX_REMAINDER = 1.0  # px: the error of DIS is smaller; a larger remainder is a wrong match
 LEAST_VARIANCE = 1e-5  # of brightness in [0, 1]: below it there is nothing to correlate
 CONSISTENCY_SCALE = 0.6  # px, forward-backward error at which confidence falls to exp(-1/2)
 TEXTURE_SCALE = 2e-4  # 1/px^2, smaller eigenvalue of the structure tensor that halves confidence
@@ -35,7 +35,7 @@ class ClassicalFlowConfig:
 
 @dataclass(frozen=True)
 class Windows:
-    """Brightness in [0, 1] around each grid cell (h, w), of a source and of its warped target."""
+    """Moments of brightness in [0, 1] around each cell (h, w), of source and warped target."""
 
     mean: np.ndarray
     variance: np.ndarray
@@ -60,7 +60,7 @@ def measure_on_grid(
 
 
 def windows_of(source: np.ndarray, warped: np.ndarray, stride: int) -> Windows:
-    """Return the moments of brightness around each grid cell of two images (H, W) uint8."""
+    """Return means, variances and covariance of two images (H, W) uint8 around each cell."""
 
     def at_cells(image: np.ndarray) -> np.ndarray:
         return image[::stride, ::stride]
@@ -168,7 +168,7 @@ def as_matches(
     textures: list[np.ndarray],  # per edge (h, w), the most its confidence could be
     dtype: torch.dtype,
 ) -> FlowMatches:
-    """Bundle the measurements of single edges."""
+    """Stack the measurements of E edges; compute the matched ratio of each edge."""
     matched = torch.from_numpy(np.stack(targets)).to(dtype).flatten(1, 2).mT.contiguous()
     confidence = torch.from_numpy(np.stack(confidences)).to(dtype)
     possible = torch.from_numpy(np.stack(textures)).to(dtype).sum((1, 2))

@@ -1,4 +1,4 @@
-"""What a run tells about itself: run.json with its warnings, and metrics.json."""
+"""What a run reports: run.json with its warnings, and metrics.json."""
 
 import sys
 from dataclasses import asdict

@@ -1,4 +1,4 @@
-"""Checkpoints of a run: when they are saved, and which of them a run may go on from."""
+"""Checkpoints of a run: when they are saved, and which run may be resumed from them."""
 
 import functools
 import json
@@ -74,7 +74,7 @@ class Checkpoints:
 
 
 def _origin(sequence: Sequence, config: SlamConfig, choice: PriorChoice) -> dict[str, Any]:
-    """Return what must be the same for a run to go on, as JSON gives it back."""
+    """Return what must be the same for a run to be resumed, as it is read back from JSON."""
     origin = {
         "version": minislam.__version__,
         "sequence": {

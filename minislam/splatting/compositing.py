@@ -81,9 +81,9 @@ def log_alpha_coefficients(
     conics: Tensor,  # (3, S) px^-2
     log_opacities: Tensor,  # (S,)
 ) -> Tensor:  # (6, S)
-    """Return the coefficients of ln alpha = ln o - d^T Q d / 2 over the monomials.
+    """Return the coefficients of ln alpha = ln o - d^T Q d / 2 for 1, x, y, x^2, x y, y^2.
 
-    Slow twin: reference.gaussian_alphas. Eq. (1).
+    (x, y) is the pixel minus the tile centre. Slow twin: reference.gaussian_alphas. Eq. (1).
     """
     m_x, m_y = offsets
     a, b, c = conics
@@ -155,7 +155,7 @@ def composite(
         last = min(first + CHUNK, slots)
         T = workspace.block(_T, last - first + 1, tiles)
         T.slots[0].copy_(checkpoints[chunk])
-        # alpha_k waits where T_{k+1} goes: half the memory, so more of it stays in the cache.
+        # alpha_k is stored in the place of T_{k+1}: half the memory, so more stays in the cache.
         _gaussian_alphas(coefficients[:, first * tiles : last * tiles], workspace, out=T.all[1:])
         _transmittances(T, T.slots[1:])
         out.baddbmm_(steps[first:last].permute(1, 2, 0), T.all[:-1].transpose(0, 1))

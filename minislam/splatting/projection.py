@@ -114,7 +114,7 @@ def project_factors_vjp(
     camera: Camera,
     v_factors2d: Tensor,  # (2, 3, N)
 ) -> tuple[Tensor, Tensor]:  # (3, N), (3, 3, N)
-    """Pull gradients of V back to points and factors, J's own change included.
+    """Return the gradients of points and factors from those of V; J depends on the points, too.
 
     V depends on the point through the tangents h, unless they are limited, and through 1/z, in
     which it is linear: dV/dz at fixed h is -V/z.

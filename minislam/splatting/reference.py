@@ -1,9 +1,9 @@
 """The renderer as the paper writes it: dense, plain torch, differentiated by autograd.
 
-It evaluates every Gaussian at every pixel and is therefore slow. Read it first; it is also the
-truth that the fast renderer is tested against, in both directions. Its functions have the names
-of their fast twins wherever both compute the same thing, but its arrays have one row per
-Gaussian, (N, 3), where the fast ones are component-first, (3, N).
+It evaluates every Gaussian at every pixel and is therefore slow. Read it first. The fast renderer
+is tested against its values and gradients. Where both compute the same thing, its functions have
+the names of their fast twins. Its arrays have one row per Gaussian, (N, 3), where the fast ones
+are component-first, (3, N).
 """
 
 from typing import NamedTuple

@@ -22,8 +22,8 @@ from minislam.splatting.visible import project_gaussians, project_gaussians_vjp
 def render(
     gaussians: GaussianMap,
     camera: Camera,
-    T_camera_world: Tensor,  # (4, 4), carries no gradient: see `twist`
-    background: Tensor | None = None,  # (3,) RGB, carries no gradient; None is black
+    T_camera_world: Tensor,  # (4, 4), gets no gradient: see `twist`
+    background: Tensor | None = None,  # (3,) RGB, gets no gradient; None is black
     twist: Tensor | None = None,  # (6,) left perturbation of the pose: T <- exp(twist) T
     screen_offsets: Tensor | None = None,  # (N, 2) px, added to the projected means
 ) -> Rendering:

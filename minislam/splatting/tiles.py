@@ -148,9 +148,9 @@ def _column_spans(
 ) -> tuple[Tensor, Tensor]:  # (R,), (R,) px
     """Return the leftmost and rightmost u that the ellipse reaches within each row of tiles.
 
-    At height y over the centre the ellipse spans x = -(b/a) y -+ sqrt(a level - det Q y^2) / a.
-    Its right end lies at y = -b ex / c, ex = sqrt(level xx); if the row does not contain that
-    point the extreme is on the nearest border of the row. The left end mirrors it.
+    The ellipse is d^T Q d = level, Q = (a, b; b, c). At height y from the centre it spans
+    x = -(b/a) y -+ sqrt(a level - det Q y^2) / a. Its rightmost point is at y = -b ex / c with
+    ex = sqrt(level Sigma'_xx), the leftmost at -y. A y outside the row is clamped to it.
     """
     a, b, c = conics
     slope = b / a

@@ -106,7 +106,7 @@ def project_gaussians_vjp(
     v_depths: Tensor,  # (V,)  dL/dz through the depth image
     T_camera_world: Tensor,  # (4, 4)
     camera: Camera,
-    needs_shape: bool,  # False where only the pose is asked for
+    needs_shape: bool,  # False if only the gradient of the pose is needed
 ) -> VisibleGradients:
     """Pull gradients in the image back to the Gaussians and to the camera pose."""
     g = visible

@@ -9,10 +9,10 @@ from minislam.state.stateful import Stateful
 
 
 class Observer(Protocol):
-    """Follows a run: it is told the progress, and it may end the run between two steps."""
+    """Shows the progress of a run, and may end the run between two steps."""
 
     def show(self, stage: str, done: int, total: int) -> None:
-        """Take note of the progress of a stage."""
+        """Show that `done` of the `total` steps of a stage are finished."""
 
     def should_stop(self) -> bool:
         """Tell whether the run should end after the present step."""
@@ -87,7 +87,7 @@ class Steps(Stateful):
             raise KeyboardInterrupt
 
     def _lap(self, next_stage: str | None) -> None:
-        """Add the time since the last lap to the stage being timed, and go on with the next."""
+        """Add the time since the last lap to the stage being timed; then time the next stage."""
         now = time.perf_counter()
         if self._stage is not None:
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since

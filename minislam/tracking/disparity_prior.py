@@ -22,7 +22,7 @@ MIN_DEPTH = 1e-6  # world units: points at or behind the camera are not seen
 
 @dataclass(frozen=True)
 class DepthView:
-    """What the consistency of depth needs of one keyframe."""
+    """Depth, features and pose of one keyframe, compared with those of other keyframes."""
 
     metric_depth: Tensor  # (H, W) D~, world units, 0 where unknown
     features: Tensor  # (h', w', C)
@@ -122,7 +122,7 @@ def warp_depth(
     points = torch.where(seen[:, None], points, points.new_ones(3))  # 1/z would not be finite
     column, row = camera.project(points).round().unbind(1)
     seen &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    # Only the pixels of the grid carry unknowns, one in stride^2.
+    # Only one pixel in stride^2 is a grid cell with an unknown disparity.
     seen &= (column % stride == 0) & (row % stride == 0)
 
     cell = (row[seen] / stride).long() * grid.shape[1] + (column[seen] / stride).long()

@@ -83,9 +83,9 @@ def best_hypothesis(
 ) -> tuple[BundleState, BundleReport]:
     """Adjust every hypothesis on the same measurements and return the one of lowest cost.
 
-    Comparing is safe where a threshold is not: a wrong minimum can have small residuals too, but
-    on the same measurements the right one has smaller ones. A guess that is far off can leave its
-    basin only while the robust weight is wide. A depth prior gives one hypothesis, which is near.
+    No threshold is used, because a wrong minimum can have small residuals too; on the same
+    measurements the right one has smaller ones. A wide robust weight lets a bad guess leave its
+    wrong minimum. A depth prior gives only one hypothesis, which is already near.
     """
     robust = problem.robust
     widenings = ROBUST_WIDENING if robust and len(states) > 1 else (1.0,)

@@ -1,7 +1,7 @@
 """The keyframe graph: which keyframes are linked, and the optical flow along each link.
 
 The links of a new keyframe lead to its predecessors (neighbourhood) and to older keyframes that
-see the same (covisibility, measured by the flow distance). A link that spans more than the
+see the same place (covisibility, measured by the flow distance). A link that spans more than the
 neighbourhood is added only if the flow confirms it in both directions.
 """
 
@@ -109,7 +109,7 @@ class KeyframeGraph(Stateful):
     def start_pose(self, matches: FlowMatches) -> Tensor:  # (4, 4)
         """Return T_camera_world of a frame from its flow (E = 1) from the newest keyframe.
 
-        It starts from the pose of that keyframe, and from the motion that led to it going on.
+        Two starts are tried: the pose of that keyframe, and its last motion repeated from there.
         """
         keyframes, newest = self.keyframes, len(self.keyframes) - 1
         last = keyframes.T_camera_world[newest]
@@ -121,7 +121,7 @@ class KeyframeGraph(Stateful):
         return start_pose(self.grid, matches, disparities, weights, last, starts, robust)
 
     def warp_disparities(self, keyframe: int, T_camera_world: Tensor) -> Tensor:  # (N,)
-        """Return the disparities of a keyframe as a camera at another pose (4, 4) sees them."""
+        """Warp the disparities of a keyframe to another camera pose (4, 4)."""
         motion = T_camera_world @ se3_inverse(self.keyframes.T_camera_world[keyframe])
         return warp_disparities(self.grid, motion, self.keyframes.disparities[keyframe])
 
@@ -179,10 +179,10 @@ class KeyframeGraph(Stateful):
         return [edge for edge in edges if min(edge) >= since]
 
     def proximity_edges(self, keyframe: int) -> list[Edge]:
-        """Return edges from a new keyframe to older ones that see the same, if confirmed.
+        """Return edges from a new keyframe to covisible older ones, if the flow confirms them.
 
-        A far link starts from geometry that may have drifted. A wrong one pulls harder than all
-        right ones together, so its flow must be confirmed before it is added.
+        The flow of a far link starts from poses that may have drifted. One wrong link can outweigh
+        all right ones, so its flow must be confirmed before the link is added.
         """
         start = max(0, keyframe + 1 - HORIZON * self.config.window)
         limit = PROXIMITY_DISTANCE * self.pixel_scale
@@ -201,12 +201,12 @@ class KeyframeGraph(Stateful):
     def _proximity_pairs(
         self,
         start: int,  # first keyframe to look at
-        newer: range,  # keyframes that want links
+        newer: range,  # keyframes that get links
         planned: list[Edge],  # edges about to be added, treated as existing
         limit: float,  # px
         links: int,  # per keyframe
     ) -> list[Edge]:
-        """Return pairs of keyframes that see the same from different places."""
+        """Return pairs of covisible keyframes, by increasing flow distance."""
         shifted = range(newer.start - start, newer.stop - start)
         distances = self.distances(start, shifted)
         existing = self.links.edges() + planned
@@ -237,7 +237,7 @@ class KeyframeGraph(Stateful):
         )
 
     def parallaxes(self, sources: Tensor, targets: Tensor) -> Tensor:  # (E,), (E,) -> (E,) px
-        """Return the mean parallax of edges, as the present geometry has it."""
+        """Return the mean parallax of edges, from the present poses and disparities."""
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         disparities = self.keyframes.disparities[sources]
         return mean_parallax(transforms, disparities, self.grid.rays, self.grid.camera)

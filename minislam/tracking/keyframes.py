@@ -8,7 +8,7 @@ from minislam.state.stateful import Stateful
 
 
 class KeyframeStore(Stateful):
-    """Everything the tracker knows of its keyframes. Only its methods write to its columns."""
+    """All data of the tracker's keyframes. Only the methods of this class change the columns."""
 
     frames: list[Frame]
     features: list[Tensor]  # (h', w', C); saved, because a network takes long to compute them
@@ -18,7 +18,7 @@ class KeyframeStore(Stateful):
     prior_disparities: Tensor  # (K, N) 1/D~, 0 where unknown
     prior_masks: Tensor  # (K, N) M; False: prior off
     static_weights: Tensor  # (K, N) in [0, 1], from beta
-    motion_weights: Tensor  # (K, N) in [0, 1], how well a cell has followed the camera
+    motion_weights: Tensor  # (K, N) in [0, 1], how well a cell's flow has fitted the camera motion
 
     def __init__(self, cells: int) -> None:
         self.frames = []

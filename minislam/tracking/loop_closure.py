@@ -74,7 +74,7 @@ def close_loops(graph: KeyframeGraph) -> bool:
 
 
 def _residual(graph: KeyframeGraph, first_edge: int) -> float:
-    """Return the weighted mean length of the residuals of the edges from a position on [px]."""
+    """Return the weighted mean length of the residuals [px], over edges `first_edge` and later."""
     problem = bundle_problem(graph, range(first_edge, len(graph.links)), first_free=0)
     residual, _ = residuals(problem, graph.state)
     weight = problem.weights.mean(1)

@@ -10,8 +10,8 @@ from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 
-# A keyframe that has just come may be off by more than the robust weight tolerates: what it is to
-# correct would look like outliers. So the weight is wide at first. [-]
+# A new keyframe may have so large an error that the robust weight takes its cells for outliers and
+# the error stays. So the weight is wide at first. [-]
 FIRST_WIDENING = 8.0
 GLOBAL_ITERATIONS = 4  # Gauss-Newton steps of an online global BA
 FINAL_ITERATIONS = 4  # Gauss-Newton steps per round of the final global BA
@@ -83,8 +83,8 @@ def adjust(
     if problem.robust:
         problem = replace(problem, robust=problem.robust.widened(widening))
     if first_free > 0:
-        # While a camera only turns, its flow says nothing about depth: the depths it started with
-        # hold the scale until it moves again.
+        # Without parallax the flow does not measure depth. Such a keyframe keeps its first
+        # disparities, and they keep the scale until the camera moves again.
         known = problem.free_disparities & _has_parallax(graph, problem)
         problem = replace(problem, free_disparities=known)
     state, report = bundle_adjust(problem, graph.state, iterations)
@@ -132,7 +132,7 @@ def bundle_problem(
 
 
 def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool
-    """Tell which keyframes are linked with another place, not only with another direction."""
+    """Tell which keyframes have a link with enough parallax, so that it measures depth."""
     most = torch.zeros(len(graph.keyframes))
     seen = graph.parallaxes(problem.edges_source, problem.edges_target)
     most.scatter_reduce_(0, problem.edges_source, seen, "amax")

@@ -16,8 +16,8 @@ from minislam.tracking.reprojection import splat_disparities
 from minislam.tracking.safeguards.robust import RobustKernel
 
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
-# A start that is off by 10 degrees is off by 50 px, where a narrow robust weight sees only
-# outliers: the weight is narrowed step by step.
+# A start with an error of 10 degrees has residuals of 50 px, all outliers for a narrow robust
+# weight. So the weight is narrowed step by step.
 ROBUST_WIDENING = (16.0, 4.0, 1.0)  # [-], times the final width
 
 
@@ -71,7 +71,7 @@ def start_pose(
     Each start is optimised by Gauss-Newton with the robust scale shrunk from 16 c, from 4 c and
     at c; the pose of lowest final cost is returned. A wide scale converges from far, but it can
     lock onto a near dynamic object with long residuals. A narrow one cannot converge from far.
-    All candidates are solved side by side, as poses of one problem that share only the source.
+    All candidates are solved together, as the target poses of one problem with one source.
     """
     candidates: list[Tensor] = []
     for widening in ROBUST_WIDENING if robust else (1.0,):
@@ -96,9 +96,9 @@ def start_pose(
 def warp_disparities(
     grid: Grid, T_target_source: Tensor, disparities: Tensor
 ) -> Tensor:  # (N,) of the target
-    """Return the disparities (N,) of a source as the target sees them.
+    """Warp the disparities (N,) of a source to the target.
 
-    A cell that nothing falls on takes the value of the nearest cell that something falls on.
+    A cell to which no point is warped takes the value of the nearest cell that has one.
     """
     warped = splat_disparities(
         T_target_source, disparities, grid.rays, grid.camera, grid.shape, grid.stride

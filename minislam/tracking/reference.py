@@ -1,8 +1,8 @@
 """One Gauss-Newton step of Eq. (5) as a textbook writes it: dense, differentiated by autograd.
 
 Every pose and every disparity is an unknown of one large system; nothing is marginalised and no
-derivative is written by hand. Read it first; it is slow, and it is also the truth that its fast
-twin, bundle_adjustment.py, is tested against.
+derivative is written by hand. Read it first. It is slow; its fast twin, bundle_adjustment.py, is
+tested against it.
 """
 
 from dataclasses import dataclass

@@ -55,7 +55,7 @@ class Tracker(Stateful):
                                                                   +---- old view or ---+
                                                                        known place
 
-    Frames that cannot be matched are lost during the warm-up, too, but it goes on.
+    A frame of the warm-up that cannot be matched is lost, too, but the warm-up continues.
     """
 
     graph: KeyframeGraph
@@ -98,11 +98,11 @@ class Tracker(Stateful):
         self._chain: FlowChain | None = None
 
     def saved_state(self) -> Tree:
-        """Return the state, with that of the chain, whose class the flow estimator knows."""
+        """Return the state, with that of the chain, which the flow estimator can restore."""
         return super().saved_state() | {"chain": to_tree(self._chain)}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Replace the present state by a saved one; the flow sees the keyframes' images again."""
+        """Replace the state by a saved one; give the flow estimator the keyframes' images again."""
         super().restore_state(state, frame_of)
         for index, frame in enumerate(self.keyframes.frames):
             self.graph.flow.add_frame(index, frame.image)
@@ -130,7 +130,7 @@ class Tracker(Stateful):
         return TrackingStep(True, first_moved)
 
     def _begin(self, frame: Frame) -> None:
-        """Make the first frame the first keyframe: its camera is the world."""
+        """Make the first frame the first keyframe; its camera frame is the world frame."""
         self.mode = Mode.WARMING_UP
         self._chain = self.graph.flow.start_chain(frame.image)
         world = torch.eye(4, dtype=torch.float64)
@@ -141,8 +141,8 @@ class Tracker(Stateful):
         """Match a frame with the newest keyframe; make it a keyframe if it should be one."""
         chain, matches = self._advance(frame)
         if not _is_followed(matches) and self._last_non_keyframe is not None:
-            # Too far from the last keyframe, but perhaps not from the last frame: make that one
-            # a keyframe after all and go on from there.
+            # Too far from the last keyframe, but perhaps not from the last frame: make the last
+            # frame a keyframe and match with it.
             self._insert(*self._last_non_keyframe, may_cull=False)
             chain, matches = self._advance(frame)
         ratio = float(matches.matched_ratios)
@@ -156,7 +156,7 @@ class Tracker(Stateful):
             self._insert(frame, matches)
 
     def _advance(self, frame: Frame) -> tuple[FlowChain, FlowMatches]:
-        """Return the flow from the newest keyframe to this frame, and the chain that goes on."""
+        """Return the chain extended to this frame, and the flow to it from the newest keyframe."""
         assert self._chain is not None, "there is a chain from the first frame on"
         return self._chain.advance(frame.image)
 
@@ -239,7 +239,7 @@ class Tracker(Stateful):
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
 
     def _resume(self, frame: Frame, place: Place, features: Tensor) -> bool:
-        """Make a relocalised frame a keyframe, if its flow confirms the place, and go on there."""
+        """Make a relocalised frame a keyframe, or return False if its flow does not match."""
         disparities = self.graph.warp_disparities(place.keyframe_index, place.T_camera_world)
         self.graph.flow_to_next.append(None)
         self._add_keyframe(frame, features, place.T_camera_world, disparities)

@@ -72,7 +72,7 @@ def _pose_between(
         robust=graph.robust and graph.robust.widened(ROBUST_NARROWING),
     )
     if count == 1:
-        # No later keyframe holds it, so it could follow a dynamic object, as a keyframe could.
+        # No later keyframe constrains the pose, so it may follow a dynamic object: two starts.
         starts = [start, _extrapolate_pose(graph, around[0], timestamp)]
         poses[-1] = start_pose(
             grid, matches, disparities[0], cell_weights[0], known[0], starts, graph.robust
@@ -85,7 +85,7 @@ def _pose_between(
 
 
 def _extrapolate_pose(graph: KeyframeGraph, keyframe: int, timestamp: float) -> Tensor:
-    """Return the pose (4, 4) at a later time if the motion up to a keyframe goes on."""
+    """Extrapolate the motion up to a keyframe; return the pose (4, 4) at a later time."""
     before = max(keyframe - 1, 0)
     poses, frames = graph.keyframes.T_camera_world, graph.keyframes.frames
     elapsed = frames[keyframe].timestamp - frames[before].timestamp

@@ -66,7 +66,7 @@ def uncertainty_loss(
 
 
 class UncertaintyTrainer(Stateful):
-    """Own the MLP, its Adam and its random source for a whole run."""
+    """Hold the MLP, its Adam and its random source for a whole run."""
 
     def __init__(
         self,

@@ -3,7 +3,7 @@
 The networks of this folder are plain functions over `Weights`, a dictionary of tensors under
 their official names. Sizes are read from the shapes, and each name is written where it is used.
 Therefore one run on a tiny image checks a file completely: a missing tensor is named, and a
-tensor that was never asked for is unexpected.
+tensor that was never read is unexpected.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,7 +29,7 @@ class Weights:
         self._used: set[str] = set()
 
     def __getitem__(self, name: str) -> Tensor:
-        """Return one tensor by the rest of its name."""
+        """Return one tensor by its name without the prefix."""
         full = self.prefix + name
         if full not in self._tensors:
             raise InputError(
@@ -47,11 +47,11 @@ class Weights:
         return (n[len(self.prefix) :] for n in self._tensors if n.startswith(self.prefix))
 
     def as_dict(self) -> dict[str, Tensor]:
-        """Return the tensors below the prefix under the rest of their names."""
+        """Return the tensors below the prefix under their names without it."""
         return {name: self._tensors[self.prefix + name] for name in self}
 
     def below(self, prefix: str) -> "Weights":
-        """Return the part whose names start with one more prefix."""
+        """Return the weights whose names start with `prefix`, under their names without it."""
         part = Weights(self._tensors, self.file, self.prefix + prefix)
         part._used = self._used
         return part
@@ -64,7 +64,7 @@ class Weights:
         return number
 
     def unused(self) -> list[str]:
-        """Return the names of the tensors that nobody has asked for so far."""
+        """Return the names of the tensors that no function has read so far."""
         return sorted(name for name in self._tensors if name not in self._used)
 
     @property

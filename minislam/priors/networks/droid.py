@@ -1,7 +1,7 @@
 """DROID-SLAM's network behind the `FlowEstimator` interface, as in the paper.
 
-An edge keeps the hidden state of its recurrent unit as long as every call asks for it. So a later
-answer builds on the earlier ones, while the geometry improves between the calls.
+An edge keeps the hidden state of its recurrent unit as long as every call includes the edge. So a
+later result refines the earlier ones, while the geometry improves between the calls.
 """
 
 from dataclasses import dataclass
@@ -96,7 +96,7 @@ class DroidFlow(Stateful):
             found, confidence = self._refine(batch, expected[start : start + len(batch)])
             states |= dict(zip(batch, found, strict=True))
             confidences.append(confidence)
-        # Edges that this call does not ask for start anew next time. So memory is bounded.
+        # Edges that are not in this call start anew next time. So memory is bounded.
         self._edges = states
         targets = torch.stack([states[edge].target for edge in edges])
         return self.as_matches(targets, torch.cat(confidences), predicted_targets)

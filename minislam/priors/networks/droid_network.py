@@ -24,7 +24,7 @@ _MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
 
 @dataclass(frozen=True)
 class EncodedFrames:
-    """What the network knows of B frames."""
+    """What the encoder computes of B frames."""
 
     features: Tensor  # (B, 128, h, w) compared between frames
     hidden: Tensor  # (B, 128, h, w) initial hidden state of the recurrent unit
@@ -33,7 +33,7 @@ class EncodedFrames:
 
 @dataclass(frozen=True)
 class Update:
-    """The answer of one update."""
+    """The result of one update."""
 
     hidden: Tensor  # (E, 128, h, w)
     revision: Tensor  # (E, h, w, 2) cells, to be added to the expected position

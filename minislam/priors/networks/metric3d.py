@@ -4,7 +4,7 @@ A near small object and a far large one look the same; only the focal length tel
 the network answers as if every image came from one "canonical" camera of 1000 px, and the answer
 is scaled by the true focal length: that of the image the network SAW, after resizing.
 
-    tokens of the ViT -> maps at 4 resolutions -> fused coarse to fine -> first estimate
+    tokens of the ViT -> 4 maps at 3 resolutions -> fused coarse to fine -> first estimate
     -> a few rounds of recurrent refinement (metric3d_refinement.py) -> 4x upsampling
 """
 
@@ -78,7 +78,7 @@ class Metric3D:
         return refine(self.weights, features, context, self.rounds)
 
     def pyramid(self, image: Tensor) -> Pyramid:
-        """Return the maps that are read from the tokens (all four readings of the last block)."""
+        """Return the four maps, all computed from the tokens of the last block."""
         tokens = self.transformer(image)[0]
         weights = self.weights.below("token2feature.")
         readings = []
@@ -130,7 +130,7 @@ class Fitted:
 
 
 def fit(image: Tensor, size: tuple[int, int], device: torch.device) -> Fitted:
-    """Resize an image (H, W, 3) into the centre of the network's size, keeping its aspect."""
+    """Resize an image (H, W, 3) with its aspect kept; pad it to the network's size."""
     height, width = image.shape[:2]
     scale = min(size[0] / height, size[1] / width)
     # The small number protects from 616 * (1 - 1e-16) being cut to 615.

@@ -13,7 +13,7 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 
 @dataclass(frozen=True)
 class KeyframeDiagnostics:
-    """What the links of one keyframe say, after its adjustment."""
+    """Matched ratio and parallax of one keyframe, after its adjustment."""
 
     frame_index: int
     matched_ratio: float  # of its cells, in the best of its links [-]
@@ -21,7 +21,7 @@ class KeyframeDiagnostics:
 
 
 def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
-    """Judge a keyframe by its links."""
+    """Return the matched ratio and the parallax of a keyframe, the best among its links."""
     frame_index = graph.keyframes.frames[keyframe].frame_index
     edges = graph.links.edges()
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]

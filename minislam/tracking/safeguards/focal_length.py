@@ -1,8 +1,8 @@
 """Check of the given focal length: does the flow fit another one better?
 
-While tracking, a wrong focal length is hidden, because rotations and depths bend until most of
-the flow fits. What bending cannot explain stays in the residuals of the final global BA. So that
-BA is repeated with shorter and longer focal lengths until the lowest cost lies between two higher
+Tracking hides a wrong focal length, because wrong rotations and depths can explain most of the
+flow. The part that they cannot explain is in the residuals of the final global BA. So that BA is
+repeated with shorter and longer focal lengths until the lowest cost lies between two higher
 ones. The minimum of the parabola through the three is the best focal length.
 """
 
@@ -36,7 +36,7 @@ class FocalLengthFit:
 
     @property
     def is_doubtful(self) -> bool:
-        """Tell whether the given focal length is probably wrong."""
+        """Tell whether the given focal length is probably wrong: both thresholds are exceeded."""
         if self.factor is None:
             return False
         return abs(math.log(self.factor)) > WORTH_SAYING and self.saved > WORTH_SAVING

@@ -1,9 +1,9 @@
-"""Motion memory: the motion weight of each cell, handed on along the flow.
+"""Motion memory: the motion weight of each cell, passed on along the flow.
 
 While a dynamic object is small, the robust weight alone excludes it. Once it fills half of the
 image, the pose follows the object instead of the static scene, and beta, which learns from the
 poses, learns the wrong thing. But the object was seen to move while it was still small. Therefore
-each cell has a motion weight, which says how well it has followed the camera so far, and the cell
+each cell has a motion weight: how well its flow has fitted the camera motion so far. The cell that
 it flows to inherits that weight.
 """
 
@@ -33,12 +33,12 @@ class MotionMemory:
     @property
     def scale(self) -> float | None:
         """Return the scale of the residuals [px], None while nothing is remembered."""
-        # Without a depth prior structure and motion are estimated together, so neither can judge
-        # the other.
+        # Without a depth prior both disparities and motion come from the flow, so its residuals do
+        # not show which cells move.
         return self._scale if self._scale > 0 and self._keyframes.has_prior else None
 
     def remember(self, matches: FlowMatches, T_camera_world: Tensor) -> None:
-        """Lower the weight of cells of the newest keyframe that do not follow the camera.
+        """Lower the weight of the newest keyframe's cells whose flow does not fit the motion.
 
         The camera moves on to `T_camera_world` (4, 4).
         """
@@ -56,7 +56,7 @@ class MotionMemory:
         keyframes.set_motion_weight(-1, weight)
 
     def inherit(self, matches: FlowMatches) -> None:
-        """Give the newest keyframe the motion weights of the cells that flow to its own."""
+        """Set the motion weights of the newest keyframe from those of the keyframe before it."""
         if self.scale is not None:
             before = self._keyframes.motion_weights[-2]
             weight = inherit_motion_weight(self._grid, matches, before)
@@ -69,7 +69,7 @@ def update_motion_weight(
     disparities: Tensor,  # (N,) of the source
     T_target_source: Tensor,  # (4, 4)
     weight: Tensor,  # (N,) of the source cells so far, in [0, 1]
-    scale: float,  # px, of the residuals that still count as following the camera
+    scale: float,  # px, of the residuals that still fit the camera motion
 ) -> Tensor:  # (N,)
     """Return the motion weight of the source cells after one more step of the camera."""
     motion = T_target_source[None].to(disparities.dtype)
@@ -83,8 +83,8 @@ def update_motion_weight(
 def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> Tensor:  # (N,)
     """Return the motion weight of the target cells: that of the source cells that flow there.
 
-    Where several cells meet, the lowest weight counts; where none arrives, that of the nearest
-    cell where one does.
+    If several source cells flow to one cell, the lowest weight counts. If none does, the weight of
+    the nearest cell that has one is taken.
     """
     cells = (matches.targets[0].mT / grid.stride).round().long()
     height, width = grid.shape

@@ -26,7 +26,7 @@ MAX_RATIO = 0.8  # of the distance to the best over the second-best descriptor (
 PNP_ERROR = 3.0  # px at 320x240, inlier distance
 PNP_ITERATIONS = 300
 MIN_INLIERS = 20
-MIN_STATIC_WEIGHT = 0.5  # a point on something that may move says nothing about the camera
+MIN_STATIC_WEIGHT = 0.5  # a point on a dynamic object gives a wrong pose
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Relocaliser:
         self._keypoints: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
 
     def find(self, image: Tensor, features: Tensor) -> Place | None:
-        """Return the best supported place of an image (H, W, 3) with features (h', w', C)."""
+        """Return the place with most inliers: image (H, W, 3), features (h', w', C); or None."""
         seen = _keypoints(image)
         places = [self._place(seen, index) for index in self._most_similar(features)]
         found = [place for place in places if place is not None]

@@ -11,7 +11,7 @@ from minislam.tracking.reprojection import relative_transforms, reproject, scale
 # Relative disagreement of two views of a point that still counts as agreement. [-]
 MAX_DISPARITY_ERROR = 0.05
 MIN_AGREEING_VIEWS = 2  # other keyframes that must see a point at the same depth
-NEIGHBOURS = 4  # keyframes on either side that are asked
+NEIGHBOURS = 4  # keyframes on either side that are compared
 EDGE_RATIO = 1.15  # neighbouring cells whose depths differ more lie on different surfaces
 
 
