@@ -20,6 +20,13 @@ def pytest_configure(config) -> None:
     sys.path.insert(0, str(ROOT))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as fast what is neither slow nor a notebook: `pytest -m fast`."""
+    for item in items:
+        if item.path.suffix == ".py" and item.get_closest_marker("slow") is None:
+            item.add_marker(pytest.mark.fast)
+
+
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Return where the runs go; the frames are rendered once, into a cache beside them."""

@@ -16,6 +16,8 @@ from minislam.priors.flow import ClassicalFlow
 from minislam.records import Sequence
 from minislam.slam import Priors, Slam
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 12
 # Budgets cut down to seconds; what makes a preset or an ablation what it is stays.
 SHORT = {

@@ -20,6 +20,8 @@ from minislam.evaluation import absolute_trajectory_error
 from minislam.priors.features import ClassicalFeatures
 from minislam.uncertainty import UncertaintyTrainer
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 28
 INPUT = ["synth:person", "--stride", "3", "--max-frames", str(FRAMES), "--size", "96x72"]
 COMMAND = ["run", *INPUT, "--preset", "test"]

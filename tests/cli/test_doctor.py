@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 
 from minislam.cli.main import main
 from tests.checkpoint_files import lpips_files, tiny_fit3d, write_all
+
+pytestmark = pytest.mark.slow
 
 
 def lines_of(folder: Path, capsys) -> dict[str, str]:

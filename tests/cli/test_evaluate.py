@@ -17,6 +17,8 @@ from minislam.geometry.alignment import Similarity
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[str, str]:

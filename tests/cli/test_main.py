@@ -15,6 +15,8 @@ import minislam
 from minislam.cli.main import main
 from tests.recordings import picture, save, tum_folder, video
 
+pytestmark = pytest.mark.slow
+
 TEXTURE = np.random.default_rng(0).integers(0, 256, (20, 27, 3)).astype(np.uint8)
 # What a failed run may leave.
 RUN_FILES = {"checkpoint.npz", "config.json", "keyframes", "plots", "run.json"}

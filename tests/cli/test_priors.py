@@ -18,6 +18,8 @@ from minislam.priors.networks.dinov2 import DinoFeatures
 from minislam.priors.networks.metric3d import Metric3DDepth
 from tests.checkpoint_files import calm_droid, tiny_fit3d, write_all
 
+pytestmark = pytest.mark.slow
+
 FRAMES, SIZE = 20, "112x84"  # a grid of 11x14 cells for DROID, of 6x8 patches for the features
 CLIP = ["synth:ball", "--max-frames", str(FRAMES), "--size", SIZE, "--preset", "test"]
 FRONT_END = [

@@ -9,6 +9,8 @@ from minislam.mapping import MappingConfig
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe
 
+pytestmark = pytest.mark.slow
+
 
 def psnr(first: torch.Tensor, second: torch.Tensor) -> float:
     return float(-10 * ((first - second) ** 2).mean().log10())

@@ -15,6 +15,8 @@ from minislam.cli.progress import ProgressLine
 from minislam.data import RunFolder
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 16
 INPUT = ["--stride", "3", "--max-frames", str(FRAMES), "--size", "96x72"]
 SETTINGS = [

@@ -2,9 +2,13 @@
 
 from pathlib import Path
 
+import pytest
+
 from minislam.cli.main import main
 from minislam.data import RunFolder
 from minislam.tracking import bundle_adjustment
+
+pytestmark = pytest.mark.slow
 
 COMMAND = [
     "run", "synth:person", "--stride", "3", "--max-frames", "10", "--size", "96x72", "--preset",

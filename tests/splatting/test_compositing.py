@@ -18,6 +18,8 @@ from minislam.splatting.constants import MIN_ALPHA
 from minislam.splatting.tiles import PIXELS
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 
+pytestmark = pytest.mark.slow
+
 TILES = 2
 
 

@@ -16,6 +16,8 @@ from tests.splatting.scenes import (
     random_pose,
 )
 
+pytestmark = pytest.mark.slow
+
 SCENES_PER_KIND = 25  # times eight kinds: 200 scenes
 
 

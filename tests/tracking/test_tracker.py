@@ -22,6 +22,8 @@ from tests.tracking.recording import (
     trajectories,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def finished(with_depth: bool) -> Tracker:

@@ -17,6 +17,8 @@ from tests.tracking.recording import (
     run,
 )
 
+pytestmark = pytest.mark.slow
+
 BLIND = 20  # first frame without a view
 PLACE_ERROR = 0.02  # of the distance between the first and the last camera
 

@@ -18,6 +18,8 @@ from minislam.records import Frame
 from minislam.tracking.tracker import Tracker
 from tests.tracking.recording import CONFIG, SIZE, lost_frames, run
 
+pytestmark = pytest.mark.slow
+
 TURNED = 20  # frames of a turn
 TURN = 0.3  # rad, the most that the camera turns to the side
 MAX_TURN_ERROR = 0.3  # degrees

@@ -1,11 +1,14 @@
 """A frame is found again among keyframes of a recording, or not at all."""
 
+import pytest
 import torch
 
 from minislam.geometry import se3_inverse, se3_log
 from minislam.tracking.safeguards.relocalisation import Relocaliser
 from minislam.tracking.tracker import Tracker
 from tests.tracking.recording import frames, new_tracker, recording, run
+
+pytestmark = pytest.mark.slow
 
 
 def finder() -> tuple[Relocaliser, Tracker]:
