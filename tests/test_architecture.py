@@ -1,6 +1,7 @@
 """The shape of the package: who may import whom, how long a module is, what is forbidden."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,7 @@ def part_of(path: Path) -> str:
     return path.relative_to(ROOT / "minislam").parts[0].removesuffix(".py")
 
 
+@cache
 def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 

@@ -32,7 +32,10 @@ LONGEST_LINE = 100  # characters
 LONGEST_TEXT = 180  # words, formulas and tables not counted
 MACHINE_PATH = re.compile(r"(?<![\w.])(/home/|/Users/|/root/|/tmp/|[A-Z]:\\\\)")
 
-pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy"),
+]
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 

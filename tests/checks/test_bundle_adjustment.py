@@ -1,11 +1,14 @@
 """The checks of notebook 05: right answers pass, known mistakes are named."""
 
+import pytest
 import torch
 from torch import Tensor
 
 from minislam.checks import WRONG, check_schur_step, check_target_jacobian
 from minislam.geometry import Camera
 from tests.helpers import assert_graded
+
+pytestmark = pytest.mark.slow
 
 
 def jacobian_of_target(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:

@@ -47,6 +47,7 @@ def test_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path: Path):
 # A crash between the two steps
 
 
+@pytest.mark.slow
 def test_a_writer_killed_before_the_exchange_leaves_the_old_file(tmp_path: Path):
     path = tmp_path / "trajectory.txt"
     path.write_bytes(b"old")

@@ -10,6 +10,8 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from tests.recordings import picture, save, tum_folder, video
 
+pytestmark = pytest.mark.slow
+
 # Known answers
 
 

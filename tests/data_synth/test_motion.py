@@ -15,6 +15,8 @@ from data_synth.motion import (
     path_length,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def some_path(seed):
     return handheld_path(np.random.default_rng(seed), np.array([0, -1.7, 1.4]), np.array([0, 1, 1]))

@@ -11,6 +11,8 @@ from data_synth.motion import FRAME_RATE, ROUND_FRAMES, path_length
 from data_synth.render import camera_rays, trace
 from data_synth.sequence import in_order, novel_poses, render_frame
 
+pytestmark = pytest.mark.slow
+
 SMALL = (80, 60)
 CAMERA = default_intrinsics(SMALL)
 # The share of moving pixels in percent: least and most of the mean, most of the peak.

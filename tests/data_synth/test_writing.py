@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from data_synth import SynthError, cached_sequence, generate, write_sequence, writing
 from data_synth.cli import main
 
+pytestmark = pytest.mark.slow
+
 FRAMES, SIZE = 3, (64, 48)
 STAMPS = ["0.000000", "0.033333", "0.066667"]
 

@@ -11,6 +11,8 @@ from minislam.evaluation.lpips import Lpips, recognise_heads, recognise_trunk
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 from tests.priors.networks import rebuilt
 
+pytestmark = pytest.mark.slow
+
 SHAPES = {
     "alex": ({0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3),
               10: (256, 256, 3)}, (64, 192, 384, 256, 256)),

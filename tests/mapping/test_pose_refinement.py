@@ -18,6 +18,8 @@ from minislam.uncertainty import UncertaintyConfig
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
 
+pytestmark = pytest.mark.slow
+
 # `farthest` belongs to 320x240: these images are a tenth of that.
 CONFIG = PoseRefinementConfig(iterations=8, tolerance=0.01, fraction=1.0, farthest=100.0)
 BLACK = torch.zeros(3)

@@ -59,6 +59,7 @@ def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
     assert facts.peak_memory_mb() == pytest.approx(on_linux / 1024, rel=0.1)
 
 
+@pytest.mark.slow
 def test_without_the_counter_of_unix_the_package_still_imports():
     program = (
         "import sys; sys.modules['resource'] = None\n"

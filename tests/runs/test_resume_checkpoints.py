@@ -11,6 +11,8 @@ from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 from minislam.runs import resume
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:

@@ -18,6 +18,8 @@ from minislam.viz import (
     trajectory_plot,
 )
 
+pytestmark = pytest.mark.slow
+
 IMAGE, DEPTH = np.full((24, 32, 3), 0.5), np.linspace(0, 3, 24 * 32).reshape(24, 32)
 BETA = np.ones((3, 4))
 

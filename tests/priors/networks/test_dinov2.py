@@ -12,6 +12,8 @@ from minislam.priors.networks.vit import PositionResize
 from tests.helpers import frame_of
 from tests.priors.networks import rebuilt
 
+pytestmark = pytest.mark.slow
+
 TOLERANCE = 2e-5  # the official code differs from its own float64 run by 3e-6
 NETWORKS = {
     "dinov2_vits14": PositionResize.OFFSET,

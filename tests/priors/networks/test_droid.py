@@ -28,6 +28,8 @@ from minislam.tracking.tracker import Tracker
 from tests.priors.networks import rebuilt
 from tests.priors.networks.test_droid_network import moving_image
 
+pytestmark = pytest.mark.slow
+
 HEIGHT, WIDTH = 66, 90  # no multiples of 8: 9 x 12 cells
 
 

@@ -15,6 +15,8 @@ from minislam.priors.networks.vit import normalise
 from minislam.records import Frame
 from tests.priors.networks import rebuilt
 
+pytestmark = pytest.mark.slow
+
 # With one or two threads the official code differs from itself by 1e-4 m and 4e-6.
 DEPTH, REST = 1e-3, 5e-5
 CPU = torch.device("cpu")
@@ -57,7 +59,6 @@ def test_the_finest_map_is_that_of_the_official_code():
     rebuilt.assert_close(pyramid.fine[0, ::16], stored("56x84/read_0_every16ch"), REST)
 
 
-@pytest.mark.slow
 def test_the_whole_box_is_that_of_the_official_slam():
     # The official system resizes the depth bicubically and scales by the focal length of the
     # image before any resizing, here 87.5 px.

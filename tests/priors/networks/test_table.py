@@ -21,6 +21,8 @@ from tests.checkpoint_files import tiny_fit3d
 from tests.helpers import frame_of, generator
 from tests.priors.networks import rebuilt
 
+pytestmark = pytest.mark.slow
+
 DROID, DINOV2, FIT3D, METRIC3D, DEPTH_ANYTHING = NETWORKS
 SMALL = NetworksConfig(
     metric3d=Metric3DConfig((56, 84)),

@@ -4,6 +4,7 @@ The "meta" device computes shapes only, and refuses to meet tensors of the CPU: 
 also runs on a GPU, which no test needs.
 """
 
+import pytest
 import torch
 
 from minislam.priors.networks.checkpoints import Weights
@@ -14,6 +15,8 @@ from minislam.priors.networks.droid_network import cell_grid
 from minislam.priors.networks.metric3d import Metric3D, fit
 from minislam.priors.networks.vit import VisionTransformer, normalise
 from tests.priors.networks import rebuilt
+
+pytestmark = pytest.mark.slow
 
 META = torch.device("meta")
 IMAGE = torch.zeros(56, 84, 3)

@@ -10,6 +10,8 @@ from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.vit import PositionResize, Tokens, VisionTransformer, normalise
 from tests.priors.networks import rebuilt
 
+pytestmark = pytest.mark.slow
+
 TOLERANCE = 2e-5  # the official code differs from its own float64 run by 3e-6
 CPU = torch.device("cpu")
 NETWORKS = {  # name: (position resize, names of the stored outputs)
