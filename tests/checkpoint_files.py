@@ -10,6 +10,12 @@ from tests.priors.networks import rebuilt
 ALEX = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
 
 
+def write(path: Path, content: object) -> Path:
+    """Save the content of a checkpoint; return its path."""
+    torch.save(content, path)
+    return path
+
+
 def tiny_fit3d() -> dict[str, Tensor]:
     """Return a FiT3D checkpoint with two blocks, small enough to write and break often."""
     shapes = rebuilt.shapes_of("fit3d_reg_small")

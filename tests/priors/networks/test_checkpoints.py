@@ -7,18 +7,13 @@ import torch
 
 from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights, load_checkpoint
-from tests.checkpoint_files import tiny_fit3d
+from tests.checkpoint_files import tiny_fit3d, write
 from tests.priors.networks import rebuilt
 
 
 @pytest.fixture(scope="module")
 def tensors() -> dict[str, torch.Tensor]:
     return tiny_fit3d()
-
-
-def write(path: Path, content: object) -> Path:
-    torch.save(content, path)
-    return path
 
 
 # Known answers

@@ -17,7 +17,7 @@ from minislam.priors.networks.table import (
     find_network,
     load_network,
 )
-from tests.checkpoint_files import tiny_fit3d
+from tests.checkpoint_files import tiny_fit3d, write
 from tests.helpers import frame_of, generator
 from tests.priors.networks import rebuilt
 
@@ -33,11 +33,6 @@ SMALL = NetworksConfig(
 @pytest.fixture(scope="module")
 def tensors() -> dict[str, torch.Tensor]:
     return tiny_fit3d()
-
-
-def write(path: Path, content: object) -> Path:
-    torch.save(content, path)
-    return path
 
 
 # Known answers
