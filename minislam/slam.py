@@ -10,7 +10,7 @@ beta into the weight of each cell. `_move_map` deforms the map when an adjustmen
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimat
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
+from minislam.stereo.dense_structure import dense_depths
 from minislam.tracking.safeguards.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.safeguards.structure import depth_from_disparities
 from minislam.tracking.tracker import Tracker
@@ -68,13 +69,7 @@ class Slam(Stateful):
         self._features = priors.features
         if config.uncertainty.grid_factor > 1:
             self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
-        self.mapper = Mapper(
-            sequence.camera,
-            config.mapping,
-            config.uncertainty,
-            priors.features.dimension,
-            config.seed,
-        )
+        self.mapper = self._new_mapper()
         self.tracker = Tracker(
             sequence.camera,
             config.tracking,
@@ -101,10 +96,17 @@ class Slam(Stateful):
             self._initialise()
 
         self.steps.once("final adjustment", self._adjust_all)
-        self.steps.once("refinement", self._refine_map)
         self.steps.once("all frames", self._pose_all_frames)
+        if not self.tracker.keyframes.has_prior:
+            self.steps.once("dense structure", self._rebuild_map)
+        self.steps.once("refinement", self._refine_map)
         if self.config.mapping.pose_refinement.enabled:
             self.steps.once("photometric refinement", self._refine_other_poses)
+
+    def _new_mapper(self) -> Mapper:
+        config, dimension = self.config, self._features.dimension
+        camera = self.sequence.camera
+        return Mapper(camera, config.mapping, config.uncertainty, dimension, config.seed)
 
     def _frames_left(self) -> Iterator[Frame]:
         """Yield the frames to come. If one cannot be read, the state before it is saved."""
@@ -134,14 +136,28 @@ class Slam(Stateful):
                 self.mapper.integrate(self._keyframe(index))
 
     def _adjust_all(self) -> None:
+        step = self.tracker.end()
+        if step.has_new_keyframes:
+            self._map_new_keyframes(step.first_moved)
         self.tracker.finish(self.steps.on_progress("final adjustment"))
+        self._move_map(first_changed=0)
         self.focal_length = check_focal_length(self.tracker.graph)
+
+    def _rebuild_map(self) -> None:
+        """Build map and MLP anew on dense depth, which takes the poses of all frames."""
+        depths = dense_depths(
+            self.sequence, self._poses, self.tracker.graph, self.steps.on_progress("dense depth")
+        )
+        self.mapper = self._new_mapper()
+        keyframes = [
+            replace(self._keyframe(k), depth=depth, confirmation=confirmation)
+            for k, (depth, confirmation) in enumerate(depths)
+        ]
+        self.mapper.initialise(keyframes, self.steps.on_progress("first map"))
 
     def _refine_map(self) -> None:
         stage = "refining the map"
         done = self.steps.done(stage)
-        if done == 0:
-            self._move_map(first_changed=0)
         iterations = self.config.mapping.refine_iterations
         self.mapper.refine(iterations, self.steps.on_step(stage), done)
 

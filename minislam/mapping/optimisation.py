@@ -20,6 +20,8 @@ from minislam.uncertainty import (
     mapping_weight,
 )
 
+CONFIRMED_BETA = 0.4
+
 Progress = Callable[[int, int], None]  # called with the iterations done and their number
 
 
@@ -88,7 +90,10 @@ class JointOptimisation(Stateful):
         """Return the raw beta (h', w') of a keyframe: that of its given mask, or the MLP's."""
         if keyframe.given_beta is not None:
             return keyframe.given_beta
-        return self.predict_beta(keyframe.features)
+        beta = self.predict_beta(keyframe.features)
+        if keyframe.confirmation is not None:
+            beta = beta * (1 - CONFIRMED_BETA * keyframe.confirmation)
+        return beta
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
         """Return the static weight (H, W) for a raw beta; 1 with uncertainty switched off."""

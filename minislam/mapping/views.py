@@ -1,13 +1,13 @@
 """Keyframes as the mapper stores them: one pose, and the image at several sizes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.images import shrink_depth, shrink_image
+from minislam.images import resample, shrink_depth, shrink_image
 from minislam.records import Keyframe
 from minislam.splatting import Rendering
 from minislam.state.stateful import FrameOf, Tree
@@ -17,6 +17,9 @@ from minislam.uncertainty import (
     beta_of_mask,
     rendering_error,
 )
+
+
+CONFIRMED_ERROR = 1.5
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class MappedKeyframe:
     depth: Tensor  # (H, W) world units, 0 where unknown
     T_camera_world: Tensor  # (4, 4) float64
     given_beta: Tensor | None = None  # (h, w) instead of the MLP's
+    confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
     _views: dict[tuple[int, int], View] = field(default_factory=dict)
 
     @classmethod
@@ -51,6 +55,9 @@ class MappedKeyframe:
             keyframe.depth,
             keyframe.T_camera_world.double(),
             None if keyframe.moving_mask is None else beta_of_mask(keyframe.moving_mask),
+            None
+            if keyframe.confirmation is None
+            else resample(keyframe.confirmation, *keyframe.features.shape[:2]),
         )
 
     def saved_state(self) -> Tree:
@@ -105,7 +112,7 @@ def keyframe_rendering_error(
     view = keyframe.view(camera)
     depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
     depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
-    return rendering_error(
+    error = rendering_error(
         view.image,
         view.depth,
         shrink_image(rendering.color, *size),
@@ -115,3 +122,7 @@ def keyframe_rendering_error(
         depth_unit,
         config,
     )
+    if keyframe.confirmation is not None:
+        doubt = (1 - CONFIRMED_ERROR * keyframe.confirmation).clamp_min(0)
+        error = replace(error, ssim=doubt * error.ssim, depth=doubt * error.depth)
+    return error

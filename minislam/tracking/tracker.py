@@ -36,6 +36,7 @@ from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, atta
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 MAX_CULLED_IN_A_ROW = 2  # keyframes, official code
+LONGEST_TAIL = 2  # frames after the last keyframe
 
 
 class Mode(Enum):
@@ -123,6 +124,19 @@ class Tracker(Stateful):
             self._begin(frame)
         else:
             self._follow(frame)
+        return self._step_since(count)
+
+    def end(self) -> TrackingStep:
+        """Make the last frame a keyframe, so that the frames before it lie between two."""
+        count = len(self.keyframes)
+        if self._last_non_keyframe is not None:
+            tail = self._last_non_keyframe[0].frame_index - self.keyframes.frames[-1].frame_index
+            if tail > LONGEST_TAIL:
+                self._insert(*self._last_non_keyframe, may_cull=False)
+        return self._step_since(count)
+
+    def _step_since(self, count: int) -> TrackingStep:
+        """Return what has changed since there were `count` keyframes."""
         if len(self.keyframes) == count:
             return TrackingStep(False, count)
         first_moved = self.graph.first_moved

@@ -1,13 +1,15 @@
 """Poses of the frames between the keyframes."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.geometry import se3_interpolate
-from minislam.records import Sequence
-from minislam.tracking.bundle_adjustment import BundleState, motion_only_adjust
+from minislam.records import Sequence, TrackedFrame, TrackingStatus
+from minislam.tracking.bundle_adjustment import BundleState, motion_only_adjust, residuals
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import motion_only_problem, start_pose
 from minislam.tracking.reprojection import relative_transforms, reproject
@@ -15,6 +17,17 @@ from minislam.tracking.tracker import Tracker
 
 ITERATIONS = 8  # Gauss-Newton steps of six unknowns
 ROBUST_NARROWING = 0.5  # of the robust scale, because the structure is known by now [-]
+# Support of a pose, relative to the median of all frames between keyframes: [-]
+DOUBTFUL_SUPPORT = 0.5  # with less, other starts are tried
+LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """A pose and how much of the flow fits it."""
+
+    T_camera_world: Tensor  # (4, 4)
+    support: float  # in [0, 1], mean robust weight of all cells
 
 
 def pose_all_frames(
@@ -23,33 +36,66 @@ def pose_all_frames(
     """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
 
     A keyframe keeps its pose. Another frame starts from the interpolated pose and is adjusted on
-    the flow from the keyframe before it and the keyframe after it. Their disparities are held.
+    the flow from the keyframe before it and the keyframe after it. Their disparities are held. In
+    a wide gap that start may be too far off. So a frame that little of the flow supports is tried
+    again from the pose of the frame before it, then from that of the frame after it. A frame that
+    stays without support is lost.
     """
-    frames, known = tracker.keyframes.frames, tracker.keyframes.T_camera_world
-    poses = {frame.frame_index: T for frame, T in zip(frames, known, strict=True)}
-    others = [t for t in tracker.tracked if t.status.is_followed and t.frame_index not in poses]
+    graph, frames = tracker.graph, tracker.keyframes.frames
+    poses = tracker.keyframes.T_camera_world
+    keyframes = {f.frame_index: PoseFit(T, 1.0) for f, T in zip(frames, poses, strict=True)}
+    fits = dict(keyframes)
+    others = [t for t in tracker.tracked if t.status.is_followed and t.frame_index not in fits]
     for done, tracked in enumerate(others):
-        following = sum(f.frame_index < tracked.frame_index for f in frames)
-        around = [following - 1]
-        if following < len(frames) and not tracker.graph.follows_a_loss(following):
-            around.append(following)
-        image = sequence.frame(tracked.frame_index).image
-        poses[tracked.frame_index] = _pose_between(tracker.graph, around, tracked.timestamp, image)
+        start = _interpolate(graph, tracked)
+        fits[tracked.frame_index] = _fit_pose(graph, sequence, tracked, start)
         if progress:
             progress(done + 1, len(others))
-    return dict(sorted(poses.items()))
+    supports = [fits[tracked.frame_index].support for tracked in others]
+    typical = float(np.median(supports)) if supports else 0.0
+    for step in (-1, 1):
+        for tracked in others[::-step]:
+            index = tracked.frame_index
+            if fits[index].support < DOUBTFUL_SUPPORT * typical and index + step in fits:
+                start = fits[index + step].T_camera_world
+                other = _fit_pose(graph, sequence, tracked, start)
+                fits[index] = max(fits[index], other, key=lambda fit: fit.support)
+    for position, tracked in enumerate(tracker.tracked):
+        fit = fits.get(tracked.frame_index)
+        if fit is not None and fit.support < LOST_SUPPORT * typical:
+            tracker.tracked[position] = replace(tracked, status=TrackingStatus.LOST)
+            del fits[tracked.frame_index]
+    return {index: fits[index].T_camera_world for index in sorted(fits)}
 
 
-def _pose_between(
-    graph: KeyframeGraph, around: list[int], timestamp: float, image: Tensor
-) -> Tensor:
-    """Return T_camera_world (4, 4) of a frame after one keyframe or between two."""
+def _around(graph: KeyframeGraph, tracked: TrackedFrame) -> list[int]:
+    """Return the keyframes before and after a frame; one, if the camera was lost between them."""
+    frames = graph.keyframes.frames
+    following = sum(frame.frame_index < tracked.frame_index for frame in frames)
+    is_between = following < len(frames) and not graph.follows_a_loss(following)
+    return [following - 1, following] if is_between else [following - 1]
+
+
+def _interpolate(graph: KeyframeGraph, tracked: TrackedFrame) -> Tensor:  # (4, 4)
+    """Interpolate the pose of a frame between two keyframes; after a single one, return its pose.
+
+    The interpolation is by timestamp.
+    """
+    around = _around(graph, tracked)
+    known = graph.keyframes.T_camera_world[around]
+    if len(around) == 1:
+        return known[0]
+    first, second = (graph.keyframes.frames[k].timestamp for k in around)
+    return se3_interpolate(known[0], known[1], (tracked.timestamp - first) / (second - first))
+
+
+def _fit_pose(
+    graph: KeyframeGraph, sequence: Sequence, tracked: TrackedFrame, start: Tensor
+) -> PoseFit:
+    """Estimate the pose of a frame from a start (4, 4)."""
     keyframes, grid = graph.keyframes, graph.grid
+    around = _around(graph, tracked)
     known = keyframes.T_camera_world[around]
-    start = known[0]
-    if len(around) == 2:
-        first, second = (keyframes.frames[k].timestamp for k in around)
-        start = se3_interpolate(known[0], known[1], (timestamp - first) / (second - first))
     newest, count = len(keyframes), len(around)
     poses = torch.cat([known, start[None]])
     disparities = keyframes.disparities[around]
@@ -57,7 +103,7 @@ def _pose_between(
 
     transforms = relative_transforms(poses, sources, targets).float()
     predicted, _ = reproject(transforms, disparities, grid.rays, grid.camera)
-    graph.flow.add_frame(newest, image)
+    graph.flow.add_frame(newest, sequence.frame(tracked.frame_index).image)
     matches = graph.flow.match(around, [newest] * count, predicted)
     graph.flow.remove_frame(newest)
 
@@ -71,23 +117,12 @@ def _pose_between(
         free_poses=torch.arange(count + 1) == count,
         robust=graph.robust and graph.robust.widened(ROBUST_NARROWING),
     )
-    if count == 1:
-        # No later keyframe constrains the pose, so it may follow a dynamic object: two starts.
-        starts = [start, _extrapolate_pose(graph, around[0], timestamp)]
-        poses[-1] = start_pose(
-            grid, matches, disparities[0], cell_weights[0], known[0], starts, graph.robust
-        )
+    if count == 1:  # no later keyframe constrains the pose, so it may follow a dynamic object
+        weights, robust = cell_weights[0], graph.robust
+        poses[-1] = start_pose(grid, matches, disparities[0], weights, known[0], [start], robust)
     unused = torch.zeros(1, len(grid.rays))  # disparities of the frame itself
     state = BundleState(poses, torch.cat([disparities, unused]))
     state, report = motion_only_adjust(problem, state, ITERATIONS)
     graph.count_adjustment(report)
-    return state.T_camera_world[-1]
-
-
-def _extrapolate_pose(graph: KeyframeGraph, keyframe: int, timestamp: float) -> Tensor:
-    """Extrapolate the motion up to a keyframe; return the pose (4, 4) at a later time."""
-    before = max(keyframe - 1, 0)
-    poses, frames = graph.keyframes.T_camera_world, graph.keyframes.frames
-    elapsed = frames[keyframe].timestamp - frames[before].timestamp
-    fraction = (timestamp - frames[before].timestamp) / elapsed if elapsed > 0 else 1.0
-    return se3_interpolate(poses[before], poses[keyframe], fraction)
+    _, final_weights = residuals(problem, state)
+    return PoseFit(state.T_camera_world[-1], float(final_weights.mean()))

@@ -1,0 +1,140 @@
+"""Dense depth from all posed frames: which views to sweep, and from which others."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.geometry import Camera
+from minislam.records import Sequence
+from minislam.stereo.aggregation import aggregate, refined_minimum
+from minislam.stereo.sweep import PosedImage, sweep
+from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.safeguards.structure import MIN_AGREEING_VIEWS, agreeing_views
+
+WIDTH = 160  # px of the images that are swept
+VIEWS = 8  # other images in a sweep
+REACH = 40  # frames to either side among which they are chosen
+MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
+BETWEEN = 2  # frames between two keyframes that are swept as well, to vote
+VOTERS = 6  # swept frames on either side that vote
+DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
+LARGEST_QUANTILE = 0.98
+PLANES = (48, 96)  # fewest and most
+EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
+
+
+def dense_depths(
+    sequence: Sequence,
+    poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
+    graph: KeyframeGraph,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[tuple[Tensor, Tensor]]:
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe."""
+    sweeper = Sweeper(sequence, poses)
+    keyframes = [frame.frame_index for frame in graph.keyframes.frames]
+    frames = swept_frames(keyframes, list(poses))
+    swept = []
+    for done, frame in enumerate(frames):
+        nearest = int(np.argmin([abs(frame - keyframe) for keyframe in keyframes]))
+        swept.append(sweeper.sweep(frame, _sparse_disparities(graph, nearest)))
+        if progress:
+            progress(done + 1, len(frames))
+    depths = []
+    for keyframe in keyframes:
+        at = frames.index(keyframe)
+        others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
+        depths.append(full_size(confirm(sweeper.camera, swept[at], others), sequence.camera))
+    return depths
+
+
+def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
+    """Return the keyframes and some followed frames between each pair, which vote as well."""
+    frames = set(keyframes)
+    for first, last in zip(keyframes, keyframes[1:], strict=False):
+        there = [frame for frame in followed if first < frame < last]
+        number = min(BETWEEN, len(there) // 3)
+        frames |= {there[len(there) * (k + 1) // (number + 1)] for k in range(number)}
+    return sorted(frames)
+
+
+def _sparse_disparities(graph: KeyframeGraph, keyframe: int) -> np.ndarray:  # (n,)
+    """Return the disparities around a keyframe on which several keyframes agree."""
+    count = len(graph.keyframes)
+    around = range(max(0, keyframe - 1), min(count, keyframe + 2))
+    needed = min(MIN_AGREEING_VIEWS, count - 1)
+    agreed = [graph.keyframes.disparities[k][agreeing_views(graph, k) >= needed] for k in around]
+    known = torch.cat(agreed)
+    return (known if len(known) else graph.keyframes.disparities[keyframe]).numpy()
+
+
+class Sweeper:
+    """Sweeps single frames; it keeps the small grey images that it has read."""
+
+    def __init__(self, sequence: Sequence, poses: dict[int, Tensor]) -> None:
+        camera = sequence.camera
+        self.camera = camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
+        self._sequence = sequence
+        self._poses = {index: pose.double().numpy() for index, pose in poses.items()}
+        self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
+
+    def _read_image(self, frame_index: int) -> PosedImage:
+        gray = cv2.cvtColor(self._sequence.frame(frame_index).image.numpy(), cv2.COLOR_RGB2GRAY)
+        size = (self.camera.width, self.camera.height)
+        small = cv2.resize(gray, size, None, 0, 0, cv2.INTER_AREA)
+        return PosedImage(small, self._poses[frame_index])
+
+    def sweep(self, frame: int, known: np.ndarray) -> SweptView:
+        """Sweep one frame against frames around it; `known` are inverse depths of its scene."""
+        others = self._views(frame, float(np.median(known)))
+        nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
+        reference = self._image(frame)
+        baseline = max(self._distance(frame, other) for other in others)
+        number = int(np.clip(baseline * nearest * self.camera.fx, *PLANES))
+        planes = np.linspace(0, nearest, number)
+        cost = sweep(self.camera, reference, [self._image(k) for k in others], planes)
+        best, fraction = refined_minimum(aggregate(cost, reference.gray))
+        step = planes[1]
+        found = ((best + fraction) * step).clip(0).astype(np.float32)
+        found[best == number - 1] = np.nan  # the cost still falls there: the minimum lies nearer
+        at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
+        return SweptView(found, at_best, step, reference.T_camera_world)
+
+    def _views(self, frame: int, inverse_depth: float) -> list[int]:
+        """Choose the frames to sweep against, spread evenly over those of moderate parallax."""
+        near = [k for k in self._poses if 0 < abs(k - frame) <= REACH]
+        limit = MAX_PARALLAX * self.camera.width / (self.camera.fx * inverse_depth)
+        usable = [k for k in near if self._distance(frame, k) <= limit]
+        if len(usable) < 2:
+            return sorted(near, key=lambda k: abs(k - frame))[:2]
+        chosen = np.linspace(0, len(usable) - 1, min(VIEWS, len(usable))).round().astype(int)
+        return [usable[k] for k in chosen]
+
+    def _distance(self, first: int, second: int) -> float:
+        """Return the distance between two cameras."""
+        centres = [np.linalg.inv(self._poses[k])[:3, 3] for k in (first, second)]
+        return float(np.linalg.norm(centres[0] - centres[1]))
+
+
+def full_size(depth: ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) at the size of the images.
+
+    Inverse depth is interpolated on a surface; at its edge each pixel takes the nearest value.
+    """
+    size = (camera.width, camera.height)
+    known = (depth.inverse_depth > 0).astype(np.uint8)
+    smooth = cv2.resize(depth.inverse_depth, size, None, 0, 0, cv2.INTER_LINEAR)
+    nearest = cv2.resize(depth.inverse_depth, size, None, 0, 0, cv2.INTER_NEAREST)
+    square = np.ones((3, 3), np.uint8)
+    largest = cv2.dilate(depth.inverse_depth, square)
+    smallest = cv2.erode(depth.inverse_depth, square)
+    surface = ((largest < EDGE_RATIO * smallest) & (known > 0)).astype(np.uint8)
+    inside = cv2.resize(surface, size, None, 0, 0, cv2.INTER_NEAREST) > 0
+    inverse = np.where(inside, smooth, nearest)
+    full = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-6), 0).astype(np.float32)
+    confirmation = cv2.resize(depth.confirmation, size, None, 0, 0, cv2.INTER_LINEAR)
+    return torch.from_numpy(full), torch.from_numpy(confirmation)

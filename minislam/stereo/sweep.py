@@ -1,0 +1,126 @@
+"""Plane sweep: how well each pixel of an image matches other images at each depth.
+
+A plane parallel to the image, at inverse depth q, warps another image into this one by the
+homography
+
+    H(q) = K (R + q t e3^T) K^-1,        with T_other_this = (R, t).
+
+Where the plane lies on the surface that a pixel shows, the warped image equals this one around the
+pixel. So the cost of a pixel over all planes has its minimum at the depth of the pixel. That holds
+for what stands still. A moving object matches at a depth that differs from view to view, or
+nowhere.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from minislam.geometry import Camera
+
+NCC_WINDOW = 5  # px, side of the window that is correlated
+NCC_VARIANCE = 4e-4  # of grey values in [0, 1]: contrast below its root does not count
+COLOUR_WINDOW = 3  # px, side of the window of the absolute difference
+COLOUR_SCALE = 0.06  # grey values: a larger difference counts no more
+COLOUR_WEIGHT = 0.15  # of the absolute difference beside the correlation [-]
+MIN_SEEN = 0.25  # of the views that must see a pixel's plane [-]
+UNSEEN_COST = 0.8  # of a plane that fewer views see: neither right nor wrong [-]
+OUTSIDE = -1e4  # grey value outside of an image; mixed into a pixel, it makes it negative
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """A grey image and its pose."""
+
+    gray: np.ndarray  # (h, w) float32 in [0, 1]
+    T_camera_world: np.ndarray  # (4, 4) float64
+
+
+def plane_homographies(
+    camera: Camera,
+    T_other_this: np.ndarray,  # (4, 4)
+    inverse_depths: np.ndarray,  # (D,) 1/world unit
+) -> np.ndarray:  # (D, 3, 3)
+    """Return H(q): where a pixel of this image, lying on plane q, is seen in the other image."""
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    rotation, translation = T_other_this[:3, :3], T_other_this[:3, 3]
+    motion = np.repeat(rotation[None], len(inverse_depths), 0)
+    motion[:, :, 2] += inverse_depths[:, None] * translation
+    return K @ motion @ np.linalg.inv(K)
+
+
+def sweep(
+    camera: Camera,  # of all images
+    reference: PosedImage,
+    others: list[PosedImage],  # V views
+    inverse_depths: np.ndarray,  # (D,) 1/world unit, of the planes
+) -> np.ndarray:  # (h, w, D) float32 in [0, 1]
+    """Return the matching cost of every pixel and plane.
+
+    The better half of the views is averaged: in the worse half the pixel may be covered, or
+    something may have moved there.
+    """
+    T_world_this = np.linalg.inv(reference.T_camera_world)
+    homographies = [
+        plane_homographies(camera, other.T_camera_world @ T_world_this, inverse_depths)
+        for other in others
+    ]
+    gray = reference.gray
+    mean, variance = _moments(gray[None])
+    spread = np.sqrt(variance + NCC_VARIANCE)
+    cost = np.empty((*gray.shape, len(inverse_depths)), np.float32)
+    for plane in range(len(inverse_depths)):
+        warped = np.stack(
+            [warp(other.gray, H[plane]) for other, H in zip(others, homographies, strict=True)]
+        )
+        seen = warped >= 0
+        costs = _dissimilarity(gray, mean, spread, np.where(seen, warped, gray))
+        cost[..., plane] = _mean_of_better_half(costs, seen)
+    return cost
+
+
+def warp(gray: np.ndarray, H: np.ndarray) -> np.ndarray:  # (h, w)
+    """Return the image sampled at H p for every pixel p, negative outside of the image."""
+    height, width = gray.shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1.0]])
+    # A plane that reaches behind the other camera would be mirrored: it counts as not seen.
+    if (corners @ H[2]).min() <= 0:
+        return np.full_like(gray, OUTSIDE)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(gray, H, (width, height), flags=flags, borderValue=OUTSIDE)
+
+
+def _moments(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance (V, h, w) of the windows around each pixel."""
+    mean = _window_mean(images, NCC_WINDOW)
+    return mean, np.maximum(_window_mean(images * images, NCC_WINDOW) - mean * mean, 0)
+
+
+def _window_mean(images: np.ndarray, size: int) -> np.ndarray:
+    return np.stack([cv2.blur(image, (size, size)) for image in images])
+
+
+def _dissimilarity(
+    gray: np.ndarray,  # (h, w), this image
+    mean: np.ndarray,  # (1, h, w) of its windows
+    spread: np.ndarray,  # (1, h, w) of its windows
+    warped: np.ndarray,  # (V, h, w), the other images on one plane
+) -> np.ndarray:  # (V, h, w) in [0, 1]
+    """Return 1 - NCC, where it is positive, with a part of the absolute difference."""
+    mean_warped, variance_warped = _moments(warped)
+    covariance = _window_mean(gray * warped, NCC_WINDOW) - mean * mean_warped
+    ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))
+    difference = _window_mean(np.abs(gray - warped), COLOUR_WINDOW)
+    colour = np.minimum(difference / COLOUR_SCALE, 1)
+    return (1 - COLOUR_WEIGHT) * (1 - ncc.clip(0, 1)) + COLOUR_WEIGHT * colour
+
+
+def _mean_of_better_half(costs: np.ndarray, seen: np.ndarray) -> np.ndarray:  # (h, w)
+    """Return the mean of the lower half of the costs (V, h, w) of the views that see a pixel."""
+    views = len(costs)
+    number = seen.sum(0)
+    half = np.maximum((number + 1) // 2, 1)
+    ordered = np.sort(np.where(seen, costs, 2), 0)
+    rank = np.arange(views)[:, None, None]
+    mean = np.where(rank < half, ordered, 0).sum(0) / half
+    return np.where(number >= max(1, MIN_SEEN * views), mean, UNSEEN_COST)

@@ -1,0 +1,79 @@
+"""Votes: which swept depths are right, by what the depths of other views say about them.
+
+The point of a pixel is projected into another swept view. If the depth found there is the depth of
+the point, the view agrees. If the view has a good match behind the point, it looks through it, and
+the point is refuted. A moving object is swept to a depth with which no other view agrees.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from minislam.geometry import Camera
+
+TOLERANCE = 0.05  # relative error of the inverse depth that still agrees [-]
+WELL_MATCHED = 0.5  # a view with a larger matching cost cannot refute [-]
+MIN_AGREEING = 3  # views
+MAX_REFUTED = 0.5  # refuting views per agreeing view [-]
+SUPPORT_WINDOW = 7  # px, side of the window that supports a pixel
+MIN_SUPPORT = 0.4  # of the window that must be known, too [-]
+CONFIRMING_COST = 0.6  # a pixel with a larger matching cost confirms nothing [-]
+
+
+@dataclass(frozen=True)
+class SweptView:
+    """What the sweep found for one image."""
+
+    inverse_depth: np.ndarray  # (h, w) float32 1/world unit, nan where the sweep found nothing
+    cost: np.ndarray  # (h, w) float32 in [0, 1], matching cost at that depth
+    plane_step: float  # 1/world unit between two planes
+    T_camera_world: np.ndarray  # (4, 4) float64
+
+
+@dataclass(frozen=True)
+class ConfirmedDepth:
+    """The depths of one image that other views confirm."""
+
+    inverse_depth: np.ndarray  # (h, w) float32 1/world unit, 0 where unknown
+    confirmation: np.ndarray  # (h, w) float32 in [0, 1]: near 1, all around stands still
+
+
+def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> ConfirmedDepth:
+    """Keep the depths of a view on which enough other views agree."""
+    agreeing, refuting = np.zeros_like(view.cost), np.zeros_like(view.cost)
+    for other in others:
+        agrees, refutes = vote(camera, view, other)
+        agreeing += agrees
+        refuting += refutes
+    needed = min(MIN_AGREEING, len(others))
+    known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)
+    window = (SUPPORT_WINDOW, SUPPORT_WINDOW)
+    known &= cv2.blur(known.astype(np.float32), window) >= MIN_SUPPORT
+    static = known & (view.cost < CONFIRMING_COST)
+    confirmation = cv2.blur(static.astype(np.float32), window)
+    return ConfirmedDepth(np.where(known, view.inverse_depth, 0), confirmation)
+
+
+def vote(camera: Camera, view: SweptView, other: SweptView) -> tuple[np.ndarray, np.ndarray]:
+    """Return where another view agrees with the depths of this one, and where it refutes them.
+
+    Both are (h, w) bool; a point outside the other image is neither agreed with nor refuted.
+    """
+    height, width = view.cost.shape
+    column, row = np.meshgrid(np.arange(width), np.arange(height))
+    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
+    motion = other.T_camera_world @ np.linalg.inv(view.T_camera_world)
+    # Points times their inverse depth: a point at infinity stays finite.
+    points = rays @ motion[:3, :2].T + motion[:3, 2] + view.inverse_depth[..., None] * motion[:3, 3]
+    z = np.maximum(points[..., 2], 1e-6)
+    u = camera.fx * points[..., 0] / z + camera.cx
+    v = camera.fy * points[..., 1] / z + camera.cy
+    inside = (points[..., 2] > 1e-3) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    u, v = np.where(inside, u, 0).round().astype(int), np.where(inside, v, 0).round().astype(int)
+    expected = view.inverse_depth / z
+    found = other.inverse_depth[v, u]
+    tolerance = np.maximum(TOLERANCE * expected, max(view.plane_step, other.plane_step))
+    agrees = inside & (np.abs(found - expected) < tolerance)
+    behind = found < expected - 2 * tolerance
+    return agrees, inside & behind & (other.cost[v, u] < WELL_MATCHED)
