@@ -79,14 +79,6 @@ class TrackedFrame:
     matched_ratio: float  # of the last keyframe, [-]
 
 
-@dataclass(frozen=True)
-class TrackingStep:
-    """What one frame changed among the keyframes."""
-
-    has_new_keyframes: bool
-    first_moved: int  # first keyframe that moved since the last new keyframe; their number: none
-
-
 class GroundTruth(Protocol):
     """The ground truth of a benchmark, which the system must not see. Each part may be None."""
 

@@ -28,13 +28,16 @@ from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import dense_depths
 from minislam.tracking.safeguards.focal_length import FocalLengthFit, check_focal_length
-from minislam.tracking.safeguards.structure import depth_from_disparities
+from minislam.tracking.safeguards.structure import agreed_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty import (
     beta_of_mask,
     tracking_weight,
 )
+
+
+DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
 
 
 @dataclass(frozen=True)
@@ -86,10 +89,10 @@ class Slam(Stateful):
         warmup = self.config.tracking.warmup_keyframes
         for frame in self._frames_left():
             with self.steps.timed("tracking"):
-                step = self.tracker.track(frame)
-            if step.has_new_keyframes and self.tracker.initialised:
-                self._map_new_keyframes(step.first_moved)
-            elif step.has_new_keyframes and len(self.tracker.keyframes) >= warmup:
+                has_new_keyframes = self.tracker.track(frame)
+            if has_new_keyframes and self.tracker.initialised:
+                self._map_new_keyframes()
+            elif has_new_keyframes and len(self.tracker.keyframes) >= warmup:
                 self._initialise()
             self.steps.finish("tracking and mapping", frame.frame_index + 1, len(self.sequence))
         if not self.tracker.initialised:
@@ -97,7 +100,7 @@ class Slam(Stateful):
 
         self.steps.once("final adjustment", self._adjust_all)
         self.steps.once("all frames", self._pose_all_frames)
-        if not self.tracker.keyframes.has_prior:
+        if self.tracker.keyframes.known_prior < DENSE_PRIOR:
             self.steps.once("dense structure", self._rebuild_map)
         self.steps.once("refinement", self._refine_map)
         if self.config.mapping.pose_refinement.enabled:
@@ -122,37 +125,51 @@ class Slam(Stateful):
         """Start in two stages (paper Sec. 3.3): first without beta, then with beta."""
         with self.steps.timed("initialisation"):
             self.tracker.initialise()
-        with self.steps.timed("mapping"):
-            all_keyframes = [self._keyframe(k) for k in range(len(self.tracker.keyframes))]
-            self.mapper.initialise(all_keyframes, self.steps.on_progress("first map"))
+        if self.tracker.keyframes.has_prior:
+            with self.steps.timed("mapping"):
+                self.mapper.initialise(self._keyframes(), self.steps.on_progress("first map"))
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
 
-    def _map_new_keyframes(self, first_moved: int) -> None:
-        with self.steps.timed("mapping"):
-            mapped = len(self.mapper.keyframes)
-            self._move_map(first_changed=min(mapped, first_moved))
-            for index in range(mapped, len(self.tracker.keyframes)):
-                self.mapper.integrate(self._keyframe(index))
+    def _map_new_keyframes(self) -> None:
+        """Add new keyframes to the map. Without a depth prior it is built at the end."""
+        if self.tracker.keyframes.has_prior:
+            with self.steps.timed("mapping"):
+                self._move_map()
+                for keyframe in self._keyframes(first=len(self.mapper.keyframes)):
+                    self.mapper.integrate(keyframe)
+
+    def _move_map(self) -> None:
+        """Deform the map to follow the keyframes that an adjustment has moved."""
+        mapped = len(self.mapper.keyframes)
+        if mapped:
+            self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped])
 
     def _adjust_all(self) -> None:
-        step = self.tracker.end()
-        if step.has_new_keyframes:
-            self._map_new_keyframes(step.first_moved)
+        self.tracker.end()
+        self._map_new_keyframes()
         self.tracker.finish(self.steps.on_progress("final adjustment"))
-        self._move_map(first_changed=0)
+        self._move_map()
         self.focal_length = check_focal_length(self.tracker.graph)
 
     def _rebuild_map(self) -> None:
-        """Build map and MLP anew on dense depth, which takes the poses of all frames."""
+        """Build map and MLP anew on dense depth, which takes the poses of all frames.
+
+        Known depths of a prior with holes stay as they are.
+        """
+        graph, keyframes = self.tracker.graph, self._keyframes()
         depths = dense_depths(
-            self.sequence, self._poses, self.tracker.graph, self.steps.on_progress("dense depth")
+            self.sequence,
+            self._poses,
+            [keyframe.frame_index for keyframe in keyframes],
+            [agreed_disparities(graph, index).numpy() for index in range(len(keyframes))],
+            self.steps.on_progress("dense depth"),
         )
+        for index, (depth, confirmation) in enumerate(depths):
+            known = keyframes[index].depth
+            depth = torch.where(known > 0, known, depth)
+            keyframes[index] = replace(keyframes[index], depth=depth, confirmation=confirmation)
         self.mapper = self._new_mapper()
-        keyframes = [
-            replace(self._keyframe(k), depth=depth, confirmation=confirmation)
-            for k, (depth, confirmation) in enumerate(depths)
-        ]
         self.mapper.initialise(keyframes, self.steps.on_progress("first map"))
 
     def _refine_map(self) -> None:
@@ -164,15 +181,6 @@ class Slam(Stateful):
     def _pose_all_frames(self) -> None:
         on_progress = self.steps.on_progress("posing all frames")
         self._poses = pose_all_frames(self.tracker, self.sequence, on_progress)
-
-    def _move_map(self, first_changed: int) -> None:
-        """Deform the map to follow the keyframes that an adjustment has moved."""
-        mapped = len(self.mapper.keyframes)
-        depths: list[Tensor | None] | None = None
-        if not self.tracker.keyframes.has_prior:
-            depths = [None] * first_changed
-            depths += [self._depth(index) for index in range(first_changed, mapped)]
-        self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped], depths)
 
     def _refine_other_poses(self) -> None:
         """Refine the poses between the keyframes until the rendered map matches the images."""
@@ -191,13 +199,12 @@ class Slam(Stateful):
 
         The tracker asks for it when a keyframe comes, at the end of the warm-up and in the final
         adjustment, so online a keyframe keeps the beta that it had when it came. Without a depth
-        prior the map is built from the tracker's own disparities. Where they are poor, the MLP's
-        beta is high on everything with texture. Then only given masks are used.
+        prior there is no map online, hence no beta. Then only given masks are used.
         """
         keyframes = self.tracker.keyframes
         uncertainty = self.config.uncertainty
-        is_usable = uncertainty.given_masks or keyframes.has_prior
-        if not (uncertainty.enabled and is_usable and self.mapper.keyframes):
+        is_known = uncertainty.given_masks or bool(self.mapper.keyframes)
+        if not (uncertainty.enabled and is_known):
             return torch.ones(self.tracker.grid.shape)
         beta = self._beta(keyframes.frames[index], keyframes.features[index])
         return tracking_weight(beta, self.sequence.camera, self._stride)
@@ -222,27 +229,25 @@ class Slam(Stateful):
             )
         return torch.from_numpy(mask)
 
-    def _keyframe(self, index: int) -> Keyframe:
-        """Return a keyframe of the tracker in the form that the mapper takes."""
-        keyframes = self.tracker.keyframes
-        frame = keyframes.frames[index]
-        return Keyframe(
-            keyframe_index=index,
-            frame_index=frame.frame_index,
-            timestamp=frame.timestamp,
-            image=frame.image,
-            features=keyframes.features[index],
-            depth=self._depth(index),
-            T_camera_world=keyframes.T_camera_world[index],
-            moving_mask=self._given_mask(frame.frame_index),
-        )
-
-    def _depth(self, index: int) -> Tensor:
-        """Return the mapper's reference depth (H, W): the prior, or else the tracker's depth."""
-        metric_depth = self.tracker.keyframes.metric_depths[index]
-        if metric_depth is not None:
-            return metric_depth
-        return depth_from_disparities(self.tracker.graph, index)
+    def _keyframes(self, first: int = 0) -> list[Keyframe]:
+        """Return the tracker's keyframes from `first` on in the form that the mapper takes."""
+        store = self.tracker.keyframes
+        unknown = torch.zeros(self.sequence.camera.height, self.sequence.camera.width)
+        result = []
+        for index in range(first, len(store)):
+            frame, depth = store.frames[index], store.metric_depths[index]
+            record = Keyframe(
+                keyframe_index=index,
+                frame_index=frame.frame_index,
+                timestamp=frame.timestamp,
+                image=frame.image,
+                features=store.features[index],
+                depth=unknown if depth is None else depth,
+                T_camera_world=store.T_camera_world[index],
+                moving_mask=self._given_mask(frame.frame_index),
+            )
+            result.append(record)
+        return result
 
     # Results ------------------------------------------------------------------------------
 

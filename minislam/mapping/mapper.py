@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from minislam.errors import InputError
-from minislam.mapping.deformation import deform_rigidly, rescale_to_depths
+from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.density import ScreenGradients
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation, Progress
@@ -60,33 +60,20 @@ class Mapper(JointOptimisation):
         )
         self._optimise([self._online_camera] * self.config.keyframe_iterations, probabilities)
 
-    def update_keyframes(
-        self,
-        T_camera_world: Tensor,  # (K, 4, 4) float64, of all keyframes in the map, in their order
-        depths: list[Tensor | None] | None = None,  # K new reference depths, None where unchanged
-    ) -> None:
-        """Take over new poses and depths: each Gaussian moves with its anchor keyframe.
+    def update_keyframes(self, T_camera_world: Tensor) -> None:
+        """Take over new poses (K, 4, 4) of all keyframes: Gaussians move with their anchors.
 
         Adam's moments are kept, because a bundle adjustment moves the map by little.
         """
-        count = len(self.keyframes)
-        if len(T_camera_world) != count or (depths is not None and len(depths) != count):
+        if len(T_camera_world) != len(self.keyframes):
             raise InputError(
-                f"expected poses and depths of the {count} keyframes in the map, found "
+                f"expected poses of the {len(self.keyframes)} keyframes in the map, found "
                 f"{len(T_camera_world)}; give all of them in the order of their integration"
             )
         old = torch.stack([keyframe.T_camera_world for keyframe in self.keyframes])
-        rows = self.anchor_rows()
-        gaussians = self.gaussians
-        if depths is not None:
-            before = [keyframe.depth for keyframe in self.keyframes]
-            after = [b if d is None else d for b, d in zip(before, depths, strict=True)]
-            gaussians = rescale_to_depths(gaussians, rows, old, before, after, self.camera)
-            for keyframe, depth in zip(self.keyframes, after, strict=True):
-                keyframe.set_depth(depth)
-        gaussians = deform_rigidly(gaussians, rows, old, T_camera_world.double())
-        self._optimizer.replace(gaussians)
-        for keyframe, pose in zip(self.keyframes, T_camera_world.double(), strict=True):
+        new = T_camera_world.double()
+        self._optimizer.replace(deform_rigidly(self.gaussians, self.anchor_rows(), old, new))
+        for keyframe, pose in zip(self.keyframes, new, strict=True):
             keyframe.T_camera_world = pose
 
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:

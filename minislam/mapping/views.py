@@ -32,7 +32,7 @@ class View:
 
 @dataclass
 class MappedKeyframe:
-    """A keyframe in the map. Bundle adjustment changes its pose and its reference depth."""
+    """A keyframe in the map. Bundle adjustment changes its pose."""
 
     keyframe_index: int
     frame_index: int
@@ -77,11 +77,6 @@ class MappedKeyframe:
             image = shrink_image(self.image, *size)
             self._views[size] = View(image, shrink_depth(self.depth, *size))
         return self._views[size]
-
-    def set_depth(self, depth: Tensor) -> None:
-        """Replace the reference depth (H, W)."""
-        self.depth = depth
-        self._views.clear()
 
 
 def median_depth(keyframes: list[Keyframe]) -> float:  # world units

@@ -13,8 +13,6 @@ from minislam.records import Sequence
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
-from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.safeguards.structure import MIN_AGREEING_VIEWS, agreeing_views
 
 WIDTH = 160  # px of the images that are swept
 VIEWS = 8  # other images in a sweep
@@ -31,17 +29,22 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 def dense_depths(
     sequence: Sequence,
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
-    graph: KeyframeGraph,
+    keyframes: list[int],  # K frame indices, increasing
+    disparities: list[np.ndarray],  # K x (n,) known inverse depths of the scene [1/world unit]
     progress: Callable[[int, int], None] | None = None,
 ) -> list[tuple[Tensor, Tensor]]:
-    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe."""
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe.
+
+    The known inverse depths of a keyframe and its neighbours say how near the nearest plane is.
+    """
     sweeper = Sweeper(sequence, poses)
-    keyframes = [frame.frame_index for frame in graph.keyframes.frames]
     frames = swept_frames(keyframes, list(poses))
-    swept = []
+    swept: list[SweptView] = []
     for done, frame in enumerate(frames):
         nearest = int(np.argmin([abs(frame - keyframe) for keyframe in keyframes]))
-        swept.append(sweeper.sweep(frame, _sparse_disparities(graph, nearest)))
+        swept.append(
+            sweeper.sweep(frame, np.concatenate(disparities[max(0, nearest - 1) : nearest + 2]))
+        )
         if progress:
             progress(done + 1, len(frames))
     depths = []
@@ -60,16 +63,6 @@ def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
         number = min(BETWEEN, len(there) // 3)
         frames |= {there[len(there) * (k + 1) // (number + 1)] for k in range(number)}
     return sorted(frames)
-
-
-def _sparse_disparities(graph: KeyframeGraph, keyframe: int) -> np.ndarray:  # (n,)
-    """Return the disparities around a keyframe on which several keyframes agree."""
-    count = len(graph.keyframes)
-    around = range(max(0, keyframe - 1), min(count, keyframe + 2))
-    needed = min(MIN_AGREEING_VIEWS, count - 1)
-    agreed = [graph.keyframes.disparities[k][agreeing_views(graph, k) >= needed] for k in around]
-    known = torch.cat(agreed)
-    return (known if len(known) else graph.keyframes.disparities[keyframe]).numpy()
 
 
 class Sweeper:

@@ -47,7 +47,6 @@ class KeyframeGraph(Stateful):
     links: FrameGraph
     flow: FlowEstimator
     adjustments: AdjustmentCount = AdjustmentCount()
-    first_moved: int = 0  # first keyframe that moved since the tracker reported it last
 
     def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
         self.config = config

@@ -40,6 +40,11 @@ class KeyframeStore(Stateful):
         return any(depth is not None for depth in self.metric_depths)
 
     @property
+    def known_prior(self) -> float:
+        """Return the fraction of the cells with a known prior."""
+        return float((self.prior_disparities > 0).float().mean())
+
+    @property
     def cell_weights(self) -> Tensor:  # (K, N) in [0, 1]
         """Return the weight of each cell: by its appearance (beta) and by its motion so far."""
         return self.static_weights * self.motion_weights

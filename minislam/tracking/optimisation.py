@@ -89,7 +89,6 @@ def adjust(
         problem = replace(problem, free_disparities=known)
     state, report = bundle_adjust(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
-    graph.first_moved = min(graph.first_moved, first_free)
     graph.count_adjustment(report)
 
 

@@ -15,7 +15,7 @@ from minislam.priors.interfaces import (
     FlowEstimator,
     FlowMatches,
 )
-from minislam.records import Frame, TrackedFrame, TrackingStatus, TrackingStep
+from minislam.records import Frame, TrackedFrame, TrackingStatus
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import mask_priors
@@ -117,31 +117,21 @@ class Tracker(Stateful):
 
     # One frame ----------------------------------------------------------------------------------
 
-    def track(self, frame: Frame) -> TrackingStep:
-        """Follow the camera into the next frame."""
+    def track(self, frame: Frame) -> bool:
+        """Follow the camera into the next frame; tell whether there are new keyframes."""
         count = len(self.keyframes)
         if self.mode is Mode.WAITING:
             self._begin(frame)
         else:
             self._follow(frame)
-        return self._step_since(count)
+        return len(self.keyframes) > count
 
-    def end(self) -> TrackingStep:
+    def end(self) -> None:
         """Make the last frame a keyframe, so that the frames before it lie between two."""
-        count = len(self.keyframes)
         if self._last_non_keyframe is not None:
-            tail = self._last_non_keyframe[0].frame_index - self.keyframes.frames[-1].frame_index
-            if tail > LONGEST_TAIL:
+            last = self._last_non_keyframe[0].frame_index
+            if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:
                 self._insert(*self._last_non_keyframe, may_cull=False)
-        return self._step_since(count)
-
-    def _step_since(self, count: int) -> TrackingStep:
-        """Return what has changed since there were `count` keyframes."""
-        if len(self.keyframes) == count:
-            return TrackingStep(False, count)
-        first_moved = self.graph.first_moved
-        self.graph.first_moved = len(self.keyframes)
-        return TrackingStep(True, first_moved)
 
     def _begin(self, frame: Frame) -> None:
         """Make the first frame the first keyframe; its camera frame is the world frame."""

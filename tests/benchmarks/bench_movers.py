@@ -48,7 +48,7 @@ def tracked(sequence: Sequence, tracking: TrackingConfig, masks: bool = False) -
         sequence.camera, tracking, priors.flow, priors.features, priors.depth, static_weight
     )
     for frame in sequence:
-        is_start = tracker.track(frame).has_new_keyframes and not tracker.initialised
+        is_start = tracker.track(frame) and not tracker.initialised
         if is_start and len(tracker.keyframes) >= tracking.warmup_keyframes:
             tracker.initialise()
             tracker.refine_initialisation()

@@ -129,9 +129,10 @@ def bench_keyframes() -> None:
     for index, image in enumerate(clip.rgb):
         frame = Frame(index, float(clip.timestamps[index]), torch.from_numpy(image))
         start = time.process_time()
-        step = tracker.track(frame)
+        was_initialised = tracker.initialised
+        has_new_keyframes = tracker.track(frame)
         elapsed = time.process_time() - start
-        if step.has_new_keyframes and tracker.initialised and step.first_moved > 0:
+        if has_new_keyframes and was_initialised:
             times.append(1e3 * elapsed)
         if not tracker.initialised and len(tracker.keyframes) == tracker.config.warmup_keyframes:
             tracker.initialise()

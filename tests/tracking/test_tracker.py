@@ -9,7 +9,7 @@ import torch
 from minislam.errors import TrackingLost
 from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error, centres
 from minislam.records import Frame, TrackingStatus, Trajectory
-from minislam.tracking.tracker import Mode, Tracker
+from minislam.tracking.tracker import LONGEST_TAIL, Mode, Tracker
 from tests.tracking.recording import (
     CONFIG,
     SIZE,
@@ -78,10 +78,8 @@ def test_no_adjustment_failed():
 def test_the_modes_follow_each_other():
     tracker, images = new_tracker(with_depth=True), frames()
     assert tracker.mode is Mode.WAITING and not tracker.initialised
-    step = tracker.track(images[0])
-    assert step.has_new_keyframes and tracker.mode is Mode.WARMING_UP
-    step = tracker.track(images[1])
-    assert not step.has_new_keyframes and step.first_moved == len(tracker.keyframes) == 1
+    assert tracker.track(images[0]) and tracker.mode is Mode.WARMING_UP
+    assert not tracker.track(images[1]) and len(tracker.keyframes) == 1
     tracker.initialise()
     assert tracker.mode is Mode.TRACKING and len(tracker.keyframes) == 2
     tracker.track(Frame(2, 2 / 30, torch.zeros_like(images[0].image)))
@@ -90,16 +88,15 @@ def test_the_modes_follow_each_other():
     assert tracker.mode is Mode.TRACKING
 
 
-def test_the_first_keyframe_after_the_warm_up_reports_that_all_have_moved():
+def test_the_last_frame_becomes_a_keyframe():
     tracker = new_tracker(with_depth=True)
-    for frame in frames():
-        step = tracker.track(frame)
-        if tracker.initialised and step.has_new_keyframes:
-            break
-        if not tracker.initialised and len(tracker.keyframes) == CONFIG.warmup_keyframes:
-            tracker.initialise()
-            tracker.refine_initialisation()
-    assert step.first_moved == 0
+    run(tracker, frames())
+    followed = [t.frame_index for t in tracker.tracked if t.status.is_followed]
+    tracker.end()
+    assert followed[-1] - tracker.keyframes.frames[-1].frame_index <= LONGEST_TAIL
+    count = len(tracker.keyframes)
+    tracker.end()
+    assert len(tracker.keyframes) == count
 
 
 def test_two_runs_are_the_same_to_the_bit():

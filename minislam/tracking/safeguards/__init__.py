@@ -4,7 +4,7 @@ robust           the robust weight inside Sigma, for a flow without a learned co
 motion_memory    remembers which cells have moved, so that a growing dynamic object stays excluded
 relocalisation   finds a lost camera among the keyframes
 first_depth      depth of the first keyframe from matches alone, where there is no depth prior
-structure        depth images from the tracker's disparities, for footage without a depth prior
+structure        which disparities several keyframes agree on
 diagnostics      how well each keyframe is tied to the others
 focal_length     tells at the end whether the given focal length was wrong
 """

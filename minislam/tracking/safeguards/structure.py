@@ -1,7 +1,5 @@
-"""Depth images from the tracker's own disparities, for footage without a depth prior."""
+"""Which of the tracker's disparities several keyframes agree on."""
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,7 +10,6 @@ from minislam.tracking.reprojection import relative_transforms, reproject, scale
 MAX_DISPARITY_ERROR = 0.05
 MIN_AGREEING_VIEWS = 2  # other keyframes that must see a point at the same depth
 NEIGHBOURS = 4  # keyframes on either side that are compared
-EDGE_RATIO = 1.15  # neighbouring cells whose depths differ more lie on different surfaces
 
 
 def agreeing_views(graph: KeyframeGraph, keyframe_index: int) -> Tensor:  # (N,) int
@@ -40,30 +37,8 @@ def agreeing_views(graph: KeyframeGraph, keyframe_index: int) -> Tensor:  # (N,)
     return (visible & (error < MAX_DISPARITY_ERROR)).sum(0)
 
 
-def depth_from_disparities(
-    graph: KeyframeGraph, keyframe_index: int
-) -> Tensor:  # (H, W), 0: unknown
-    """Return a depth image: cells on which several views agree, interpolated between them.
-
-    Pixels between cells of two surfaces stay unknown.
-    """
-    grid, keyframes = graph.grid, graph.keyframes
-    disparities = keyframes.disparities[keyframe_index].reshape(grid.shape).numpy()
-    needed = min(MIN_AGREEING_VIEWS, len(keyframes) - 1)
-    agreed = (agreeing_views(graph, keyframe_index) >= needed).reshape(grid.shape).numpy()
-    static = keyframes.static_weights[keyframe_index].reshape(grid.shape).numpy() > 0
-    square = np.ones((2, 2), np.uint8)
-    largest = cv2.dilate(disparities, square, anchor=(0, 0))
-    smallest = cv2.erode(disparities, square, anchor=(0, 0))
-    smooth = largest < EDGE_RATIO * smallest
-    usable = cv2.erode((agreed & static).astype(np.uint8), square, anchor=(0, 0))
-    known = (usable > 0) & smooth  # of the square between a cell and its right and lower ones
-
-    column, row = np.meshgrid(
-        np.arange(grid.camera.width, dtype=np.float32) / grid.stride,
-        np.arange(grid.camera.height, dtype=np.float32) / grid.stride,
-    )
-    dense = cv2.remap(disparities, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inside = known[row.astype(int), column.astype(int)]
-    depth = np.where(inside, 1 / np.maximum(dense, 1e-6), 0).astype(np.float32)
-    return torch.from_numpy(depth)
+def agreed_disparities(graph: KeyframeGraph, keyframe_index: int) -> Tensor:  # (n,)
+    """Return the disparities of a keyframe on which enough others agree."""
+    needed = min(MIN_AGREEING_VIEWS, len(graph.keyframes) - 1)
+    agreed = agreeing_views(graph, keyframe_index) >= needed
+    return graph.keyframes.disparities[keyframe_index][agreed]
