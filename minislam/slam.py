@@ -10,7 +10,7 @@ beta into the weight of each cell. `_move_map` deforms the map when an adjustmen
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimat
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.stereo.dense_structure import dense_depths
+from minislam.stereo.dense_structure import fill_depth
 from minislam.tracking.safeguards.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.safeguards.structure import agreed_disparities
 from minislam.tracking.tracker import Tracker
@@ -35,7 +35,6 @@ from minislam.uncertainty import (
     beta_of_mask,
     tracking_weight,
 )
-
 
 DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
 
@@ -107,8 +106,7 @@ class Slam(Stateful):
             self.steps.once("photometric refinement", self._refine_other_poses)
 
     def _new_mapper(self) -> Mapper:
-        config, dimension = self.config, self._features.dimension
-        camera = self.sequence.camera
+        config, dimension, camera = self.config, self._features.dimension, self.sequence.camera
         return Mapper(camera, config.mapping, config.uncertainty, dimension, config.seed)
 
     def _frames_left(self) -> Iterator[Frame]:
@@ -158,17 +156,9 @@ class Slam(Stateful):
         Known depths of a prior with holes stay as they are.
         """
         graph, keyframes = self.tracker.graph, self._keyframes()
-        depths = dense_depths(
-            self.sequence,
-            self._poses,
-            [keyframe.frame_index for keyframe in keyframes],
-            [agreed_disparities(graph, index).numpy() for index in range(len(keyframes))],
-            self.steps.on_progress("dense depth"),
-        )
-        for index, (depth, confirmation) in enumerate(depths):
-            known = keyframes[index].depth
-            depth = torch.where(known > 0, known, depth)
-            keyframes[index] = replace(keyframes[index], depth=depth, confirmation=confirmation)
+        disparities = [agreed_disparities(graph, index) for index in range(len(keyframes))]
+        on_progress = self.steps.on_progress("dense depth")
+        keyframes = fill_depth(keyframes, self.sequence, self._poses, disparities, on_progress)
         self.mapper = self._new_mapper()
         self.mapper.initialise(keyframes, self.steps.on_progress("first map"))
 
@@ -179,8 +169,8 @@ class Slam(Stateful):
         self.mapper.refine(iterations, self.steps.on_step(stage), done)
 
     def _pose_all_frames(self) -> None:
-        on_progress = self.steps.on_progress("posing all frames")
-        self._poses = pose_all_frames(self.tracker, self.sequence, on_progress)
+        progress = self.steps.on_progress("posing all frames")
+        self._poses = pose_all_frames(self.tracker, self.sequence, progress)
 
     def _refine_other_poses(self) -> None:
         """Refine the poses between the keyframes until the rendered map matches the images."""

@@ -20,7 +20,7 @@ from minislam.uncertainty import (
     mapping_weight,
 )
 
-CONFIRMED_BETA = 0.4
+CONFIRMED_BETA = 0.4  # fraction of beta that confirmation takes away [-]
 
 Progress = Callable[[int, int], None]  # called with the iterations done and their number
 
@@ -87,13 +87,11 @@ class JointOptimisation(Stateful):
         return self._trainer.predict(features)
 
     def beta_of(self, keyframe: MappedKeyframe) -> Tensor:
-        """Return the raw beta (h', w') of a keyframe: that of its given mask, or the MLP's."""
+        """Return the raw beta (h', w') of a keyframe: its mask's or, less if confirmed, the MLP's."""
         if keyframe.given_beta is not None:
             return keyframe.given_beta
-        beta = self.predict_beta(keyframe.features)
-        if keyframe.confirmation is not None:
-            beta = beta * (1 - CONFIRMED_BETA * keyframe.confirmation)
-        return beta
+        beta, confirmation = self.predict_beta(keyframe.features), keyframe.confirmation
+        return beta if confirmation is None else beta * (1 - CONFIRMED_BETA * confirmation)
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
         """Return the static weight (H, W) for a raw beta; 1 with uncertainty switched off."""

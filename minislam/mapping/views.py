@@ -18,7 +18,7 @@ from minislam.uncertainty import (
     rendering_error,
 )
 
-
+# The rendering error of a confirmed cell fades: where it stands still, the map is wrong. [-]
 CONFIRMED_ERROR = 1.5
 
 

@@ -1,0 +1,9 @@
+"""Multi-view stereo: dense depth from posed frames, where no network and no sensor gives it.
+
+Not a part of the paper, which takes its depth from a network. Read the files in this order:
+
+    sweep              how well each pixel matches other images at each depth
+    aggregation        depths of neighbouring pixels fit together
+    votes              which depths other views confirm: those of what stands still
+    dense_structure    which frames are swept, and against which others
+"""

@@ -1,7 +1,9 @@
 """Dense depth from all posed frames: which views to sweep, and from which others."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -9,7 +11,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.records import Sequence
+from minislam.records import Keyframe, Sequence
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
@@ -24,6 +26,26 @@ DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the spars
 LARGEST_QUANTILE = 0.98
 PLANES = (48, 96)  # fewest and most
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
+
+
+def fill_depth(
+    keyframes: list[Keyframe],
+    sequence: Sequence,
+    poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
+    disparities: list[Tensor],  # K x (n,) known inverse depths of the keyframes [1/world unit]
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Keyframe]:
+    """Return the keyframes with dense depth where theirs is unknown, and with confirmation."""
+    frames = [keyframe.frame_index for keyframe in keyframes]
+    found = dense_depths(sequence, poses, frames, [d.numpy() for d in disparities], progress)
+    return [
+        replace(
+            keyframe,
+            depth=torch.where(keyframe.depth > 0, keyframe.depth, depth),
+            confirmation=confirmation,
+        )
+        for keyframe, (depth, confirmation) in zip(keyframes, found, strict=True)
+    ]
 
 
 def dense_depths(
@@ -58,7 +80,7 @@ def dense_depths(
 def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
     """Return the keyframes and some followed frames between each pair, which vote as well."""
     frames = set(keyframes)
-    for first, last in zip(keyframes, keyframes[1:], strict=False):
+    for first, last in pairwise(keyframes):
         there = [frame for frame in followed if first < frame < last]
         number = min(BETWEEN, len(there) // 3)
         frames |= {there[len(there) * (k + 1) // (number + 1)] for k in range(number)}
@@ -66,7 +88,7 @@ def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
 
 
 class Sweeper:
-    """Sweeps single frames; it keeps the small grey images that it has read."""
+    """Sweeps single frames. It keeps the small grey images that it has read."""
 
     def __init__(self, sequence: Sequence, poses: dict[int, Tensor]) -> None:
         camera = sequence.camera
@@ -83,19 +105,21 @@ class Sweeper:
 
     def sweep(self, frame: int, known: np.ndarray) -> SweptView:
         """Sweep one frame against frames around it; `known` are inverse depths of its scene."""
+        reference = self._image(frame)
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
-        reference = self._image(frame)
-        baseline = max(self._distance(frame, other) for other in others)
-        number = int(np.clip(baseline * nearest * self.camera.fx, *PLANES))
-        planes = np.linspace(0, nearest, number)
+        baseline = max((self._distance(frame, other) for other in others), default=0.0)
+        # About one plane per pixel of parallax.
+        planes = np.linspace(0, nearest, int(np.clip(baseline * nearest * self.camera.fx, *PLANES)))
+        if baseline == 0:
+            nothing = np.full_like(reference.gray, np.nan)
+            return SweptView(nothing, nothing + 1, planes[1], reference.T_camera_world)
         cost = sweep(self.camera, reference, [self._image(k) for k in others], planes)
         best, fraction = refined_minimum(aggregate(cost, reference.gray))
-        step = planes[1]
-        found = ((best + fraction) * step).clip(0).astype(np.float32)
-        found[best == number - 1] = np.nan  # the cost still falls there: the minimum lies nearer
+        found = ((best + fraction) * planes[1]).clip(0).astype(np.float32)
+        found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
         at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
-        return SweptView(found, at_best, step, reference.T_camera_world)
+        return SweptView(found, at_best, planes[1], reference.T_camera_world)
 
     def _views(self, frame: int, inverse_depth: float) -> list[int]:
         """Choose the frames to sweep against, spread evenly over those of moderate parallax."""

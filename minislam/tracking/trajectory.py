@@ -36,10 +36,9 @@ def pose_all_frames(
     """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
 
     A keyframe keeps its pose. Another frame starts from the interpolated pose and is adjusted on
-    the flow from the keyframe before it and the keyframe after it. Their disparities are held. In
-    a wide gap that start may be too far off. So a frame that little of the flow supports is tried
-    again from the pose of the frame before it, then from that of the frame after it. A frame that
-    stays without support is lost.
+    the flow from the keyframes around it, whose disparities are held. If little of the flow
+    supports its pose, it starts again from the frame before it, then from the frame after it. A
+    frame that stays without support is lost.
     """
     graph, frames = tracker.graph, tracker.keyframes.frames
     poses = tracker.keyframes.T_camera_world
@@ -77,10 +76,7 @@ def _around(graph: KeyframeGraph, tracked: TrackedFrame) -> list[int]:
 
 
 def _interpolate(graph: KeyframeGraph, tracked: TrackedFrame) -> Tensor:  # (4, 4)
-    """Interpolate the pose of a frame between two keyframes; after a single one, return its pose.
-
-    The interpolation is by timestamp.
-    """
+    """Interpolate the pose by timestamp between two keyframes; after one, return its pose."""
     around = _around(graph, tracked)
     known = graph.keyframes.T_camera_world[around]
     if len(around) == 1:

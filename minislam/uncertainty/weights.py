@@ -9,8 +9,6 @@ follow here, first stretches beta, then caps the weight in tracking and cuts it 
 So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41.
 """
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -56,12 +54,10 @@ def adjusted_beta(beta_raw: Tensor, camera: Camera) -> Tensor:
 def mapping_weight(
     beta_raw: Tensor,  # (h', w') output of the MLP
     camera: Camera,
-    largest_beta: float = math.inf,  # adjusted; pixels above it get weight 0, too
 ) -> Tensor:  # (H, W) 0 or >= 0.1, at most 48.4
     """Return the weight of each pixel in L_render, Eq. (6): 0.5 / beta_adj^2, cut at 0.1."""
-    beta = adjusted_beta(beta_raw, camera)
-    weight = WEIGHT_SCALE / beta**2
-    return torch.where((weight < MAPPING_CUT) | (beta > largest_beta), 0, weight)
+    weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2
+    return torch.where(weight < MAPPING_CUT, torch.zeros_like(weight), weight)
 
 
 def tracking_weight(

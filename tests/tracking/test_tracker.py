@@ -11,7 +11,6 @@ from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error,
 from minislam.records import Frame, TrackingStatus, Trajectory
 from minislam.tracking.tracker import LONGEST_TAIL, Mode, Tracker
 from tests.tracking.recording import (
-    CONFIG,
     SIZE,
     WHERE_LOST,
     frames,

@@ -38,7 +38,8 @@ def agreeing_views(graph: KeyframeGraph, keyframe_index: int) -> Tensor:  # (N,)
 
 
 def agreed_disparities(graph: KeyframeGraph, keyframe_index: int) -> Tensor:  # (n,)
-    """Return the disparities of a keyframe on which enough others agree."""
+    """Return the disparities of a keyframe on which enough others agree; all, if none is."""
     needed = min(MIN_AGREEING_VIEWS, len(graph.keyframes) - 1)
     agreed = agreeing_views(graph, keyframe_index) >= needed
-    return graph.keyframes.disparities[keyframe_index][agreed]
+    disparities = graph.keyframes.disparities[keyframe_index]
+    return disparities[agreed] if bool(agreed.any()) else disparities

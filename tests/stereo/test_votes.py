@@ -1,0 +1,91 @@
+"""Votes on a wall: true depths are confirmed, wrong ones are not, near ones are refuted."""
+
+import numpy as np
+
+from minislam.geometry import Camera
+from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, vote
+
+CAMERA = Camera(fx=60.0, fy=66.0, cx=19.5, cy=14.5, width=40, height=30)
+WALL = 0.5  # inverse depth
+
+
+def view(shift: float = 0.0, inverse_depth: float = WALL, cost: float = 0.1) -> SweptView:
+    """Return what a camera sees that has moved sideways along the wall."""
+    pose = np.eye(4)
+    pose[0, 3] = -shift
+    shape = (CAMERA.height, CAMERA.width)
+    found = np.full(shape, inverse_depth, np.float32)
+    return SweptView(found, np.full(shape, cost, np.float32), 0.01, pose)
+
+
+def others(count: int = 4, **kind: float) -> list[SweptView]:
+    return [view(0.05 * (k + 1), **kind) for k in range(count)]
+
+
+def with_square(swept: SweptView, inverse_depth: float) -> SweptView:
+    swept.inverse_depth[10:20, 10:20] = inverse_depth
+    return swept
+
+
+def confirmed(swept: SweptView, voters: list[SweptView]) -> ConfirmedDepth:
+    return confirm(CAMERA, swept, voters)
+
+
+def test_the_wall_is_confirmed():
+    result = confirmed(view(), others())
+    inner = (slice(4, -4), slice(8, -8))
+    assert (result.inverse_depth[inner] == np.float32(WALL)).all()
+    np.testing.assert_allclose(result.confirmation[inner], 1, atol=1e-6)
+
+
+def test_a_depth_that_nobody_else_finds_is_unknown():
+    result = confirmed(with_square(view(), 0.8), others())
+    assert (result.inverse_depth[11:19, 11:19] == 0).all()
+    assert result.confirmation[13:17, 13:17].max() == 0
+    assert (result.inverse_depth[4:8, 8:-8] > 0).all()
+
+
+def test_a_view_that_looks_through_a_point_refutes_it():
+    near = with_square(view(), 0.8)
+    agrees, refutes = vote(CAMERA, near, view(0.1))
+    assert refutes[10:20, 10:20].all() and not agrees[10:20, 10:20].any()
+    assert agrees[:5, 8:].all() and not refutes[:5].any()
+
+
+def test_a_view_in_front_of_a_point_does_not_refute_it():
+    far = with_square(view(), 0.3)  # a covered point, seen through the wall
+    agrees, refutes = vote(CAMERA, far, view(0.1))
+    assert not refutes.any() and not agrees[10:20, 10:20].any()
+
+
+def test_a_badly_matched_view_cannot_refute():
+    assert not vote(CAMERA, with_square(view(), 0.8), view(0.1, cost=0.9))[1].any()
+
+
+def test_one_plane_of_error_still_agrees():
+    agrees, _ = vote(CAMERA, view(inverse_depth=0.02), view(0.1, inverse_depth=0.029))
+    assert agrees[:, 2:-2].all()
+
+
+def test_a_view_outside_of_the_other_image_has_no_vote():
+    agrees, refutes = vote(CAMERA, view(), view(100.0))
+    assert not agrees.any() and not refutes.any()
+
+
+def test_too_few_votes_are_not_enough():
+    assert (confirmed(view(), others(2) + others(1, inverse_depth=0.9)).inverse_depth == 0).all()
+    assert (confirmed(view(), []).inverse_depth == 0).all()
+    assert (confirmed(view(), others(2)).inverse_depth[4:-4, 8:-8] > 0).all()  # all there are
+
+
+def test_what_matches_badly_is_known_but_confirms_nothing():
+    result = confirmed(view(cost=0.7), others())
+    assert (result.inverse_depth[4:-4, 8:-8] > 0).all() and result.confirmation.max() == 0
+
+
+def test_where_the_sweep_found_nothing_there_is_no_vote():
+    lost = with_square(view(), np.nan)
+    result = confirmed(lost, others())
+    assert (result.inverse_depth[10:20, 10:20] == 0).all()
+    agrees, refutes = vote(CAMERA, view(), lost)
+    assert not agrees[12:18, 12:18].any() and not refutes[12:18, 12:18].any()
