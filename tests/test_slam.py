@@ -175,7 +175,7 @@ def test_run_json_says_what_was_done(with_depth: RunFolder):
 
 def test_pictures_and_report_are_there(finished: RunFolder):
     plots = {path.stem for path in (finished.path / "plots").iterdir()}
-    always = {"ate_over_time", "gaussians", "losses", "overview", "trajectory"}
+    always = {"ate_over_time", "gaussians", "health", "losses", "overview", "trajectory"}
     assert plots == always
     keyframes = len(finished.read_keyframe_trajectory())
     pictures = sorted((finished.path / "keyframes").glob("*.png"))

@@ -52,8 +52,10 @@ minislam run --resume -o FOLDER
   to the same bytes. Other settings are refused. Checkpoints are written before each of the
   last stages, on Ctrl-C, and between steps in --checkpoint_fraction of the time (1 %).
 
-exit codes: 0 finished, 1 known error in one sentence, 2 wrong usage, 3 finished but part of the
-  sequence was lost, 130 interrupted with everything so far written
+exit codes: 0 finished, 1 known error in one sentence, 2 wrong usage, 3 finished but not to be
+  trusted as a whole: frames were lost, the trajectory is broken (motion and depth contradict the
+  images; run.json lists the breaks and the segments between them) or most bundle adjustments
+  failed, 130 interrupted with everything so far written
 
 ablations of the paper:
   --no-uncertainty                       the same weight for every pixel

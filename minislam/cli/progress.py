@@ -45,6 +45,11 @@ class ProgressLine:
             text += ", stopping after this step; Ctrl-C again stops at once"
         self._print(stage, text, done / max(total, 1))
 
+    def warn(self, text: str) -> None:
+        """Print a warning on a line of its own."""
+        start = "\r\033[K" if self._terminal else ""
+        print(f"{start}WARNING: {text}", file=sys.stderr, flush=True)
+
     def should_stop(self) -> bool:
         """Tell whether Ctrl-C was pressed."""
         return self._should_stop

@@ -52,8 +52,8 @@ def measure_run(
     if truth is None:
         return metrics
     if truth.trajectory is not None:
-        metrics["ate_all_cm"] = _ate_cm(trajectory, truth.trajectory)
-        metrics["ate_keyframes_cm"] = _ate_cm(keyframe_trajectory, truth.trajectory)
+        metrics["ate_all_cm"] = ate_cm(trajectory, truth.trajectory)
+        metrics["ate_keyframes_cm"] = ate_cm(keyframe_trajectory, truth.trajectory)
         metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(truth.trajectory)
         if metrics["ate_all_cm"] is not None:
             metrics |= _novel_views(truth, truth.trajectory, trajectory, render, lpips)
@@ -63,7 +63,8 @@ def measure_run(
     return metrics
 
 
-def _ate_cm(estimate: Trajectory, truth: Trajectory) -> float | None:
+def ate_cm(estimate: Trajectory, truth: Trajectory) -> float | None:
+    """Return the ATE [cm], None where nothing can be aligned."""
     try:
         error = absolute_trajectory_error(estimate, truth, max_difference=MAX_DIFFERENCE)
     except InputError:

@@ -9,9 +9,10 @@ from torch import Tensor
 
 import minislam
 from minislam.evaluation.lpips import Lpips
-from minislam.evaluation.metrics import MappedView, measure_run
+from minislam.evaluation.metrics import MappedView, ate_cm, measure_run
 from minislam.geometry import se3_inverse
 from minislam.priors.choice import PriorChoice
+from minislam.records import Trajectory
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Slam
 from minislam.splatting import Rendering
@@ -42,7 +43,9 @@ def run_facts(
         "failed_adjustments": failed,
         "gaussians": len(slam.mapper.gaussians),
         "focal_length": asdict(slam.focal_length) if slam.focal_length else None,
-        "keyframe_diagnostics": [asdict(d) for d in slam.tracker.diagnostics],
+        "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
+        "segments": slam.tracker.watch.segments,
+        "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],
     }
 
 
@@ -71,10 +74,26 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         slam.render,
         lpips,
     )
+    metrics |= _segment_errors(slam)
     metrics["seconds_total"] = seconds
     metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds
     metrics["peak_memory_mb"] = peak_memory_mb()
     return metrics
+
+
+def _segment_errors(slam: Slam) -> dict[str, float | None]:
+    """Return the ATE of each piece of a broken trajectory, aligned by itself [cm]."""
+    truth, segments = slam.sequence.ground_truth, slam.tracker.watch.segments
+    if truth is None or truth.trajectory is None or not slam.tracker.watch.breaks:
+        return {}
+    trajectory, errors = slam.trajectory(), {}
+    stamp = {tracked.frame_index: tracked.timestamp for tracked in slam.tracker.tracked}
+    for first, last in segments:
+        times = trajectory.timestamps
+        inside = (times >= stamp[first]) & (times <= stamp[last])
+        piece = Trajectory(times[inside], trajectory.T_world_camera[inside])
+        errors[f"ate_{first}_to_{last}_cm"] = ate_cm(piece, truth.trajectory)
+    return errors
 
 
 def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
@@ -101,6 +120,7 @@ def _warnings(slam: Slam) -> list[str]:
             f"{lost} of {len(slam.tracker.tracked)} frames could not be tracked and have no "
             "pose; lost_frames.txt lists them"
         )
+    warnings += _break_warnings(slam)
     failed, adjustments = failed_adjustments(slam)
     if failed:
         warnings.append(
@@ -111,6 +131,19 @@ def _warnings(slam: Slam) -> list[str]:
     if not slam.tracker.keyframes.has_prior:
         warnings.append("without a depth prior the unit of length is arbitrary")
     return warnings
+
+
+def _break_warnings(slam: Slam) -> list[str]:
+    breaks = slam.tracker.watch.breaks
+    if not breaks:
+        return []
+    where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in breaks)
+    pieces = ", ".join(f"{first} to {last}" for first, last in slam.tracker.watch.segments)
+    return [
+        f"the trajectory is broken at frames {where}: motion and depth there contradict the images. "
+        f"Before and after, scale and direction do not belong together; each piece (frames "
+        f"{pieces or 'none'}) stands for itself"
+    ]
 
 
 def _focal_length_warnings(slam: Slam) -> list[str]:
@@ -125,7 +158,7 @@ def _focal_length_warnings(slam: Slam) -> list[str]:
 
 
 def _parallax_warnings(slam: Slam) -> list[str]:
-    diagnostics = slam.tracker.diagnostics
+    diagnostics = slam.tracker.watch.diagnostics
     least = slam.config.tracking.min_parallax * slam.tracker.graph.pixel_scale
     without = sum(keyframe.parallax < least for keyframe in diagnostics)
     if not without or 2 * without < len(diagnostics):

@@ -6,12 +6,14 @@ from minislam.data import RunFolder
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.slam import Slam
+from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED
 from minislam.viz import (
     ate_over_time,
     beta_to_rgb,
     build_report,
     depth_to_rgb,
     figure_png,
+    keyframe_health,
     keyframe_strip,
     loss_curves,
     map_growth,
@@ -39,6 +41,7 @@ def write_pictures(
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
     plots["losses"] = "Losses", figure_png(loss_curves(curves))
     plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
+    plots["health"] = "Do motion and depth explain the flow?", _health(slam)
     for name, (_, png) in plots.items():
         folder.write_plot(name, png)
 
@@ -52,6 +55,18 @@ def write_pictures(
     figures = [plots.pop("trajectory"), *strips, *plots.values()]
     title = f"minislam: {slam.sequence.name}"
     folder.write_report(build_report(title, summary, warnings, figures))
+
+
+def _health(slam: Slam) -> bytes:
+    diagnostics = slam.tracker.watch.diagnostics
+    figure = keyframe_health(
+        [keyframe.frame_index for keyframe in diagnostics],
+        [keyframe.explained for keyframe in diagnostics],
+        MIN_EXPLAINED,
+        [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
+        [index for index, _, _ in slam.lost_frames()],
+    )
+    return figure_png(figure)
 
 
 def _write_keyframes(folder: RunFolder, slam: Slam) -> list[tuple[str, bytes]]:

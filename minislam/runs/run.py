@@ -12,11 +12,12 @@ from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import FILES, PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
+from minislam.runs.alarms import Alarms
 from minislam.runs.facts import failed_adjustments, measure, run_facts
 from minislam.runs.pictures import write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
-from minislam.state.steps import Observer
+from minislam.state.steps import Observer, SilentObserver
 
 FAILED_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 3, 130  # exit codes of a run that is not complete
 
@@ -68,7 +69,13 @@ def run_sequence(
     """
     torch.set_num_threads(config.threads)
     checkpoints = Checkpoints(folder, sequence, config, choice)
-    slam = Slam(sequence, config, priors, observer, lambda force: checkpoints.save(slam, force))
+    alarms = Alarms(observer or SilentObserver())
+
+    def between_steps(force: bool) -> None:
+        alarms.check(slam)
+        checkpoints.save(slam, force)
+
+    slam = Slam(sequence, config, priors, observer, between_steps)
     if resume:
         checkpoints.restore(slam)
     folder.write_config({**sequence.opened_as, "priors": asdict(choice), **as_json(config)})
@@ -100,11 +107,13 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     """Return the state of run.json and the exit code."""
     if interrupted:
         return "interrupted", INTERRUPTED_EXIT
+    failed, adjustments = failed_adjustments(slam)
+    if 2 * failed > adjustments:
+        return "finished, most bundle adjustments failed", LOST_EXIT
+    if slam.tracker.watch.breaks:
+        return "finished, broken", LOST_EXIT
     if slam.lost_frames():
         return "finished, partly lost", LOST_EXIT
-    failed, adjustments = failed_adjustments(slam)
-    if failed and failed == adjustments:
-        return "finished, every bundle adjustment failed", 0
     return "finished", 0
 
 

@@ -14,6 +14,9 @@ class Observer(Protocol):
     def show(self, stage: str, done: int, total: int) -> None:
         """Show that `done` of the `total` steps of a stage are finished."""
 
+    def warn(self, text: str) -> None:
+        """Tell the user of something at once."""
+
     def should_stop(self) -> bool:
         """Tell whether the run should end after the present step."""
 
@@ -23,6 +26,9 @@ class SilentObserver:
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Show nothing."""
+
+    def warn(self, text: str) -> None:
+        """Say nothing."""
 
     def should_stop(self) -> bool:
         """Return False."""

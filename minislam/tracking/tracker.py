@@ -30,7 +30,7 @@ from minislam.tracking.optimisation import (
     online_global_ba,
     warm_up_ba,
 )
-from minislam.tracking.safeguards.diagnostics import KeyframeDiagnostics, diagnose
+from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 
@@ -61,7 +61,7 @@ class Tracker(Stateful):
 
     graph: KeyframeGraph
     tracked: list[TrackedFrame]
-    diagnostics: list[KeyframeDiagnostics]  # of every keyframe, when it came
+    watch: Watch
     mode: Mode = Mode.WAITING
     _last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
     _lost_in_a_row: int = 0  # frames
@@ -88,7 +88,7 @@ class Tracker(Stateful):
         self.keyframes = self.graph.keyframes
         self.grid = self.graph.grid
         self.tracked = []
-        self.diagnostics = []
+        self.watch = Watch(self.graph)
         self._features = features
         self._depth_prior = depth_prior
         self._predict_static_weight = predict_static_weight
@@ -195,7 +195,7 @@ class Tracker(Stateful):
         if self.initialised:
             self._motion.inherit(matches)
             local_ba(self.graph)
-            self.diagnostics.append(diagnose(self.graph, newest + 1))
+            self.watch.judge_newest()
             self._adjust_all_if_due()
 
     def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
@@ -250,7 +250,7 @@ class Tracker(Stateful):
         if not attach_newest(self.graph, place.keyframe_index):
             self.graph.remove_newest()
             return False
-        self.diagnostics.append(diagnose(self.graph, len(self.keyframes) - 1))
+        self.watch.judge_newest()
         self._chain = self.graph.flow.start_chain(frame.image)
         self._last_non_keyframe = None
         self._log_followed(frame, 1.0)
@@ -281,13 +281,13 @@ class Tracker(Stateful):
         edges = self.graph.links.edges()
         mask_priors(self.keyframes, self.grid, edges, self.config)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds_with_beta)
-        count = len(self.keyframes)
-        self.diagnostics = [diagnose(self.graph, index) for index in range(count)]
+        self.watch.judge_all()
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Run the final global BA, with the newest beta."""
         self._update_static_weights()
         final_global_ba(self.graph, progress)
+        self.watch.conclude()
 
     def _update_static_weights(self, first: int = 0) -> None:
         """Predict the static weights of the keyframes from `first` on, by the present beta."""

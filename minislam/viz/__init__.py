@@ -2,6 +2,7 @@
 
 from minislam.viz.figures import (
     ate_over_time,
+    keyframe_health,
     keyframe_strip,
     loss_curves,
     map_growth,
@@ -25,6 +26,7 @@ __all__ = [
     "build_report",
     "depth_to_rgb",
     "figure_png",
+    "keyframe_health",
     "keyframe_strip",
     "loss_curves",
     "map_growth",

@@ -118,6 +118,28 @@ def map_growth(gaussians: Series[int]) -> Figure:
     return figure
 
 
+def keyframe_health(
+    frames: Series[int],  # (K,) frame_index of the keyframes
+    explained: Series[float | None],  # (K,) part of the flow that poses and disparities explain [-]
+    least: float,  # of a healthy keyframe
+    broken: Series[tuple[int, int]],  # first and last frame
+    lost: Series[int],  # frame_index
+) -> Figure:
+    """Draw how well poses and depths explain the flow, and where the run is broken or lost."""
+    figure = new_figure(WIDE)
+    axes = figure.subplots()
+    axes.plot(frames, [np.nan if e is None else e for e in explained], ".-", **ESTIMATE_STYLE)
+    axes.axhline(least, color="gray", linestyle=":", label="least of a healthy keyframe")
+    for position, (first, last) in enumerate(broken):
+        label = "broken" if position == 0 else None
+        axes.axvspan(first - 0.5, last + 0.5, color="tab:red", alpha=0.25, label=label)
+    axes.plot(lost, np.zeros(len(lost)), "|", color="black", label="lost" if len(lost) else None)
+    axes.set(xlabel="frame", ylabel="explained flow", ylim=(-0.05, 1.05))
+    axes.legend(loc="lower left")
+    axes.grid(alpha=0.3)
+    return figure
+
+
 def online_uncertainty(
     image: np.ndarray,  # (H, W, 3) RGB in [0, 1] of one frame
     betas: Mapping[str, np.ndarray],  # caption of an earlier MLP -> its beta (h, w)

@@ -21,6 +21,13 @@ def test_off_a_terminal_a_stage_prints_a_line_every_tenth(capsys):
     assert re.fullmatch(r"walking: 200/200 \(\d+ s\)", walking[-1])
 
 
+def test_a_warning_has_a_line_of_its_own(capsys):
+    progress = ProgressLine()
+    progress.show("walking", 1, 10)
+    progress.warn("frame 3: the camera is lost")
+    assert capsys.readouterr().err.splitlines()[-1] == "WARNING: frame 3: the camera is lost"
+
+
 def test_ctrl_c_waits_for_the_end_of_a_step_and_a_second_does_not(capsys):
     before = signal.getsignal(signal.SIGINT)
     with ProgressLine() as progress:

@@ -10,6 +10,7 @@ import torch
 from minislam.records import AdjustmentCount
 from minislam.runs import facts
 from minislam.splatting import Rendering
+from minislam.tracking.safeguards.diagnostics import Break
 
 
 def slam(**parts: object) -> SimpleNamespace:
@@ -22,7 +23,11 @@ def slam(**parts: object) -> SimpleNamespace:
     tracker = SimpleNamespace(
         tracked=[None] * 4,
         graph=graph,
-        diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
+        watch=SimpleNamespace(
+            diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
+            breaks=parts.pop("breaks", []),
+            segments=[(0, 1), (3, 3)],
+        ),
         keyframes=SimpleNamespace(has_prior=parts.pop("has_prior", True)),
     )
     lost = parts.pop("lost", 0)
@@ -38,6 +43,8 @@ def slam(**parts: object) -> SimpleNamespace:
 DOUBTFUL = SimpleNamespace(is_doubtful=True, factor=1.1, saved=0.25)
 WARNINGS = [
     ({"lost": 1}, "1 of 4 frames could not be tracked"),
+    ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
+    ({"breaks": [Break(2, 2)]}, "each piece (frames 0 to 1, 3 to 3) stands for itself"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),

@@ -10,6 +10,7 @@ from minislam.records import Trajectory
 from minislam.viz import (
     ate_over_time,
     figure_png,
+    keyframe_health,
     keyframe_strip,
     loss_curves,
     map_growth,
@@ -40,6 +41,7 @@ FIGURES = {
     "losses": lambda: loss_curves({"render": [3, 2, 1], "uncertainty": [0.0, -1]}),
     "losses with pauses": lambda: loss_curves({"uncertainty": [1.0, np.nan, -1.0, np.nan]}),
     "growth": lambda: map_growth([10, 30, 20]),
+    "health": lambda: keyframe_health([0, 4, 9], [None, 0.9, 0.3], 0.8, [(9, 12)], [13, 14]),
     "empty map": lambda: map_growth([]),
     "online": lambda: online_uncertainty(IMAGE, {"first": BETA, "last": 3 * BETA}, "frame 5"),
     "no losses": lambda: loss_curves({}),

@@ -1,32 +1,163 @@
-"""How well each keyframe is tied to the others: what to look at when a run fails.
+"""How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
 
 Where the camera turns but hardly moves, or where little can be matched, the scale can drift while
 all residuals stay small. A low matched ratio and little parallax are the signs.
+
+A run may also go wrong where everything is matched. Two measurements tell broken keyframes from
+healthy ones (tests/benchmarks/bench_broken.py has the table). A wrong pose does not explain the
+flow to the keyframes before it. After a wrong scale two keyframes see a thing at different depths.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
+from minislam.state.stateful import Stateful
+from minislam.tracking.bundle_adjustment import residuals
+from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.reprojection import (
+    lengths,
+    relative_transforms,
+    scaled_points,
+)
+
+LOOK_BACK = 3  # keyframes before one that it is judged by
+EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
+# Of the matched flow, after the final adjustment [-]; measured: healthy .91 to 1, broken .3 to .78.
+MIN_EXPLAINED = 0.8
+MIN_EXPLAINED_AT_ONCE = 0.5  # the same when a keyframe has just come; healthy .69 to 1
+MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .06, broken .5
+HEALED_AFTER = 3  # healthy keyframes that end a break
 
 
 @dataclass(frozen=True)
 class KeyframeDiagnostics:
-    """Matched ratio and parallax of one keyframe, after its adjustment."""
+    """How one keyframe is tied to the others, after its adjustment or after the final one."""
 
     frame_index: int
     matched_ratio: float  # of its cells, in the best of its links [-]
     parallax: float  # px, the largest mean flow by translation alone among its links
+    explained: float | None  # of the matched flow between it and its predecessors; None: no link
+    depth_error: float | None  # median relative difference from them; None: they see other things
+
+
+@dataclass(frozen=True)
+class Break:
+    """Keyframes whose poses hang together neither with those before nor with those after."""
+
+    first_frame: int
+    last_frame: int
+
+
+class Watch(Stateful):
+    """Judges each keyframe when it comes, and all of them at the end."""
+
+    diagnostics: list[KeyframeDiagnostics]
+    breaks: list[Break]  # known at the end, because the newest depths are rough
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        self._graph = graph
+        self.diagnostics, self.breaks = [], []
+
+    def judge_newest(self) -> None:
+        """Add the diagnostics of the newest keyframe."""
+        self.diagnostics.append(diagnose(self._graph, len(self._graph.keyframes) - 1))
+
+    def judge_all(self) -> None:
+        """Replace the diagnostics of all keyframes by their present ones."""
+        count = len(self._graph.keyframes)
+        self.diagnostics = [diagnose(self._graph, keyframe) for keyframe in range(count)]
+
+    def conclude(self) -> None:
+        """Judge all keyframes after the final adjustment, and find the breaks."""
+        self.judge_all()
+        self.breaks = find_breaks(self.diagnostics)
+
+    @property
+    def segments(self) -> list[tuple[int, int]]:
+        """Return the first and last frame of each piece of trajectory between breaks."""
+        segments: dict[int, tuple[int, int]] = {}
+        for frame in (keyframe.frame_index for keyframe in self.diagnostics):
+            if not any(b.first_frame <= frame <= b.last_frame for b in self.breaks):
+                after = sum(b.last_frame < frame for b in self.breaks)
+                segments[after] = segments.get(after, (frame, frame))[0], frame
+        return list(segments.values())
 
 
 def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
-    """Return the matched ratio and the parallax of a keyframe, the best among its links."""
+    """Return the diagnostics of a keyframe by its links and by its predecessors."""
     frame_index = graph.keyframes.frames[keyframe].frame_index
     edges = graph.links.edges()
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]
+    explained, depth_error = tie_to_predecessors(graph, keyframe)
     if not positions:
-        return KeyframeDiagnostics(frame_index, 0.0, 0.0)
+        return KeyframeDiagnostics(frame_index, 0.0, 0.0, explained, depth_error)
     sources, targets = torch.tensor([edges[p] for p in positions]).unbind(1)
     ratio = max(graph.links.matched_ratios[p] for p in positions)
-    return KeyframeDiagnostics(frame_index, ratio, float(graph.parallaxes(sources, targets).max()))
+    parallax = float(graph.parallaxes(sources, targets).max())
+    return KeyframeDiagnostics(frame_index, ratio, parallax, explained, depth_error)
+
+
+def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
+    """Return how a keyframe agrees with the keyframes before it, over the links between them.
+
+    First the part of the flow, by its weight in Eq. (5), that poses and disparities explain [-].
+    Then the median relative difference of the depths that the two ends of a link see, over the
+    cells that count in the adjustment; a dynamic object does not. None where there is no link.
+    """
+    near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
+    positions = [p for p, edge in enumerate(graph.links.edges()) if edge in near]
+    if not positions:
+        return None, None
+    problem, keyframes, grid = bundle_problem(graph, positions, 0, 0.0), graph.keyframes, graph.grid
+    residual, robust_weights = residuals(problem, graph.state)
+    fits = lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
+    weights = problem.weights[:, 0]
+    explained = float((weights * fits).sum() / weights.sum().clamp_min(1e-6))
+
+    sources, targets = problem.edges_source, problem.edges_target
+    transforms = relative_transforms(keyframes.T_camera_world, sources, targets).float()
+    disparities = keyframes.disparities[sources]
+    expected = disparities / scaled_points(transforms, disparities, grid.rays)[:, 2].clamp_min(1e-6)
+    positions_seen = (problem.targets - residual).mT
+    seen = grid.sample(keyframes.disparities[targets][..., None], positions_seen)[..., 0]
+    counted = robust_weights[:, 0] * grid.camera.contains(positions_seen)
+    return explained, weighted_median((seen / expected).log().abs(), counted)
+
+
+def weighted_median(values: Tensor, weights: Tensor) -> float | None:
+    """Return the value below which half of the weight lies; None without weight."""
+    order = values.flatten().argsort()
+    below = weights.flatten()[order].cumsum(0)
+    if below[-1] <= 0:
+        return None
+    return float(values.flatten()[order][torch.searchsorted(below, below[-1] / 2)])
+
+
+def is_unexplained(newest: KeyframeDiagnostics) -> bool:
+    """Tell whether the pose of a keyframe that has just come contradicts its flow."""
+    return newest.explained is not None and newest.explained < MIN_EXPLAINED_AT_ONCE
+
+
+def is_broken(keyframe: KeyframeDiagnostics) -> bool:
+    """Tell whether a keyframe, after the final adjustment, contradicts those before it."""
+    unexplained = keyframe.explained is not None and keyframe.explained < MIN_EXPLAINED
+    error = keyframe.depth_error
+    return unexplained or (error is not None and error > MAX_DEPTH_ERROR)
+
+
+def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
+    """Return the breaks of a trajectory from the diagnostics after the final adjustment."""
+    found: list[Break] = []
+    last = 0  # broken keyframe
+    for index, keyframe in enumerate(diagnostics):
+        if is_broken(keyframe):
+            goes_on = found and index - last <= HEALED_AFTER
+            first = found.pop().first_frame if goes_on else keyframe.frame_index
+            found.append(Break(first, keyframe.frame_index))
+            last = index
+    return found

@@ -83,15 +83,18 @@ class Relocaliser:
     def _pose(self, points: np.ndarray, pixels: np.ndarray) -> tuple[Tensor, int] | None:
         """Return T_frame_keyframe and its inliers from points (P, 3) and pixels (P, 2)."""
         cv2.setRNGSeed(0)
-        found, phi, t, inliers = cv2.solvePnPRansac(
-            points,
-            pixels.astype(np.float64),
-            camera_matrix(self._grid.camera),
-            None,
-            iterationsCount=PNP_ITERATIONS,
-            reprojectionError=self._error,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
+        try:
+            found, phi, t, inliers = cv2.solvePnPRansac(
+                points,
+                pixels.astype(np.float64),
+                camera_matrix(self._grid.camera),
+                None,
+                iterationsCount=PNP_ITERATIONS,
+                reprojectionError=self._error,
+                flags=cv2.SOLVEPNP_SQPNP,
+            )
+        except cv2.error:  # SQPnP raises where all points coincide
+            return None
         if not found or inliers is None or len(inliers) < MIN_INLIERS:
             return None
         rotation = so3_exp(torch.from_numpy(phi[:, 0]))

@@ -1,21 +1,59 @@
-"""What the links of a keyframe say about it."""
+"""What the links of a keyframe say about it, and where a trajectory is broken."""
 
+import math
+
+import pytest
 import torch
 
 from minislam.geometry import se3_exp
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.optimisation import adjust
-from minislam.tracking.safeguards.diagnostics import diagnose
+from minislam.tracking.safeguards.diagnostics import (
+    Break,
+    KeyframeDiagnostics,
+    Watch,
+    diagnose,
+    find_breaks,
+    is_unexplained,
+    weighted_median,
+)
 from tests.tracking.wall import true_graph
 
+HEALTHY, UNEXPLAINED, DEEP = (0.97, 0.02), (0.6, 0.02), (0.97, 0.5)  # explained flow, depth error
 
-def test_at_the_truth_all_is_matched_and_there_is_parallax():
+
+def keyframes(*kinds: tuple[float | None, float | None]) -> list[KeyframeDiagnostics]:
+    """Return diagnostics of keyframes at frames 0, 10, 20, ..."""
+    return [KeyframeDiagnostics(10 * k, 0.9, 30.0, *kind) for k, kind in enumerate(kinds)]
+
+
+def test_at_the_truth_all_is_matched_explained_and_of_one_depth():
     graph = true_graph([0, 1, 2])
     graph.match(neighbourhood_edges(0, 3, 2))
     found = diagnose(graph, 2)
     assert found.frame_index == 2 and found.matched_ratio == 1
     assert found.parallax > 3
+    assert found.explained == 1
+    assert found.depth_error < 1e-3
+
+
+def test_a_wrong_pose_does_not_explain_the_flow():
+    graph = true_graph([0, 1, 2])
+    graph.match(neighbourhood_edges(0, 3, 2))
+    turn = se3_exp(torch.tensor([0, 0, 0, 0.05, 0.1, 0], dtype=torch.float64))
+    graph.keyframes.T_camera_world[2] = turn @ graph.keyframes.T_camera_world[2]
+    assert diagnose(graph, 2).explained < 0.1
+    assert diagnose(graph, 1).explained == 1  # judged by keyframes before it
+
+
+def test_a_keyframe_of_another_scale_sees_other_depths():
+    graph = true_graph([0, 0])  # from one place the flow says nothing about depth
+    graph.match(neighbourhood_edges(0, 2, 1))
+    graph.keyframes.disparities[1] *= 1.5
+    found = diagnose(graph, 1)
+    assert found.explained == 1
+    assert found.depth_error == pytest.approx(math.log(1.5), rel=1e-3)
 
 
 def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
@@ -32,3 +70,35 @@ def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
 def test_a_keyframe_without_links_is_reported_as_such():
     found = diagnose(true_graph([0, 1]), 1)
     assert found.matched_ratio == 0 and found.parallax == 0
+    assert found.explained is None and found.depth_error is None
+    assert find_breaks([found]) == [] and not is_unexplained(found)
+
+
+def test_the_weighted_median_splits_the_weight():
+    values, weights = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([0.1, 1.0, 0.5])
+    assert weighted_median(values, weights) == 1  # of 1.6 in all, 0.8 lies below: within the first
+    assert weighted_median(values, 0 * weights) is None
+
+
+@pytest.mark.parametrize(
+    ("kinds", "breaks"),
+    [
+        ([HEALTHY] * 4, []),
+        ([HEALTHY, HEALTHY, UNEXPLAINED, HEALTHY], [Break(20, 20)]),
+        ([HEALTHY, DEEP, HEALTHY, UNEXPLAINED, HEALTHY], [Break(10, 30)]),
+        ([UNEXPLAINED, *[HEALTHY] * 4, DEEP], [Break(0, 0), Break(50, 50)]),
+        ([HEALTHY, (None, None), HEALTHY], []),
+    ],
+)
+def test_breaks_are_runs_of_broken_keyframes(kinds: list, breaks: list[Break]):
+    assert find_breaks(keyframes(*kinds)) == breaks
+
+
+def test_segments_lie_between_breaks():
+    watch = Watch(true_graph([0]))
+    watch.diagnostics = keyframes(*[HEALTHY] * 7)
+    assert watch.segments == [(0, 60)]
+    watch.breaks = [Break(20, 30), Break(60, 60)]
+    assert watch.segments == [(0, 10), (40, 50)]
+    watch.breaks = [Break(0, 60)]
+    assert watch.segments == []

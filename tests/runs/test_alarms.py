@@ -1,0 +1,57 @@
+"""What a run says the moment something goes wrong: once each time, and nothing otherwise."""
+
+from types import SimpleNamespace
+
+from minislam.records import TrackedFrame, TrackingStatus
+from minislam.runs.alarms import Alarms
+from minislam.tracking.safeguards.diagnostics import KeyframeDiagnostics
+
+
+class Said:
+    """An observer that remembers its warnings."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        pass
+
+    def should_stop(self) -> bool:
+        return False
+
+    def warn(self, text: str) -> None:
+        self.texts.append(text)
+
+
+def said(statuses: list[TrackingStatus], explained: dict[int, float | None]) -> list[str]:
+    """Return the warnings of a run; `explained` is that of the keyframes, by frame."""
+    tracked, diagnostics = [], []
+    watch = SimpleNamespace(diagnostics=diagnostics)
+    slam = SimpleNamespace(tracker=SimpleNamespace(tracked=tracked, watch=watch))
+    observer = Said()
+    alarms = Alarms(observer)
+    alarms.check(slam)
+    for index, status in enumerate(statuses):
+        tracked.append(TrackedFrame(index, index / 30, status, 0.5))
+        if index in explained:
+            diagnostics.append(KeyframeDiagnostics(index, 0.5, 9.0, explained[index], 0.01))
+        alarms.check(slam)
+        alarms.check(slam)  # between steps may come more often than frames
+    return observer.texts
+
+
+OK, LOST, RECENTLY = TrackingStatus.OK, TrackingStatus.LOST, TrackingStatus.RECENTLY_LOST
+
+
+def test_a_good_run_is_quiet():
+    assert said([TrackingStatus.INITIALISING, OK, OK], {0: None, 1: 0.9, 2: 0.7}) == []
+
+
+def test_a_loss_is_said_once_each_time():
+    texts = said([OK, RECENTLY, LOST, OK, RECENTLY], {})
+    assert [text.split(":")[0] for text in texts] == ["frame 1", "frame 4"]
+
+
+def test_a_keyframe_that_contradicts_its_flow_is_said_once():
+    (text,) = said([OK] * 4, {1: 0.9, 2: 0.3})
+    assert text.startswith("frame 2: the estimated motion explains only 30%")
