@@ -128,7 +128,7 @@ def keyframe_health(
     """Draw how well poses and depths explain the flow, and where the run is broken or lost."""
     figure = new_figure(WIDE)
     axes = figure.subplots()
-    axes.plot(frames, [np.nan if e is None else e for e in explained], ".-", **ESTIMATE_STYLE)
+    axes.plot(frames, [np.nan if e is None else e for e in explained], marker=".", **ESTIMATE_STYLE)
     axes.axhline(least, color="gray", linestyle=":", label="least of a healthy keyframe")
     for position, (first, last) in enumerate(broken):
         label = "broken" if position == 0 else None
