@@ -27,8 +27,8 @@ from minislam.tracking.reprojection import (
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
-# Of the matched flow, after the final adjustment [-]; measured: healthy .91 to 1, broken .3 to .78.
-MIN_EXPLAINED = 0.8
+# Of the matched flow, after the final adjustment [-]; measured: healthy .91 to 1, broken .3 to .83.
+MIN_EXPLAINED = 0.85
 MIN_EXPLAINED_AT_ONCE = 0.5  # the same when a keyframe has just come; healthy .69 to 1
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .06, broken .5
 HEALED_AFTER = 3  # healthy keyframes that end a break
