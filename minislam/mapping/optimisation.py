@@ -20,7 +20,7 @@ from minislam.uncertainty import (
     mapping_weight,
 )
 
-CONFIRMED_BETA = 0.4  # fraction of beta that confirmation takes away [-]
+CONFIRMED_BETA = 0.4  # fraction of beta that is taken away where other views confirm [-]
 
 Progress = Callable[[int, int], None]  # called with the iterations done and their number
 
@@ -87,7 +87,7 @@ class JointOptimisation(Stateful):
         return self._trainer.predict(features)
 
     def beta_of(self, keyframe: MappedKeyframe) -> Tensor:
-        """Return the raw beta (h', w') of a keyframe: its mask's or, less if confirmed, the MLP's."""
+        """Return the raw beta (h', w') of a keyframe: from its mask or from the MLP."""
         if keyframe.given_beta is not None:
             return keyframe.given_beta
         beta, confirmation = self.predict_beta(keyframe.features), keyframe.confirmation

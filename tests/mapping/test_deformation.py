@@ -3,7 +3,7 @@ import torch
 
 from minislam.geometry import se3_exp, so3_log
 from minislam.geometry.se3 import rotation_from_quaternion
-from minislam.mapping.deformation import deform_rigidly, rescale_to_depths
+from minislam.mapping.deformation import deform_rigidly
 from minislam.splatting import GaussianMap, render
 from tests.helpers import generator, random_transforms
 from tests.mapping.plane_scene import CAMERA
@@ -22,20 +22,6 @@ def random_map(count: int, dtype: torch.dtype = torch.float64) -> GaussianMap:
         torch.rand(count, 3, generator=source, dtype=dtype),
         torch.zeros(count, dtype=torch.int64),
     )
-
-
-# Known answers
-
-
-def test_a_doubled_reference_depth_doubles_the_distance_along_the_ray():
-    gaussians = random_map(20)
-    rows = torch.zeros(20, dtype=torch.int64)
-    near = torch.full((CAMERA.height, CAMERA.width), 2.0)
-    identity = torch.eye(4, dtype=torch.float64)[None]
-    result = rescale_to_depths(gaussians, rows, identity, [near], [near + 1], CAMERA)
-    factor = 1 + 1 / gaussians.means[:, 2]
-    torch.testing.assert_close(result.means, gaussians.means * factor[:, None])
-    torch.testing.assert_close(result.scales, gaussians.scales * factor[:, None])
 
 
 # Identities
@@ -78,19 +64,3 @@ def test_rotations_of_any_size_turn_means_and_axes_alike(angle):
         rtol=1e-6,
         atol=1e-12,
     )
-
-
-# Degenerate input
-
-
-def test_unknown_depths_and_points_behind_the_camera_stay():
-    gaussians = random_map(6)
-    gaussians.means[0, 2] = -1
-    rows = torch.zeros(6, dtype=torch.int64)
-    known = torch.full((CAMERA.height, CAMERA.width), 2.0)
-    identity = torch.eye(4, dtype=torch.float64)[None]
-    for old, new in [(known, 0 * known), (0 * known, known)]:
-        result = rescale_to_depths(gaussians, rows, identity, [old], [new], CAMERA)
-        assert torch.equal(result.means, gaussians.means)
-    result = rescale_to_depths(gaussians, rows, identity, [known], [known + 1], CAMERA)
-    assert torch.equal(result.means[0], gaussians.means[0])

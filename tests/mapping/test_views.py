@@ -29,12 +29,10 @@ def test_shrinking_depth_averages_known_pixels_only():
 # Identities
 
 
-def test_the_full_size_is_the_keyframe_itself_and_follows_a_new_depth():
+def test_the_full_size_is_the_keyframe_itself():
     keyframe = MappedKeyframe.from_record(wall_keyframe(0))
     assert keyframe.view(CAMERA).image is keyframe.image
     assert keyframe.view(CAMERA) is keyframe.view(CAMERA)
-    keyframe.set_depth(torch.full((24, 32), 3.0))
-    assert float(keyframe.view(HALF).depth.mean()) == pytest.approx(3.0)
 
 
 # Errors

@@ -1,18 +1,13 @@
-"""Depth images from the tracker's own disparities, on a wall whose depth is known."""
+"""Which disparities several keyframes agree on, on a wall whose depth is known."""
 
 import pytest
 import torch
-from torch import Tensor
 
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import relative_transforms, reproject
-from minislam.tracking.safeguards.structure import (
-    EDGE_RATIO,
-    agreeing_views,
-    depth_from_disparities,
-)
-from tests.tracking.scene import CAMERA, STRIDE
-from tests.tracking.wall import GRID, disparities_at, true_graph, true_poses
+from minislam.tracking.safeguards.structure import agreed_disparities, agreeing_views
+from tests.tracking.scene import CAMERA
+from tests.tracking.wall import GRID, disparities_at, true_graph
 
 COLUMNS = GRID.shape[1]
 MIDDLE = 3 * COLUMNS + 4  # a cell, row 3 and column 4
@@ -20,12 +15,6 @@ MIDDLE = 3 * COLUMNS + 4  # a cell, row 3 and column 4
 
 def spoil(graph: KeyframeGraph, keyframe: int, cell: int, factor: float) -> None:
     graph.keyframes.disparities[keyframe, cell] *= factor
-
-
-def square(row: int, column: int) -> tuple[slice, slice]:
-    """Return the pixels between a cell and its right and lower neighbours."""
-    first_row, first_column = row * STRIDE, column * STRIDE
-    return slice(first_row, first_row + STRIDE), slice(first_column, first_column + STRIDE)
 
 
 # Known answers
@@ -42,27 +31,18 @@ def test_a_cell_is_confirmed_by_all_views_that_see_it():
     assert 1 < int(expected.max()) <= 3
 
 
-def test_the_depth_of_the_wall_is_found_in_every_pixel_between_cells():
-    graph = true_graph([0, 1, 2])
-    depth = depth_from_disparities(graph, 1)
-    assert depth.shape == (CAMERA.height, CAMERA.width) and depth.dtype == torch.float32
-    inside = depth[: 6 * STRIDE + 1, : 9 * STRIDE + 1]
-    rays = CAMERA.rays(CAMERA.pixel_grid(1, torch.float64))[: len(inside), : inside.shape[1]]
-    truth = 1 / disparities_at(true_poses()[1], rays)
-    known = inside > 0
-    assert known.double().mean() > 0.5
-    torch.testing.assert_close(inside[known].double(), truth[known], rtol=2e-3, atol=0)
+def test_agreed_disparities_are_those_of_enough_views():
+    graph = true_graph([0, 1, 2, 3])
+    views, disparities = agreeing_views(graph, 1), graph.keyframes.disparities[1]
+    assert torch.equal(agreed_disparities(graph, 1), disparities[views >= 2])
+    assert 0 < len(agreed_disparities(graph, 1)) < len(disparities)
 
 
-def test_a_wrong_disparity_is_confirmed_by_none_and_its_squares_are_unknown():
+def test_a_wrong_disparity_is_confirmed_by_none():
     graph = true_graph([0, 1, 2])
-    assert depth_from_disparities(graph, 1)[square(3, 4)].min() > 0
     spoil(graph, 1, MIDDLE, 1.1)
     assert int(agreeing_views(graph, 1)[MIDDLE]) == 0
-    depth = depth_from_disparities(graph, 1)
-    for row, column in [(3, 4), (2, 4), (3, 3), (2, 3)]:
-        assert depth[square(row, column)].max() == 0
-    assert depth[square(4, 5)].min() > 0
+    assert graph.keyframes.disparities[1, MIDDLE] not in agreed_disparities(graph, 1)
 
 
 def test_an_error_below_the_tolerance_is_forgiven():
@@ -72,35 +52,16 @@ def test_an_error_below_the_tolerance_is_forgiven():
     assert agreeing_views(graph, 1)[MIDDLE] == before
 
 
-def test_cells_without_trust_are_unknown():
-    graph = true_graph([0, 1, 2])
-    graph.keyframes.static_weights[1, MIDDLE] = 0
-    assert depth_from_disparities(graph, 1)[square(3, 4)].max() == 0
-
-
-def test_nothing_is_interpolated_across_an_edge():
-    graph = true_graph([0, 1, 2])
-    step = torch.ones(GRID.shape)
-    step[:, 5:] = EDGE_RATIO * 1.1
-    depth = depth_with_all_confirmed(graph, step.reshape(-1))
-    assert depth[:, 4 * STRIDE : 5 * STRIDE].max() == 0
-    assert depth[:, 3 * STRIDE : 4 * STRIDE].min() > 0
-    assert depth[:, 5 * STRIDE : 6 * STRIDE].min() > 0
-
-
-def depth_with_all_confirmed(graph: KeyframeGraph, factors: Tensor) -> Tensor:
-    """Return keyframe 1's depth if both its neighbours stand in the same place and agree."""
-    for keyframe in range(3):
-        graph.keyframes.T_camera_world[keyframe] = torch.eye(4, dtype=torch.float64)
-        graph.keyframes.disparities[keyframe] = 0.25 * factors
-    return depth_from_disparities(graph, 1)
-
-
 # Degenerate input
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_with_few_keyframes_fewer_must_agree(count: int):
-    depth = depth_from_disparities(true_graph(list(range(count))), 0)
-    assert depth[square(3, 4)].min() > 0
-    assert depth.isfinite().all() and depth.min() >= 0
+    graph = true_graph(list(range(count)))
+    assert MIDDLE < len(agreed_disparities(graph, 0)) <= len(GRID.rays)
+
+
+def test_if_none_agree_all_are_returned():
+    graph = true_graph([0, 1, 2])
+    graph.keyframes.disparities[1] *= 2
+    assert torch.equal(agreed_disparities(graph, 1), graph.keyframes.disparities[1])
