@@ -103,6 +103,7 @@ class Sequence(Protocol):
     name: str  # short, usable as a folder name
     description: str  # one line: what was found
     camera: Camera  # of the undistorted images at the working size
+    refines_focal: bool  # whether the focal length is to be estimated, the camera's is a guess
     warnings: list[str]  # what the user must know, for instance that the focal length is guessed
     ground_truth: GroundTruth | None
     depth_scale: float  # units of a stored depth image per metre

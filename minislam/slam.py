@@ -27,7 +27,11 @@ from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import fill_depth
-from minislam.tracking.safeguards.focal_length import FocalLengthFit, check_focal_length
+from minislam.tracking.safeguards.focal_length import (
+    FocalLengthFit,
+    check_focal_length,
+    seek_focal_length,
+)
 from minislam.tracking.safeguards.structure import agreed_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
@@ -54,7 +58,7 @@ class Slam(Stateful):
     tracker: Tracker
     mapper: Mapper
     steps: Steps
-    focal_length: FocalLengthFit | None = None  # the one that fits the flow best, at the end
+    focal_length: FocalLengthFit | None = None  # where it was not refined, the best one at the end
     _poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
@@ -71,7 +75,6 @@ class Slam(Stateful):
         self._features = priors.features
         if config.uncertainty.grid_factor > 1:
             self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
-        self.mapper = self._new_mapper()
         self.tracker = Tracker(
             sequence.camera,
             config.tracking,
@@ -80,6 +83,8 @@ class Slam(Stateful):
             priors.depth,
             self._static_weight,
         )
+        self.tracker.graph.seeks_focal = sequence.refines_focal
+        self.mapper = self._new_mapper()
         self._stride = priors.flow.stride
         self._poses = {}
 
@@ -106,7 +111,8 @@ class Slam(Stateful):
             self.steps.once("photometric refinement", self._refine_other_poses)
 
     def _new_mapper(self) -> Mapper:
-        config, dimension, camera = self.config, self._features.dimension, self.sequence.camera
+        config, dimension = self.config, self._features.dimension
+        camera = self.tracker.grid.camera
         return Mapper(camera, config.mapping, config.uncertainty, dimension, config.seed)
 
     def _frames_left(self) -> Iterator[Frame]:
@@ -125,6 +131,7 @@ class Slam(Stateful):
             self.tracker.initialise()
         if self.tracker.keyframes.has_prior:
             with self.steps.timed("mapping"):
+                self.mapper.camera = self.tracker.grid.camera
                 self.mapper.initialise(self._keyframes(), self.steps.on_progress("first map"))
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
@@ -141,11 +148,13 @@ class Slam(Stateful):
         """Deform the map to follow the keyframes that an adjustment has moved."""
         mapped = len(self.mapper.keyframes)
         if mapped:
+            self.mapper.camera = self.tracker.grid.camera
             self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped])
 
     def _adjust_all(self) -> None:
         self.tracker.end()
         self._map_new_keyframes()
+        seek_focal_length(self.tracker.graph)
         self.tracker.finish(self.steps.on_progress("final adjustment"))
         self._move_map()
         self.focal_length = check_focal_length(self.tracker.graph)
@@ -158,7 +167,9 @@ class Slam(Stateful):
         graph, keyframes = self.tracker.graph, self._keyframes()
         disparities = [agreed_disparities(graph, index) for index in range(len(keyframes))]
         on_progress = self.steps.on_progress("dense depth")
-        keyframes = fill_depth(keyframes, self.sequence, self._poses, disparities, on_progress)
+        keyframes = fill_depth(
+            keyframes, self.sequence, graph.grid.camera, self._poses, disparities, on_progress
+        )
         self.mapper = self._new_mapper()
         self.mapper.initialise(keyframes, self.steps.on_progress("first map"))
 

@@ -178,7 +178,7 @@ def _run(args: argparse.Namespace) -> int:
         outcome = run_sequence(
             sequence, config, choice, priors, folder, progress, lpips, args.resume
         )
-    print(f"{outcome.state}:")
+    print(f"{outcome.state}:\n  focal length           {outcome.focal_length}")
     for name, value in outcome.metrics.items():
         print(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
     for warning in outcome.warnings:

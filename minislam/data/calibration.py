@@ -1,5 +1,6 @@
 """Camera intrinsics: read from a file, known from a benchmark, or guessed with a warning."""
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -27,6 +28,7 @@ class Calibration:
     size: tuple[int, int] | None = None  # (width, height) px of the images it was made for
     distortion: BrownDistortion = field(default_factory=BrownDistortion)
     origin: str = "calibration"  # where it comes from, for messages
+    is_rough: bool = False  # its focal length is only a first guess
 
     def camera_for(self, width: int, height: int) -> Camera:
         """Return the camera of raw images of `width` x `height`."""
@@ -49,10 +51,17 @@ class Calibration:
         return abs(self.size[0] * height / (self.size[1] * width) - 1) <= _ASPECT_TOLERANCE
 
 
-def guessed_calibration(width: int, height: int) -> Calibration:
-    """Guess the intrinsics of an unknown camera from its image size: see GUESSED_FOCAL_RATIO."""
-    focal = GUESSED_FOCAL_RATIO * max(width, height)
-    return Calibration(focal, focal, (width - 1) / 2, (height - 1) / 2, origin="guessed intrinsics")
+def rough_calibration(
+    width: int,
+    height: int,
+    noted: tuple[float, str] | None = None,  # focal length over image diagonal, and its origin
+) -> Calibration:
+    """Return rough intrinsics of images of a size: as noted, or else see GUESSED_FOCAL_RATIO."""
+    focal, origin = GUESSED_FOCAL_RATIO * max(width, height), "guessed intrinsics"
+    if noted:
+        focal, origin = noted[0] * math.hypot(width, height), noted[1]
+    centre = (width - 1) / 2, (height - 1) / 2
+    return Calibration(focal, focal, *centre, origin=origin, is_rough=True)
 
 
 def read_calibration(path: Path) -> Calibration:

@@ -8,6 +8,7 @@ import numpy as np
 
 from minislam.data.calibration import Calibration, read_calibration
 from minislam.data.images import is_image, list_images
+from minislam.data.metadata import noted_focal_length
 from minislam.data.recording import Recording
 from minislam.data.sources import ASSUMED_FRAME_RATE, FileImages, VideoImages
 from minislam.errors import InputError
@@ -29,6 +30,7 @@ def read_image_folder(folder: Path) -> Recording:
         images=FileImages(paths),
         timestamps=stamps,
         calibration=calibration_beside(folder),
+        noted_focal_length=noted_focal_length(paths[0]),
         notes=[source],
     )
 
@@ -53,6 +55,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
         images=images,
         timestamps=np.arange(len(images)) / rate,
         calibration=calibration_beside(path.parent, path.stem + ".calibration.txt"),
+        noted_focal_length=noted_focal_length(path),
         notes=[f"{rate:g} frames per second"],
         warnings=warnings,
     )

@@ -7,6 +7,8 @@ from minislam.data.preparation import MINIMUM_SIDE
 from minislam.errors import InputError
 from minislam.parameters import parameter
 
+FOCAL_MODES = ("fixed", "refine", "auto")
+
 
 @dataclass(frozen=True)
 class InputOptions:
@@ -26,6 +28,11 @@ class InputOptions:
     calibration: str | None = parameter(
         None, "file with fx fy cx cy [width height [k1 k2 p1 p2 k3]] of the raw images"
     )
+    focal: str = parameter(
+        "auto",
+        "fixed: the focal length as given, noted or guessed; refine: estimated from the motion, "
+        "starting there; auto: refine if no calibration and no --fx is given, else fixed",
+    )
     depth_scale: float = parameter(
         5000.0, "units of a depth image per metre, TUM RGB-D benchmark [1/m]"
     )
@@ -41,6 +48,8 @@ class InputOptions:
                 )
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(f"expected a finite {field.name}, found {value}; correct it")
+        if self.focal not in FOCAL_MODES:
+            raise InputError(f"expected focal as {', '.join(FOCAL_MODES)}, found {self.focal!r}")
         if not self.depth_scale > 0:
             raise InputError(
                 f"expected a positive depth_scale, found {self.depth_scale}; TUM files use 5000"

@@ -25,6 +25,7 @@ class Recording:
     images: ImageSource
     timestamps: np.ndarray  # (N,) float64 second, strictly increasing
     calibration: Calibration | None = None  # None: unknown
+    noted_focal_length: tuple[float, str] | None = None  # over the image diagonal, and its origin
     trajectory: Trajectory | None = None  # ground truth
     depth_paths: list[Path | None] = field(default_factory=list)
     mask_paths: list[Path | None] = field(default_factory=list)  # True on dynamic objects

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from minislam.data.calibration import Calibration, guessed_calibration, read_calibration
+from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.folder import read_image_folder, read_video
 from minislam.data.images import read_depth
 from minislam.data.options import InputOptions
@@ -62,7 +62,7 @@ class RecordedSequence:
                 f"{len(recording.images)}; choose a smaller start"
             )
         height, width = recording.images.read(self._chosen[0]).shape[:2]
-        calibration, guessed = _calibration(recording, options, width, height)
+        calibration = _calibration(recording, options, width, height)
         raw_camera = calibration.camera_for(width, height)
         self._prepare = ImagePreparation(
             raw_camera, calibration.distortion, options.size, options.pixels
@@ -70,14 +70,20 @@ class RecordedSequence:
         self.name = recording.name
         self.camera = self._prepare.camera
         self.warnings = list(recording.warnings)
-        if guessed:
+        self.refines_focal = options.focal == "refine"
+        if options.focal == "auto":
+            self.refines_focal = calibration.is_rough
+        if calibration.is_rough and not self.refines_focal:
             self.warnings.append(
-                f"the focal length is unknown: {calibration.fx:.0f} px guessed for {width}x{height}"
-                " images, trajectory and map may be bent; give --fx or a calibration file"
+                f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}, for "
+                f"{width}x{height} images, trajectory and map may be bent; give --fx, a "
+                "calibration file, or --focal refine"
             )
         size = f"{width}x{height} -> {self.camera.width}x{self.camera.height} px"
         counts = f"{len(self)} of {len(recording.images)} images"
         parts = [counts, *recording.notes, size, calibration.origin]
+        if self.refines_focal:
+            parts.append("focal length to be refined")
         self.description = f"{recording.kind}: {', '.join(parts)}"
         self.ground_truth: GroundTruth | None = None
         if recording.has_truth():
@@ -115,14 +121,15 @@ class RecordedSequence:
 
 def _calibration(
     recording: Recording, options: InputOptions, width: int, height: int
-) -> tuple[Calibration, bool]:
-    """Return the calibration, and whether its focal length is a guess.
+) -> Calibration:
+    """Return the calibration of raw images of this size.
 
-    The options come before files, files before known cameras, known cameras before the guess.
+    The options come before files, files before known cameras, known cameras before what the
+    camera noted in its files, that before the guess.
     """
     found = read_calibration(Path(options.calibration)) if options.calibration else None
     found = found or recording.calibration
-    calibration = found or guessed_calibration(width, height)
+    calibration = found or rough_calibration(width, height, recording.noted_focal_length)
     fy = options.fx if options.fy is None else options.fy
     given = {"fx": options.fx, "fy": fy, "cx": options.cx, "cy": options.cy}
     given = {name: value for name, value in given.items() if value is not None}
@@ -133,7 +140,8 @@ def _calibration(
         if found is None and options.fx is not None:
             origin = "intrinsics given"
         calibration = replace(calibration, **(base | given), size=(width, height), origin=origin)
-    return calibration, found is None and options.fx is None
+        calibration = replace(calibration, is_rough=calibration.is_rough and options.fx is None)
+    return calibration
 
 
 def _open_synthetic(

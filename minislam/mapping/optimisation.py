@@ -31,6 +31,7 @@ class JointOptimisation(Stateful):
     Which Gaussians there are, and when an optimisation runs, is decided in `mapper.py`.
     """
 
+    camera: Camera  # of the keyframe images; the tracker may refine its focal length
     keyframes: list[MappedKeyframe]
     window: list[int]  # positions in `keyframes`, newest first
     median_depth: float = 1.0  # world units; set by the first keyframes, then fixed
@@ -62,14 +63,16 @@ class JointOptimisation(Stateful):
         self._generator = torch.Generator().manual_seed(seed + 1)
         self._optimizer = MapOptimizer(GaussianMap.empty(), LearningRates())
         self._gradients = ScreenGradients(0)
-        sides = (camera.width, camera.height)
-        online = [max(1, round(config.image_scale * side)) for side in sides]
-        self._online_camera = camera.resized(*online)
 
     @property
     def gaussians(self) -> GaussianMap:
         """Return the map, without gradients."""
         return self._optimizer.gaussians.detach()
+
+    @property
+    def _online_camera(self) -> Camera:
+        sides = (self.camera.width, self.camera.height)
+        return self.camera.resized(*(max(1, round(self.config.image_scale * s)) for s in sides))
 
     @property
     def mlp(self) -> UncertaintyMLP:

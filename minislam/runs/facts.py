@@ -42,7 +42,9 @@ def run_facts(
         "adjustments": adjustments,
         "failed_adjustments": failed,
         "gaussians": len(slam.mapper.gaussians),
-        "focal_length": asdict(slam.focal_length) if slam.focal_length else None,
+        "camera": asdict(slam.tracker.grid.camera),
+        "focal_length": {"used": focal_length_note(slam)}
+        | (asdict(slam.focal_length) if slam.focal_length else {}),
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
         "segments": slam.tracker.watch.segments,
         "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],
@@ -53,6 +55,17 @@ def failed_adjustments(slam: Slam) -> tuple[int, int]:
     """Return how many bundle adjustments failed, and how many there were."""
     adjustments = slam.tracker.graph.adjustments
     return adjustments.failed, adjustments.count
+
+
+def focal_length_note(slam: Slam) -> str:
+    """Return which focal length was used, and where it comes from."""
+    camera, start = slam.tracker.grid.camera, slam.sequence.camera
+    how = "as given"
+    if slam.tracker.graph.seeks_focal:
+        how = f"estimated from the motion, from {start.fx:.1f} px on"
+        if not slam.tracker.graph.focal_is_free:
+            how = "kept as noted or guessed, because the motion does not tell it"
+    return f"{camera.fx:.1f} px for {camera.width}x{camera.height} images, {how}"
 
 
 def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
@@ -75,6 +88,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         lpips,
     )
     metrics |= _segment_errors(slam)
+    metrics["focal_length_px"] = slam.tracker.grid.camera.fx
     metrics["seconds_total"] = seconds
     metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds
     metrics["peak_memory_mb"] = peak_memory_mb()
@@ -147,9 +161,15 @@ def _break_warnings(slam: Slam) -> list[str]:
 
 
 def _focal_length_warnings(slam: Slam) -> list[str]:
-    fit = slam.focal_length
-    if fit is None or not fit.is_doubtful:
-        return []
+    fit, graph = slam.focal_length, slam.tracker.graph
+    if graph.seeks_focal and graph.adjustments.count and not graph.focal_is_free:
+        return [
+            "the focal length is unknown and the motion does not tell it: trajectory and map may "
+            "be bent; give --fx or a calibration file"
+        ]
+    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or failed_adjustments(slam)[0]
+    if fit is None or not fit.is_doubtful or is_broken:
+        return []  # the flow of a broken run fits whatever focal length
     factor = f"{fit.factor:.2f}"
     return [
         f"the flow fits {factor} times the present focal length better, with {fit.saved:.0%} less "

@@ -5,6 +5,7 @@ import numpy as np
 from minislam.data import RunFolder
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
+from minislam.runs.facts import focal_length_note
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED
 from minislam.viz import (
@@ -51,7 +52,8 @@ def write_pictures(
     color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).numpy()
     picture = overview(keyframe.image.numpy(), beta, color, estimate, true_path, unit)
     folder.write_plot("overview", figure_png(picture))
-    summary = {name: _shown(value) for name, value in metrics.items()}
+    summary = {"focal_length": focal_length_note(slam)}
+    summary |= {name: _shown(value) for name, value in metrics.items()}
     figures = [plots.pop("trajectory"), *strips, *plots.values()]
     title = f"minislam: {slam.sequence.name}"
     folder.write_report(build_report(title, summary, warnings, figures))

@@ -13,7 +13,7 @@ from minislam.priors.choice import FILES, PriorChoice, choose_depth, choose_feat
 from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms
-from minislam.runs.facts import failed_adjustments, measure, run_facts
+from minislam.runs.facts import failed_adjustments, focal_length_note, measure, run_facts
 from minislam.runs.pictures import write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
@@ -27,6 +27,7 @@ class RunOutcome:
     """The result of a finished or interrupted run, for the command line to print."""
 
     metrics: dict[str, float | None]
+    focal_length: str  # which one was used, and where it comes from
     warnings: list[str]
     exit_code: int
     state: str  # "finished", "interrupted", ... as in run.json
@@ -100,7 +101,7 @@ def run_sequence(
     folder.write_run(facts)
     if not interrupted:
         folder.remove_checkpoint()
-    return RunOutcome(metrics, facts["warnings"], exit_code, state)
+    return RunOutcome(metrics, focal_length_note(slam), facts["warnings"], exit_code, state)
 
 
 def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:

@@ -31,13 +31,16 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 def fill_depth(
     keyframes: list[Keyframe],
     sequence: Sequence,
+    camera: Camera,  # of its images
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
     disparities: list[Tensor],  # K x (n,) known inverse depths of the keyframes [1/world unit]
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Keyframe]:
     """Return the keyframes with dense depth where theirs is unknown, and with confirmation."""
     frames = [keyframe.frame_index for keyframe in keyframes]
-    found = dense_depths(sequence, poses, frames, [d.numpy() for d in disparities], progress)
+    found = dense_depths(
+        sequence, camera, poses, frames, [d.numpy() for d in disparities], progress
+    )
     return [
         replace(
             keyframe,
@@ -50,6 +53,7 @@ def fill_depth(
 
 def dense_depths(
     sequence: Sequence,
+    camera: Camera,  # of its images
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
     keyframes: list[int],  # K frame indices, increasing
     disparities: list[np.ndarray],  # K x (n,) known inverse depths of the scene [1/world unit]
@@ -59,7 +63,7 @@ def dense_depths(
 
     The known inverse depths of a keyframe and its neighbours say how near the nearest plane is.
     """
-    sweeper = Sweeper(sequence, poses)
+    sweeper = Sweeper(sequence, camera, poses)
     frames = swept_frames(keyframes, list(poses))
     swept: list[SweptView] = []
     for done, frame in enumerate(frames):
@@ -90,8 +94,7 @@ def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
 class Sweeper:
     """Sweeps single frames. It keeps the small grey images that it has read."""
 
-    def __init__(self, sequence: Sequence, poses: dict[int, Tensor]) -> None:
-        camera = sequence.camera
+    def __init__(self, sequence: Sequence, camera: Camera, poses: dict[int, Tensor]) -> None:
         self.camera = camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
         self._sequence = sequence
         self._poses = {index: pose.double().numpy() for index, pose in poses.items()}

@@ -17,11 +17,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
-from minislam.tracking.reprojection import (
-    Linearisation,
-    relative_transforms,
-    reproject_with_jacobians,
-)
+from minislam.tracking.reprojection import Linearisation, relative_transforms
+from minislam.tracking.safeguards.focal_column import reproject_with_focal
 from minislam.tracking.safeguards.robust import RobustKernel
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
@@ -45,6 +42,7 @@ class BundleProblem:
     free_poses: Tensor  # (K,) bool
     free_disparities: Tensor  # (K,) bool
     robust: RobustKernel | None = None  # None: plain least squares
+    free_focal: bool = False  # f is one more unknown, not in the paper
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,7 @@ class BundleState:
 
     T_camera_world: Tensor  # (K, 4, 4) float64
     disparities: Tensor  # (K, N) 1/world unit
+    log_focal: float = 0.0  # s = ln(f / f of the problem's camera)
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class _Linearised:
     cost: float  # px^2
     residual: Tensor  # (E, 2, N) px
     weight: Tensor  # (E, 2, N), the robust one included
-    reprojection: Linearisation
+    reprojection: Linearisation  # J_target is (E, 6 + G, 2, N); G = 1 if the focal length is free
     transforms: Tensor  # (E, 4, 4) T_target_source
 
 
@@ -143,9 +142,8 @@ def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tenso
 def _linearised(problem: BundleProblem, state: BundleState) -> _Linearised:
     source, dtype = problem.edges_source, problem.targets.dtype
     transforms = relative_transforms(state.T_camera_world, source, problem.edges_target)
-    reprojection = reproject_with_jacobians(
-        transforms.to(dtype), state.disparities[source], problem.rays, problem.camera
-    )
+    view = problem.rays, problem.camera, state.log_focal, problem.free_focal
+    reprojection = reproject_with_focal(transforms.to(dtype), state.disparities[source], *view)
     residual = problem.targets - reprojection.positions
     weight = problem.weights * reprojection.valid[:, None]
     if problem.robust is not None:
@@ -181,10 +179,9 @@ def _normal_equations(
     problem: BundleProblem, state: BundleState, at: _Linearised
 ) -> _NormalEquations:
     residual, weight, J = at.residual, at.weight, at.reprojection.J_target
-    edges, cells = residual.shape[0], residual.shape[2]
-    weighted_J = (J * weight[:, None]).reshape(edges, 6, 2 * cells)
-    A = (weighted_J @ J.reshape(edges, 6, 2 * cells).mT).double()  # (E, 6, 6)
-    b = (weighted_J @ residual.reshape(edges, 2 * cells, 1)).squeeze(-1).double()  # (E, 6)
+    weighted_J = (J * weight[:, None]).flatten(2)
+    A = (weighted_J @ J.flatten(2).mT).double()  # (E, 6 + G, 6 + G)
+    b = (weighted_J @ residual.flatten(1)[..., None]).squeeze(-1).double()  # (E, 6 + G)
 
     adjoint = se3_adjoint(at.transforms)
     H, g = _assemble_poses(problem, A, b, adjoint)
@@ -197,7 +194,7 @@ def _normal_equations(
     J_disparity = at.reprojection.J_disparity * free[:, None, None]
     weighted_Jd = weight * J_disparity
     E_target = J[:, :, 0] * weighted_Jd[:, None, 0] + J[:, :, 1] * weighted_Jd[:, None, 1]
-    E_source = -adjoint.mT.to(J.dtype) @ E_target
+    E_source = -adjoint.mT.to(J.dtype) @ E_target[:, :6]
     C.index_add_(0, problem.edges_source, (weighted_Jd * J_disparity).sum(1))
     s.index_add_(0, problem.edges_source, (weighted_Jd * residual).sum(1))
     return _NormalEquations(H, g, C, s, _source_blocks(problem, E_target, E_source))
@@ -214,24 +211,29 @@ def _assemble_poses(
 ) -> tuple[Tensor, Tensor]:
     """Sum J^T W J = A and J^T W r = b of all edges over the free poses, targets and sources.
 
-    With J_source = -J_target Ad: H_st = -Ad^T A, H_ss = Ad^T A Ad, g_s = -Ad^T b.
+    With J_source = -J_target Ad: H_st = -Ad^T A, H_ss = Ad^T A Ad, g_s = -Ad^T b. The columns
+    after the poses (G) are common to all edges: rows of A beyond the sixth are just summed.
     """
     slots = _pose_slots(problem)
     count = int(problem.free_poses.sum())
     width = count + 1  # one extra slot collects the fixed poses and is cut off afterwards
     source = slots[problem.edges_source] % width
     target = slots[problem.edges_target] % width
+    common, border, A = A[:, 6:, 6:].sum(0), A[:, :6, 6:], A[:, :6, :6]
     A_source = -adjoint.mT @ A  # rows of the source, columns of the target
     H = torch.zeros(width**2, 6, 6, dtype=torch.float64)
     H.index_add_(0, target * width + target, A)
     H.index_add_(0, source * width + target, A_source)
     H.index_add_(0, target * width + source, A_source.mT)
     H.index_add_(0, source * width + source, -A_source @ adjoint)
-    g = torch.zeros(width, 6, dtype=torch.float64)
-    g.index_add_(0, target, b)
-    g.index_add_(0, source, -(adjoint.mT @ b[..., None]).squeeze(-1))
-    H = H.reshape(width, width, 6, 6)[:count, :count].permute(0, 2, 1, 3)
-    return H.reshape(6 * count, 6 * count), g[:count].reshape(-1)
+    right = torch.cat([border, b[:, :6, None]], 2)  # the border and g are summed alike
+    B = torch.zeros(width, 6, right.shape[2], dtype=torch.float64)
+    B.index_add_(0, target, right)
+    B.index_add_(0, source, -adjoint.mT @ right)
+    H = H.reshape(width, width, 6, 6)[:count, :count].permute(0, 2, 1, 3).flatten(2).flatten(0, 1)
+    B, g = B[:count].flatten(0, 1).tensor_split([-1], 1)
+    H = torch.cat([torch.cat([H, B], 1), torch.cat([B.T, common], 1)])
+    return H, torch.cat([g[:, 0], b[:, 6:].sum(0)])
 
 
 def _source_blocks(
@@ -239,27 +241,21 @@ def _source_blocks(
 ) -> list[tuple[int, Tensor, Tensor]]:
     """Collect for each source frame the coupling of its disparities with the free poses.
 
-    The rows of E_k belong to frame k itself (summed over its edges) and to its targets, so the
-    Schur complement is one small matrix product per source frame.
+    The rows of E_k belong to frame k itself (summed over its edges), to its targets and to the
+    common columns, so the Schur complement is one small matrix product per source frame.
     """
-    slots = _pose_slots(problem)
-    offsets = torch.arange(6)
+    slots, offsets = _pose_slots(problem), torch.arange(6)
+    common = 6 * int(problem.free_poses.sum()) + torch.arange(E_target.shape[1] - 6)
     blocks = []
     for source in torch.unique(problem.edges_source).tolist():
         if not problem.free_disparities[source]:
             continue
         members = torch.nonzero(problem.edges_source == source).squeeze(1)
-        target_slots = slots[problem.edges_target[members]]
-        movable = target_slots >= 0
-        rows, parts = [], []
-        if slots[source] >= 0:
-            rows.append(slots[source] * 6 + offsets)
-            parts.append(E_source[members].sum(0))
-        if movable.any():
-            rows.append((target_slots[movable, None] * 6 + offsets).reshape(-1))
-            parts.append(E_target[members[movable]].reshape(-1, E_target.shape[2]))
-        if rows:
-            blocks.append((source, torch.cat(rows), torch.cat(parts)))
+        ends = torch.cat([slots[source : source + 1], slots[problem.edges_target[members]]])
+        parts = torch.cat([E_source[members].sum(0)[None], E_target[members, :6]])
+        rows = torch.cat([(ends[ends >= 0, None] * 6 + offsets).flatten(), common])
+        E = torch.cat([parts[ends >= 0].flatten(0, 1), E_target[members, 6:].sum(0)])
+        blocks.append((source, rows, E))
     return blocks
 
 
@@ -288,12 +284,13 @@ def _damped_step(
         return None
 
     poses = state.T_camera_world.clone()
-    moved_poses = se3_exp(xi.reshape(-1, 6)) @ poses[problem.free_poses]
-    poses[problem.free_poses] = se3_normalised(moved_poses)
+    moving = poses[problem.free_poses]
+    twists, zoom = xi[: 6 * len(moving)], xi[6 * len(moving) :]
+    poses[problem.free_poses] = se3_normalised(se3_exp(twists.reshape(-1, 6)) @ moving)
     step = equations.disparity_gradient.clone()
     for source, rows, E in equations.source_blocks:
         step[source] -= xi[rows].to(E.dtype) @ E
     disparities = state.disparities + inverse_C * step
     clamped = disparities.clamp_min(MIN_DISPARITY)
     disparities = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
-    return BundleState(poses, disparities)
+    return BundleState(poses, disparities, state.log_focal + float(zoom.sum()))

@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
+from minislam.state.stateful import Stateful
+from minislam.tracking.safeguards.focal_column import zoomed
 
 
-@dataclass(frozen=True)
-class Grid:
+@dataclass
+class Grid(Stateful):
     """The cells of the tracker: every `stride`-th pixel of the image."""
 
     camera: Camera
@@ -25,6 +27,10 @@ class Grid:
         height, width = pixels.shape[:2]
         flat = pixels.reshape(-1, 2)
         return cls(camera, stride, (height, width), flat, camera.rays(flat))
+
+    def zoom(self, log_focal: float) -> None:
+        """Make both focal lengths exp(log_focal) times as long, for all who hold this grid."""
+        self.camera, self.rays = zoomed(self.camera, self.rays, log_focal)
 
     def sample(self, values: Tensor, positions: Tensor) -> Tensor:
         """Interpolate cell values (..., N, C) bilinearly at pixels (..., N, 2).

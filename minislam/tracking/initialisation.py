@@ -25,6 +25,7 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
 from minislam.tracking.safeguards.first_depth import essential_disparities
+from minislam.tracking.safeguards.focal_length import seek_focal_length
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, update_motion_weight
 from minislam.tracking.safeguards.robust import RobustKernel
 
@@ -102,7 +103,10 @@ def first_geometry(
     graph: KeyframeGraph,
     memory_scale: float | None,  # px; None: motion is not remembered
 ) -> None:
-    """Estimate poses and disparities of all keyframes of the warm-up, beta unknown."""
+    """Estimate poses and disparities of all keyframes of the warm-up, beta unknown.
+
+    A focal length that nobody gave is estimated with them.
+    """
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
     keyframes = graph.keyframes
@@ -123,3 +127,4 @@ def first_geometry(
     state, report = best_hypothesis(problem, [state for state, _ in hypotheses])
     graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)
+    seek_focal_length(graph)

@@ -42,11 +42,14 @@ ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [
 class KeyframeGraph(Stateful):
     """The keyframes, the links between them, and the estimator of the flow along the links."""
 
+    grid: Grid
     keyframes: KeyframeStore
     flow_to_next: list[FlowMatches | None]  # keyframe k to k + 1 (E = 1), None across a loss
     links: FrameGraph
     flow: FlowEstimator
     adjustments: AdjustmentCount = AdjustmentCount()
+    seeks_focal: bool = False  # the focal length is only a first guess
+    focal_is_free: bool = False  # the motion has told it; adjustments of all keyframes refine it
 
     def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
         self.config = config

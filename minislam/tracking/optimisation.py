@@ -43,7 +43,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
     edges = graph.global_edges()
     if edges:
         graph.match(edges)
-    adjust(graph, 0, GLOBAL_ITERATIONS)
+    adjust(graph, 0, GLOBAL_ITERATIONS, free_focal=graph.focal_is_free)
 
 
 def final_global_ba(
@@ -59,7 +59,7 @@ def final_global_ba(
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
     for done in range(config.final_rounds):
         graph.match(edges)
-        adjust(graph, 0, FINAL_ITERATIONS, lambda_prior)
+        adjust(graph, 0, FINAL_ITERATIONS, lambda_prior, free_focal=graph.focal_is_free)
         if progress:
             progress(done + 1, config.final_rounds)
 
@@ -68,7 +68,7 @@ def warm_up_ba(graph: KeyframeGraph, edges: list[Edge], rounds: int) -> None:
     """Adjust the keyframes of the warm-up together: rounds of flow and BA."""
     for _ in range(rounds):
         graph.match(edges)
-        adjust(graph, 0, 2 * graph.config.iterations)
+        adjust(graph, 0, 2 * graph.config.iterations, free_focal=graph.focal_is_free)
 
 
 def adjust(
@@ -77,11 +77,12 @@ def adjust(
     iterations: int,
     lambda_prior: float | None = None,  # None: as configured
     widening: float = 1.0,  # of the robust weight
+    free_focal: bool = False,
 ) -> None:
     """Run a bundle adjustment over the links that touch the free keyframes."""
     problem = bundle_problem(graph, graph.links.select(first_free), first_free, lambda_prior)
-    if problem.robust:
-        problem = replace(problem, robust=problem.robust.widened(widening))
+    robust = problem.robust and problem.robust.widened(widening)
+    problem = replace(problem, robust=robust, free_focal=free_focal)
     if first_free > 0:
         # Without parallax the flow does not measure depth. Such a keyframe keeps its first
         # disparities, and they keep the scale until the camera moves again.
@@ -89,6 +90,7 @@ def adjust(
         problem = replace(problem, free_disparities=known)
     state, report = bundle_adjust(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
+    graph.grid.zoom(state.log_focal)
     graph.count_adjustment(report)
 
 

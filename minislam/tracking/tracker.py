@@ -90,7 +90,7 @@ class Tracker(Stateful):
         self.tracked = []
         self.watch = Watch(self.graph)
         self._features = features
-        self._depth_prior = depth_prior
+        self._depth_prior = lambda frame: depth_prior(frame, camera)  # as given: one unit of length
         self._predict_static_weight = predict_static_weight
         memory_scale = config.motion_memory * self.graph.pixel_scale
         self._motion = MotionMemory(self.grid, self.keyframes, memory_scale)
@@ -208,7 +208,7 @@ class Tracker(Stateful):
     def _add_keyframe(
         self, frame: Frame, features: Tensor, pose: Tensor, disparities: Tensor
     ) -> None:
-        metric_depth = self._depth_prior(frame, self.grid.camera)
+        metric_depth = self._depth_prior(frame)
         self.graph.append(frame, features, metric_depth, pose, disparities)
         if self.initialised:
             self._update_static_weights(first=len(self.keyframes) - 1)

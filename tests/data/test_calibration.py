@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from minislam.data.calibration import (
-    guessed_calibration,
     parse_calibration,
     read_calibration,
+    rough_calibration,
 )
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
@@ -33,10 +33,16 @@ def test_a_calibration_is_carried_to_images_resized_by_half():
 
 def test_the_guess_is_a_field_of_view_of_about_sixty_degrees():
     for width, height in ((1280, 720), (720, 1280)):
-        camera = guessed_calibration(width, height).camera_for(width, height)
+        camera = rough_calibration(width, height).camera_for(width, height)
         angle = 2 * np.degrees(np.arctan(max(width, height) / 2 / camera.fx))
         assert 55 < angle < 65
         assert (camera.cx, camera.cy) == ((width - 1) / 2, (height - 1) / 2)
+
+
+def test_a_noted_focal_length_comes_before_the_guess():
+    noted = rough_calibration(400, 300, (0.6, "EXIF of a photo"))
+    assert (noted.fx, noted.fy, noted.origin) == (300, 300, "EXIF of a photo")
+    assert noted.is_rough and not parse_calibration("500 500 320 240", "c").is_rough
 
 
 # Errors

@@ -8,6 +8,7 @@ import pytest
 from minislam.data import InputOptions, open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from tests.data.test_metadata import exif
 from tests.recordings import picture, save, tum_folder, video
 
 pytestmark = pytest.mark.slow
@@ -49,7 +50,7 @@ def test_a_video_keeps_the_time_of_skipped_frames(tmp_path: Path):
 def test_an_unknown_focal_length_is_guessed_and_said(tmp_path: Path):
     for number in range(3):
         save(tmp_path / f"{number}.png", picture(number, 64, 48))
-    sequence = open_sequence(str(tmp_path))
+    sequence = open_sequence(str(tmp_path), InputOptions(focal="fixed"))
     assert sequence.camera.fx == pytest.approx(0.85 * 64)
     assert len(sequence.warnings) == 1 and "--fx" in sequence.warnings[0]
     assert sequence.ground_truth is None and sequence.sensor_depth(0) is None
@@ -63,10 +64,30 @@ def test_what_the_user_gives_wins(tmp_path: Path):
     given = InputOptions(calibration=str(tmp_path / "other.txt"))
     assert open_sequence(folder, given).camera == Camera(50, 50, 23.5, 15.5, 48, 32)
     (tmp_path / "a/calibration.txt").unlink()
-    guessed = open_sequence(folder)
     known = open_sequence(folder, InputOptions(fx=60.0))
-    assert len(guessed.warnings) == 1 and known.warnings == []
+    assert known.warnings == []
     assert known.camera == Camera(60, 60, 23.5, 15.5, 48, 32)
+
+
+def test_the_focal_length_is_refined_where_it_is_not_known(tmp_path: Path):
+    folder = tum_folder(tmp_path / "a")
+    expected = {"auto": False, "fixed": False, "refine": True}
+    for focal, refines in expected.items():
+        assert open_sequence(str(folder), InputOptions(focal=focal)).refines_focal == refines
+    (folder / "calibration.txt").unlink()
+    for given, refines in (({}, True), ({"cx": 20.0}, True), ({"fx": 60.0}, False)):
+        sequence = open_sequence(str(folder), InputOptions(**given))
+        assert sequence.refines_focal == refines and sequence.warnings == []
+
+
+def test_a_focal_length_noted_in_a_photo_is_the_start(tmp_path: Path):
+    for number in range(3):
+        path = save(tmp_path / f"{number}.jpg", picture(number, 64, 48))
+        path.write_bytes(exif({0xA405: (3, 26)}) + path.read_bytes()[2:])
+    sequence = open_sequence(str(tmp_path))
+    assert sequence.camera.fx == pytest.approx(26 / 43.267 * 80, rel=1e-4)
+    assert sequence.refines_focal
+    assert sequence.description.endswith("EXIF of 0.jpg, focal length to be refined")
 
 
 def test_the_size_given_is_exact(tmp_path: Path):

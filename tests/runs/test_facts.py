@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+from minislam.geometry import Camera
 from minislam.records import AdjustmentCount
 from minislam.runs import facts
 from minislam.splatting import Rendering
@@ -19,6 +21,9 @@ def slam(**parts: object) -> SimpleNamespace:
     graph = SimpleNamespace(
         adjustments=AdjustmentCount(2 + failed, failed, "singular" if failed else ""),
         pixel_scale=1.0,
+        seeks_focal=parts.pop("seeks_focal", False),
+        focal_is_free=parts.pop("focal_is_free", False),
+        grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
     )
     tracker = SimpleNamespace(
         tracked=[None] * 4,
@@ -32,7 +37,7 @@ def slam(**parts: object) -> SimpleNamespace:
     )
     lost = parts.pop("lost", 0)
     return SimpleNamespace(
-        sequence=SimpleNamespace(warnings=[]),
+        sequence=SimpleNamespace(warnings=[], camera=CAMERA),
         lost_frames=lambda: [None] * lost,
         tracker=tracker,
         config=SimpleNamespace(tracking=SimpleNamespace(min_parallax=1.0)),
@@ -40,6 +45,7 @@ def slam(**parts: object) -> SimpleNamespace:
     )
 
 
+CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
 DOUBTFUL = SimpleNamespace(is_doubtful=True, factor=1.1, saved=0.25)
 WARNINGS = [
     ({"lost": 1}, "1 of 4 frames could not be tracked"),
@@ -47,6 +53,7 @@ WARNINGS = [
     ({"breaks": [Break(2, 2)]}, "each piece (frames 0 to 1, 3 to 3) stands for itself"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
+    ({"seeks_focal": True}, "the motion does not tell it"),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
     ({"has_prior": False}, "the unit of length is arbitrary"),
 ]
@@ -57,6 +64,27 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
     assert facts._warnings(slam()) == []
     (warning,) = facts._warnings(slam(**parts))
     assert words in warning
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({}, "as given"),
+        ({"seeks_focal": True, "focal_is_free": True}, "estimated from the motion, from 272.0"),
+        ({"seeks_focal": True}, "the motion does not tell it"),
+    ],
+)
+def test_the_focal_length_is_said_with_its_origin(parts: dict, words: str):
+    run = slam(**parts)
+    run.tracker.grid = run.tracker.graph.grid
+    note = facts.focal_length_note(run)
+    assert note.startswith("250.0 px for 320x240 images, ") and words in note
+
+
+@pytest.mark.parametrize("broken", [{"lost": 1}, {"failed": 3}])
+def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
+    (warning,) = facts._warnings(slam(focal_length=DOUBTFUL, **broken))
+    assert "present focal length" not in warning
 
 
 def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):

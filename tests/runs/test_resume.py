@@ -128,8 +128,9 @@ def photos(whole: Path, root: Path) -> Path:
 
 
 def test_without_a_depth_prior_after_a_damaged_image_was_replaced(photos: Path, root: Path, capsys):
-    inputs = ["--fx", "80"]
+    inputs = ["--fx", "75", "--focal", "refine"]
     assert run(photos, root / "photos_whole", inputs=inputs) == 0
+    assert RunFolder(root / "photos_whole").read_run()["camera"]["fx"] != 75
     content = (photos / "12.png").read_bytes()
     (photos / "12.png").write_bytes(content[:300])
     assert run(photos, root / "photos_broken", inputs=inputs) == 1
@@ -170,6 +171,7 @@ REFUSALS = [
         "expected sequence.description = .*16 of 48.* found .*24 of 48",
     ),
     ([*INPUT, "--fx", "99"], "expected sequence.description = .* found .*given"),
+    ([*INPUT, "--focal", "refine"], "found .* to be refined"),
     ([*INPUT, "--depth", "none"], "expected priors.depth = simulated .* found none"),
     ([*INPUT, "--tracking.window", "3"], "expected tracking.window = 10 .* found 3; leave"),
     ([*INPUT, "--seed", "7"], "expected seed = 0 .* found 7"),

@@ -1,7 +1,5 @@
 """Dense depth of keyframes, against the truth of the ray-caster, and which frames are swept."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -48,7 +46,7 @@ def test_views_of_much_parallax_are_not_used():
     for index in range(20):
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.1 * index
-    sweeper = Sweeper(sequence(), poses)
+    sweeper = Sweeper(sequence(), camera(), poses)
     near = sweeper._views(0, 0.3)
     largest = max(near) * 0.1 * 0.3 * sweeper.camera.fx
     assert len(near) >= 2 and largest <= 0.125 * sweeper.camera.width
@@ -61,13 +59,13 @@ def test_views_of_much_parallax_are_not_used():
 
 def test_a_camera_that_stands_still_gives_no_depth():
     poses = {index: torch.from_numpy(pose(0)) for index in range(6)}
-    depths = dense_depths(sequence(), poses, [0, 5], [np.ones(3), np.ones(3)])
+    depths = dense_depths(sequence(), camera(), poses, [0, 5], [np.ones(3), np.ones(3)])
     assert all(float(depth.max()) == 0 == float(c.max()) for depth, c in depths)
 
 
 def test_a_single_frame_gives_no_depth():
     ((depth, confirmation),) = dense_depths(
-        sequence(), {0: torch.from_numpy(pose(0))}, [0], [np.ones(3)]
+        sequence(), camera(), {0: torch.from_numpy(pose(0))}, [0], [np.ones(3)]
     )
     assert depth.shape == SIZE[::-1] and float(depth.max()) == 0 == float(confirmation.max())
 
@@ -75,7 +73,9 @@ def test_a_single_frame_gives_no_depth():
 def test_progress_is_told_for_every_swept_frame():
     told = []
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
-    dense_depths(sequence(), poses, [0, 2], [np.ones(3)] * 2, lambda *step: told.append(step))
+    dense_depths(
+        sequence(), camera(), poses, [0, 2], [np.ones(3)] * 2, lambda *step: told.append(step)
+    )
     assert told == [(1, 2), (2, 2)]
 
 
@@ -97,5 +97,5 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
 
 
 def test_the_swept_camera_sees_what_the_camera_sees():
-    small = Sweeper(SimpleNamespace(camera=camera()), {}).camera
+    small = Sweeper(sequence(), camera(), {}).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx

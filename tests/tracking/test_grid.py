@@ -1,5 +1,8 @@
 """The grid of cells: its pixels, its rays, and sampling between cells."""
 
+import math
+
+import pytest
 import torch
 
 from minislam.tracking.grid import Grid
@@ -16,6 +19,16 @@ def test_cells_are_every_eighth_pixel_in_rows():
 
 def test_rays_project_to_the_pixels():
     torch.testing.assert_close(CAMERA.project(3 * GRID.rays), GRID.pixels)
+
+
+def test_a_refined_focal_length_is_seen_by_all_who_hold_the_grid_and_is_restored():
+    grid, other = Grid.of(CAMERA, STRIDE), Grid.of(CAMERA, STRIDE)
+    holder = [grid]
+    grid.zoom(math.log(1.25))
+    assert holder[0].camera.fx == pytest.approx(75)
+    torch.testing.assert_close(grid.camera.project(3 * grid.rays), grid.pixels)
+    other.restore_state(grid.saved_state(), lambda index: None)
+    assert other.camera == grid.camera and torch.equal(other.rays, grid.rays)
 
 
 def test_a_size_that_is_no_multiple_of_the_stride():

@@ -6,5 +6,6 @@ relocalisation   finds a lost camera among the keyframes
 first_depth      depth of the first keyframe from matches alone, where there is no depth prior
 structure        which disparities several keyframes agree on
 diagnostics      how well each keyframe is tied to the others
-focal_length     tells at the end whether the given focal length was wrong
+focal_length     estimates an unknown focal length, tells whether a given one was wrong
+focal_column     the focal length as one more unknown of the bundle adjustment
 """

@@ -1,5 +1,6 @@
 """The focal length that the flow wants: found where the camera turns, untold where it does not."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,11 +8,15 @@ import torch
 
 from minislam.geometry import se3_exp
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.frame_graph import neighbourhood_edges
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import warm_up_ba
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
     check_focal_length,
     fit_focal_length,
+    seek_focal_length,
 )
 from tests.tracking.scene import CAMERA, RAYS, known_problem, noisy, normal, poses_on_an_arc
 from tests.tracking.wall import true_graph
@@ -44,17 +49,19 @@ def without_turning() -> tuple[BundleProblem, BundleState]:
 @pytest.mark.parametrize("factor", [0.75, 0.9, 1.0, 1.1, 1.3])
 def test_the_true_focal_length_is_found(factor: float):
     known = known_problem(keyframes=8)
-    fit = fit_focal_length(seen_through(noisy(known, NOISE), factor), known.truth)
-    assert fit.given == pytest.approx(factor * CAMERA.fx)
+    fit, state = fit_focal_length(seen_through(noisy(known, NOISE), factor), known.truth)
+    assert fit.present == pytest.approx(factor * CAMERA.fx)
     assert fit.factor * factor == pytest.approx(1, rel=FOUND)
+    assert fit.factor == pytest.approx(math.exp(state.log_focal))
     assert fit.is_doubtful == (factor != 1)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
 def test_a_camera_that_does_not_turn_tells_nothing(factor: float):
     problem, state = without_turning()
-    fit = fit_focal_length(seen_through(problem, factor), state)
+    fit, end = fit_focal_length(seen_through(problem, factor), state)
     assert fit.factor is None and not fit.is_doubtful
+    assert end is state
 
 
 def test_residuals_below_what_any_flow_can_do_tell_nothing():
@@ -66,8 +73,35 @@ def test_residuals_below_what_any_flow_can_do_tell_nothing():
 
 def test_a_focal_length_out_of_reach_is_no_estimate():
     known = known_problem()
-    fit = fit_focal_length(seen_through(noisy(known, NOISE), 2.0), known.truth)
+    fit, _ = fit_focal_length(seen_through(noisy(known, NOISE), 2.5), known.truth)
     assert fit.factor is None
+
+
+def turned_graph(factor: float) -> KeyframeGraph:
+    """Return a graph with true flow for which a wrong focal length is assumed."""
+    graph = true_graph([0, 2, 4, 6, 8, 10])
+    graph.match(neighbourhood_edges(0, 6, 5))
+    graph.grid.zoom(math.log(factor))
+    return graph
+
+
+def test_an_unknown_focal_length_is_replaced_and_from_then_on_refined():
+    graph = turned_graph(1.2)
+    graph.seeks_focal = True
+    seek_focal_length(graph)
+    assert graph.focal_is_free
+    assert graph.grid.camera.fx == pytest.approx(CAMERA.fx, rel=FOUND)
+    graph.grid.zoom(math.log(1.02))
+    warm_up_ba(graph, graph.links.edges(), 1)
+    assert graph.grid.camera.fx == pytest.approx(CAMERA.fx, rel=FOUND)
+
+
+def test_a_given_focal_length_stays():
+    graph = turned_graph(1.2)
+    seek_focal_length(graph)
+    warm_up_ba(graph, graph.links.edges(), 1)
+    assert not graph.focal_is_free
+    assert graph.grid.camera.fx == pytest.approx(1.2 * CAMERA.fx)
 
 
 def test_the_check_changes_nothing():

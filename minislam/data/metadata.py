@@ -1,0 +1,120 @@
+"""The focal length that a camera noted in its file: EXIF of a photo, QuickTime tags of a video.
+
+Photos (JPEG) name the equivalent on 35 mm film, or else the focal length and the pixels per inch
+of the sensor. iPhone videos name the equivalent; most other videos name nothing. Equivalents are
+whole millimetres, and stabilisation crops the image, so that all this is a first guess.
+"""
+
+import math
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm; equivalents keep the field of view of the diagonal
+VIDEO_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
+POSSIBLE = (0.2, 20.0)  # image diagonals, of a focal length that is believed
+
+_HEADER = 1 << 17  # bytes of a photo in which its EXIF segment is looked for
+_LARGEST_INDEX = 1 << 27  # bytes; the index of a video is smaller unless it is damaged
+# Tags of EXIF
+_POINTER, _FILM_EQUIVALENT, _FOCAL_LENGTH, _RESOLUTION, _UNIT, _WIDTH, _HEIGHT = (
+    0x8769, 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002, 0xA003,
+)  # fmt: skip
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution
+_EXIF_NUMBERS = {3: "H", 4: "I", 5: "II"}  # struct codes: short, long, rational
+_VIDEO_NUMBERS = {21: ">i", 22: ">I", 67: ">i", 77: ">I", 66: ">h", 76: ">H", 23: ">f", 24: ">d"}
+
+
+def noted_focal_length(path: Path) -> tuple[float, str] | None:
+    """Return the focal length over the image diagonal and its origin; None if none is noted."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(_HEADER)
+            is_photo = start.startswith(b"\xff\xd8")
+            found = _of_exif(_exif_segment(start)) if is_photo else _of_video(_movie_box(file))
+    except (OSError, struct.error, LookupError, ValueError, ArithmeticError):
+        return None  # Damaged notes are no reason to refuse whole images.
+    if found is None or not POSSIBLE[0] < found < POSSIBLE[1]:
+        return None
+    return found, f"{'EXIF' if is_photo else 'QuickTime tag'} of {path.name}"
+
+
+def _exif_segment(photo: bytes) -> bytes:
+    """Return the TIFF structure in the APP1 segment of a JPEG file."""
+    at = 2
+    while photo[at] == 0xFF:
+        (length,) = struct.unpack_from(">H", photo, at + 2)
+        if photo[at + 1] == 0xE1 and photo[at + 4 : at + 10] == b"Exif\0\0":
+            return photo[at + 10 : at + 2 + length]
+        at += 2 + length
+    raise ValueError("no EXIF")
+
+
+def _of_exif(tiff: bytes) -> float | None:
+    """Return the focal length over the image diagonal."""
+    order = {b"II": "<", b"MM": ">"}[tiff[:2]]
+
+    def tags(at: int) -> dict[int, float]:
+        values = {}
+        for entry in range(struct.unpack_from(f"{order}H", tiff, at)[0]):
+            tag, kind, count, place = struct.unpack_from(f"{order}HHII", tiff, at + 2 + 12 * entry)
+            if kind in _EXIF_NUMBERS and count == 1:
+                start = place if kind == 5 else at + 10 + 12 * entry
+                first, *rest = struct.unpack_from(order + _EXIF_NUMBERS[kind], tiff, start)
+                values[tag] = first / (rest[0] or math.inf) if rest else first
+        return values
+
+    found = tags(int(tags(struct.unpack_from(f"{order}I", tiff, 4)[0])[_POINTER]))
+    if found.get(_FILM_EQUIVALENT):
+        return found[_FILM_EQUIVALENT] / FILM_DIAGONAL
+    per_millimetre = found[_RESOLUTION] / _MILLIMETRES[int(found.get(_UNIT, 2))]
+    return found[_FOCAL_LENGTH] * per_millimetre / math.hypot(found[_WIDTH], found[_HEIGHT])
+
+
+def _movie_box(file: BinaryIO) -> bytes:
+    """Return the content of the box `moov` of a video; the images beside it are skipped."""
+    at = 0
+    while True:
+        file.seek(at)
+        header = file.read(16)
+        size, kind = struct.unpack_from(">I4s", header)
+        start = 16 if size == 1 else 8
+        size = struct.unpack_from(">Q", header, 8)[0] if size == 1 else size
+        if kind == b"moov":
+            file.seek(at + start)
+            return file.read(min(size - start, _LARGEST_INDEX))
+        if size < start:
+            raise ValueError("no moov")
+        at += size
+
+
+def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield kind and content of the boxes in a box."""
+    at = 0
+    while at + 8 <= len(data):
+        size, kind = struct.unpack_from(">I4s", data, at)
+        if size < 8:
+            return
+        yield kind, data[at + 8 : at + size]
+        at += size
+
+
+def _of_video(box: bytes) -> float | None:
+    """Return the focal length over the image diagonal that a box, or one inside it, notes."""
+    for kind, content in _boxes(box):
+        found = None
+        if kind in (b"trak", b"udta"):
+            found = _of_video(content)
+        elif kind == b"meta":
+            # ISO files have four bytes of version in front of the boxes, QuickTime has none.
+            inner = dict(_boxes(content if content[4:8] == b"hdlr" else content[4:]))
+            names = [name for _, name in _boxes(inner.get(b"keys", b"")[8:])]
+            if VIDEO_KEY in names:
+                place = struct.pack(">I", names.index(VIDEO_KEY) + 1)  # values go by position
+                ((_, value),) = _boxes(dict(_boxes(inner[b"ilst"]))[place])
+                number = _VIDEO_NUMBERS[struct.unpack_from(">I", value)[0]]
+                found = struct.unpack_from(number, value, 8)[0] / FILM_DIAGONAL
+        if found:
+            return found
+    return None
