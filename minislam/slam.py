@@ -138,10 +138,11 @@ class Slam(Stateful):
 
     def _map_new_keyframes(self) -> None:
         """Add new keyframes to the map. Without a depth prior it is built at the end."""
-        if self.tracker.keyframes.has_prior:
+        new_keyframes = self._keyframes(first=len(self.mapper.keyframes))
+        if new_keyframes and self.tracker.keyframes.has_prior:
             with self.steps.timed("mapping"):
                 self._move_map()
-                for keyframe in self._keyframes(first=len(self.mapper.keyframes)):
+                for keyframe in new_keyframes:
                     self.mapper.integrate(keyframe)
 
     def _move_map(self) -> None:

@@ -17,6 +17,7 @@ from minislam.checks.splatting import (
     check_twist_vjp,
 )
 from minislam.checks.start_here import check_mapping_weight
+from minislam.checks.stereo import check_plane_homography
 from minislam.checks.tracking import check_flow_distance, check_suppressed
 from minislam.checks.uncertainty import check_best_beta, check_feature_variance
 
@@ -35,6 +36,7 @@ __all__ = [
     "check_function",
     "check_mapping_weight",
     "check_pixel_color",
+    "check_plane_homography",
     "check_projected_covariance",
     "check_reproject",
     "check_resized_intrinsics",

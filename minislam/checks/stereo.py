@@ -1,0 +1,41 @@
+"""Exercise of notebook 09."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.checks.grading import Case, Verdict, check_function
+from minislam.geometry import Camera, se3_exp, se3_inverse
+from minislam.stereo.sweep import plane_homographies
+
+
+def check_plane_homography(student: Callable[[Tensor, Tensor, float], Tensor]) -> Verdict:
+    """Check (K (3, 3), T_other_this (4, 4), inverse depth q) -> H(q) (3, 3)."""
+
+    def reference(K: Tensor, T: Tensor, q: float) -> Tensor:
+        fx, fy, cx, cy = K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()
+        camera = Camera(fx, fy, cx, cy, 320, 240)
+        return torch.from_numpy(plane_homographies(camera, T.numpy(), np.array([q]))[0])
+
+    def with_depth(K: Tensor, T: Tensor, q: float) -> Tensor:
+        return reference(K, T, 1 / q) if q else reference(K, T, q)
+
+    def without_intrinsics(K: Tensor, T: Tensor, q: float) -> Tensor:
+        return torch.linalg.solve(K, reference(K, T, q) @ K)
+
+    K = torch.tensor([[60.0, 0, 33], [0, 66, 19], [0, 0, 1]], dtype=torch.float64)
+    T = se3_exp(torch.tensor([0.3, -0.1, 0.2, 0.1, -0.2, 0.05], dtype=torch.float64))
+    cases = [
+        Case((K, T, 0.0), "a plane at infinity"),
+        Case((K, T, 0.5), "a plane two units away"),
+        Case((K, se3_inverse(T), 0.8), "a camera that moves the other way"),
+    ]
+    hints = [
+        (lambda K, T, q: reference(K, se3_inverse(T), q), "This is the way back."),
+        (with_depth, "q is an inverse depth: the translation is multiplied by it."),
+        (without_intrinsics, "H maps pixels to pixels: it needs K on both sides."),
+        (lambda K, T, q: reference(K, T, -q), "The sign of the translation is the other one."),
+    ]
+    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
