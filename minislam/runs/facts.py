@@ -154,7 +154,7 @@ def _break_warnings(slam: Slam) -> list[str]:
     where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in breaks)
     pieces = ", ".join(f"{first} to {last}" for first, last in slam.tracker.watch.segments)
     return [
-        f"the trajectory is broken at frames {where}: motion and depth there contradict the images. "
+        f"the trajectory is broken at frames {where}: motion or depth contradicts the images. "
         f"Before and after, scale and direction do not belong together; each piece (frames "
         f"{pieces or 'none'}) stands for itself"
     ]

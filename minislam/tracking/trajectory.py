@@ -1,9 +1,8 @@
 """Poses of the frames between the keyframes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,21 +12,11 @@ from minislam.tracking.bundle_adjustment import BundleState, motion_only_adjust,
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import motion_only_problem, start_pose
 from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.safeguards.pose_support import PoseFit, retry_doubtful
 from minislam.tracking.tracker import Tracker
 
 ITERATIONS = 8  # Gauss-Newton steps of six unknowns
 ROBUST_NARROWING = 0.5  # of the robust scale, because the structure is known by now [-]
-# Support of a pose, relative to the median of all frames between keyframes: [-]
-DOUBTFUL_SUPPORT = 0.5  # with less, other starts are tried
-LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
-
-
-@dataclass(frozen=True)
-class PoseFit:
-    """A pose and how much of the flow fits it."""
-
-    T_camera_world: Tensor  # (4, 4)
-    support: float  # in [0, 1], mean robust weight of all cells
 
 
 def pose_all_frames(
@@ -42,28 +31,21 @@ def pose_all_frames(
     """
     graph, frames = tracker.graph, tracker.keyframes.frames
     poses = tracker.keyframes.T_camera_world
-    keyframes = {f.frame_index: PoseFit(T, 1.0) for f, T in zip(frames, poses, strict=True)}
-    fits = dict(keyframes)
-    others = [t for t in tracker.tracked if t.status.is_followed and t.frame_index not in fits]
-    for done, tracked in enumerate(others):
-        start = _interpolate(graph, tracked)
-        fits[tracked.frame_index] = _fit_pose(graph, sequence, tracked, start)
+    fits = {f.frame_index: PoseFit(T, 1.0) for f, T in zip(frames, poses, strict=True)}
+    followed = [t for t in tracker.tracked if t.status.is_followed]
+    others = {t.frame_index: t for t in followed if t.frame_index not in fits}
+
+    def fit_from(index: int, start: Tensor) -> PoseFit:
+        return _fit_pose(graph, sequence, others[index], start)
+
+    for done, (index, tracked) in enumerate(others.items()):
+        fits[index] = fit_from(index, _interpolate(graph, tracked))
         if progress:
             progress(done + 1, len(others))
-    supports = [fits[tracked.frame_index].support for tracked in others]
-    typical = float(np.median(supports)) if supports else 0.0
-    for step in (-1, 1):
-        for tracked in others[::-step]:
-            index = tracked.frame_index
-            if fits[index].support < DOUBTFUL_SUPPORT * typical and index + step in fits:
-                start = fits[index + step].T_camera_world
-                other = _fit_pose(graph, sequence, tracked, start)
-                fits[index] = max(fits[index], other, key=lambda fit: fit.support)
+    lost = retry_doubtful(fits, list(others), fit_from)
     for position, tracked in enumerate(tracker.tracked):
-        fit = fits.get(tracked.frame_index)
-        if fit is not None and fit.support < LOST_SUPPORT * typical:
+        if tracked.frame_index in lost:
             tracker.tracked[position] = replace(tracked, status=TrackingStatus.LOST)
-            del fits[tracked.frame_index]
     return {index: fits[index].T_camera_world for index in sorted(fits)}
 
 

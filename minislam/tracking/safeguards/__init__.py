@@ -3,6 +3,7 @@
 robust           the robust weight inside Sigma, for a flow without a learned confidence
 motion_memory    remembers which cells have moved, so that a growing dynamic object stays excluded
 relocalisation   finds a lost camera among the keyframes
+pose_support     tries other starts for poses between keyframes that little of the flow supports
 first_depth      depth of the first keyframe from matches alone, where there is no depth prior
 structure        which disparities several keyframes agree on
 diagnostics      how well each keyframe is tied to the others
