@@ -63,9 +63,13 @@ class Watch(Stateful):
         self._graph = graph
         self.diagnostics, self.breaks = [], []
 
-    def judge_newest(self) -> None:
-        """Add the diagnostics of the newest keyframe."""
-        self.diagnostics.append(diagnose(self._graph, len(self._graph.keyframes) - 1))
+    def accepts_newest(self) -> bool:
+        """Tell whether the newest keyframe does not contradict its flow; add its diagnostics."""
+        newest = diagnose(self._graph, len(self._graph.keyframes) - 1)
+        if is_unexplained(newest):
+            return False
+        self.diagnostics.append(newest)
+        return True
 
     def judge_all(self) -> None:
         """Replace the diagnostics of all keyframes by their present ones."""

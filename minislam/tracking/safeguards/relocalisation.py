@@ -126,6 +126,22 @@ def _keypoint_matches(
     )
 
 
+class Undo:
+    """Remembers a keyframe graph before a keyframe is added, and removes that keyframe again."""
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        self._graph, self._before, self._links = graph, graph.state, len(graph.links)
+        self._motion_weights = graph.keyframes.motion_weights[-1].clone()
+
+    def remove_newest(self) -> None:
+        """Remove the newest keyframe with its links; the others are as they were."""
+        graph = self._graph
+        graph.links.remove_newest(len(graph.links) - self._links)
+        graph.remove_newest()
+        graph.keyframes.set_geometry(self._before.T_camera_world, self._before.disparities)
+        graph.keyframes.set_motion_weight(-1, self._motion_weights)
+
+
 def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
     """Link a relocalised keyframe, the newest, with a similar one and the neighbours of that one.
 
