@@ -98,7 +98,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
 def _segment_errors(slam: Slam) -> dict[str, float | None]:
     """Return the ATE of each piece of a broken trajectory, aligned by itself [cm]."""
     truth, segments = slam.sequence.ground_truth, slam.tracker.watch.segments
-    if truth is None or truth.trajectory is None or not slam.tracker.watch.breaks:
+    if truth is None or truth.trajectory is None or not slam.tracker.watch.is_broken:
         return {}
     trajectory, errors = slam.trajectory(), {}
     stamp = {tracked.frame_index: tracked.timestamp for tracked in slam.tracker.tracked}

@@ -111,7 +111,7 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     failed, adjustments = failed_adjustments(slam)
     if 2 * failed > adjustments:
         return "finished, most bundle adjustments failed", LOST_EXIT
-    if slam.tracker.watch.breaks:
+    if slam.tracker.watch.is_broken:
         return "finished, broken", LOST_EXIT
     if slam.lost_frames():
         return "finished, partly lost", LOST_EXIT

@@ -82,6 +82,11 @@ class Watch(Stateful):
         self.breaks = find_breaks(self.diagnostics)
 
     @property
+    def is_broken(self) -> bool:
+        """Tell whether the whole trajectory does not hang together; known at the end."""
+        return bool(self.breaks)
+
+    @property
     def segments(self) -> list[tuple[int, int]]:
         """Return the first and last frame of each piece of trajectory between breaks."""
         segments: dict[int, tuple[int, int]] = {}
