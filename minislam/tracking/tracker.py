@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -32,7 +33,7 @@ from minislam.tracking.optimisation import (
 )
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
-from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, Undo, attach_newest
+from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, Undo, rejoin
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 MAX_CULLED_IN_A_ROW = 2  # keyframes, official code
@@ -145,13 +146,14 @@ class Tracker(Stateful):
     def _follow(self, frame: Frame) -> None:
         """Match a frame with the newest keyframe; make it a keyframe if it should be one."""
         chain, matches = self._advance(frame)
-        if not _is_followed(matches) and self._last_non_keyframe is not None:
+        ratio = float(matches.matched_ratios)
+        if ratio < MIN_MATCHED_RATIO and self._last_non_keyframe is not None:
             # Too far from the last keyframe, but perhaps not from the last frame: make the last
             # frame a keyframe and match with it.
             self._insert(*self._last_non_keyframe, may_cull=False)
             chain, matches = self._advance(frame)
-        ratio = float(matches.matched_ratios)
-        if not _is_followed(matches):
+            ratio = float(matches.matched_ratios)
+        if ratio < MIN_MATCHED_RATIO:
             self._handle_loss(frame, ratio)
             return
         self._chain = chain
@@ -201,8 +203,7 @@ class Tracker(Stateful):
                 undo.remove_newest()
                 return False
             self._adjust_all_if_due()
-        assert self._chain is not None, "there is a chain from the first frame on"
-        self._chain = self._chain.restart()
+        self._chain = self._chain and self._chain.restart()
         return True
 
     def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
@@ -251,13 +252,8 @@ class Tracker(Stateful):
 
     def _resume(self, frame: Frame, place: Place, features: Tensor) -> bool:
         """Make a relocalised frame a keyframe, or return False if its flow does not match."""
-        disparities = self.graph.warp_disparities(place.keyframe_index, place.T_camera_world)
-        undo = Undo(self.graph)
-        self.graph.flow_to_next.append(None)
-        self._add_keyframe(frame, features, place.T_camera_world, disparities)
-        attached = attach_newest(self.graph, place.keyframe_index)
-        if not (attached and self.watch.accepts_newest()):
-            undo.remove_newest()
+        add = partial(self._add_keyframe, frame, features)
+        if not rejoin(self.graph, place, add, self.watch.accepts_newest):
             return False
         self._chain = self.graph.flow.start_chain(frame.image)
         self._last_non_keyframe = None
@@ -302,7 +298,3 @@ class Tracker(Stateful):
         for index in range(first, len(self.keyframes)):
             weight = self._predict_static_weight(index)
             self.keyframes.set_static_weight(index, weight.reshape(-1))
-
-
-def _is_followed(matches: FlowMatches) -> bool:
-    return float(matches.matched_ratios) >= MIN_MATCHED_RATIO

@@ -4,6 +4,7 @@ The keyframes with the most similar features are tried. Keypoints are matched be
 images; the disparities of the keyframe make them 3D points, and PnP with RANSAC gives the pose.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -140,6 +141,23 @@ class Undo:
         graph.remove_newest()
         graph.keyframes.set_geometry(self._before.T_camera_world, self._before.disparities)
         graph.keyframes.set_motion_weight(-1, self._motion_weights)
+
+
+def rejoin(
+    graph: KeyframeGraph,
+    place: Place,
+    add: Callable[[Tensor, Tensor], None],  # adds the frame as a keyframe: pose, disparities
+    accepts_newest: Callable[[], bool],
+) -> bool:
+    """Add a relocalised frame to the graph; return False, without a trace, if it does not fit."""
+    undo = Undo(graph)
+    disparities = graph.warp_disparities(place.keyframe_index, place.T_camera_world)
+    graph.flow_to_next.append(None)
+    add(place.T_camera_world, disparities)
+    if attach_newest(graph, place.keyframe_index) and accepts_newest():
+        return True
+    undo.remove_newest()
+    return False
 
 
 def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
