@@ -2,25 +2,32 @@
 
 from minislam.slam import Slam
 from minislam.state.steps import Observer
-from minislam.tracking.tracker import MIN_MATCHED_RATIO
+from minislam.tracking.safeguards.diagnostics import is_unexplained
 
 
 class Alarms:
-    """Says once each time when the camera is lost."""
+    """Says once when the camera is lost and when a keyframe contradicts its flow."""
 
     def __init__(self, observer: Observer) -> None:
         self._observer = observer
-        self._is_lost = False
+        self._lost = False
+        self._judged = -1  # frame of the keyframe that was looked at last
 
     def check(self, slam: Slam) -> None:
-        """Look at the newest frame."""
-        newest = slam.tracker.tracked[-1:]
-        is_lost = any(not tracked.status.is_followed for tracked in newest)
-        if is_lost and not self._is_lost:
-            is_matched = newest[0].matched_ratio >= MIN_MATCHED_RATIO
-            reason = "no motion explains its optical flow" if is_matched else "too little matches"
+        """Look at the newest frame and at the newest keyframe."""
+        tracked, diagnostics = slam.tracker.tracked, slam.tracker.watch.diagnostics
+        lost = bool(tracked) and not tracked[-1].status.is_followed
+        if lost and not self._lost:
             self._observer.warn(
-                f"frame {newest[0].frame_index}: the camera is lost, {reason}; it is looked for "
-                "among the keyframes"
+                f"frame {tracked[-1].frame_index}: the camera is lost; it is looked for among the "
+                "keyframes"
             )
-        self._is_lost = is_lost
+        self._lost = lost
+        if diagnostics and diagnostics[-1].frame_index > self._judged:
+            newest = diagnostics[-1]
+            if is_unexplained(newest):
+                self._observer.warn(
+                    f"frame {newest.frame_index}: the estimated motion explains only "
+                    f"{newest.explained:.0%} of the optical flow; the trajectory may break here"
+                )
+            self._judged = newest.frame_index

@@ -7,7 +7,7 @@ from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.runs.facts import focal_length_note
 from minislam.slam import Slam
-from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED
+from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
 from minislam.viz import (
     ate_over_time,
     beta_to_rgb,
@@ -64,7 +64,7 @@ def _health(slam: Slam) -> bytes:
     figure = keyframe_health(
         [keyframe.frame_index for keyframe in diagnostics],
         [keyframe.explained for keyframe in diagnostics],
-        MIN_EXPLAINED,
+        MIN_EXPLAINED_LONG,
         [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
         [index for index, _, _ in slam.lost_frames()],
     )

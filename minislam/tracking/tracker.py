@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from enum import Enum
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -33,7 +32,7 @@ from minislam.tracking.optimisation import (
 )
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
-from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, Undo, rejoin
+from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 MAX_CULLED_IN_A_ROW = 2  # keyframes, official code
@@ -57,8 +56,7 @@ class Tracker(Stateful):
                                                                   +---- old view or ---+
                                                                        known place
 
-    A keyframe whose flow contradicts its pose counts as no match. A frame of the warm-up that
-    cannot be matched is lost, too, but the warm-up continues.
+    A frame of the warm-up that cannot be matched is lost, too, but the warm-up continues.
     """
 
     graph: KeyframeGraph
@@ -159,10 +157,8 @@ class Tracker(Stateful):
         self._chain = chain
         self._log_followed(frame, ratio)
         self._last_non_keyframe = (frame, matches)
-        due = needs_keyframe(self.graph, frame, matches, self.initialised)
-        if due and not self._insert(frame, matches):
-            self.tracked.pop()
-            self._handle_loss(frame, ratio)
+        if needs_keyframe(self.graph, frame, matches, self.initialised):
+            self._insert(frame, matches)
 
     def _advance(self, frame: Frame) -> tuple[FlowChain, FlowMatches]:
         """Return the chain extended to this frame, and the flow to it from the newest keyframe."""
@@ -179,32 +175,29 @@ class Tracker(Stateful):
 
     # Keyframes ----------------------------------------------------------------------------------
 
-    def _insert(self, frame: Frame, matches: FlowMatches, may_cull: bool = True) -> bool:
+    def _insert(self, frame: Frame, matches: FlowMatches, may_cull: bool = True) -> None:
         """Make a frame a keyframe, unless it is culled, and adjust the graph around it.
 
-        Its pose comes from its flow, its disparities from its predecessor. Return False, and change
-        nothing, if the adjusted geometry contradicts the flow.
+        Its pose comes from its flow, its disparities from its predecessor.
         """
-        newest, undo = len(self.keyframes) - 1, Undo(self.graph)
+        newest = len(self.keyframes) - 1
         pose, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
         if self.initialised:  # before, initialise() will estimate all poses together
             pose = self.graph.start_pose(matches)
             if may_cull and self._is_culled(frame, pose):
-                return True
+                return
             disparities = self.graph.warp_disparities(newest, pose)
             self._motion.remember(matches, pose)
+        assert self._chain is not None, "there is a chain from the first frame on"
+        self._chain = self._chain.restart()
         self._last_non_keyframe = None
         self.graph.flow_to_next.append(matches)
         self._add_keyframe(frame, self._features(frame), pose, disparities)
         if self.initialised:
             self._motion.inherit(matches)
             local_ba(self.graph)
-            if not self.watch.accepts_newest():
-                undo.remove_newest()
-                return False
+            self.watch.judge_newest()
             self._adjust_all_if_due()
-        self._chain = self._chain and self._chain.restart()
-        return True
 
     def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
         """Tell whether a keyframe is left out, because it would repeat the last one."""
@@ -252,9 +245,13 @@ class Tracker(Stateful):
 
     def _resume(self, frame: Frame, place: Place, features: Tensor) -> bool:
         """Make a relocalised frame a keyframe, or return False if its flow does not match."""
-        add = partial(self._add_keyframe, frame, features)
-        if not rejoin(self.graph, place, add, self.watch.accepts_newest):
+        disparities = self.graph.warp_disparities(place.keyframe_index, place.T_camera_world)
+        self.graph.flow_to_next.append(None)
+        self._add_keyframe(frame, features, place.T_camera_world, disparities)
+        if not attach_newest(self.graph, place.keyframe_index):
+            self.graph.remove_newest()
             return False
+        self.watch.judge_newest()
         self._chain = self.graph.flow.start_chain(frame.image)
         self._last_non_keyframe = None
         self._log_followed(frame, 1.0)

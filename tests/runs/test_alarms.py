@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 from minislam.records import TrackedFrame, TrackingStatus
 from minislam.runs.alarms import Alarms
+from minislam.tracking.safeguards.diagnostics import KeyframeDiagnostics
 
 
 class Said:
@@ -22,37 +23,35 @@ class Said:
         self.texts.append(text)
 
 
-def said(*frames: tuple[TrackingStatus, float]) -> list[str]:
-    """Return the warnings of a run from status and matched ratio of its frames."""
-    tracked: list[TrackedFrame] = []
-    slam = SimpleNamespace(tracker=SimpleNamespace(tracked=tracked))
+def said(statuses: list[TrackingStatus], explained: dict[int, float | None]) -> list[str]:
+    """Return the warnings of a run; `explained` is that of the keyframes, by frame."""
+    tracked, diagnostics = [], []
+    watch = SimpleNamespace(diagnostics=diagnostics)
+    slam = SimpleNamespace(tracker=SimpleNamespace(tracked=tracked, watch=watch))
     observer = Said()
     alarms = Alarms(observer)
     alarms.check(slam)
-    for index, frame in enumerate(frames):
-        tracked.append(TrackedFrame(index, index / 30, *frame))
+    for index, status in enumerate(statuses):
+        tracked.append(TrackedFrame(index, index / 30, status, 0.5))
+        if index in explained:
+            diagnostics.append(KeyframeDiagnostics(index, 0.5, 9.0, explained[index], 0.01))
         alarms.check(slam)
         alarms.check(slam)  # between steps may come more often than frames
     return observer.texts
 
 
-BEGUN, OK = (TrackingStatus.INITIALISING, 1.0), (TrackingStatus.OK, 0.6)
-RECENTLY, LOST = (TrackingStatus.RECENTLY_LOST, 0.02), (TrackingStatus.LOST, 0.0)
-CONTRADICTED = (TrackingStatus.RECENTLY_LOST, 0.5)
+OK, LOST, RECENTLY = TrackingStatus.OK, TrackingStatus.LOST, TrackingStatus.RECENTLY_LOST
 
 
 def test_a_good_run_is_quiet():
-    assert said(BEGUN, OK, OK) == []
+    assert said([TrackingStatus.INITIALISING, OK, OK], {0: None, 1: 0.9, 2: 0.7}) == []
 
 
 def test_a_loss_is_said_once_each_time():
-    texts = said(OK, RECENTLY, LOST, OK, RECENTLY)
-    assert [text.split(",")[0] for text in texts] == [
-        "frame 1: the camera is lost",
-        "frame 4: the camera is lost",
-    ]
+    texts = said([OK, RECENTLY, LOST, OK, RECENTLY], {})
+    assert [text.split(":")[0] for text in texts] == ["frame 1", "frame 4"]
 
 
-def test_the_reason_is_flow_that_is_not_there_or_flow_that_contradicts():
-    assert "too little matches" in said(OK, RECENTLY)[0]
-    assert "no motion explains" in said(OK, CONTRADICTED)[0]
+def test_a_keyframe_that_contradicts_its_flow_is_said_once():
+    (text,) = said([OK] * 4, {1: 0.9, 2: 0.3})
+    assert text.startswith("frame 2: the estimated motion explains only 30%")

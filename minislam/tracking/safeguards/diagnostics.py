@@ -27,10 +27,12 @@ from minislam.tracking.reprojection import (
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
-# Of the matched flow, after the final adjustment [-]; measured: healthy .91 to 1, broken .3 to .83.
-MIN_EXPLAINED = 0.85
-MIN_EXPLAINED_AT_ONCE = 0.5  # the same when a keyframe has just come; healthy .69 to 1
-MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .06, broken .5
+# Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .9 to 1, two in a
+# row on fast real video .57; broken ones .3 to .5, and the worse of many in a row .6 to .84.
+MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
+LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
+MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
+MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .1, broken .5
 HEALED_AFTER = 3  # healthy keyframes that end a break
 
 
@@ -63,13 +65,9 @@ class Watch(Stateful):
         self._graph = graph
         self.diagnostics, self.breaks = [], []
 
-    def accepts_newest(self) -> bool:
-        """Tell whether the newest keyframe does not contradict its flow; add its diagnostics."""
-        newest = diagnose(self._graph, len(self._graph.keyframes) - 1)
-        if is_unexplained(newest):
-            return False
-        self.diagnostics.append(newest)
-        return True
+    def judge_newest(self) -> None:
+        """Add the diagnostics of the newest keyframe."""
+        self.diagnostics.append(diagnose(self._graph, len(self._graph.keyframes) - 1))
 
     def judge_all(self) -> None:
         """Replace the diagnostics of all keyframes by their present ones."""
@@ -152,21 +150,22 @@ def is_unexplained(newest: KeyframeDiagnostics) -> bool:
     return newest.explained is not None and newest.explained < MIN_EXPLAINED_AT_ONCE
 
 
-def is_broken(keyframe: KeyframeDiagnostics) -> bool:
-    """Tell whether a keyframe, after the final adjustment, contradicts those before it."""
-    unexplained = keyframe.explained is not None and keyframe.explained < MIN_EXPLAINED
-    error = keyframe.depth_error
-    return unexplained or (error is not None and error > MAX_DEPTH_ERROR)
-
-
 def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
-    """Return the breaks of a trajectory from the diagnostics after the final adjustment."""
+    """Return the breaks of a trajectory from the diagnostics after the final adjustment.
+
+    One keyframe is a break if it explains very little of its flow or sees other depths than those
+    before it. LONG keyframes in a row need to explain less than they should by a little.
+    """
     found: list[Break] = []
-    last = 0  # broken keyframe
+    last = weak = 0  # broken keyframe; keyframes in a row that explain too little
     for index, keyframe in enumerate(diagnostics):
-        if is_broken(keyframe):
-            goes_on = found and index - last <= HEALED_AFTER
-            first = found.pop().first_frame if goes_on else keyframe.frame_index
+        explained = 1.0 if keyframe.explained is None else keyframe.explained
+        weak = weak + 1 if explained < MIN_EXPLAINED_LONG else 0
+        error = keyframe.depth_error or 0.0
+        if explained < MIN_EXPLAINED or weak >= LONG or error > MAX_DEPTH_ERROR:
+            first = diagnostics[index - LONG + 1 if weak >= LONG else index].frame_index
+            if found and index - last <= HEALED_AFTER:
+                first = found.pop().first_frame
             found.append(Break(first, keyframe.frame_index))
             last = index
     return found

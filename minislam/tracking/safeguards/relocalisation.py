@@ -4,7 +4,6 @@ The keyframes with the most similar features are tried. Keypoints are matched be
 images; the disparities of the keyframe make them 3D points, and PnP with RANSAC gives the pose.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -125,39 +124,6 @@ def _keypoint_matches(
         first[0][[match.queryIdx for match in clear]],
         second[0][[match.trainIdx for match in clear]],
     )
-
-
-class Undo:
-    """Remembers a keyframe graph before a keyframe is added, and removes that keyframe again."""
-
-    def __init__(self, graph: KeyframeGraph) -> None:
-        self._graph, self._before, self._links = graph, graph.state, len(graph.links)
-        self._motion_weights = graph.keyframes.motion_weights[-1].clone()
-
-    def remove_newest(self) -> None:
-        """Remove the newest keyframe with its links; the others are as they were."""
-        graph = self._graph
-        graph.links.remove_newest(len(graph.links) - self._links)
-        graph.remove_newest()
-        graph.keyframes.set_geometry(self._before.T_camera_world, self._before.disparities)
-        graph.keyframes.set_motion_weight(-1, self._motion_weights)
-
-
-def rejoin(
-    graph: KeyframeGraph,
-    place: Place,
-    add: Callable[[Tensor, Tensor], None],  # adds the frame as a keyframe: pose, disparities
-    accepts_newest: Callable[[], bool],
-) -> bool:
-    """Add a relocalised frame to the graph; return False, without a trace, if it does not fit."""
-    undo = Undo(graph)
-    disparities = graph.warp_disparities(place.keyframe_index, place.T_camera_world)
-    graph.flow_to_next.append(None)
-    add(place.T_camera_world, disparities)
-    if attach_newest(graph, place.keyframe_index) and accepts_newest():
-        return True
-    undo.remove_newest()
-    return False
 
 
 def attach_newest(graph: KeyframeGraph, similar: int) -> bool:

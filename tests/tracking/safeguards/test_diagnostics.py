@@ -20,7 +20,12 @@ from minislam.tracking.safeguards.diagnostics import (
 )
 from tests.tracking.wall import true_graph
 
-HEALTHY, UNEXPLAINED, DEEP = (0.97, 0.02), (0.6, 0.02), (0.97, 0.5)  # explained flow, depth error
+HEALTHY, WEAK, UNEXPLAINED, DEEP = (
+    (0.97, 0.02),
+    (0.8, 0.02),
+    (0.4, 0.02),
+    (0.97, 0.5),
+)  # explained flow, depth error
 
 
 def keyframes(*kinds: tuple[float | None, float | None]) -> list[KeyframeDiagnostics]:
@@ -88,6 +93,8 @@ def test_the_weighted_median_splits_the_weight():
         ([HEALTHY, DEEP, HEALTHY, UNEXPLAINED, HEALTHY], [Break(10, 30)]),
         ([UNEXPLAINED, *[HEALTHY] * 4, DEEP], [Break(0, 0), Break(50, 50)]),
         ([HEALTHY, (None, None), HEALTHY], []),
+        ([HEALTHY, WEAK, WEAK, HEALTHY], []),
+        ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),
     ],
 )
 def test_breaks_are_runs_of_broken_keyframes(kinds: list, breaks: list[Break]):
