@@ -35,10 +35,7 @@ from minislam.tracking.safeguards.focal_length import (
 from minislam.tracking.safeguards.structure import agreed_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
-from minislam.uncertainty import (
-    beta_of_mask,
-    tracking_weight,
-)
+from minislam.uncertainty import beta_of_mask, tracking_weight
 
 DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
 

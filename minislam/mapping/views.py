@@ -11,12 +11,7 @@ from minislam.images import resample, shrink_depth, shrink_image
 from minislam.records import Keyframe
 from minislam.splatting import Rendering
 from minislam.state.stateful import FrameOf, Tree
-from minislam.uncertainty import (
-    RenderingError,
-    UncertaintyConfig,
-    beta_of_mask,
-    rendering_error,
-)
+from minislam.uncertainty import RenderingError, UncertaintyConfig, beta_of_mask, rendering_error
 
 # The rendering error of a confirmed cell fades: where it stands still, the map is wrong. [-]
 CONFIRMED_ERROR = 1.5

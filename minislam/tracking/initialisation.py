@@ -28,6 +28,7 @@ from minislam.tracking.safeguards.first_depth import essential_disparities
 from minislam.tracking.safeguards.focal_length import seek_focal_length
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, update_motion_weight
 from minislam.tracking.safeguards.robust import RobustKernel
+from minislam.tracking.safeguards.two_views import pose_with_depth
 
 HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps per width before hypotheses are compared
 
@@ -55,6 +56,7 @@ def chain_state(
     known_disparities: Tensor,  # (K, N), 0 where there is no depth prior
     robust: RobustKernel | None,
     memory_scale: float | None,  # px; None: motion is not remembered
+    prior_strength: float,  # lambda_4 fx^2
 ) -> tuple[BundleState, Tensor]:  # and the motion weights (K, N)
     """Return poses and disparities of K keyframes, each from its predecessor."""
     poses = [torch.eye(4, dtype=torch.float64)]
@@ -66,6 +68,10 @@ def chain_state(
         if index > 0:
             starts.append(se3_interpolate(poses[-2], last, 2.0))
         pose = start_pose(grid, matches, of_last, weights[-1], last, starts, robust)
+        if memory_scale is not None:
+            pair = BundleState(torch.stack([last, pose]), of_last.expand(2, -1))
+            prior = known_disparities[index]
+            pose = pose_with_depth(grid, matches, pair, prior, prior_strength, weights[-1], robust)
         motion = pose @ se3_inverse(last)
         if memory_scale is not None:
             weights[-1] = update_motion_weight(
@@ -116,8 +122,9 @@ def first_geometry(
         graph.grid, keyframes.prior_disparities[0], graph.links.flow_from(0)
     )
     known = keyframes.prior_disparities
+    strength = graph.config.lambda_disparity_prior * graph.grid.camera.fx**2
     hypotheses = [
-        chain_state(graph.grid, flow_to_next, guess, known, graph.robust, memory_scale)
+        chain_state(graph.grid, flow_to_next, guess, known, graph.robust, memory_scale, strength)
         for guess in guesses
     ]
     if memory_scale is not None:  # then there is a depth prior, and with it one hypothesis

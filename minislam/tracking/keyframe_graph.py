@@ -26,6 +26,7 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.pose_from_flow import compose_matches, start_pose, warp_disparities
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
+from minislam.tracking.safeguards.inverse_flow import inverted_targets
 from minislam.tracking.safeguards.robust import RobustKernel
 
 Edge = tuple[int, int]  # keyframe index of source and target
@@ -108,17 +109,18 @@ class KeyframeGraph(Stateful):
         """Tell whether the camera was lost between a keyframe and the one before it."""
         return keyframe > 0 and self.flow_to_next[keyframe - 1] is None
 
-    def start_pose(self, matches: FlowMatches) -> Tensor:  # (4, 4)
+    def start_pose(self, matches: FlowMatches, trust: Tensor) -> Tensor:  # (4, 4)
         """Return T_camera_world of a frame from its flow (E = 1) from the newest keyframe.
 
-        Two starts are tried: the pose of that keyframe, and its last motion repeated from there.
+        Each cell counts as far as it is trusted (N,). Two starts are tried: the pose of that
+        keyframe, and its last motion repeated from there.
         """
         keyframes, newest = self.keyframes, len(self.keyframes) - 1
         last = keyframes.T_camera_world[newest]
         starts = [last]
         if newest > 0 and not self.follows_a_loss(newest):
             starts.append(se3_interpolate(keyframes.T_camera_world[newest - 1], last, 2.0))
-        weights, robust = keyframes.cell_weights[newest], self.robust
+        weights, robust = keyframes.cell_weights[newest] * trust, self.robust
         disparities = keyframes.disparities[newest]
         return start_pose(self.grid, matches, disparities, weights, last, starts, robust)
 
@@ -134,10 +136,10 @@ class KeyframeGraph(Stateful):
         self.links.record(edges, self._flow_from_geometry(edges))
 
     def match_composed(self, target: int) -> None:
-        """Measure the flow from the predecessors of a keyframe, since the last loss.
+        """Measure the flow between a keyframe and its predecessors, since the last loss.
 
-        It starts from the flow between neighbours, composed. No pose is needed, so a wrong pose of
-        the target does no harm.
+        It starts from the flow between neighbours, composed. No pose is needed, so a wrong one does
+        no harm. Without a depth prior disparities may be wrong too: the flow back is measured now.
         """
         edges: list[Edge] = []
         predictions, composed = [], None
@@ -148,6 +150,9 @@ class KeyframeGraph(Stateful):
             composed = compose_matches(matches, composed, self.grid) if composed else matches
             edges.append((source, target))
             predictions.append(composed.targets)
+            if not self.keyframes.has_prior:
+                edges.append((target, source))
+                predictions.append(inverted_targets(composed.targets, self.grid))
         sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
         self.links.record(edges, self.flow.match(sources, targets, torch.cat(predictions)))
 

@@ -11,12 +11,7 @@ from torch import Tensor
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import FAR, both_directions, proximity_pairs
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.optimisation import (
-    FIRST_WIDENING,
-    GLOBAL_ITERATIONS,
-    adjust,
-    bundle_problem,
-)
+from minislam.tracking.optimisation import FIRST_WIDENING, GLOBAL_ITERATIONS, adjust, bundle_problem
 from minislam.tracking.reprojection import lengths
 
 LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code

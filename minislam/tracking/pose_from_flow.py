@@ -98,13 +98,14 @@ def warp_disparities(
 ) -> Tensor:  # (N,) of the target
     """Warp the disparities (N,) of a source to the target.
 
-    A cell to which no point is warped takes the value of the nearest cell that has one.
+    A cell to which no point is warped takes the value of the nearest cell that has one. A cell of
+    disparity zero is not warped.
     """
     warped = splat_disparities(
         T_target_source, disparities, grid.rays, grid.camera, grid.shape, grid.stride
     ).reshape(grid.shape)
     empty = warped.numpy() == 0
     if empty.all():
-        return disparities.median().expand(len(disparities)).clone()
+        return disparities[disparities > 0].median().expand(len(disparities)).clone()
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     return warped[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])].reshape(-1)

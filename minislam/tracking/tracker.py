@@ -24,15 +24,11 @@ from minislam.tracking.initialisation import first_geometry
 from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframe_selection import is_redundant, needs_keyframe
 from minislam.tracking.loop_closure import close_loops
-from minislam.tracking.optimisation import (
-    final_global_ba,
-    local_ba,
-    online_global_ba,
-    warm_up_ba,
-)
+from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
+from minislam.tracking.safeguards.settling import Settling, certainty
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 MAX_CULLED_IN_A_ROW = 2  # keyframes, official code
@@ -62,6 +58,7 @@ class Tracker(Stateful):
     graph: KeyframeGraph
     tracked: list[TrackedFrame]
     watch: Watch
+    _settling: Settling
     mode: Mode = Mode.WAITING
     _last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
     _lost_in_a_row: int = 0  # frames
@@ -94,6 +91,7 @@ class Tracker(Stateful):
         self._predict_static_weight = predict_static_weight
         memory_scale = config.motion_memory * self.graph.pixel_scale
         self._motion = MotionMemory(self.grid, self.keyframes, memory_scale)
+        self._settling = Settling(self.graph)
         self._relocaliser = Relocaliser(self.grid, self.keyframes, self.graph.pixel_scale)
         # From the newest keyframe to the newest frame that could be matched with it.
         self._chain: FlowChain | None = None
@@ -180,13 +178,13 @@ class Tracker(Stateful):
 
         Its pose comes from its flow, its disparities from its predecessor.
         """
-        newest = len(self.keyframes) - 1
         pose, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
         if self.initialised:  # before, initialise() will estimate all poses together
-            pose = self.graph.start_pose(matches)
+            information = self._settling.information()
+            pose = self.graph.start_pose(matches, certainty(information))
             if may_cull and self._is_culled(frame, pose):
                 return
-            disparities = self.graph.warp_disparities(newest, pose)
+            disparities = self._settling.hand_on(information, pose)
             self._motion.remember(matches, pose)
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()

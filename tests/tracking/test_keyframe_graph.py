@@ -25,3 +25,14 @@ def test_distance_to_the_newest_keyframe(moved: float):
     pose = se3_exp(slide) @ graph.keyframes.T_camera_world[-1]
     expected = moved * 60.0 * float(graph.keyframes.disparities[-1].mean())  # fx t d
     assert graph.distance_to_newest(pose) == pytest.approx(expected, rel=0.05, abs=1e-6)
+
+
+@pytest.mark.parametrize("has_prior", [False, True])
+def test_flow_back_from_the_newest_keyframe_is_measured_where_no_prior_gives_its_depth(
+    has_prior: bool,
+):
+    graph = true_graph([0, 1, 2])
+    graph.keyframes.metric_depths[0] = torch.ones(1, 1) if has_prior else None
+    graph.match_composed(2)
+    expected = [(1, 2), (0, 2)] if has_prior else [(1, 2), (2, 1), (0, 2), (2, 0)]
+    assert graph.links.edges() == expected

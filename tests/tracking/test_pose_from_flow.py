@@ -120,3 +120,9 @@ def test_when_nothing_arrives_the_median_stands_in():
     turned[0, 0] = turned[2, 2] = -1.0  # about face
     warped = warp_disparities(GRID, turned, disparities)
     assert (warped == disparities.median()).all()
+
+
+def test_a_cell_of_disparity_zero_is_not_warped():
+    disparities = torch.full((CELLS,), 0.4)
+    disparities[::5] = 0.0
+    assert (warp_disparities(GRID, torch.eye(4).double(), disparities) == 0.4).all()

@@ -21,6 +21,7 @@ MIN_CONFIDENCE = 0.1  # of a match that counts [-]
 # Smoothing factors: the weight falls fast and recovers slowly, since a moving object may pause. [-]
 LOSS_RATE = 0.9
 RECOVERY_RATE = 0.1
+DEPTH_ERROR = 0.1  # of a depth prior, relative: so much of the parallax is no motion [-]
 
 
 class MotionMemory:
@@ -75,7 +76,10 @@ def update_motion_weight(
     motion = T_target_source[None].to(disparities.dtype)
     positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
     squared = (positions[0] - matches.targets[0]).square().sum(0)
-    agreement = (1 + squared / scale**2) ** -2
+    # The flow that depth explains is as wrong as the depth, relatively.
+    turned, _ = reproject(motion, torch.zeros_like(disparities)[None], grid.rays, grid.camera)
+    parallax = (positions[0] - turned[0]).square().sum(0)
+    agreement = (1 + squared / (scale**2 + DEPTH_ERROR**2 * parallax)) ** -2
     rate = torch.where(agreement < weight, LOSS_RATE, RECOVERY_RATE)
     return torch.where(valid[0] & _is_matched(matches), weight.lerp(agreement, rate), weight)
 

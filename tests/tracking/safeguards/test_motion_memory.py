@@ -45,12 +45,26 @@ def test_a_mover_loses_it_at_once_and_regains_it_slowly():
 
 
 def test_the_agreement_halves_where_the_kernel_says():
-    # (1 + r^2 / c^2)^-2 = 1/4 at r = c, and nine tenths of the way are gone at once.
+    # (1 + r^2 / c^2)^-2 = 1/4 at r = c, and nine tenths of the way are gone at once. At infinity
+    # there is no parallax, which would widen c.
     off = torch.tensor([SCALE, 0.0]).expand(CELLS, 2)
-    weight = update_motion_weight(
-        GRID, matches_of(off), DISPARITIES, MOTION, torch.ones(CELLS), SCALE
-    )
+    positions, _ = reproject(MOTION[None].float(), torch.zeros(1, CELLS), GRID.rays, CAMERA)
+    matches = FlowMatches(positions + off.T, torch.ones(1, 2, CELLS), torch.ones(1))
+    far, ones = torch.zeros(CELLS), torch.ones(CELLS)
+    weight = update_motion_weight(GRID, matches, far, MOTION, ones, SCALE)
     torch.testing.assert_close(weight, torch.full((CELLS,), 0.1 + 0.9 / 4), atol=1e-4, rtol=0)
+
+
+def test_an_error_of_depth_is_no_motion_on_a_wide_step():
+    # 20 px of parallax from a depth that is 8 % off: 1.6 px, against a scale of 0.5 px.
+    slide = se3_exp(torch.tensor([20 / (60 * 0.5), 0, 0, 0, 0, 0], dtype=torch.float64))
+    seen, _ = reproject(slide[None].float(), DISPARITIES[None], GRID.rays, CAMERA)
+    matches = FlowMatches(seen, torch.ones(1, 2, CELLS), torch.ones(1))
+    known = DISPARITIES * 1.08
+    weight = update_motion_weight(GRID, matches, known, slide, torch.ones(CELLS), 0.5)
+    assert weight.min() > 0.4
+    still = update_motion_weight(GRID, matches, known, slide, torch.ones(CELLS), 0.05)
+    assert still.min() > 0.3  # the parallax alone decides there
 
 
 def test_cells_without_a_match_keep_what_they_had():

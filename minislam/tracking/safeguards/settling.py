@@ -1,0 +1,87 @@
+"""Settled disparities: those that parallax has measured, of this keyframe or of one before it.
+
+Without a depth prior a new keyframe gets its disparities from its predecessor. Where its view is
+new, they are filled in from the nearest cells. If one of those is an outlier, a whole strip of the
+image is wrong, its residuals are so long that the robust weight takes the cells for outliers for
+ever, and the next keyframe fills a wider strip from it, until the poses follow. Therefore only
+settled cells are handed on, and the pose of a new frame trusts a cell as far as it is settled.
+
+By its edges e a disparity d has the information sum_e w_e |J_e|^2 (its entry of C in Eq. (5); w_e
+with the robust weight, J_e the derivative of the reprojection). So its relative standard deviation
+is 1 / sqrt(I) with I = d^2 sum_e w_e |J_e|^2 [px^2], which is about sum_e w_e parallax_e^2. I does
+not depend on the unit of length, so it can be handed on from keyframe to keyframe.
+"""
+
+import torch
+from torch import Tensor
+
+from minislam.geometry import se3_inverse
+from minislam.state.stateful import Stateful
+from minislam.tracking.bundle_adjustment import residuals
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.pose_from_flow import warp_disparities
+from minislam.tracking.reprojection import relative_transforms, reproject, reproject_with_jacobians
+
+SETTLED = 25.0  # px^2, information of a disparity that is known to a fifth of itself
+# Neighbouring keyframes see much of the same flow, so information is handed on in part. [-]
+HANDED_ON = 0.5
+MOST = 1e6  # px^2, instead of infinite information
+LEAST = 0.05  # weight of a cell whose disparity nothing is known of: it still shows a rotation [-]
+
+
+class Settling(Stateful):
+    """Tells how well the newest keyframe's disparities are settled, and hands them on."""
+
+    handed_on: Tensor  # (N,) px^2, the newest keyframe's information from its predecessor
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        self._graph = graph
+        self.handed_on = torch.zeros(len(graph.grid.rays))
+
+    def information(self) -> Tensor:  # (N,) px^2
+        """Return the information of the newest keyframe's disparities; a prior settles all."""
+        graph, newest = self._graph, len(self._graph.keyframes) - 1
+        if graph.keyframes.has_prior:
+            return torch.full_like(self.handed_on, torch.inf)
+        measured = measured_information(graph, newest)
+        return measured if graph.follows_a_loss(newest) else measured + self.handed_on
+
+    def hand_on(self, information: Tensor, T_camera_world: Tensor) -> Tensor:  # (N,)
+        """Return the disparities of the next keyframe, warped from settled cells of the newest.
+
+        The camera moves on to `T_camera_world` (4, 4). Each cell is handed the information (N,) at
+        the point of the newest keyframe that is seen there. If no cell is settled, all are warped.
+        """
+        grid, keyframes = self._graph.grid, self._graph.keyframes
+        settled = information > SETTLED
+        known = keyframes.disparities[-1] * (settled | ~settled.any())
+        motion = keyframes.T_camera_world[-1] @ se3_inverse(T_camera_world)
+        disparities = warp_disparities(grid, se3_inverse(motion), known)
+        known = HANDED_ON * torch.where(settled, information, 0).clamp_max(MOST)
+        motion = motion[None].to(disparities.dtype)
+        positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
+        there = grid.sample(known[None, :, None], positions.mT)[0, :, 0]
+        seen = valid[0] & grid.camera.contains(positions[0].mT)
+        self.handed_on = torch.where(seen, there, 0)
+        return disparities
+
+
+def certainty(information: Tensor) -> Tensor:  # (N,) px^2 -> (N,) in (0, 1]
+    """Return the weight of cells in a pose estimate: one half where a cell is just settled."""
+    return (1 / (1 + SETTLED / information)).clamp_min(LEAST)
+
+
+def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) px^2
+    """Return the information that the flow of its edges gives to a keyframe's disparities."""
+    disparities = graph.keyframes.disparities[keyframe]
+    positions = [p for p, source in enumerate(graph.links.edges_source) if source == keyframe]
+    if not positions:
+        return torch.zeros_like(disparities)
+    problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
+    _, weights = residuals(problem, graph.state)
+    ends = problem.edges_source, problem.edges_target
+    transforms = relative_transforms(graph.keyframes.T_camera_world, *ends).to(disparities.dtype)
+    repeated = disparities.expand(len(positions), -1)
+    at = reproject_with_jacobians(transforms, repeated, graph.grid.rays, graph.grid.camera)
+    return disparities.square() * (weights * at.J_disparity.square()).sum((0, 1))
