@@ -86,9 +86,11 @@ def run_sequence(
     except KeyboardInterrupt:
         interrupted = True
         if not slam.mapper.keyframes:  # there is no map to write yet
+            _write_trajectories(folder, slam)
             folder.write_run(run_facts(slam, choice, checkpoints, "interrupted", INTERRUPTED_EXIT))
             raise
     except MinislamError as error:
+        _write_trajectories(folder, slam)
         folder.write_run(run_facts(slam, choice, checkpoints, f"failed: {error}", FAILED_EXIT))
         raise
     seconds = checkpoints.run_seconds
@@ -118,10 +120,16 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     return "finished", 0
 
 
+def _write_trajectories(folder: RunFolder, slam: Slam) -> None:
+    """Write the poses, as far as there are any; a run that ends without a map keeps them."""
+    if slam.tracker.initialised:
+        folder.write_trajectory(slam.trajectory())
+        folder.write_keyframe_trajectory(slam.keyframe_trajectory())
+        folder.write_lost_frames(slam.lost_frames())
+
+
 def _write_estimates(folder: RunFolder, slam: Slam) -> None:
-    folder.write_trajectory(slam.trajectory())
-    folder.write_keyframe_trajectory(slam.keyframe_trajectory())
-    folder.write_lost_frames(slam.lost_frames())
+    _write_trajectories(folder, slam)
     arrays = slam.mapper.gaussians.to_arrays()
     arrays.pop("anchor_keyframe")
     folder.write_map(GaussianArrays(**arrays))
