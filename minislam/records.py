@@ -32,7 +32,7 @@ class Keyframe:
     depth: Tensor  # (H, W) float32 world units, 0 where unknown: the mapper's reference D~
     T_camera_world: Tensor  # (4, 4) float64
     moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
-    confirmation: Tensor | None = None  # (H, W) in [0, 1], near 1 where several views agree
+    confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimat
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.stereo.dense_structure import fill_depth
+from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
     check_focal_length,
@@ -36,8 +36,6 @@ from minislam.tracking.safeguards.structure import agreed_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty import beta_of_mask, tracking_weight
-
-DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import (
-    CAMERA,
-    Case,
-    Function,
-    Hints,
-    Verdict,
-    check_function,
-    doubles,
-)
+from minislam.checks.grading import CAMERA, Case, Function, Hints, Verdict, check_function, doubles
 from minislam.geometry import Camera, se3_exp
 from minislam.tracking.reprojection import reproject_with_jacobians, scaled_points
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.images import resample, shrink_depth, shrink_image
+from minislam.images import shrink_depth, shrink_image
 from minislam.records import Keyframe
 from minislam.splatting import Rendering
 from minislam.state.stateful import FrameOf, Tree
@@ -50,9 +50,7 @@ class MappedKeyframe:
             keyframe.depth,
             keyframe.T_camera_world.double(),
             None if keyframe.moving_mask is None else beta_of_mask(keyframe.moving_mask),
-            None
-            if keyframe.confirmation is None
-            else resample(keyframe.confirmation, *keyframe.features.shape[:2]),
+            keyframe.confirmation,
         )
 
     def saved_state(self) -> Tree:

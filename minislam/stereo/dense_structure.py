@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
+from minislam.images import resample
 from minislam.records import Keyframe, Sequence
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
 
+DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
 WIDTH = 160  # px of the images that are swept
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
@@ -45,7 +47,7 @@ def fill_depth(
         replace(
             keyframe,
             depth=torch.where(keyframe.depth > 0, keyframe.depth, depth),
-            confirmation=confirmation,
+            confirmation=resample(confirmation, *keyframe.features.shape[:2]),
         )
         for keyframe, (depth, confirmation) in zip(keyframes, found, strict=True)
     ]

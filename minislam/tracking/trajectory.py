@@ -25,9 +25,8 @@ def pose_all_frames(
     """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
 
     A keyframe keeps its pose. Another frame starts from the interpolated pose and is adjusted on
-    the flow from the keyframes around it, whose disparities are held. If little of the flow
-    supports its pose, it starts again from the frame before it, then from the frame after it. A
-    frame that stays without support is lost.
+    the flow from the keyframes around it, whose disparities are held. A pose that little of the
+    flow supports starts again from its neighbours; a frame that stays without support is lost.
     """
     graph, frames = tracker.graph, tracker.keyframes.frames
     poses = tracker.keyframes.T_camera_world

@@ -5,7 +5,14 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.stereo.dense_structure import Sweeper, dense_depths, full_size, swept_frames
+from minislam.records import Keyframe
+from minislam.stereo.dense_structure import (
+    Sweeper,
+    dense_depths,
+    fill_depth,
+    full_size,
+    swept_frames,
+)
 from minislam.stereo.votes import ConfirmedDepth
 from tests.stereo.clip import KEYFRAMES, SIZE, camera, clip, found, pose, sequence
 
@@ -99,3 +106,29 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
 def test_the_swept_camera_sees_what_the_camera_sees():
     small = Sweeper(sequence(), camera(), {}).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx
+
+
+# Keyframes
+
+
+def test_known_depth_stays_and_confirmation_comes_on_the_grid_of_the_features():
+    known = torch.zeros(SIZE[::-1])
+    known[:60] = 7.0
+    keyframes = [
+        Keyframe(
+            k,
+            index,
+            float(clip().timestamps[index]),
+            torch.from_numpy(clip().rgb[index]),
+            torch.zeros(15, 20, 2),
+            known,
+            torch.from_numpy(pose(index)),
+        )
+        for k, index in enumerate((8, 16))
+    ]
+    poses = {index: torch.from_numpy(pose(index)) for index in range(4, 21)}
+    sparse = [torch.from_numpy(1 / clip().depth[k][::8, ::8].reshape(-1)) for k in (8, 16)]
+    filled = fill_depth(keyframes, sequence(), camera(), poses, sparse)
+    for before, after in zip(keyframes, filled, strict=True):
+        assert torch.equal(after.depth[:60], known[:60]) and float((after.depth[60:] > 0).sum()) > 0
+        assert after.confirmation.shape == (15, 20) and before.confirmation is None

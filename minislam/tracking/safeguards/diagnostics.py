@@ -19,11 +19,7 @@ from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.reprojection import (
-    lengths,
-    relative_transforms,
-    scaled_points,
-)
+from minislam.tracking.reprojection import lengths, relative_transforms, scaled_points
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
