@@ -18,7 +18,7 @@ from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
 
 DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
-WIDTH = 160  # px of the images that are swept
+WIDTH = 160  # px of the images that are swept, at most
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
@@ -97,7 +97,8 @@ class Sweeper:
     """Sweeps single frames. It keeps the small grey images that it has read."""
 
     def __init__(self, sequence: Sequence, camera: Camera, poses: dict[int, Tensor]) -> None:
-        self.camera = camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
+        width = min(WIDTH, camera.width)
+        self.camera = camera.resized(width, max(1, round(width * camera.height / camera.width)))
         self._sequence = sequence
         self._poses = {index: pose.double().numpy() for index, pose in poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)

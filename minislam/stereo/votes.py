@@ -51,6 +51,7 @@ def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> Confirm
     window = (SUPPORT_WINDOW, SUPPORT_WINDOW)
     known &= cv2.blur(known.astype(np.float32), window) >= MIN_SUPPORT
     static = known & (view.cost < CONFIRMING_COST)
+    known &= static.any()  # if nothing matches well, aggregation has only spread a guess
     confirmation = cv2.blur(static.astype(np.float32), window)
     return ConfirmedDepth(np.where(known, view.inverse_depth, 0), confirmation)
 

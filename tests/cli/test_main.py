@@ -148,7 +148,6 @@ INPUTS: list[tuple[Callable[[Path], Path], str]] = [
     (truth_with_nan, r"finite numbers in line 4 of .*groundtruth\.txt"),
     (lambda path: images(path, [texture(0)]), "at least two frames.* found 1 "),
     (lambda path: images(path, [0 * texture(0)] * 8), "at least two frames.* found 8 "),
-    (lambda path: images(path, [picture(k) for k in range(2)]), "too little texture"),
     (lambda path: Path("synth:nothing"), "with NAME one of .*crowd.* found synth:nothing"),
     (lambda path: Path("synth:crowd:-1"), "found synth:crowd:-1"),
 ]
@@ -162,6 +161,12 @@ def test_a_wrong_input_is_one_sentence_and_exit_code_1(make, words: str, tmp_pat
     left = {path.name for path in out.iterdir()} if out.exists() else set()
     assert left <= RUN_FILES  # nothing that looks like a result
     assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_two_smooth_pictures_are_said_to_be_broken(tmp_path: Path, capsys):
+    source = images(tmp_path / "input", [picture(k) for k in range(2)])
+    assert run(source, "-o", tmp_path / "out") == 3
+    assert "the trajectory is broken" in capsys.readouterr().err
 
 
 def test_a_video_that_is_none_is_one_line_on_the_real_stderr(tmp_path: Path):

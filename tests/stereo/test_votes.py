@@ -79,8 +79,15 @@ def test_too_few_votes_are_not_enough():
 
 
 def test_what_matches_badly_is_known_but_confirms_nothing():
-    result = confirmed(view(cost=0.7), others())
-    assert (result.inverse_depth[4:-4, 8:-8] > 0).all() and result.confirmation.max() == 0
+    half = view()
+    half.cost[:, 20:] = 0.7
+    result = confirmed(half, others())
+    assert (result.inverse_depth[4:-4, 8:-8] > 0).all()
+    assert result.confirmation[:, 24:].max() == 0 < result.confirmation[:, 10:16].min()
+
+
+def test_if_nothing_matches_well_nothing_is_known():
+    assert confirmed(view(cost=0.7), others()).inverse_depth.max() == 0
 
 
 def test_where_the_sweep_found_nothing_there_is_no_vote():
