@@ -73,7 +73,8 @@ def test_the_papers_front_end_runs_from_its_checkpoint_files(
         monkeypatch.setattr(network, "__call__", recorded)
     out = tmp_path / "out"
     more = ["--tracking.keyframe_interval", "2", "-o", str(out)]
-    assert main(["run", *CLIP, *located(files, FRONT_END), *more]) == 0
+    # Networks with random weights: the run may rightly say that its trajectory is broken (3).
+    assert main(["run", *CLIP, *located(files, FRONT_END), *more]) in (0, 3)
 
     folder = RunFolder(out)
     facts, metrics = folder.read_run(), folder.read_metrics()
