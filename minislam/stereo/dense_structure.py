@@ -79,7 +79,7 @@ def dense_depths(
     for keyframe in keyframes:
         at = frames.index(keyframe)
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
-        depths.append(full_size(confirm(sweeper.camera, swept[at], others), sequence.camera))
+        depths.append(full_size(confirm(sweeper.camera, swept[at], others), camera))
     return depths
 
 

@@ -18,10 +18,8 @@ from minislam.tracking.optimisation import bundle_problem
 
 STEP = math.log(1.05)  # to either side, where the cost must have risen
 ITERATIONS = 10  # Gauss-Newton steps of each adjustment
-WIDENINGS: tuple[float, ...] = (
-    4.0,
-    1.0,
-)  # of the robust weight: a focal length far off has large residuals [-]
+# Of the robust weight: a focal length far off has large residuals. [-]
+WIDENINGS: tuple[float, ...] = (4.0, 1.0)
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
 # Smallest mean rise of the cost. In six pieces of real video, two seconds each, the cost rose by
