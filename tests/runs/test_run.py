@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from minislam import slam
 from minislam.cli.main import main
 from minislam.data import RunFolder
+from minislam.errors import InputError
 from minislam.tracking import bundle_adjustment
 
 pytestmark = pytest.mark.slow
@@ -38,3 +40,16 @@ def test_a_run_whose_every_adjustment_fails_says_so(root: Path, monkeypatch, cap
     warning = f"{facts['adjustments']} of {facts['adjustments']} bundle adjustments failed"
     assert any(warning in text for text in facts["warnings"])
     assert warning in capsys.readouterr().err and facts["state"] != "finished"
+
+
+def test_a_run_that_ends_without_a_map_keeps_its_trajectory(root: Path, monkeypatch):
+    def no_depth(*arguments: object) -> list:
+        raise InputError("expected some known depth, found none")
+
+    monkeypatch.setattr(slam, "fill_depth", no_depth)
+    out = root / "no_map"
+    assert main([*COMMAND, "-o", str(out)]) == 1
+    folder = RunFolder(out)
+    assert folder.read_run()["state"].startswith("failed: expected some known depth")
+    assert len(folder.read_trajectory()) == folder.read_run()["frames"]
+    assert not (out / "map.ply").exists()
