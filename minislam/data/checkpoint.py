@@ -48,8 +48,8 @@ def write_checkpoint(path: Path | str, tree: Any) -> None:
         np.savez(file, **named)
 
 
-def read_checkpoint(path: Path | str) -> Any:
-    """Return the tree that was written, each tensor on the device it was on."""
+def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
+    """Return the tree that was written; tensors that were on a GPU go to the device `gpu`."""
     content = io.BytesIO(read_bytes(path))
     try:
         with np.load(content, allow_pickle=False) as file:
@@ -68,7 +68,7 @@ def read_checkpoint(path: Path | str) -> Any:
                 return {key: whole(item) for key, item in value.items()}
             name, *layout = value[_TENSOR]
             if name not in tensors:
-                tensors[name] = _strided(arrays[name], *layout)
+                tensors[name] = _strided(arrays[name], gpu, *layout)
             return tensors[name]
 
         return whole(tree)
@@ -87,8 +87,11 @@ def _once(tensor: Tensor) -> Tensor:
     return tensor
 
 
-def _strided(array: np.ndarray, shape: list[int], strides: list[int], device: str) -> Tensor:
+def _strided(
+    array: np.ndarray, gpu: str, shape: list[int], strides: list[int], written_on: str
+) -> Tensor:
     """Restore the strides: they fix the order of summation and thereby the last bits of sums."""
     stored = torch.from_numpy(array)
+    device = "cpu" if written_on == "cpu" else gpu
     tensor = torch.empty_strided(stored.shape, strides, dtype=stored.dtype, device=device)
     return tensor.copy_(stored).expand(shape)

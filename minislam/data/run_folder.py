@@ -125,14 +125,14 @@ class RunFolder:
         """Write the state from which an interrupted run can continue."""
         write_checkpoint(self.path / CHECKPOINT, tree)
 
-    def read_checkpoint(self) -> dict[str, Any]:
-        """Return the state from which an interrupted run can continue."""
+    def read_checkpoint(self, gpu: str = "cpu") -> dict[str, Any]:
+        """Return the state from which an interrupted run can continue, see `read_checkpoint`."""
         if not (self.path / CHECKPOINT).exists():
             raise InputError(
                 f"expected {CHECKPOINT} of an interrupted run in {self.path}, found none; give the "
                 "folder of such a run, or leave out --resume to start anew"
             )
-        return read_checkpoint(self.path / CHECKPOINT)
+        return read_checkpoint(self.path / CHECKPOINT, gpu)
 
     def remove_checkpoint(self) -> None:
         """Remove the checkpoint, which a finished run does not need."""

@@ -39,9 +39,14 @@ class PriorChoice:
     device: str = "cpu"  # where networks run, cpu or cuda; everything else stays on the CPU
 
     def __post_init__(self) -> None:
-        """Refuse a device that is none."""
+        """Refuse a device that is not there."""
         if self.device not in ("cpu", "cuda"):
             raise InputError(f"expected --device cpu or cuda, found {self.device!r}; choose one")
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise InputError(
+                "expected a GPU that this torch can use for --device cuda, found none; say "
+                "--device cpu, or make the priors elsewhere with minislam priors"
+            )
 
 
 def choose_flow(
@@ -124,11 +129,6 @@ def _load(
         raise InputError(
             f"expected --{kind}-weights FILE with --{kind} {name}, found none; give the official "
             "checkpoint, minislam/priors/networks/README.md says where to get it"
-        )
-    if choice.device == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            "expected a GPU that this torch can use for --device cuda, found none; leave it out, "
-            "or make the priors elsewhere with minislam priors"
         )
     return load_network(network, Path(weights).expanduser(), choice.device, networks)
 

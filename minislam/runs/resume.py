@@ -58,9 +58,15 @@ class Checkpoints:
         self.seconds += self._cost
 
     def restore(self, slam: Slam) -> None:
-        """Restore the state in the folder, if it belongs to the same run."""
-        found = self._folder.read_checkpoint()
+        """Restore the state in the folder, if it belongs to the same run.
+
+        What a GPU began may go on without one, no longer to the same bytes.
+        """
+        device = self._origin["priors"]["device"]
+        found = self._folder.read_checkpoint(device)
         then = flattened({name: found.get(name) for name in self._origin})
+        if device == "cpu":
+            then["priors.device"] = "cpu"
         for name, now in flattened(self._origin).items():
             if then.get(name) != now:
                 raise InputError(

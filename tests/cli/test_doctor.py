@@ -50,7 +50,7 @@ def test_what_is_broken_or_foreign_is_said_on_its_line(tmp_path: Path, capsys):
     torch.save({n: t for n, t in fit3d.items() if n != "norm.bias"}, tmp_path / "lacking.pth")
     torch.save({n: t for n, t in trunk.items() if ".10." not in n}, tmp_path / "trunk.pt")
     torch.save({n: t for n, t in heads.items() if "lin4" not in n}, tmp_path / "heads.pt")
-    torch.save({"anything": torch.zeros(2)}, tmp_path / "other.pth")
+    torch.save({"anything": torch.ones(2)}, tmp_path / "other.pth")
     (tmp_path / "notes.txt").write_text("not a checkpoint")
     lines = lines_of(tmp_path, capsys)
     assert set(lines) == {

@@ -167,10 +167,11 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "empty.pth").write_bytes(b"")
     torch.save({n: t for n, t in droid.items() if "convq." not in n}, folder / "lacking.pth")
     torch.save({**fit3d, "norm.weight": torch.zeros(768)}, folder / "other_size.pth")
-    torch.save({**fit3d, "blocks.0.mlp.w12.weight": torch.zeros(1)}, folder / "giant.pth")
+    giant = {**fit3d, "patch_embed.proj.weight": torch.ones(1536, 1)}
+    torch.save(giant, folder / "giant.pth")
     torch.save(
         {f"pretrained.{n}": t for n, t in fit3d.items()}
-        | {"depth_head.scratch.output_conv1.weight": torch.zeros(1)},
+        | {"depth_head.scratch.output_conv1.weight": torch.ones(1)},
         folder / "depth_anything_v2_metric_hypersim_vits.pth",
     )
     return folder
@@ -194,10 +195,10 @@ ERRORS = [
     (["--features", "fit3d", "--features-weights", "droid.pth"], "which looks like DROID-SLAM"),
     (["--features", "dinov2", "--features-weights", "fit3d.pth"], "expected a DINOv2 checkpoint"),
     (["--features", "fit3d", "--features-weights", "other_size.pth"], "do not fit together"),
-    (["--features", "fit3d", "--features-weights", "giant.pth"], "found a ViT-giant"),
+    (["--features", "fit3d", "--features-weights", "giant.pth"], "one of width 1536"),
     (["--depth", "metric3d", "--depth-weights", "fit3d.pth"], "which looks like FiT3D"),
     (["--depth", "depth-anything", "--depth-weights",
-      "depth_anything_v2_metric_hypersim_vits.pth"], "12 or 24 blocks"),
+      "depth_anything_v2_metric_hypersim_vits.pth"], "the tensor depth_head.projects.0.w"),
     (["--features", "files:nowhere"], "expected a folder of features files, found nothing at"),
     (["--lpips-trunk", "fit3d.pth"], "expected --lpips-heads FILE with --lpips-trunk, found none"),
     (["--lpips-trunk", "fit3d.pth", "--lpips-heads", "droid.pth"], "AlexNet or VGG-16 for LPIPS"),

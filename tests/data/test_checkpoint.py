@@ -64,6 +64,19 @@ def test_what_is_one_tensor_stays_one_and_is_stored_once(tmp_path: Path):
     assert 2 * 400_000 < (tmp_path / "checkpoint.npz").stat().st_size < 2 * 400_000 + 5000
 
 
+def test_what_was_written_on_a_gpu_is_read_without_one(tmp_path: Path):
+    path = tmp_path / "checkpoint.npz"
+    values = torch.arange(6.0).reshape(2, 3)
+    write_checkpoint(path, {"values": values.T})
+    with np.load(path) as file:
+        arrays = dict(file)
+    text = arrays["tree.json"].tobytes().replace(b'"cpu"', b'"cuda:0"')
+    np.savez(path, **arrays | {"tree.json": np.frombuffer(text, np.uint8)})
+    again = read_checkpoint(path)["values"]
+    assert again.device.type == "cpu" and torch.equal(again, values.T)
+    assert read_checkpoint(path, "meta")["values"].device.type == "meta"
+
+
 # Errors
 
 

@@ -7,7 +7,9 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 import minislam
 from minislam.cli.main import main
@@ -147,6 +149,28 @@ def test_sequence_input_and_settings_come_from_the_folder(whole: Path, root: Pat
     assert run_until(ctrl_c, TRACKING, 3, "synth:person", out) == 130
     assert main(["run", "-o", str(out), "--resume"]) == 0
     assert_same_results(whole, out)
+
+
+def test_what_a_gpu_began_goes_on_without_one(
+    interrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    out = shutil.copytree(interrupted, tmp_path / "out")
+    tree = read_checkpoint(out / "checkpoint.npz")
+    tree["priors"]["device"] = "cuda"
+    write_checkpoint(out / "checkpoint.npz", tree)
+    with np.load(out / "checkpoint.npz") as file:
+        arrays = dict(file)
+    text = arrays["tree.json"].tobytes().replace(b'"cpu"]', b'"cuda:0"]')
+    np.savez(out / "checkpoint.npz", **arrays | {"tree.json": np.frombuffer(text, np.uint8)})
+    config = (out / "config.json").read_text().replace('"device": "cpu"', '"device": "cuda"')
+    (out / "config.json").write_text(config)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(["run", "-o", str(out), "--resume"]) == 1
+    assert_one_sentence("expected a GPU .* found none; say --device cpu", capsys)
+    again = ("--resume", "--device", "cpu")
+    assert run_until(ctrl_c, TRACKING, 4, "synth:person", out, *again) == 130
+    state = RunFolder(out).read_checkpoint()
+    assert state["priors"]["device"] == "cpu" and state["slam"]["steps"]["_done"] == {TRACKING: 4}
 
 
 def test_a_finished_run_keeps_no_checkpoint(whole: Path, capsys):

@@ -6,8 +6,10 @@ Therefore one run on a tiny image checks a file completely: a missing tensor is 
 tensor that was never read is unexpected.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,8 +17,11 @@ from torch.nn import functional
 
 from minislam.errors import InputError
 
-_CONTAINERS = ("model_state_dict", "state_dict", "model")  # where trainers put the weights
-_DATA_PARALLEL = "module."  # what torch's DistributedDataParallel puts before every name
+# What trainers put the weights into: an entry of the file, or the first part of every name.
+_WRAPPERS = (
+    "model_state_dict", "state_dict", "model", "module", "_orig_mod", "teacher", "net", "model_ema"
+)  # fmt: skip
+_SHOWN = 8  # entries of a file that a message names
 
 
 class Weights:
@@ -83,9 +88,16 @@ class Weights:
         stride: int = 1,
         padding: int | None = None,  # None: what keeps the size of an odd kernel at stride 1
         bias: bool = True,
+        channels: tuple[int, ...] = (),  # of the output, where no later layer notices another width
     ) -> Tensor:
         """Apply a convolution."""
         weight = self[f"{name}.weight"]
+        if channels and len(weight) not in channels:
+            raise InputError(
+                f"expected {' or '.join(map(str, channels))} output channels of "
+                f"{self.prefix}{name}.weight in {self.file}, found {len(weight)}; it is another "
+                "version of the network"
+            )
         padding = weight.shape[-1] // 2 if padding is None else padding
         return functional.conv2d(x, weight, self._bias(name, bias), stride, padding)
 
@@ -124,22 +136,76 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
         raise InputError(f"expected a checkpoint file, found nothing at {path}; check the path")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
+        tensors = _unwrapped(_tensors_in(content))
     except Exception as error:  # a broken file can break the reader anywhere
+        refused = re.search(r"GLOBAL (\S+)", str(error))
+        problem = f"which cannot be read as one ({type(error).__name__}); download it again"
+        if refused:
+            problem = (
+                f"which holds a {refused[1]}, and such a Python object can run code; it is read "
+                "with weights_only=True: if you trust its maker, save its tensors alone to a file"
+            )
         raise InputError(
             f"expected a PyTorch checkpoint of plain tensors, found {path} ({path.stat().st_size} "
-            f"bytes), which cannot be read as one ({type(error).__name__}); download it again"
+            f"bytes), {problem}"
         ) from error
-    for name in _CONTAINERS:
-        if isinstance(content, dict) and isinstance(content.get(name), dict):
-            content = content[name]
-    tensors = content.items() if isinstance(content, dict) else []
-    named = {
-        name.removeprefix(_DATA_PARALLEL): tensor.float()
-        for name, tensor in tensors
-        if isinstance(tensor, Tensor)
-    }
-    if not named:
+    if not tensors:
         raise InputError(
-            f"expected named tensors in {path}, found none; give the file with the weights"
+            f"expected named tensors in {path}, found {_entries(content)}; give the file with the "
+            "weights, or save the dictionary of its tensors alone to a file"
         )
-    return Weights(named, str(path))
+    _require_numbers(tensors, path)
+    return Weights({name: tensor.float() for name, tensor in tensors.items()}, str(path))
+
+
+def _tensors_in(content: Any, prefix: str = "") -> dict[str, Tensor]:
+    """Return the tensors of a file; those of a wrapper in it begin with the wrapper's name."""
+    tensors: dict[str, Tensor] = {}
+    for key, value in content.items() if isinstance(content, dict) else ():
+        if isinstance(value, Tensor):
+            tensors[f"{prefix}{key}"] = value
+        elif key in _WRAPPERS:
+            tensors |= _tensors_in(value, f"{prefix}{key}.")
+    return tensors
+
+
+def _unwrapped(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors inside all wrappers, whatever their order; what is beside goes."""
+    for wrapper in _WRAPPERS:
+        names = [name for name in tensors if name.startswith(f"{wrapper}.")]
+        if names:
+            return _unwrapped({name[len(wrapper) + 1 :]: tensors[name] for name in names})
+    return tensors
+
+
+def _entries(content: Any) -> str:
+    """Say what a file without named tensors holds."""
+    if not isinstance(content, dict):
+        return f"a {type(content).__name__}"
+    entries = [
+        f"{key} ({', '.join(map(str, list(value)[:_SHOWN]))})" if isinstance(value, dict) else key
+        for key, value in content.items()
+    ]
+    return f"the entries {', '.join(map(str, entries[:_SHOWN]))}" if entries else "nothing"
+
+
+def _require_numbers(tensors: dict[str, Tensor], path: Path) -> None:
+    """Refuse tensors that are no trained weights: integers, NaN and infinity, mostly zeros."""
+    zeros = 0
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point() and tensor.ndim:
+            raise InputError(
+                f"expected floating-point numbers in {path}, found {tensor.dtype} in {name}; give "
+                "the official file, not a quantised copy"
+            )
+        if not tensor.isfinite().all():
+            raise InputError(
+                f"expected finite numbers in {path}, found NaN or infinity in {name}; the file is "
+                "damaged or its training failed: download it again"
+            )
+        zeros += not tensor.any()
+    if 2 * zeros > len(tensors):
+        raise InputError(
+            f"expected trained weights in {path}, found {zeros} of {len(tensors)} tensors that are "
+            "zero everywhere; download it again"
+        )

@@ -43,11 +43,6 @@ class DepthAnythingHead:
     def __init__(self, weights: Weights) -> None:
         transformer = VisionTransformer(weights.below("pretrained."), PositionResize.OFFSET)
         self.transformer, self.weights = transformer, weights.below("depth_head.")
-        if transformer.depth not in _TAPS:
-            raise InputError(
-                f"expected a ViT of {' or '.join(map(str, _TAPS))} blocks in {weights.file}, found "
-                f"{transformer.depth}; the file is not complete"
-            )
         self.taps = _TAPS[transformer.depth]
 
     def __call__(
@@ -73,7 +68,7 @@ class DepthAnythingHead:
 
         out = _resize(scratch.conv("output_conv1", fused), image.shape[-2:])
         out = functional.relu(scratch.conv("output_conv2.0", out))
-        return scratch.conv("output_conv2.2", out)[:, 0]
+        return scratch.conv("output_conv2.2", out, channels=(1,))[:, 0]
 
 
 def _fuse(weights: Weights, coarse: Tensor, fine: Tensor | None, size: tuple[int, ...]) -> Tensor:

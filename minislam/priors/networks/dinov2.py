@@ -3,10 +3,13 @@
 FiT3D is DINOv2 made consistent across views; its files come in the layout of the timm library.
 """
 
+from pathlib import Path
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from minislam.errors import InputError
 from minislam.priors.features import grid_size
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
@@ -41,10 +44,17 @@ def position_resize_of(weights: Weights) -> PositionResize:
     """Return how a features checkpoint was trained to resize its positions.
 
     The file does not state it, but the three published kinds differ in what they contain: FiT3D
-    alone lacks the mask token of the training, and DINOv2 has registers or not.
+    alone lacks the mask token of the training, and DINOv2 has registers or not. A file that has
+    lost such a tensor looks like another kind; then its official name tells.
     """
-    antialias = "mask_token" not in weights or "register_tokens" in weights
-    return PositionResize.ANTIALIAS if antialias else PositionResize.OFFSET
+    name = Path(weights.file).name
+    is_fit3d = "mask_token" not in weights
+    has_registers = "register_tokens" in weights or "reg_token" in weights
+    lacks_mask = is_fit3d and ("dinov2_vit" in name or "register_tokens" in weights)
+    if lacks_mask or ("_reg" in name and not has_registers):
+        lost = "mask_token" if lacks_mask else "register tokens"
+        raise InputError(f"expected {lost} in {weights.file}, found none; the file is not complete")
+    return PositionResize.ANTIALIAS if is_fit3d or has_registers else PositionResize.OFFSET
 
 
 def build_dino_features(weights: Weights) -> DinoFeatures:

@@ -18,6 +18,7 @@ from minislam.priors.networks.checkpoints import Weights
 STRIDE = 8  # px per cell, fixed by the three halvings of the encoders
 CHANNELS = 128  # of features, hidden state and context
 LEVELS = 4  # of the correlation pyramid
+_HEAD = (2, 3)  # channels; a third of some checkpoints was of use in the training only
 RADIUS = 3  # cells looked at around the expected position, at every level
 _MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
 
@@ -62,7 +63,7 @@ def _encode(weights: Weights, x: Tensor, normalised: bool) -> Tensor:
             y = norm(part.conv("conv2", y)).relu()
             skip = norm(part.conv("downsample.0", x, stride)) if stride == 2 else x
             x = (skip + y).relu()
-    return weights.conv("conv2", x)
+    return weights.conv("conv2", x, channels=(CHANNELS if normalised else 2 * CHANNELS,))
 
 
 def correlation_pyramid(
@@ -118,9 +119,8 @@ def update(
         _two_convs(weights.below("flow_encoder."), motion).relu(),
     ]
     hidden = _gru(weights.below("gru."), hidden, torch.cat(inputs, 1))
-    # Checkpoints may hold a third output channel, which was of use in the training only.
-    revision = _two_convs(weights.below("delta."), hidden)[:, :2]
-    confidence = _two_convs(weights.below("weight."), hidden)[:, :2].sigmoid()
+    revision = _two_convs(weights.below("delta."), hidden, _HEAD)[:, :2]
+    confidence = _two_convs(weights.below("weight."), hidden, _HEAD)[:, :2].sigmoid()
     return Update(hidden, revision.permute(0, 2, 3, 1), confidence.permute(0, 2, 3, 1))
 
 
@@ -132,8 +132,8 @@ def cell_grid(like: Tensor) -> Tensor:  # (h, w, 2) cells
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
-def _two_convs(weights: Weights, x: Tensor) -> Tensor:
-    return weights.conv("2", weights.conv("0", x).relu())
+def _two_convs(weights: Weights, x: Tensor, channels: tuple[int, ...] = ()) -> Tensor:
+    return weights.conv("2", weights.conv("0", x).relu(), channels=channels)
 
 
 def _gru(weights: Weights, hidden: Tensor, inputs: Tensor) -> Tensor:

@@ -63,20 +63,20 @@ def first_estimate(
     weights: Weights, features: Tensor, depth_confidence: Tensor, normal_confidence: Tensor
 ) -> Tensor:  # (B, 6, h, w)
     """Return the state before refinement: depth is an expectation over logarithmic bins."""
-    logits = _head(weights.below("depth_regressor."), features, layers=2)
+    logits = _head(weights.below("depth_regressor."), features, layers=2, channels=_BINS)
     bins = torch.linspace(math.log(NEAREST), math.log(FARTHEST), _BINS, device=features.device)
     depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
     depth = depth.clamp(NEAREST, FARTHEST)
-    normal = _head(weights.below("normal_predictor."), features, layers=4)
+    normal = _head(weights.below("normal_predictor."), features, layers=4, channels=3)
     oriented = normalised(torch.cat([normal, normal_confidence], 1))
     return torch.cat([(depth - FARTHEST) / _STATE_UNIT, depth_confidence, oriented], 1)
 
 
-def _head(weights: Weights, x: Tensor, layers: int) -> Tensor:
+def _head(weights: Weights, x: Tensor, layers: int, channels: int) -> Tensor:
     """Apply convolutions with ReLUs between them; they are numbered 0, 2, 4, ..."""
-    for k in range(layers):
-        x = weights.conv(f"{2 * k}", x.relu() if k else x)
-    return x
+    for k in range(layers - 1):
+        x = weights.conv(f"{2 * k}", x).relu()
+    return weights.conv(f"{2 * layers - 2}", x, channels=(channels,))
 
 
 def normalised(oriented: Tensor) -> Tensor:
@@ -138,8 +138,8 @@ def _resized(x: Tensor, like: Tensor) -> Tensor:
 
 def _proposed_change(weights: Weights, hidden: Tensor) -> Tensor:
     """Return the change of the state (B, 6, h, w)."""
-    depth = weights.conv("conv2d", weights.conv("conv1d", hidden).relu())
-    normal = weights.conv("conv2n", weights.conv("conv1n", hidden).relu())
+    depth = weights.conv("conv2d", weights.conv("conv1d", hidden).relu(), channels=(2,))
+    normal = weights.conv("conv2n", weights.conv("conv1n", hidden).relu(), channels=(4,))
     return torch.cat([depth, normal], 1)
 
 

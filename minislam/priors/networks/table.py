@@ -5,6 +5,7 @@ To add a network, write its module: a class that is a `FlowEstimator`, a `Featur
 NETWORKS below, and a field to NetworksConfig if it has settings.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +41,9 @@ class Network:
     build: Callable[[Weights, NetworksConfig], Any]  # makes it and runs it on a tiny image
     unneeded: tuple[str, ...] = ()  # parts of names that are stored in its files but not used
     transformer: str | None = None  # prefix of the names of its vision transformer, if it has one
+    is_strict: bool = (
+        True  # its official loader refuses further tensors, and so do we; else we warn
+    )
 
 
 # The first row whose marks are all in a file tells what the file is.
@@ -47,7 +51,8 @@ NETWORKS = (
     Network(
         "flow", "droid", "DROID-SLAM", ("update.gru.convz.weight",),
         lambda weights, config: build_droid(weights, config.droid),
-        unneeded=("update.agg.",),  # damping and upsampling of a bundle adjustment that is not ours
+        # Damping and upsampling of a bundle adjustment that is not ours, and MegaSaM's own.
+        unneeded=("update.agg.", "update.agg_motion."),
     ),
     Network(
         "features", "dinov2", "DINOv2", ("blocks.0.ls1.gamma", "mask_token"),
@@ -66,6 +71,7 @@ NETWORKS = (
         lambda weights, config: build_metric3d(weights, config.metric3d),
         unneeded=("mask_token", "norm3."),  # norm3 is another norm under a second name
         transformer="depth_model.encoder.",
+        is_strict=False,
     ),
     Network(
         "depth", "depth-anything", "Depth Anything V2", ("depth_head.scratch.output_conv1.weight",),
@@ -135,8 +141,11 @@ def build_checked(
         ) from error
     extra = [n for n in weights.unused() if not any(part in n for part in network.unneeded)]
     if extra:
-        raise InputError(
-            f"expected only the tensors of {network.title} in {weights.file}, found "
-            f"{len(extra)} more, such as {extra[0]}; it is another version of the network"
+        found = (
+            f"expected only the tensors of {network.title} in {weights.file}, found {len(extra)} "
+            f"more, such as {extra[0]}"
         )
+        if network.is_strict:
+            raise InputError(f"{found}; it is another version of the network")
+        warnings.warn(f"{found}; they are not used", stacklevel=2)
     return built

@@ -20,6 +20,7 @@ from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights
 
 PATCH = 14  # px
+_BLOCKS = {384: 12, 768: 12, 1024: 24}  # by the width of ViT-S, -B and -L
 _HEAD_WIDTH = 64  # channels per attention head, at every size of the network
 _EPSILON = 1e-6  # of every layer norm of the transformer; torch's default is another
 _TRAINED_GRID = 37  # patches per side of the 518 px images of the training
@@ -55,16 +56,17 @@ class VisionTransformer:
         self.position_resize = position_resize
         # Metric3D stores all blocks in one chunk.
         self._block = "blocks.0.{}." if "blocks.0.0.norm1.weight" in weights else "blocks.{}."
-        self.depth = weights.count(self._block)
-        if self.depth == 0:
+        self.width = weights["patch_embed.proj.weight"].shape[0]
+        if self.width not in _BLOCKS:
             raise InputError(
-                f"expected the blocks of a transformer in {weights.file}, found none; the file is "
-                "not complete"
+                f"expected a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in "
+                f"{weights.file}, found one of width {self.width}; give another size of the network"
             )
-        if f"{self._block.format(0)}mlp.w12.weight" in weights:
+        self.depth = weights.count(self._block)
+        if self.depth != _BLOCKS[self.width]:
             raise InputError(
-                f"expected a ViT-S, -B or -L, found a ViT-giant in {weights.file}; "
-                "give the small or the large checkpoint"
+                f"expected {_BLOCKS[self.width]} blocks of a ViT of width {self.width} in "
+                f"{weights.file}, found {self.depth} in a row; the file is not complete"
             )
         class_token, positions = weights["cls_token"], weights["pos_embed"]
         if positions.shape[1] == _TRAINED_GRID**2 + 1:
@@ -79,7 +81,6 @@ class VisionTransformer:
         leading += [weights[n] for n in ("register_tokens", "reg_token") if n in weights]
         self._leading = torch.cat(leading, 1)
         self._positions = positions.unflatten(1, (_TRAINED_GRID, _TRAINED_GRID)).movedim(-1, 1)
-        self.width = positions.shape[-1]
 
     def __call__(
         self,

@@ -1,7 +1,9 @@
 """Checkpoint files: official containers are read, everything else is refused in one sentence."""
 
+import argparse
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -32,9 +34,17 @@ def test_the_rule_of_the_rebuilt_weights_gives_the_published_values():
         lambda t: t,
         lambda t: {"model_state_dict": t, "optimizer": {}, "epoch": 3},
         lambda t: {"state_dict": {f"module.{n}": v for n, v in t.items()}},
+        lambda t: {f"_orig_mod.{n}": v for n, v in t.items()},
+        lambda t: {f"module._orig_mod.{n}": v for n, v in t.items()},
+        lambda t: {f"model.{n}": v for n, v in t.items()} | {"loss.weight": torch.ones(2)},
+        lambda t: {"model": {"state_dict": {f"_orig_mod.module.{n}": v for n, v in t.items()}}},
+        lambda t: {"state_dict": {"model": t}, "epoch": torch.tensor(3)},
+        lambda t: {"teacher": t, "student": {n: v + 1 for n, v in t.items()}},
+        lambda t: {"net": t},
+        lambda t: {"model_ema": {n: v.double() for n, v in t.items()}},
     ],
 )
-def test_flat_wrapped_and_data_parallel_files_are_the_same(tmp_path: Path, tensors, wrap):
+def test_containers_and_prefixes_in_any_order_are_the_same_file(tmp_path: Path, tensors, wrap):
     weights = load_checkpoint(write(tmp_path / "w.pth", wrap(tensors)))
     assert sorted(weights) == sorted(tensors)
     assert torch.equal(weights["norm.weight"], tensors["norm.weight"])
@@ -69,19 +79,62 @@ def test_a_missing_file_is_refused(tmp_path: Path):
         load_checkpoint(tmp_path / "none.pth")
 
 
-def test_files_that_are_no_checkpoints_are_refused_and_never_executed(tmp_path: Path, tensors):
+def test_files_that_are_no_checkpoints_are_refused(tmp_path: Path, tensors):
     (tmp_path / "text.pth").write_text("hello")
     (tmp_path / "empty.pth").write_bytes(b"")
     whole = write(tmp_path / "whole.pth", tensors).read_bytes()
     (tmp_path / "truncated.pth").write_bytes(whole[: len(whole) // 2])
-    write(tmp_path / "hostile.pth", Hostile())
-    for name in ("text", "empty", "truncated", "hostile"):
+    circle: dict = {}
+    circle["model"] = circle
+    write(tmp_path / "circle.pth", circle)
+    for name in ("text", "empty", "truncated", "circle"):
         with pytest.raises(InputError, match=rf"{name}\.pth .*cannot be read") as caught:
             load_checkpoint(tmp_path / f"{name}.pth")
         assert "\n" not in str(caught.value)
 
 
-def test_a_file_without_tensors_is_refused(tmp_path: Path):
-    for content in ({}, {"epoch": 3}, [1, 2], torch.zeros(3)):
-        with pytest.raises(InputError, match="named tensors"):
+@pytest.mark.parametrize("legacy", [False, True])
+def test_objects_in_a_file_are_named_and_never_executed(tmp_path: Path, tensors, legacy: bool):
+    contents = {
+        "run_code": Hostile(),
+        "torch.nn.modules.linear.Linear": torch.nn.Linear(1, 1),
+        "argparse.Namespace": {"model": tensors, "args": argparse.Namespace(epochs=3)},
+        "scalar": {"model": tensors, "best": np.float64(0.5)},
+    }
+    for name, content in contents.items():
+        torch.save(content, tmp_path / "w.pth", _use_new_zipfile_serialization=not legacy)
+        with pytest.raises(
+            InputError, match=rf"which holds a .*{name}, .* weights_only=True"
+        ) as it:
+            load_checkpoint(tmp_path / "w.pth")
+        assert "\n" not in str(it.value) and "download" not in str(it.value)
+
+
+def test_a_file_without_tensors_says_what_it_holds(tmp_path: Path):
+    contents = {
+        "nothing": {},
+        "the entries epoch": {"epoch": 3},
+        "a list": [1, 2],
+        "a Tensor": torch.zeros(3),
+        r"the entries weights \(a\.x, b\.y\), epoch": {
+            "weights": {"a.x": torch.ones(1), "b.y": torch.ones(1)},
+            "epoch": 3,
+        },
+    }
+    for found, content in contents.items():
+        with pytest.raises(InputError, match=f"named tensors in .*, found {found}; give"):
             load_checkpoint(write(tmp_path / "w.pth", content))
+
+
+@pytest.mark.parametrize(
+    ("damage", "found"),
+    [
+        (lambda t: t | {"norm.bias": t["norm.bias"] / 0 * 0}, "NaN or infinity in norm.bias"),
+        (lambda t: t | {"norm.bias": t["norm.bias"] / 0}, "NaN or infinity in norm.bias"),
+        (lambda t: {n: v * 0 for n, v in t.items()}, "175 of 175 tensors that are zero"),
+        (lambda t: {n: (99 * v).to(torch.int8) for n, v in t.items()}, "torch.int8 in cls_token"),
+    ],
+)
+def test_numbers_that_are_no_trained_weights_are_refused(tmp_path: Path, tensors, damage, found):
+    with pytest.raises(InputError, match=found):
+        load_checkpoint(write(tmp_path / "w.pth", damage(tensors)))

@@ -108,15 +108,15 @@ def test_an_odd_size_is_refused():
 
 
 def test_a_size_of_the_network_that_does_not_exist_is_refused():
+    encoder = "depth_model.encoder."
     tensors = {
-        "depth_model.decoder.token2feature.read_0.readoper.project_patch.weight": torch.zeros(1),
-        "depth_model.encoder.patch_embed.proj.weight": torch.zeros(768, 3, 14, 14),
-        "depth_model.encoder.cls_token": torch.zeros(1, 1, 768),
-        "depth_model.encoder.pos_embed": torch.zeros(1, 1370, 768),
-        "depth_model.encoder.blocks.0.0.norm1.weight": torch.zeros(768),
+        f"{encoder}patch_embed.proj.weight": torch.zeros(768, 3, 14, 14),
+        f"{encoder}cls_token": torch.zeros(1, 1, 768),
+        f"{encoder}pos_embed": torch.zeros(1, 1370, 768),
     }
-    with pytest.raises(InputError, match=r"ViT of width 384 or 1024, found 768 in b\.pth"):
+    with pytest.raises(InputError, match=r"12 blocks of a ViT of width 768 in b\.pth, found 0"):
         Metric3DDepth(Weights(tensors, "b.pth"))
-    del tensors["depth_model.encoder.blocks.0.0.norm1.weight"]
-    with pytest.raises(InputError, match=r"the blocks of a transformer in b\.pth, found none"):
+    for block in range(12):
+        tensors[f"{encoder}blocks.0.{block}.norm1.weight"] = torch.zeros(768)
+    with pytest.raises(InputError, match=r"ViT of width 384 or 1024, found 768 in b\.pth"):
         Metric3DDepth(Weights(tensors, "b.pth"))
