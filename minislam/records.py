@@ -118,5 +118,8 @@ class Sequence(Protocol):
     def frame(self, frame_index: int) -> Frame:
         """Return one frame again."""
 
+    def given_mask(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) bool, True where something moves; None if no masks are given."""
+
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) [m], 0 where unknown; None without a sensor."""

@@ -214,15 +214,14 @@ class Slam(Stateful):
         return self.mapper.predict_beta(self._features(frame) if features is None else features)
 
     def _given_mask(self, frame_index: int) -> Tensor | None:
-        """Return the sequence's mask of dynamic objects (H, W), if given masks are used."""
+        """Return the mask of dynamic objects (H, W), if given masks are used."""
         if not self.config.uncertainty.given_masks:
             return None
-        truth = self.sequence.ground_truth
-        mask = None if truth is None else truth.moving_mask(frame_index)
+        mask = self.sequence.given_mask(frame_index)
         if mask is None:
             raise InputError(
-                f"expected a mask of movers for every frame of {self.sequence.name}, found none "
-                f"for frame {frame_index}; set uncertainty.given_masks to false"
+                f"expected a mask of movers for every frame of {self.sequence.name}, found none for"
+                f" {frame_index}; give --masks files:FOLDER, or set uncertainty.given_masks to off"
             )
         return torch.from_numpy(mask)
 

@@ -117,7 +117,7 @@ def test_only_the_poses_between_the_keyframes_are_refined(sequence: Sequence, us
 
 
 def test_masks_are_asked_of_a_sequence_that_has_them(sequence: Sequence, monkeypatch):
-    monkeypatch.setattr(sequence.ground_truth, "moving_mask", lambda frame_index: None)
+    monkeypatch.setattr(sequence, "given_mask", lambda frame_index: None)
     config = with_settings(SlamConfig(), SHORT | ABLATIONS["given masks instead of beta (c)"])
     with pytest.raises(InputError, match=r"a mask of movers for every frame of .*found none"):
         finished(sequence, config)

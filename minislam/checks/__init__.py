@@ -2,7 +2,9 @@
 
 A check calls the function with a few inputs, compares the answers with the package, and returns a
 sentence that names the first wrong number. It never raises, so that a notebook with open exercises
-still runs from top to bottom.
+still runs from top to bottom. Three more are for authors of priors: `check_depth_prior`,
+`check_feature_extractor` and `check_flow_estimator` raise InputError where an object is not what
+its interface asks for.
 """
 
 from minislam.checks.bundle_adjustment import check_schur_step, check_target_jacobian
@@ -20,6 +22,11 @@ from minislam.checks.start_here import check_mapping_weight
 from minislam.checks.stereo import check_plane_homography
 from minislam.checks.tracking import check_flow_distance, check_suppressed
 from minislam.checks.uncertainty import check_best_beta, check_feature_variance
+from minislam.priors.conformance import (
+    check_depth_prior,
+    check_feature_extractor,
+    check_flow_estimator,
+)
 
 __all__ = [
     "NOT_YET",
@@ -31,8 +38,11 @@ __all__ = [
     "check_best_beta",
     "check_conic_vjp",
     "check_deformed_means",
+    "check_depth_prior",
+    "check_feature_extractor",
     "check_feature_variance",
     "check_flow_distance",
+    "check_flow_estimator",
     "check_function",
     "check_mapping_weight",
     "check_pixel_color",

@@ -62,20 +62,11 @@ def _print_installation() -> int:
 
 def _self_test() -> float:
     """Return the error of the flow between an image and the same image shifted [px]."""
-    import torch
-
+    from minislam.priors.conformance import flow_error, shifted_images
     from minislam.priors.flow import ClassicalFlow
 
-    source = torch.Generator().manual_seed(0)
-    coarse = torch.rand(1, 3, 32, 42, generator=source)
-    smooth = torch.nn.functional.interpolate(coarse, scale_factor=8, mode="bicubic")
-    image = smooth[0].permute(1, 2, 0).clamp(0, 1)
-    _, matches = ClassicalFlow().start_chain(image[:240, :320]).advance(image[4:244, 8:328])
-    rows, columns = 240 // 8, 320 // 8
-    v, u = torch.meshgrid(8 * torch.arange(rows), 8 * torch.arange(columns), indexing="ij")
-    flow = matches.targets[0].reshape(2, rows, columns) - torch.stack([u, v])
-    middle = flow[:, 8:-8, 8:-8].flatten(1).median(1).values
-    return float((middle - torch.tensor([-8.0, -4.0])).norm())
+    flow, (first, second) = ClassicalFlow(), shifted_images()
+    return flow_error(flow.start_chain(first).advance(second)[1], flow.stride)
 
 
 def _print_checkpoints(folder: Path) -> int:

@@ -48,13 +48,14 @@ def add_priors(parser: argparse.ArgumentParser, default_depth: str) -> None:
         "to get them",
     )
     group.add_argument(
-        "--features", help="classical, dinov2, fit3d or files:FOLDER; default classical"
+        "--features",
+        help="classical, dinov2, fit3d, files:FOLDER or python:MODULE:FUNCTION; default classical",
     )
     group.add_argument("--features-weights", metavar="FILE", help="checkpoint of dinov2 or fit3d")
     group.add_argument(
         "--depth",
-        help="none, simulated (synthetic sequences), sensor, metric3d, depth-anything or "
-        f"files:FOLDER; default {default_depth}",
+        help="none, simulated (synthetic sequences), sensor, metric3d, depth-anything, "
+        f"files:FOLDER or python:MODULE:FUNCTION; default {default_depth}",
     )
     group.add_argument(
         "--depth-weights", metavar="FILE", help="checkpoint of metric3d or depth-anything"
@@ -65,7 +66,7 @@ def add_priors(parser: argparse.ArgumentParser, default_depth: str) -> None:
 def add_flow(parser: argparse.ArgumentParser) -> None:
     """Add the options of the flow, which only a run needs."""
     group = parser.add_argument_group("flow")
-    group.add_argument("--flow", help="classical or droid; default classical")
+    group.add_argument("--flow", help="classical, droid or python:MODULE:FUNCTION; classical")
     group.add_argument("--flow-weights", metavar="FILE", help="checkpoint of droid")
 
 
@@ -233,4 +234,6 @@ def _with_given(args: argparse.Namespace, base: SlamConfig) -> SlamConfig:
         given["seed"] = args.seed
     if args.no_uncertainty:
         given["uncertainty.enabled"] = False
+    if getattr(args, "masks", None):
+        given.setdefault("uncertainty.given_masks", True)
     return with_settings(base, given)

@@ -43,7 +43,13 @@ def read_color(path: Path) -> np.ndarray:  # (H, W, 3) uint8 RGB
 
 def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
     """Read a black and white picture: white is True."""
-    return _decode(path, cv2.IMREAD_GRAYSCALE) > 127
+    gray = _decode(path, cv2.IMREAD_GRAYSCALE)
+    if 0 < gray.max() <= 127:
+        raise InputError(
+            f"expected a mask of 0 and 255, found {gray.max()} as the largest value in {path}; "
+            "write 255 where something moves, not its number"
+        )
+    return gray > 127
 
 
 def read_depth(path: Path, units_per_metre: float) -> np.ndarray:  # (H, W) float32 metre

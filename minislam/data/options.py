@@ -33,6 +33,11 @@ class InputOptions:
         "fixed: the focal length as given, noted or guessed; refine: estimated from the motion, "
         "starting there; auto: refine if no calibration and no --fx is given, else fixed",
     )
+    masks: str | None = parameter(
+        None,
+        "files:FOLDER of PNG masks, 255 on what moves, named like the images or by number "
+        "(00017.png); used instead of the learnt uncertainty",
+    )
     depth_scale: float = parameter(
         5000.0, "units of a depth image per metre, TUM RGB-D benchmark [1/m]"
     )

@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from minislam.data.calibration import Calibration
-from minislam.data.images import read_color, read_mask
+from minislam.data.images import list_images, read_color, read_mask
 from minislam.data.preparation import ImagePreparation
-from minislam.data.sources import ImageSource
+from minislam.data.sources import FileImages, ImageSource
+from minislam.errors import InputError
 from minislam.records import Trajectory
+
+FILES = "files:"  # before the name of a folder
 
 
 @dataclass(frozen=True)
@@ -79,3 +82,25 @@ class RecordedTruth:
         """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
         views = self._recording.novel_views
         return [(pose, self._prepare.color(read_color(path), str(path))) for pose, path in views]
+
+
+def mask_files(images: ImageSource, masks: str, chosen: range) -> list[Path | None]:
+    """Return the mask of each image in files:FOLDER: of the image's name, or of its number."""
+    folder = Path(masks.removeprefix(FILES)).expanduser()
+    if not masks.startswith(FILES) or not folder.is_dir():
+        raise InputError(
+            f"expected --masks {FILES}FOLDER with a folder that exists, found {masks}; check it"
+        )
+    files = {path.stem: path for path in list_images(folder)}
+    numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
+    found = [numbered.get(index) for index in range(len(images))]
+    if isinstance(images, FileImages) and any(path.stem in files for path in images.paths):
+        found = [files.get(path.stem) for path in images.paths]
+    missing = [images.label(index) for index in chosen if found[index] is None]
+    if missing:
+        raise InputError(
+            f"expected a mask of every frame in {folder}, found none for {len(missing)} of "
+            f"{len(chosen)}, such as {missing[0]}; name them like the images or by number from 0, "
+            "and make a black one where nothing moves"
+        )
+    return found

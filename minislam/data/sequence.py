@@ -9,10 +9,10 @@ import torch
 
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.folder import read_image_folder, read_video
-from minislam.data.images import read_depth
+from minislam.data.images import read_depth, read_mask
 from minislam.data.options import InputOptions
 from minislam.data.preparation import ImagePreparation
-from minislam.data.recording import RecordedTruth, Recording, path_of
+from minislam.data.recording import RecordedTruth, Recording, mask_files, path_of
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.records import Frame, GroundTruth
@@ -61,6 +61,9 @@ class RecordedSequence:
                 f"expected frames from number {options.start} on, but {recording.name} has "
                 f"{len(recording.images)}; choose a smaller start"
             )
+        self._masks = recording.mask_paths
+        if options.masks is not None:
+            self._masks = mask_files(recording.images, options.masks, self._chosen)
         height, width = recording.images.read(self._chosen[0]).shape[:2]
         calibration = _calibration(recording, options, width, height)
         raw_camera = calibration.camera_for(width, height)
@@ -82,6 +85,8 @@ class RecordedSequence:
         size = f"{width}x{height} -> {self.camera.width}x{self.camera.height} px"
         counts = f"{len(self)} of {len(recording.images)} images"
         parts = [counts, *recording.notes, size, calibration.origin]
+        if options.masks is not None:
+            parts.append(f"masks from {options.masks}")
         if self.refines_focal:
             parts.append("focal length to be refined")
         self.description = f"{recording.kind}: {', '.join(parts)}"
@@ -110,6 +115,11 @@ class RecordedSequence:
         if not 0 <= frame_index < len(self):
             raise IndexError(f"frame {frame_index} of a sequence of {len(self)}")
         return self._chosen[frame_index]
+
+    def given_mask(self, frame_index: int) -> np.ndarray | None:
+        """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
+        path = path_of(self._masks, self.source_index(frame_index))
+        return None if path is None else self._prepare.nearest(read_mask(path), str(path))
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""

@@ -21,6 +21,7 @@ from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.priors.networks.table import NETWORKS, NetworksConfig, find_network, load_network
+from minislam.priors.plugins import PYTHON, load_plugin, plugin_names
 from minislam.records import Sequence
 
 FILES = "files:"  # before the name of a folder
@@ -52,10 +53,10 @@ class PriorChoice:
 def choose_flow(
     choice: PriorChoice, classical: ClassicalFlowConfig, networks: NetworksConfig
 ) -> FlowEstimator:
-    """Return the flow: classical, or a network."""
-    network = _load(choice, "flow", choice.flow, choice.flow_weights, networks)
-    if network is not None:
-        return network
+    """Return the flow: classical, a network, or a plugin."""
+    learned = _load(choice, "flow", choice.flow, choice.flow_weights, networks)
+    if learned is not None:
+        return learned
     if choice.flow == "classical":
         return ClassicalFlow(classical)
     raise _unknown("flow", choice.flow, ["classical", *_names("flow")])
@@ -67,11 +68,11 @@ def choose_features(
     classical: ClassicalFeaturesConfig,
     networks: NetworksConfig,
 ) -> FeatureExtractor:
-    """Return the features: classical, a network, or files:FOLDER."""
+    """Return the features: classical, a network, a plugin, or files:FOLDER."""
     name = choice.features
-    network = _load(choice, "features", name, choice.features_weights, networks)
-    if network is not None:
-        return network
+    learned = _load(choice, "features", name, choice.features_weights, networks)
+    if learned is not None:
+        return learned
     if name == "classical":
         return ClassicalFeatures(classical)
     if name.startswith(FILES):
@@ -86,11 +87,11 @@ def choose_depth(
     simulated: SimulatedDepthConfig,
     networks: NetworksConfig,
 ) -> DepthPrior:
-    """Return the depth: none, simulated, sensor, a network, or files:FOLDER."""
+    """Return the depth: none, simulated, sensor, a network, a plugin, or files:FOLDER."""
     name = choice.depth
-    network = _load(choice, "depth", name, choice.depth_weights, networks)
-    if network is not None:
-        return network
+    learned = _load(choice, "depth", name, choice.depth_weights, networks)
+    if learned is not None:
+        return learned
     if name == "none":
         return NoDepth()
     if name == "simulated":
@@ -116,15 +117,16 @@ def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig
 def _load(
     choice: PriorChoice, kind: str, name: str, weights: str | None, networks: NetworksConfig
 ) -> Any:
-    """Return the network of that name, None if it names none; refuse a name or file alone."""
+    """Return the network or plugin of that name, None if it names none; refuse a file alone."""
     network = find_network(kind, name)
-    if network is None and weights is not None:
-        raise InputError(
-            f"expected --{kind} {' or '.join(_names(kind))} with --{kind}-weights, found --{kind} "
-            f"{name}; name the network of {weights}"
-        )
     if network is None:
-        return None
+        plugin = load_plugin(kind, name, choice.device, weights)
+        if plugin is None and weights is not None:
+            raise InputError(
+                f"expected --{kind} {' or '.join(_names(kind))} with --{kind}-weights, found "
+                f"--{kind} {name}; name the network of {weights}"
+            )
+        return plugin
     if weights is None:
         raise InputError(
             f"expected --{kind}-weights FILE with --{kind} {name}, found none; give the official "
@@ -134,8 +136,10 @@ def _load(
 
 
 def _unknown(kind: str, name: str, known: list[str]) -> InputError:
-    names = f"{', '.join(known[:-1])} or {known[-1]}"
-    return InputError(f"expected --{kind} {names}, found {name!r}; choose one")
+    names = ", ".join([*known, *plugin_names(kind)])
+    return InputError(
+        f"expected --{kind} {names} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
+    )
 
 
 def _names(kind: str) -> list[str]:

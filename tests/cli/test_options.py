@@ -100,3 +100,10 @@ def test_a_wrong_value_in_the_file_is_named(part: str, value: object, tmp_path: 
     with pytest.raises(InputError, match=f"expected {part} in .*a.json to hold some of"):
         input_options(args)
         prior_choice(args, "none")
+
+
+def test_masks_from_files_are_used_unless_that_is_switched_off():
+    assert settings(parse("a", "--masks", "files:m")).uncertainty.given_masks
+    assert input_options(parse("a", "--masks", "files:m")).masks == "files:m"
+    off = parse("a", "--masks", "files:m", "--uncertainty.given_masks", "off")
+    assert not settings(off).uncertainty.given_masks and settings(parse("a")) == SlamConfig()

@@ -3,11 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from minislam.data import InputOptions, open_sequence
+from minislam.data import InputOptions, RecordedSequence, open_sequence
+from minislam.data.images import encode_png
 from minislam.data.recording import path_of
 from minislam.data.tum import read_tum_folder
-from tests.recordings import picture, tum_folder
+from minislam.errors import InputError
+from tests.recordings import picture, tum_folder, video
 
 # Known answers
 
@@ -45,3 +48,85 @@ def test_an_image_without_a_file_has_none():
     assert path_of([], 3) is None
     assert path_of([None, Path("1.png")], 0) is None
     assert path_of([None, Path("1.png")], 1) == Path("1.png")
+
+
+# Masks from files
+
+
+def photos(folder: Path, *names: str) -> str:
+    folder.mkdir()
+    for number, name in enumerate(names):
+        (folder / f"{name}.png").write_bytes(encode_png(picture(number)))
+    return str(folder)
+
+
+def masks(folder: Path, *names: str, value: int = 255) -> str:
+    """Write masks of which the k-th covers the first k + 1 columns."""
+    folder.mkdir()
+    for number, name in enumerate(names):
+        mask = np.zeros(picture(0).shape[:2], np.uint8)
+        mask[:, : number + 1] = value
+        (folder / f"{name}.png").write_bytes(encode_png(mask))
+    return f"files:{folder}"
+
+
+def columns(sequence: RecordedSequence) -> list[int]:
+    return [int(sequence.given_mask(k).all(0).sum()) for k in range(len(sequence))]
+
+
+def test_masks_are_found_by_the_names_of_the_images_or_by_their_numbers(tmp_path: Path):
+    source = photos(tmp_path / "photos", "b10", "b9", "b11")  # in natural order b9, b10, b11
+    named = masks(tmp_path / "named", "b9", "b10", "b11", "other")
+    sequence = open_sequence(source, InputOptions(masks=named))
+    assert columns(sequence) == [1, 2, 3] and sequence.ground_truth is None
+    assert f"masks from {named}" in sequence.description
+    numbered = masks(tmp_path / "numbered", "00000", "00001", "2")
+    assert columns(open_sequence(source, InputOptions(masks=numbered))) == [1, 2, 3]
+    later = InputOptions(masks=numbered, start=1, stride=1)
+    assert columns(open_sequence(source, later)) == [2, 3]  # the number is that in the source
+    # Names win: these numbers are names.
+    source = photos(tmp_path / "stamps", "2", "3", "4")
+    stamps = masks(tmp_path / "of_stamps", "0", "1", "2", "3", "4")
+    assert columns(open_sequence(source, InputOptions(masks=stamps))) == [3, 4, 5]
+
+
+def test_masks_of_files_come_before_those_of_the_recording_and_are_no_truth(tmp_path: Path):
+    folder = tum_folder(tmp_path)
+    given = masks(tmp_path / "given", *(p.stem for p in sorted((folder / "rgb").iterdir())))
+    sequence = open_sequence(str(folder), InputOptions(masks=given))
+    assert columns(sequence)[:2] == [1, 2]
+    assert sequence.ground_truth.moving_mask(1)[:, :24].all()
+    without = open_sequence(str(folder), InputOptions())
+    assert (without.given_mask(1) == without.ground_truth.moving_mask(1)).all()
+
+
+def test_masks_of_a_video_are_found_by_number(tmp_path: Path):
+    walk = video(tmp_path / "walk.mp4", 4, (48, 32))
+    given = masks(tmp_path / "given", "0000", "0001", "0002", "0003")
+    sequence = open_sequence(str(walk), InputOptions(masks=given, start=1, stride=2))
+    assert columns(sequence) == [2, 4]
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (lambda folder: str(folder), "expected --masks files:FOLDER with a folder that exists"),
+        (lambda folder: f"files:{folder}/none", "a folder that exists, found files:.*none"),
+        (lambda folder: masks(folder / "few", "a"), r"found none for 2 of 3, such as .*b\.png"),
+        (lambda folder: masks(folder / "no"), "found none for 3 of 3"),
+        (lambda folder: masks(folder / "one", "a", "b", "c", value=1),
+         r"a mask of 0 and 255, found 1 as the largest value in .*a\.png"),
+    ],
+)  # fmt: skip
+def test_wrong_masks_are_one_sentence(given, sentence: str, tmp_path: Path):
+    source = photos(tmp_path / "photos", "a", "b", "c")
+    with pytest.raises(InputError, match=sentence):
+        open_sequence(source, InputOptions(masks=given(tmp_path))).given_mask(0)
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path: Path):
+    source = photos(tmp_path / "photos", "a")
+    given = masks(tmp_path / "given", "a")
+    (tmp_path / "given/a.png").write_bytes(encode_png(np.zeros((9, 9), np.uint8)))
+    with pytest.raises(InputError, match=r"of one size, .* found 9x9 in .*a\.png"):
+        open_sequence(source, InputOptions(masks=given)).given_mask(0)

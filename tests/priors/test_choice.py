@@ -52,9 +52,9 @@ def test_priors_without_weights_are_found_by_their_names():
 @pytest.mark.parametrize(
     ("choose", "flags", "sentence"),
     [
-        (flow, {"flow": "raft"}, "expected --flow classical or droid, found 'raft'"),
-        (features, {"features": "x"}, "classical, dinov2, fit3d or files:FOLDER, found 'x'"),
-        (depth, {"depth": "x"}, "none, simulated, sensor, metric3d, depth-anything or files:F"),
+        (flow, {"flow": "raft"}, "expected --flow classical, droid or python:M"),
+        (features, {"features": "x"}, "classical, dinov2, fit3d, files:FOLDER or p"),
+        (depth, {"depth": "x"}, "none, simulated, sensor, metric3d, depth-anything, files:F"),
         (flow, {"flow": "droid"}, "expected --flow-weights FILE with --flow droid, found none"),
         (depth, {"depth_weights": "a.pth"}, "expected --depth metric3d or depth-anything with"),
         (features, {"features": "fit3d", "features_weights": "none.pth"}, "found nothing at none"),
