@@ -1,5 +1,6 @@
 """Choose flow, features and depth by their names on the command line; load and check them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from minislam.priors.plugins import PYTHON, load_plugin, plugin_names
 from minislam.records import Sequence
 
 FILES = "files:"  # before the name of a folder
+FOLDER = f"{FILES}FOLDER"
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,7 @@ def choose_flow(
     choice: PriorChoice, classical: ClassicalFlowConfig, networks: NetworksConfig
 ) -> FlowEstimator:
     """Return the flow: classical, a network, or a plugin."""
-    learned = _load(choice, "flow", choice.flow, choice.flow_weights, networks)
-    if learned is not None:
-        return learned
-    if choice.flow == "classical":
-        return ClassicalFlow(classical)
-    raise _unknown("flow", choice.flow, ["classical", *_names("flow")])
+    return _choose("flow", choice, networks, {"classical": lambda: ClassicalFlow(classical)})
 
 
 def choose_features(
@@ -69,15 +66,11 @@ def choose_features(
     networks: NetworksConfig,
 ) -> FeatureExtractor:
     """Return the features: classical, a network, a plugin, or files:FOLDER."""
-    name = choice.features
-    learned = _load(choice, "features", name, choice.features_weights, networks)
-    if learned is not None:
-        return learned
-    if name == "classical":
-        return ClassicalFeatures(classical)
-    if name.startswith(FILES):
-        return FileFeatures(folder_of(name.removeprefix(FILES), FEATURES), camera)
-    raise _unknown("features", name, ["classical", *_names("features"), "files:FOLDER"])
+    makers: dict[str, Callable[[], Any]] = {
+        "classical": lambda: ClassicalFeatures(classical),
+        FOLDER: lambda: FileFeatures(_folder(choice.features, FEATURES), camera),
+    }
+    return _choose("features", choice, networks, makers)
 
 
 def choose_depth(
@@ -88,20 +81,51 @@ def choose_depth(
     networks: NetworksConfig,
 ) -> DepthPrior:
     """Return the depth: none, simulated, sensor, a network, a plugin, or files:FOLDER."""
-    name = choice.depth
-    learned = _load(choice, "depth", name, choice.depth_weights, networks)
-    if learned is not None:
-        return learned
-    if name == "none":
-        return NoDepth()
-    if name == "simulated":
-        return _simulated_depth(sequence, seed, simulated)
-    if name == "sensor":
-        return SensorDepth(sequence.sensor_depth)
-    if name.startswith(FILES):
-        return FileDepth(folder_of(name.removeprefix(FILES), DEPTH), 1 / sequence.depth_scale)
-    known = ["none", "simulated", "sensor", *_names("depth"), "files:FOLDER"]
-    raise _unknown("depth", name, known)
+    makers: dict[str, Callable[[], Any]] = {
+        "none": NoDepth,
+        "simulated": lambda: _simulated_depth(sequence, seed, simulated),
+        "sensor": lambda: SensorDepth(sequence.sensor_depth),
+        FOLDER: lambda: FileDepth(_folder(choice.depth, DEPTH), 1 / sequence.depth_scale),
+    }
+    return _choose("depth", choice, networks, makers)
+
+
+def _choose(
+    kind: str,
+    choice: PriorChoice,
+    networks: NetworksConfig,
+    makers: dict[str, Callable[[], Any]],  # by name, of what needs no weights
+) -> Any:
+    """Return the prior that --KIND and --KIND-weights name."""
+    name, weights = getattr(choice, kind), getattr(choice, f"{kind}_weights")
+    network = find_network(kind, name)
+    if network is not None:
+        if weights is None:
+            raise InputError(
+                f"expected --{kind}-weights FILE with --{kind} {name}, found none; give the "
+                "official checkpoint, minislam/priors/networks/README.md says where to get it"
+            )
+        return load_network(network, Path(weights).expanduser(), choice.device, networks)
+    maker = makers.get(FOLDER if name.startswith(FILES) else name)
+    if maker is not None and weights is None:
+        return maker()
+    plugin = load_plugin(kind, name, choice.device, weights)
+    if plugin is not None:
+        return plugin
+    learned = [network.name for network in NETWORKS if network.kind == kind]
+    if weights is not None:
+        raise InputError(
+            f"expected --{kind} {' or '.join(learned)} with --{kind}-weights, found --{kind} "
+            f"{name}; name the network of {weights}"
+        )
+    known = ", ".join([*makers, *learned, *plugin_names(kind)])
+    raise InputError(
+        f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
+    )
+
+
+def _folder(name: str, kind: str) -> Path:
+    return folder_of(name.removeprefix(FILES), kind)
 
 
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:
@@ -112,35 +136,3 @@ def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig
             f"{sequence.name}; use --depth none or --depth files:FOLDER"
         )
     return SimulatedDepth(truth.depth, seed, config)
-
-
-def _load(
-    choice: PriorChoice, kind: str, name: str, weights: str | None, networks: NetworksConfig
-) -> Any:
-    """Return the network or plugin of that name, None if it names none; refuse a file alone."""
-    network = find_network(kind, name)
-    if network is None:
-        plugin = load_plugin(kind, name, choice.device, weights)
-        if plugin is None and weights is not None:
-            raise InputError(
-                f"expected --{kind} {' or '.join(_names(kind))} with --{kind}-weights, found "
-                f"--{kind} {name}; name the network of {weights}"
-            )
-        return plugin
-    if weights is None:
-        raise InputError(
-            f"expected --{kind}-weights FILE with --{kind} {name}, found none; give the official "
-            "checkpoint, minislam/priors/networks/README.md says where to get it"
-        )
-    return load_network(network, Path(weights).expanduser(), choice.device, networks)
-
-
-def _unknown(kind: str, name: str, known: list[str]) -> InputError:
-    names = ", ".join([*known, *plugin_names(kind)])
-    return InputError(
-        f"expected --{kind} {names} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
-    )
-
-
-def _names(kind: str) -> list[str]:
-    return [network.name for network in NETWORKS if network.kind == kind]

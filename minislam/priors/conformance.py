@@ -1,4 +1,4 @@
-"""Whether an object is what an interface asks for, found out on small images.
+"""Whether an object is what an interface asks for, found out on two small images.
 
 `plugins.py` asks before a run begins, and `minislam.checks` gives the same checks to authors: each
 returns nothing, or raises InputError with a sentence that says what is wrong.
@@ -27,14 +27,14 @@ def shifted_images() -> tuple[Tensor, Tensor]:  # each (H, W, 3)
     coarse = torch.rand(1, 3, 14, 22, generator=torch.Generator().manual_seed(0))
     smooth = functional.interpolate(coarse, scale_factor=8, mode="bicubic").clamp(0, 1)
     image = smooth[0].permute(1, 2, 0)
-    first, second = image[: CAMERA.height, : CAMERA.width], image[4:, 8:]
-    return first.clone(), second[: CAMERA.height, : CAMERA.width].clone()
+    first, second = (
+        image[v : v + CAMERA.height, u : u + CAMERA.width] for u, v in ((0, 0), (8, 4))
+    )
+    return first.clone(), second.clone()
 
 
-def flow_error(
-    matches: FlowMatches, stride: int, shift: tuple[float, float] = SHIFT
-) -> float:  # px
-    """Return how far the first flow of matches is from a shift, in the middle of the image."""
+def flow_error(matches: FlowMatches, stride: int, shift: tuple[float, float] = SHIFT) -> float:
+    """Return how far the first flow is from a shift in the middle of the image [px]."""
     pixels = CAMERA.pixel_grid(stride)
     found = matches.targets[0].T.reshape(pixels.shape) - pixels
     rows, cols = found.shape[0] // 4, found.shape[1] // 4
@@ -45,98 +45,96 @@ def flow_error(
 def check_depth_prior(prior: Any, name: str = "the depth prior") -> None:
     """Refuse an object that is no `DepthPrior`."""
     depth = _same_answer(name, prior, CAMERA)
-    if depth is None:
-        return
-    _require_tensor(name, depth, (CAMERA.height, CAMERA.width))
-    if not (depth >= 0).all() or not depth.any():
-        raise InputError(
-            f"expected {name} to return depths > 0 and 0 where unknown, found "
-            f"{float(depth.min()):g} to {float(depth.max()):g}; return z in world units"
-        )
+    if depth is not None:
+        _expect_tensor(name, depth, (CAMERA.height, CAMERA.width))
+        low, high = float(depth.min()), float(depth.max())
+        found = f"{low:g} to {high:g}; return z in world units"
+        _expect(low >= 0 and high > 0, f"{name} to return depths > 0 and 0 where unknown", found)
 
 
 def check_feature_extractor(features: Any, name: str = "the features") -> None:
     """Refuse an object that is no `FeatureExtractor`."""
     stride, dimension = (_count(name, features, field) for field in ("stride", "dimension"))
     found = _same_answer(name, features)
-    _require_tensor(name, found, (CAMERA.height // stride, CAMERA.width // stride, dimension))
-    if bool((found == found[0, 0]).all()):
-        raise InputError(
-            f"expected {name} to tell places apart, found the same vector everywhere; return "
-            "features of the image"
-        )
+    _expect_tensor(name, found, (CAMERA.height // stride, CAMERA.width // stride, dimension))
+    differ = bool((found != found[0, 0]).any())
+    _expect(differ, f"{name} to tell places apart", "the same vector everywhere")
 
 
 def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
     """Refuse an object that is no `FlowEstimator`; it is shown an image moved by SHIFT."""
     stride, images = _count(name, flow, "stride"), shifted_images()
-    pixels = CAMERA.pixel_grid(stride).flatten(0, 1).T[None]
-    edges = ([0, 1], [1, 0], pixels.repeat(2, 1, 1))
+    edges = [0, 1], [1, 0], CAMERA.pixel_grid(stride).flatten(0, 1).T.repeat(2, 1, 1)
     for index, image in enumerate(images):
         _call(name, flow, "add_frame", index, image)
     state = _saved_state(name, flow)
     both = _call(name, flow, "match", *edges)
-    _require_matches(f"{name}.match", both, 2, stride)
+    _expect_matches(f"{name}.match", both, 2, stride)
     _call(name, flow, "restore_state", state, None)
-    if not torch.equal(_call(name, flow, "match", *edges).targets, both.targets):
-        raise InputError(
-            f"expected {name} to match as before after restore_state(saved_state()), found other "
-            "targets; save all that a match changes, and draw nothing at random"
-        )
-    start, chain_name = _call(name, flow, "start_chain", images[0]), f"the chain of {name}"
-    chain, matches = _call(chain_name, start, "advance", images[1])
-    _require_matches(chain_name, matches, 1, stride)
-    restored = _call(name, flow, "restore_chain", _saved_state(chain_name, chain), None)
-    _call(chain_name, chain, "restart")
-    first, *others = [
-        _call(chain_name, c, "advance", images[0])[1].targets for c in (chain, chain, restored)
-    ]
-    if not all(torch.equal(first, other) for other in others):
-        raise InputError(
-            f"expected {chain_name} to stay as it is and to be restored by restore_chain, found "
-            "another answer to the same image; let advance return a new chain"
-        )
-    for index in range(2):
+    _expect(
+        torch.equal(_call(name, flow, "match", *edges).targets, both.targets),
+        f"{name} to match as before after restore_state(saved_state())",
+        "other targets; save all that a match changes, and draw nothing at random",
+    )
+    start, of_chain = _call(name, flow, "start_chain", images[0]), f"the chain of {name}"
+    chain, matches = _call(of_chain, start, "advance", images[1])
+    _expect_matches(of_chain, matches, 1, stride)
+    restored = _call(name, flow, "restore_chain", _saved_state(of_chain, chain), None)
+    _call(of_chain, chain, "restart")
+    later = [_call(of_chain, c, "advance", images[0])[1].targets for c in (chain, chain, restored)]
+    _expect(
+        torch.equal(later[0], later[1]) and torch.equal(later[0], later[2]),
+        f"{of_chain} to stay as it is and to be restored by restore_chain",
+        "another answer to the same image; let advance and restart return new chains",
+    )
+    for index in (0, 1):
         _call(name, flow, "remove_frame", index)
 
 
-def _require_matches(name: str, matches: Any, edges: int, stride: int) -> None:
+def _expect(is_right: bool, wanted: str, found: str) -> None:
+    if not is_right:
+        raise InputError(f"expected {wanted}, found {found}")
+
+
+def _expect_tensor(name: str, value: Any, shape: tuple[int, ...]) -> None:
+    wanted, found = f"{shape} torch.float32 on cpu", type(value).__name__
+    if isinstance(value, Tensor):
+        found = f"{tuple(value.shape)} {value.dtype} on {value.device}"
+        if found == wanted:
+            found += " with gradients" if value.requires_grad else ""
+            found += "" if value.isfinite().all() else ", not all finite"
+    _expect(found == wanted, f"{name} to return a finite tensor {wanted} like the image", found)
+
+
+def _expect_matches(name: str, matches: Any, edges: int, stride: int) -> None:
     """Refuse matches of another form, and targets that are not where the second image shows."""
-    if not isinstance(matches, FlowMatches):
-        raise InputError(f"expected {name} to return FlowMatches, found {type(matches).__name__}")
+    is_right = isinstance(matches, FlowMatches)
+    _expect(is_right, f"{name} to return FlowMatches", type(matches).__name__)
     cells = CAMERA.pixel_grid(stride)[..., 0].numel()
-    _require_tensor(f"{name} (targets)", matches.targets, (edges, 2, cells))
-    _require_tensor(f"{name} (confidences)", matches.confidences, (edges, 2, cells))
-    _require_tensor(f"{name} (matched_ratios)", matches.matched_ratios, (edges,))
+    _expect_tensor(f"{name} (targets)", matches.targets, (edges, 2, cells))
+    _expect_tensor(f"{name} (confidences)", matches.confidences, (edges, 2, cells))
+    _expect_tensor(f"{name} (matched_ratios)", matches.matched_ratios, (edges,))
     for part in (matches.confidences, matches.matched_ratios):
-        if part.min() < 0 or part.max() > 1:
-            raise InputError(
-                f"expected {name} to return confidences and ratios from 0 to 1, found "
-                f"{float(part.min()):g} to {float(part.max()):g}"
-            )
-    error = flow_error(matches, stride)
-    if not error <= stride / 2:
-        u, v = SHIFT
-        mistakes = {"(v, u)": (v, u), "the way back": (-u, -v), "cells": (u / stride, v / stride)}
-        near = [text for text, it in mistakes.items() if flow_error(matches, stride, it) < 1]
-        raise InputError(
-            f"expected {name} to find an image moved by {SHIFT} px, found targets off by "
-            f"{error:.1f} px{f', which fits {near[0]}' if near else ''}; return the pixel (u, v) "
-            "in the target"
-        )
+        low, high = float(part.min()), float(part.max())
+        _expect(low >= 0 and high <= 1, f"{name} to return 0 to 1", f"{low:g} to {high:g}")
+    u, v = SHIFT
+    mistakes = {"(v, u)": (v, u), "the way back": (-u, -v), "cells": (u / stride, v / stride)}
+    near = [text for text, it in mistakes.items() if flow_error(matches, stride, it) < 1]
+    error, hint = flow_error(matches, stride), f" which fits {near[0]}," if near else ""
+    found = f"targets off by {error:.1f} px,{hint} return the pixel (u, v) in the target"
+    _expect(error <= stride / 2, f"{name} to find an image moved by {SHIFT} px", found)
 
 
 def _same_answer(name: str, function: Any, *more: Any) -> Any:
     """Return the answer to a frame, which must be the same after another frame."""
     frames = [Frame(k, float(k), image) for k, image in enumerate(shifted_images())]
     first, _, again = (_call(name, function, "__call__", frames[k], *more) for k in (0, 1, 0))
-    if not torch.equal(frames[0].image, shifted_images()[0]):
-        raise InputError(f"expected {name} to leave the image as it is, found it changed; copy it")
-    if isinstance(first, Tensor) and not (isinstance(again, Tensor) and torch.equal(first, again)):
-        raise InputError(
-            f"expected {name} to answer the same frame with the same numbers, found others the "
-            "second time; switch off dropout, and seed what is random"
-        )
+    is_kept = torch.equal(frames[0].image, shifted_images()[0])
+    _expect(is_kept, f"{name} to leave the image as it is", "it changed; copy it first")
+    if isinstance(first, Tensor):
+        is_same = isinstance(again, Tensor) and torch.equal(first, again)
+        hint = "others the second time; switch off dropout, and seed what is random"
+        _expect(is_same, f"{name} to answer the same frame with the same numbers", hint)
     return first
 
 
@@ -158,29 +156,12 @@ def _count(name: str, thing: Any, field: str) -> int:
     return value
 
 
-def _require_tensor(name: str, value: Any, shape: tuple[int, ...]) -> None:
-    wanted = f"{shape} torch.float32 on cpu"
-    found = type(value).__name__
-    if isinstance(value, Tensor):
-        found = f"{tuple(value.shape)} {value.dtype} on {value.device}"
-        if found == wanted:
-            found += " with gradients" if value.requires_grad else ""
-            found += "" if value.isfinite().all() else ", not all finite"
-    if found != wanted:
-        raise InputError(
-            f"expected {name} to return a finite tensor {wanted} like the image, found {found}"
-        )
-
-
 def _saved_state(name: str, thing: Any) -> Tree:
     """Return a state, unless it holds something that no file of a run can hold."""
     state = to_tree(_call(name, thing, "saved_state"))
     parts = [state]
     for part in parts:  # grows while it is walked through
         parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
-        if not isinstance(part, _STORED):
-            raise InputError(
-                f"expected {name} to save dictionaries and lists of tensors, arrays, numbers and "
-                f"text, found a {type(part).__name__}"
-            )
+        wanted = f"{name} to save dictionaries and lists of tensors, arrays, numbers and text"
+        _expect(isinstance(part, _STORED), wanted, f"a {type(part).__name__}")
     return state

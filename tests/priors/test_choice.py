@@ -53,8 +53,8 @@ def test_priors_without_weights_are_found_by_their_names():
     ("choose", "flags", "sentence"),
     [
         (flow, {"flow": "raft"}, "expected --flow classical, droid or python:M"),
-        (features, {"features": "x"}, "classical, dinov2, fit3d, files:FOLDER or p"),
-        (depth, {"depth": "x"}, "none, simulated, sensor, metric3d, depth-anything, files:F"),
+        (features, {"features": "x"}, "classical, files:FOLDER, dinov2, fit3d or python:"),
+        (depth, {"depth": "x"}, "none, simulated, sensor, files:FOLDER, metric3d, depth-a"),
         (flow, {"flow": "droid"}, "expected --flow-weights FILE with --flow droid, found none"),
         (depth, {"depth_weights": "a.pth"}, "expected --depth metric3d or depth-anything with"),
         (features, {"features": "fit3d", "features_weights": "none.pth"}, "found nothing at none"),

@@ -70,7 +70,7 @@ WRONG_DEPTHS = {
     "found -1": lambda frame, camera: -gray_depth(frame, camera),
     "found 0 to 0": lambda frame, camera: 0 * gray_depth(frame, camera),
     "on cpu with gradients": lambda frame, camera: gray_depth(frame, camera).requires_grad_(),
-    "found it changed": changed,
+    "found it changed; copy": changed,
     "TypeError": lambda frame: gray_depth(frame, None),
     "ValueError: no": lambda frame, camera: (_ for _ in ()).throw(ValueError("no")),
     "have __call__": 3,
@@ -132,7 +132,7 @@ class Wrong(ClassicalFlow):
     [
         (Wrong().altered(targets=lambda t: t.flip(1)), "found targets off by"),
         (Wrong().altered(targets=lambda t: t.mT), "found (2, 240, 2)"),
-        (Wrong().altered(confidences=lambda c: 100 * c), "ratios from 0 to 1, found 0 to "),
+        (Wrong().altered(confidences=lambda c: 100 * c), "to return 0 to 1, found 0 to "),
         (Wrong().altered(matched_ratios=lambda r: r[:1]), "(matched_ratios) to return a fin"),
         (type("F", (Wrong,), {"match": lambda *a: None})(), "return FlowMatches, found NoneType"),
         (type("F", (Wrong,), {"saved_state": lambda s: {"a": [print]}})(), "text, found a builtin"),
@@ -155,7 +155,7 @@ def test_a_wrong_flow_is_one_sentence(flow, words: str):
         (lambda flow: -flow, "which fits the way back"),
         (lambda flow: flow.flip(1), r"which fits \(v, u\)"),
         (lambda flow: flow / 8, "which fits cells"),
-        (lambda flow: 0 * flow, "off by 8.9 px; return"),
+        (lambda flow: 0 * flow, "off by 8.9 px, return"),
     ],
 )
 def test_the_known_mistakes_of_a_flow_are_named(mistake, words: str):

@@ -21,7 +21,7 @@ from minislam.errors import InputError
 _WRAPPERS = (
     "model_state_dict", "state_dict", "model", "module", "_orig_mod", "teacher", "net", "model_ema"
 )  # fmt: skip
-_SHOWN = 8  # entries of a file that a message names
+_SHOWN = 300  # characters of the list of entries in a message
 
 
 class Weights:
@@ -182,30 +182,24 @@ def _entries(content: Any) -> str:
     """Say what a file without named tensors holds."""
     if not isinstance(content, dict):
         return f"a {type(content).__name__}"
-    entries = [
-        f"{key} ({', '.join(map(str, list(value)[:_SHOWN]))})" if isinstance(value, dict) else key
-        for key, value in content.items()
+    names = [
+        f"{k} ({', '.join(map(str, v))})" if isinstance(v, dict) else k for k, v in content.items()
     ]
-    return f"the entries {', '.join(map(str, entries[:_SHOWN]))}" if entries else "nothing"
+    return f"the entries {', '.join(map(str, names))}"[:_SHOWN] if names else "nothing"
 
 
 def _require_numbers(tensors: dict[str, Tensor], path: Path) -> None:
     """Refuse tensors that are no trained weights: integers, NaN and infinity, mostly zeros."""
-    zeros = 0
+    found = ""
     for name, tensor in tensors.items():
-        if not tensor.is_floating_point() and tensor.ndim:
-            raise InputError(
-                f"expected floating-point numbers in {path}, found {tensor.dtype} in {name}; give "
-                "the official file, not a quantised copy"
-            )
-        if not tensor.isfinite().all():
-            raise InputError(
-                f"expected finite numbers in {path}, found NaN or infinity in {name}; the file is "
-                "damaged or its training failed: download it again"
-            )
-        zeros += not tensor.any()
+        if tensor.ndim and not tensor.is_floating_point():
+            found = f"{tensor.dtype} in {name}, a quantised copy"
+        elif not tensor.isfinite().all():
+            found = f"NaN or infinity in {name}"
+    zeros = sum(not tensor.any() for tensor in tensors.values())
     if 2 * zeros > len(tensors):
+        found = f"{zeros} of {len(tensors)} tensors that are zero everywhere"
+    if found:
         raise InputError(
-            f"expected trained weights in {path}, found {zeros} of {len(tensors)} tensors that are "
-            "zero everywhere; download it again"
+            f"expected finite trained weights in {path}, found {found}; give the official file"
         )
