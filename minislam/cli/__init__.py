@@ -1,1 +1,1 @@
-"""The commands: `minislam demo | run | priors | eval | doctor`, one file each; `main.py` first."""
+"""The commands, one file each: `demo`, `run`, `priors`, `weights`, `eval`, `doctor`."""

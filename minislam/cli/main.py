@@ -1,4 +1,4 @@
-"""The command line: `minislam demo | run | priors | eval | doctor`. Start reading at `main`."""
+"""The command line, `minislam demo | run | priors | weights | eval | doctor`; `main` first."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from minislam.cli.options import (
 )
 from minislam.cli.priors import add_priors_parser
 from minislam.cli.progress import ProgressLine
+from minislam.cli.weights import add_weights_parser
 from minislam.errors import InputError, MinislamError
 
 DEMO_SEQUENCE, DEMO_FRAMES = "synth:crowd", 60
@@ -149,6 +150,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         add_input(priors)
         add_priors(priors, default_depth="none")
         add_settings(priors)
+    add_weights_parser(commands)
     add_eval_parser(commands)
     add_doctor_parser(commands)
     return parser

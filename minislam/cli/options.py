@@ -44,8 +44,8 @@ def add_priors(parser: argparse.ArgumentParser, default_depth: str) -> None:
     """Add the options that choose features and depth. Their names are checked with the weights."""
     group = parser.add_argument_group(
         "priors",
-        "networks need their official checkpoints: minislam/priors/networks/README.md says where "
-        "to get them",
+        "networks need their official checkpoints: minislam weights list; FILE is a path, or one "
+        "of those names, and without it the one that is called like the network is taken",
     )
     group.add_argument(
         "--features",
@@ -139,10 +139,18 @@ def input_options(args: argparse.Namespace) -> InputOptions:
 
 
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
-    """Return the priors: those of the file of --config, replaced by what is given."""
-    from minislam.priors.choice import PriorChoice
+    """Return the priors: those of the file of --config, replaced by what is given.
 
-    return PriorChoice(**{"depth": default_depth, **_section(args, "priors", PriorChoice)})
+    Of a network without a file, the fetched one is taken.
+    """
+    from minislam.priors.choice import PriorChoice
+    from minislam.priors.networks.published import find_weights
+
+    fields = {"depth": default_depth, **_section(args, "priors", PriorChoice)}
+    for kind in ("flow", "features", "depth"):
+        key = f"{kind}_weights"
+        fields[key] = find_weights(f"--{kind} {fields.get(kind)}", fields.get(key))
+    return PriorChoice(**fields)
 
 
 def _section(args: argparse.Namespace, name: str, kind: type) -> dict[str, Any]:
@@ -181,6 +189,7 @@ def _converted(value: Any, kind: type) -> Any:
 
 def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
     """Return the measure whose files were given, if it can be taken at this size of images."""
+    from minislam.priors.networks.published import find_weights
     from minislam.runs.run import load_lpips
 
     trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
@@ -191,7 +200,9 @@ def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
         raise InputError(
             f"expected --lpips-{missing} FILE with --lpips-{given}, found none; give both or none"
         )
-    lpips = load_lpips(trunk, heads)
+    lpips = load_lpips(
+        find_weights("--lpips-trunk", trunk) or trunk, find_weights("--lpips-heads", heads) or heads
+    )
     lpips.require_size(camera.width, camera.height)
     return lpips
 

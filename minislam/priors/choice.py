@@ -102,8 +102,8 @@ def _choose(
     if network is not None:
         if weights is None:
             raise InputError(
-                f"expected --{kind}-weights FILE with --{kind} {name}, found none; give the "
-                "official checkpoint, minislam/priors/networks/README.md says where to get it"
+                f"expected --{kind}-weights FILE with --{kind} {name}, found none; fetch it with "
+                f"minislam weights fetch {name}, or give an official checkpoint"
             )
         return load_network(network, Path(weights).expanduser(), choice.device, networks)
     maker = makers.get(FOLDER if name.startswith(FILES) else name)

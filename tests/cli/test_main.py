@@ -51,7 +51,7 @@ def the_sentence(capsys: pytest.CaptureFixture[str]) -> str:
 # Help and doctor
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["eval"], ["doctor"]])
+@pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["eval"], ["doctor"], ["weights"]])
 def test_every_command_has_help(command: list[str], capsys):
     with pytest.raises(SystemExit) as ended:
         main([*command, "--help"])
@@ -68,7 +68,7 @@ def test_help_names_every_setting_with_its_meaning_and_default(capsys):
     assert "--features.windows VALUE" in text and "1,3,5" in text
 
 
-@pytest.mark.parametrize("command", [[], ["eval"], ["doctor"]])
+@pytest.mark.parametrize("command", [[], ["eval"], ["doctor"], ["weights"]])
 def test_help_answers_without_torch(command: list[str]):
     program = (
         "import sys\nfrom minislam.cli.main import main\n"

@@ -1,0 +1,152 @@
+"""The sub-command `minislam weights`: list, fetch and check official checkpoint files."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import hashlib
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from minislam.cli.progress import ProgressLine
+from minislam.errors import InputError, MinislamError
+from minislam.priors.networks.published import PublishedFile, published_files
+
+if TYPE_CHECKING:
+    from minislam.priors.networks.checkpoints import Weights
+
+CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
+BYTES_PER_MEGABYTE = 1e6
+
+
+def add_weights_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Add `weights` to the sub-commands of a parser."""
+    parser = subparsers.add_parser("weights", help="list, fetch or check official checkpoints")
+    actions = parser.add_subparsers(required=True, metavar="list | fetch | check")
+    actions.add_parser("list", help="what there is").set_defaults(run=run_list)
+    fetch = actions.add_parser("fetch", help="fetch files of the list from their makers' sites")
+    fetch.add_argument("names", nargs="+", metavar="NAME", help="as in the list")
+    fetch.set_defaults(run=run_fetch)
+    check = actions.add_parser("check", help="which network each file of a folder belongs to")
+    check.add_argument("folder", nargs="?", metavar="DIR", help="default: what was fetched")
+    check.set_defaults(run=run_check)
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print one line per published file; return the exit code."""
+    rows = list(published_files().values())
+    for row in rows:
+        here = "fetched" if row.path.exists() else ""
+        print(f"{row.name:28s} {row.megabytes:>7s} MB  {row.use:22s} {row.licence:32s} {here}")
+    print(f"minislam weights fetch NAME... puts them in {rows[0].path.parent}")
+    return 0
+
+
+def run_fetch(args: argparse.Namespace) -> int:
+    """Fetch files by their names; return the exit code."""
+    from minislam.data.download import download
+
+    known = published_files()
+    unknown = [name for name in args.names if name not in known]
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], known, n=1, cutoff=0)[0]
+        raise InputError(
+            f"expected names of minislam weights list, found {unknown[0]!r}; the nearest is {near}"
+        )
+    rows, progress = [known[name] for name in args.names], ProgressLine()
+    for row in rows:
+        print(f"{row.name}: {row.megabytes} MB, licence {row.licence}, from {row.url}", flush=True)
+    for row in rows:
+        if row.path.exists():
+            require_published(row, row.path)
+        else:
+            show = partial(progress.show, f"fetching {row.file} [kB]")
+            download(row.url, row.path, partial(require_published, row), show)
+        print(f"{row.path}: complete, use it with {row.use}")
+    return 0
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Print one line per checkpoint file: which network, how large, complete or not, its flag."""
+    rows = {row.file: row for row in published_files().values()}
+    default = next(iter(rows.values())).path.parent
+    folder = Path(args.folder).expanduser() if args.folder else default
+    files = []
+    if folder.is_dir():
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in CHECKPOINT_ENDINGS)
+    if not files:
+        raise InputError(
+            f"expected a folder with checkpoint files ({', '.join(CHECKPOINT_ENDINGS)}), found "
+            f"none in {folder}; check the path"
+        )
+    width = max(len(file.name) for file in files)
+    for file in files:
+        verdict = _verdict(file)
+        row = rows.get(file.name)
+        if row and row.sha256 and row.sha256 != _sha256(file):
+            verdict += f"; NOT the published {row.name}, its sha256 is another"
+        size = file.stat().st_size / BYTES_PER_MEGABYTE
+        print(f"{file.name:{width}s}  {size:7.1f} MB  {verdict}", flush=True)
+    return 0
+
+
+def require_published(row: PublishedFile, path: Path) -> None:
+    """Refuse another file than the published one; where it has no hash, one of another network."""
+    from minislam.priors.networks.checkpoints import load_checkpoint
+    from minislam.priors.networks.table import describe
+
+    if row.sha256:
+        wanted, found = f"the sha256 {row.sha256}", _sha256(path)
+        is_right = found == row.sha256
+    else:
+        weights = load_checkpoint(path)
+        wanted, found = f"a checkpoint for {row.use}", describe(weights)
+        is_right = _use_of(weights, found).startswith(row.use)
+    if not is_right:
+        raise InputError(
+            f"expected {wanted} of {path}, found {found}; it is not the published file"
+        )
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _verdict(file: Path) -> str:
+    """Return which network a file belongs to, and whether it is complete."""
+    from minislam.priors.networks.checkpoints import load_checkpoint
+    from minislam.priors.networks.table import describe
+
+    try:
+        weights = load_checkpoint(file)
+        title = describe(weights)
+    except MinislamError as error:
+        return f"unreadable: {error}"
+    try:
+        use = _use_of(weights, title)
+    except MinislamError as error:
+        return f"{title}, NOT usable: {error}"
+    return f"{title}, complete: {use}" if use else f"{title}, of no use here"
+
+
+def _use_of(weights: Weights, title: str) -> str:
+    """Check a checkpoint; return the flags that use it, "" if nothing does."""
+    from minislam.evaluation.lpips import recognise_heads, recognise_trunk
+    from minislam.priors.networks.table import CLASSIFIER, LPIPS_HEADS, build_checked, recognise
+
+    network = recognise(weights)
+    if network is not None:
+        build_checked(network, weights)
+        return f"--{network.kind} {network.name} --{network.kind}-weights"
+    if title == LPIPS_HEADS:
+        recognise_heads(weights.as_dict())
+        return "--lpips-heads"
+    if title == CLASSIFIER:
+        recognise_trunk(weights.as_dict())
+        return "--lpips-trunk"
+    return ""
