@@ -7,6 +7,7 @@ import difflib
 import os
 import sys
 import time
+import warnings
 from collections.abc import Sequence
 from functools import partial
 
@@ -75,6 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # OpenCV and FFmpeg would print messages about a damaged file beside our own error message.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    warnings.formatwarning = lambda message, *_, **__: f"WARNING: {message}\n"
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     args, unknown = _parser(arguments).parse_known_args(arguments)
     if unknown:

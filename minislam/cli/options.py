@@ -139,18 +139,10 @@ def input_options(args: argparse.Namespace) -> InputOptions:
 
 
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
-    """Return the priors: those of the file of --config, replaced by what is given.
-
-    Of a network without a file, the fetched one is taken.
-    """
+    """Return the priors: those of the file of --config, replaced by what is given."""
     from minislam.priors.choice import PriorChoice
-    from minislam.priors.networks.published import find_weights
 
-    fields = {"depth": default_depth, **_section(args, "priors", PriorChoice)}
-    for kind in ("flow", "features", "depth"):
-        key = f"{kind}_weights"
-        fields[key] = find_weights(f"--{kind} {fields.get(kind)}", fields.get(key))
-    return PriorChoice(**fields)
+    return PriorChoice(**{"depth": default_depth, **_section(args, "priors", PriorChoice)})
 
 
 def _section(args: argparse.Namespace, name: str, kind: type) -> dict[str, Any]:
@@ -189,7 +181,6 @@ def _converted(value: Any, kind: type) -> Any:
 
 def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
     """Return the measure whose files were given, if it can be taken at this size of images."""
-    from minislam.priors.networks.published import find_weights
     from minislam.runs.run import load_lpips
 
     trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
@@ -200,9 +191,7 @@ def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
         raise InputError(
             f"expected --lpips-{missing} FILE with --lpips-{given}, found none; give both or none"
         )
-    lpips = load_lpips(
-        find_weights("--lpips-trunk", trunk) or trunk, find_weights("--lpips-heads", heads) or heads
-    )
+    lpips = load_lpips(trunk, heads)
     lpips.require_size(camera.width, camera.height)
     return lpips
 

@@ -70,49 +70,37 @@ def run_fetch(args: argparse.Namespace) -> int:
 def run_check(args: argparse.Namespace) -> int:
     """Print one line per checkpoint file: which network, how large, complete or not, its flag."""
     rows = {row.file: row for row in published_files().values()}
-    default = next(iter(rows.values())).path.parent
-    folder = Path(args.folder).expanduser() if args.folder else default
-    files = []
-    if folder.is_dir():
-        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in CHECKPOINT_ENDINGS)
+    folder = Path(args.folder or rows["droid.pth"].path.parent).expanduser()
+    found = folder.iterdir() if folder.is_dir() else ()
+    files = sorted(path for path in found if path.suffix.lower() in CHECKPOINT_ENDINGS)
     if not files:
         raise InputError(
             f"expected a folder with checkpoint files ({', '.join(CHECKPOINT_ENDINGS)}), found "
-            f"none in {folder}; check the path"
+            f"none in {folder}; give another one, or fetch some with minislam weights fetch"
         )
-    width = max(len(file.name) for file in files)
     for file in files:
-        verdict = _verdict(file)
-        row = rows.get(file.name)
+        row, verdict = rows.get(file.name), _verdict(file)
         if row and row.sha256 and row.sha256 != _sha256(file):
             verdict += f"; NOT the published {row.name}, its sha256 is another"
         size = file.stat().st_size / BYTES_PER_MEGABYTE
+        width = max(len(file.name) for file in files)
         print(f"{file.name:{width}s}  {size:7.1f} MB  {verdict}", flush=True)
     return 0
 
 
 def require_published(row: PublishedFile, path: Path) -> None:
     """Refuse another file than the published one; where it has no hash, one of another network."""
-    from minislam.priors.networks.checkpoints import load_checkpoint
-    from minislam.priors.networks.table import describe
-
-    if row.sha256:
-        wanted, found = f"the sha256 {row.sha256}", _sha256(path)
-        is_right = found == row.sha256
-    else:
-        weights = load_checkpoint(path)
-        wanted, found = f"a checkpoint for {row.use}", describe(weights)
-        is_right = _use_of(weights, found).startswith(row.use)
-    if not is_right:
-        raise InputError(
-            f"expected {wanted} of {path}, found {found}; it is not the published file"
-        )
+    wanted, found = f"sha256 {row.sha256}", f"sha256 {_sha256(path)}"
+    if not row.sha256:
+        wanted, found = f"complete: {row.use}", _verdict(path)
+    if not found.endswith(wanted):
+        raise InputError(f"expected the published {row.file} ({wanted}) in {path}, found {found}")
 
 
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
     with open(path, "rb") as file:
-        while block := file.read(1 << 20):
+        for block in iter(partial(file.read, 1 << 20), b""):
             digest.update(block)
     return digest.hexdigest()
 
@@ -122,12 +110,10 @@ def _verdict(file: Path) -> str:
     from minislam.priors.networks.checkpoints import load_checkpoint
     from minislam.priors.networks.table import describe
 
+    title = "unreadable"
     try:
         weights = load_checkpoint(file)
         title = describe(weights)
-    except MinislamError as error:
-        return f"unreadable: {error}"
-    try:
         use = _use_of(weights, title)
     except MinislamError as error:
         return f"{title}, NOT usable: {error}"
@@ -135,18 +121,16 @@ def _verdict(file: Path) -> str:
 
 
 def _use_of(weights: Weights, title: str) -> str:
-    """Check a checkpoint; return the flags that use it, "" if nothing does."""
+    """Check a checkpoint; return the flag that uses it, "" if none does."""
     from minislam.evaluation.lpips import recognise_heads, recognise_trunk
     from minislam.priors.networks.table import CLASSIFIER, LPIPS_HEADS, build_checked, recognise
 
     network = recognise(weights)
     if network is not None:
         build_checked(network, weights)
-        return f"--{network.kind} {network.name} --{network.kind}-weights"
-    if title == LPIPS_HEADS:
-        recognise_heads(weights.as_dict())
-        return "--lpips-heads"
-    if title == CLASSIFIER:
-        recognise_trunk(weights.as_dict())
-        return "--lpips-trunk"
-    return ""
+        return f"--{network.kind} {network.name}"
+    if title not in (LPIPS_HEADS, CLASSIFIER):
+        return ""
+    is_heads = title == LPIPS_HEADS
+    (recognise_heads if is_heads else recognise_trunk)(weights.as_dict())
+    return "--lpips-heads" if is_heads else "--lpips-trunk"

@@ -21,6 +21,7 @@ from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
+from minislam.priors.networks.published import find_weights
 from minislam.priors.networks.table import NETWORKS, NetworksConfig, find_network, load_network
 from minislam.priors.plugins import PYTHON, load_plugin, plugin_names
 from minislam.records import Sequence
@@ -100,6 +101,7 @@ def _choose(
     name, weights = getattr(choice, kind), getattr(choice, f"{kind}_weights")
     network = find_network(kind, name)
     if network is not None:
+        weights = find_weights(f"--{kind} {name}", weights)
         if weights is None:
             raise InputError(
                 f"expected --{kind}-weights FILE with --{kind} {name}, found none; fetch it with "

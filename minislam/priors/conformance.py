@@ -68,25 +68,23 @@ def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
     for index, image in enumerate(images):
         _call(name, flow, "add_frame", index, image)
     state = _saved_state(name, flow)
-    both = _call(name, flow, "match", *edges)
-    _expect_matches(f"{name}.match", both, 2, stride)
+    first = _call(name, flow, "match", *edges)
+    _expect_matches(f"{name}.match", first, 2, stride)
     _call(name, flow, "restore_state", state, None)
-    _expect(
-        torch.equal(_call(name, flow, "match", *edges).targets, both.targets),
-        f"{name} to match as before after restore_state(saved_state())",
-        "other targets; save all that a match changes, and draw nothing at random",
-    )
+    again = _call(name, flow, "match", *edges)
+    wanted = f"{name} to match as before after restore_state(saved_state())"
+    _expect(torch.equal(first.targets, again.targets), wanted, "other targets; save all it changes")
     start, of_chain = _call(name, flow, "start_chain", images[0]), f"the chain of {name}"
     chain, matches = _call(of_chain, start, "advance", images[1])
     _expect_matches(of_chain, matches, 1, stride)
     restored = _call(name, flow, "restore_chain", _saved_state(of_chain, chain), None)
     _call(of_chain, chain, "restart")
-    later = [_call(of_chain, c, "advance", images[0])[1].targets for c in (chain, chain, restored)]
-    _expect(
-        torch.equal(later[0], later[1]) and torch.equal(later[0], later[2]),
-        f"{of_chain} to stay as it is and to be restored by restore_chain",
-        "another answer to the same image; let advance and restart return new chains",
+    a, b, c = (
+        _call(of_chain, x, "advance", images[0])[1].targets for x in (chain, chain, restored)
     )
+    wanted = f"{of_chain} to stay as it is, and restore_chain to return it"
+    found = "another answer to the same image; let advance and restart return new chains"
+    _expect(torch.equal(a, b) and torch.equal(a, c), wanted, found)
     for index in (0, 1):
         _call(name, flow, "remove_frame", index)
 
@@ -100,9 +98,8 @@ def _expect_tensor(name: str, value: Any, shape: tuple[int, ...]) -> None:
     wanted, found = f"{shape} torch.float32 on cpu", type(value).__name__
     if isinstance(value, Tensor):
         found = f"{tuple(value.shape)} {value.dtype} on {value.device}"
-        if found == wanted:
-            found += " with gradients" if value.requires_grad else ""
-            found += "" if value.isfinite().all() else ", not all finite"
+        if found == wanted and (value.requires_grad or not value.isfinite().all()):
+            found += " with gradients" if value.requires_grad else ", not all finite"
     _expect(found == wanted, f"{name} to return a finite tensor {wanted} like the image", found)
 
 
@@ -110,10 +107,10 @@ def _expect_matches(name: str, matches: Any, edges: int, stride: int) -> None:
     """Refuse matches of another form, and targets that are not where the second image shows."""
     is_right = isinstance(matches, FlowMatches)
     _expect(is_right, f"{name} to return FlowMatches", type(matches).__name__)
-    cells = CAMERA.pixel_grid(stride)[..., 0].numel()
-    _expect_tensor(f"{name} (targets)", matches.targets, (edges, 2, cells))
-    _expect_tensor(f"{name} (confidences)", matches.confidences, (edges, 2, cells))
-    _expect_tensor(f"{name} (matched_ratios)", matches.matched_ratios, (edges,))
+    shape = (edges, 2, CAMERA.pixel_grid(stride)[..., 0].numel())
+    _expect_tensor(f"{name} (targets)", matches.targets, shape)
+    _expect_tensor(f"{name} (confidences)", matches.confidences, shape)
+    _expect_tensor(f"{name} (matched_ratios)", matches.matched_ratios, shape[:1])
     for part in (matches.confidences, matches.matched_ratios):
         low, high = float(part.min()), float(part.max())
         _expect(low >= 0 and high <= 1, f"{name} to return 0 to 1", f"{low:g} to {high:g}")
@@ -131,10 +128,9 @@ def _same_answer(name: str, function: Any, *more: Any) -> Any:
     first, _, again = (_call(name, function, "__call__", frames[k], *more) for k in (0, 1, 0))
     is_kept = torch.equal(frames[0].image, shifted_images()[0])
     _expect(is_kept, f"{name} to leave the image as it is", "it changed; copy it first")
-    if isinstance(first, Tensor):
-        is_same = isinstance(again, Tensor) and torch.equal(first, again)
-        hint = "others the second time; switch off dropout, and seed what is random"
-        _expect(is_same, f"{name} to answer the same frame with the same numbers", hint)
+    is_same = not isinstance(first, Tensor) or torch.equal(first, torch.as_tensor(again))
+    hint = "others the second time; switch off dropout, and seed what is random"
+    _expect(is_same, f"{name} to answer the same frame with the same numbers", hint)
     return first
 
 
@@ -143,25 +139,24 @@ def _call(name: str, thing: Any, method: str, *arguments: Any) -> Any:
     try:
         return getattr(thing, method)(*arguments)
     except Exception as error:
-        raise InputError(
-            f"expected {name} to have {method} and it to work on images of {CAMERA.width}x"
-            f"{CAMERA.height}, found {type(error).__name__}: {str(error).partition(chr(10))[0]}"
-        ) from error
+        found = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        size = f"{CAMERA.width}x{CAMERA.height}"
+        raise InputError(f"expected {method} of {name} on {size} px, found {found}") from error
 
 
 def _count(name: str, thing: Any, field: str) -> int:
     value = getattr(thing, field, None)
-    if not isinstance(value, int) or value < 1:
-        raise InputError(f"expected {name} to have a whole number {field} >= 1, found {value!r}")
-    return value
+    is_count = isinstance(value, int) and value >= 1
+    _expect(is_count, f"{name} to have a whole number {field} >= 1", repr(value))
+    return int(value or 0)
 
 
 def _saved_state(name: str, thing: Any) -> Tree:
     """Return a state, unless it holds something that no file of a run can hold."""
     state = to_tree(_call(name, thing, "saved_state"))
+    wanted = f"{name} to save dictionaries and lists of tensors, arrays, numbers and text"
     parts = [state]
     for part in parts:  # grows while it is walked through
         parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
-        wanted = f"{name} to save dictionaries and lists of tensors, arrays, numbers and text"
         _expect(isinstance(part, _STORED), wanted, f"a {type(part).__name__}")
     return state

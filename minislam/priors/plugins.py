@@ -32,17 +32,16 @@ def plugin_names(kind: str) -> list[str]:
 
 def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any | None:
     """Return the prior of a flag --KIND NAME, checked; None if no package has this name."""
+    group = f"minislam.{kind}"
+    found = list(entry_points(group=group, name=name))
     if name.startswith(PYTHON):
         if "" not in sys.path:
             sys.path.append("")  # the current folder, which `minislam` alone does not look into
-        entry = EntryPoint(name, name.removeprefix(PYTHON), f"minislam.{kind}")
-    else:
-        found = list(entry_points(group=f"minislam.{kind}", name=name))
-        if not found:
-            return None
-        entry = found[0]
+        found = [EntryPoint(name, name.removeprefix(PYTHON), group)]
+    if not found:
+        return None
     try:
-        make = entry.load()
+        make = found[0].load()
         prior = make(device) if weights is None else make(device, weights)
     except Exception as error:
         raise InputError(

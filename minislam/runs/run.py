@@ -11,6 +11,7 @@ from minislam.errors import InputError, MinislamError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import FILES, PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.networks.checkpoints import load_checkpoint
+from minislam.priors.networks.published import find_weights
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms
 from minislam.runs.facts import failed_adjustments, focal_length_note, measure, run_facts
@@ -49,9 +50,9 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
 
 
 def load_lpips(trunk: Path | str, heads: Path | str) -> Lpips:
-    """Read the two files of LPIPS."""
-    files = [load_checkpoint(Path(file).expanduser()) for file in (trunk, heads)]
-    return Lpips(*(weights.as_dict() for weights in files))
+    """Read the two files of LPIPS, given as paths or by their names in the list of weights."""
+    found = find_weights("--lpips-trunk", str(trunk)), find_weights("--lpips-heads", str(heads))
+    return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in found))
 
 
 def run_sequence(

@@ -100,8 +100,8 @@ def test_another_file_than_the_published_one_is_refused(server: Server, tmp_path
         "/lpips-heads": b"<html>quota exceeded</html>",
     }  # fmt: skip
     for name, words in (
-        ("fit3d", "expected the sha256"),
-        ("droid", "expected a checkpoint for --flow droid"),
+        ("fit3d", "expected the published dinov2_reg_small_finetuned.pth (sha256 "),
+        ("droid", "(complete: --flow droid) in "),
         ("lpips-heads", "which cannot be read as one"),
         ("metric3d", "404"),
     ):
@@ -113,7 +113,10 @@ def test_another_file_than_the_published_one_is_refused(server: Server, tmp_path
     mine = tmp_path / "cache/weights/dinov2_reg_small_finetuned.pth"
     mine.write_bytes(b"mine")
     assert main(["weights", "fetch", "fit3d"]) == 1
-    assert "it is not the published file" in said(capsys)[1] and mine.read_bytes() == b"mine"
+    assert (
+        "expected the published dinov2_reg_small" in said(capsys)[1]
+        and mine.read_bytes() == b"mine"
+    )
 
 
 def test_a_name_that_is_not_in_the_list_fetches_nothing(server: Server, capsys):
@@ -144,16 +147,16 @@ def test_every_file_is_recognised_with_its_size_and_its_flag(tmp_path: Path, cap
         ),
         "depth_anything_v2_metric_hypersim_vits.pth": (
             "Depth Anything V2 (ViT of width 384, no registers), complete: "
-            f"--depth depth-anything --depth-weights{other('depth-anything')}"
+            f"--depth depth-anything{other('depth-anything')}"
         ),
         "dinov2_reg_small_finetuned.pth": (
             "FiT3D (ViT of width 384, with registers), complete: "
-            f"--features fit3d --features-weights{other('fit3d')}"
+            f"--features fit3d{other('fit3d')}"
         ),
-        "droid.pth": "DROID-SLAM, complete: --flow droid --flow-weights",
+        "droid.pth": "DROID-SLAM, complete: --flow droid",
         "metric_depth_vit_small_800k.pth": (
             "Metric3D v2 (ViT of width 384, with registers), complete: "
-            f"--depth metric3d --depth-weights{other('metric3d')}"
+            f"--depth metric3d{other('metric3d')}"
         ),
     }  # fmt: skip
     size = (tmp_path / "weights/droid.pth").stat().st_size / 1e6
@@ -174,12 +177,12 @@ def test_what_is_broken_or_foreign_is_said_on_its_line(tmp_path: Path, capsys):
     assert set(lines) == {
         "half.pth", "heads.pt", "lacking.pth", "other.pth", "trunk.pt", "whole.pth"
     }  # fmt: skip
-    assert "unreadable: expected a PyTorch checkpoint" in lines["half.pth"]
+    assert "unreadable, NOT usable: expected a PyTorch checkpoint" in lines["half.pth"]
     assert "NOT usable: expected the tensor norm.bias" in lines["lacking.pth"]
     assert "NOT usable: expected features.10.weight of AlexNet" in lines["trunk.pt"]
     assert "NOT usable: expected five LPIPS heads" in lines["heads.pt"]
     assert "something unknown (1 tensors, the first is anything), of no use" in lines["other.pth"]
-    assert lines["whole.pth"].endswith("complete: --features fit3d --features-weights")
+    assert lines["whole.pth"].endswith("complete: --features fit3d")
 
 
 def test_a_folder_without_checkpoints_is_one_sentence(tmp_path: Path, capsys):

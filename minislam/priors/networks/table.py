@@ -2,7 +2,7 @@
 
 To add a network, write its module: a class that is a `FlowEstimator`, a `FeatureExtractor` or a
 `DepthPrior`, and a function that builds it and runs it once on a tiny image. Then add its row to
-NETWORKS below, and a field to NetworksConfig if it has settings.
+NETWORKS below and to weights.csv, and a field to NetworksConfig if it has settings.
 """
 
 import warnings
