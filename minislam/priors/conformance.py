@@ -17,14 +17,15 @@ from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.state.stateful import Tree, to_tree
 
-CAMERA = Camera(100.0, 100.0, 79.5, 47.5, 160, 96)  # not square: exchanged axes are noticed
+# Not square, so that exchanged axes are noticed; RAFT needs 128 px per side.
+CAMERA = Camera(150.0, 150.0, 111.5, 79.5, 224, 160)
 SHIFT = (-8.0, -4.0)  # px (u, v), from the first to the second of the images
 _STORED = dict | list | Tensor | np.ndarray | str | int | float | None  # by a saved state
 
 
 def shifted_images() -> tuple[Tensor, Tensor]:  # each (H, W, 3)
     """Return a smooth random image and the same one moved by SHIFT."""
-    coarse = torch.rand(1, 3, 14, 22, generator=torch.Generator().manual_seed(0))
+    coarse = torch.rand(1, 3, 22, 30, generator=torch.Generator().manual_seed(0))
     smooth = functional.interpolate(coarse, scale_factor=8, mode="bicubic").clamp(0, 1)
     image = smooth[0].permute(1, 2, 0)
     first, second = (

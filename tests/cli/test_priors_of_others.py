@@ -74,7 +74,7 @@ def test_flow_features_and_depth_of_others_run(here: Path):
 
 def test_wrong_priors_are_one_sentence_and_nothing_is_written(here: Path, capsys):
     for name, words in (
-        ("mine:distance", "to return a finite tensor (96, 160) torch.float32"),
+        ("mine:distance", "to return a finite tensor (160, 224) torch.float32"),
         ("mine:nothing", "has no attribute 'nothing'"),
         ("none:make", "No module named 'none'"),
     ):

@@ -62,8 +62,8 @@ def changed(frame, camera):
 
 
 WRONG_DEPTHS = {
-    "found (96, 160, 3)": lambda frame, camera: frame.image,
-    "found (160, 96)": lambda frame, camera: gray_depth(frame, camera).T,
+    "found (160, 224, 3)": lambda frame, camera: frame.image,
+    "found (224, 160)": lambda frame, camera: gray_depth(frame, camera).T,
     "torch.float64 on cpu": lambda frame, camera: gray_depth(frame, camera).double(),
     "found ndarray": lambda frame, camera: gray_depth(frame, camera).numpy(),
     "not all finite": lambda frame, camera: gray_depth(frame, camera) / 0,
@@ -88,7 +88,7 @@ def test_a_wrong_depth_is_one_sentence(words: str):
 def test_depth_that_is_drawn_at_random_is_refused():
     source = generator(0)
     with pytest.raises(InputError, match=r"the same numbers, found others the second time"):
-        check_depth_prior(lambda frame, camera: torch.rand(96, 160, generator=source))
+        check_depth_prior(lambda frame, camera: torch.rand(160, 224, generator=source))
 
 
 # Errors: features
@@ -99,9 +99,9 @@ def test_depth_that_is_drawn_at_random_is_refused():
     [
         ({"stride": 0}, "whole number stride >= 1, found 0"),
         ({"dimension": None}, "whole number dimension >= 1, found None"),
-        ({"dimension": 4}, "a finite tensor (6, 10, 4) torch.float32"),
-        ({"stride": 8}, r"found (12, 20, 3)"),
-        ({"__call__": lambda self, frame: torch.ones(6, 10, 3)}, "the same vector everywhere"),
+        ({"dimension": 4}, "a finite tensor (10, 14, 4) torch.float32"),
+        ({"stride": 8}, r"found (20, 28, 3)"),
+        ({"__call__": lambda self, frame: torch.ones(10, 14, 3)}, "the same vector everywhere"),
     ],
 )
 def test_wrong_features_are_one_sentence(change: dict, words: str):
@@ -131,7 +131,7 @@ class Wrong(ClassicalFlow):
     ("flow", "words"),
     [
         (Wrong().altered(targets=lambda t: t.flip(1)), "found targets off by"),
-        (Wrong().altered(targets=lambda t: t.mT), "found (2, 240, 2)"),
+        (Wrong().altered(targets=lambda t: t.mT), "found (2, 560, 2)"),
         (Wrong().altered(confidences=lambda c: 100 * c), "to return 0 to 1, found 0 to "),
         (Wrong().altered(matched_ratios=lambda r: r[:1]), "(matched_ratios) to return a fin"),
         (type("F", (Wrong,), {"match": lambda *a: None})(), "return FlowMatches, found NoneType"),
@@ -160,7 +160,7 @@ def test_a_wrong_flow_is_one_sentence(flow, words: str):
 )
 def test_the_known_mistakes_of_a_flow_are_named(mistake, words: str):
     pixels = torch.stack(
-        torch.meshgrid(8.0 * torch.arange(20), 8.0 * torch.arange(12), indexing="xy")
+        torch.meshgrid(8.0 * torch.arange(28), 8.0 * torch.arange(20), indexing="xy")
     ).flatten(1)[None]
     flow = Wrong().altered(targets=lambda targets: pixels + mistake(targets - pixels))
     with pytest.raises(InputError, match=words):
