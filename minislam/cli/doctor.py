@@ -26,13 +26,17 @@ def run_doctor(args: argparse.Namespace) -> int:
 
     import torch
 
+    from minislam.priors.conformance import flow_error, shifted_images
+    from minislam.priors.flow import ClassicalFlow
+
     print(f"minislam {minislam.__version__}, Python {platform.python_version()}")
     for name in ("numpy", "scipy", "torch", "cv2", "matplotlib"):
         print(f"  {name:11s} {importlib.import_module(name).__version__}")
     print(f"  processors  {os.cpu_count()}, torch uses {torch.get_num_threads()} threads")
     print(f"  CUDA        {torch.cuda.get_device_name() if torch.cuda.is_available() else 'none'}")
     start = time.perf_counter()
-    error = _self_test()
+    flow, (first, second) = ClassicalFlow(), shifted_images()
+    error = flow_error(flow.start_chain(first).advance(second)[1], flow.stride)
     seconds = time.perf_counter() - start
     print(f"  self-test   flow of a shifted image, off by {error:.3f} px, {seconds:.1f} s")
     if not error <= MAX_SELF_TEST_ERROR:
@@ -41,12 +45,3 @@ def run_doctor(args: argparse.Namespace) -> int:
             f"{error:.3f} px; reinstall opencv-python-headless"
         )
     return 0
-
-
-def _self_test() -> float:
-    """Return the error of the flow between an image and the same image shifted [px]."""
-    from minislam.priors.conformance import flow_error, shifted_images
-    from minislam.priors.flow import ClassicalFlow
-
-    flow, (first, second) = ClassicalFlow(), shifted_images()
-    return flow_error(flow.start_chain(first).advance(second)[1], flow.stride)

@@ -17,7 +17,7 @@ from minislam.priors.depth import (
     SimulatedDepthConfig,
 )
 from minislam.priors.features import ClassicalFeatures, ClassicalFeaturesConfig
-from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
+from minislam.priors.files import DEPTH, FEATURES, FILES, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
@@ -26,7 +26,6 @@ from minislam.priors.networks.table import NETWORKS, NetworksConfig, find_networ
 from minislam.priors.plugins import PYTHON, load_plugin, plugin_names
 from minislam.records import Sequence
 
-FILES = "files:"  # before the name of a folder
 FOLDER = f"{FILES}FOLDER"
 
 
@@ -69,7 +68,7 @@ def choose_features(
     """Return the features: classical, a network, a plugin, or files:FOLDER."""
     makers: dict[str, Callable[[], Any]] = {
         "classical": lambda: ClassicalFeatures(classical),
-        FOLDER: lambda: FileFeatures(_folder(choice.features, FEATURES), camera),
+        FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera),
     }
     return _choose("features", choice, networks, makers)
 
@@ -86,7 +85,7 @@ def choose_depth(
         "none": NoDepth,
         "simulated": lambda: _simulated_depth(sequence, seed, simulated),
         "sensor": lambda: SensorDepth(sequence.sensor_depth),
-        FOLDER: lambda: FileDepth(_folder(choice.depth, DEPTH), 1 / sequence.depth_scale),
+        FOLDER: lambda: FileDepth(folder_of(choice.depth, DEPTH), 1 / sequence.depth_scale),
     }
     return _choose("depth", choice, networks, makers)
 
@@ -124,10 +123,6 @@ def _choose(
     raise InputError(
         f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
     )
-
-
-def _folder(name: str, kind: str) -> Path:
-    return folder_of(name.removeprefix(FILES), kind)
 
 
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:

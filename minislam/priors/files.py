@@ -14,6 +14,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.records import Frame
 
+FILES = "files:"  # before the name of a folder on the command line
 INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
 FEATURES, DEPTH = "features", "depth"  # folders of one sequence's priors
 _ALSO_DEPTH = "depths"  # the folder's name where WildGS-SLAM writes its own
@@ -101,7 +102,7 @@ class FileFeatures:
 
 def folder_of(name: str, kind: str) -> Path:
     """Return where the files of a kind are: in the subfolder of that name, or in the folder."""
-    folder = Path(name).expanduser()
+    folder = Path(name.removeprefix(FILES)).expanduser()
     parts = [kind, _ALSO_DEPTH] if kind == DEPTH else [kind]
     return next((folder / part for part in parts if (folder / part).is_dir()), folder)
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from minislam.cli import doctor
 from minislam.cli.main import main
+from minislam.priors import conformance
 
 
 def test_doctor_says_what_is_installed_and_tries_the_flow(capsys: pytest.CaptureFixture[str]):
@@ -13,6 +13,6 @@ def test_doctor_says_what_is_installed_and_tries_the_flow(capsys: pytest.Capture
 
 
 def test_a_flow_that_is_wrong_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys):
-    monkeypatch.setattr(doctor, "_self_test", lambda: float("nan"))
+    monkeypatch.setattr(conformance, "flow_error", lambda *_: float("nan"))
     assert main(["doctor"]) == 1
     assert "expected the self-test to be exact to 0.1 px, found nan px" in capsys.readouterr().err

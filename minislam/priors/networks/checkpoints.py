@@ -150,9 +150,10 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
             f"bytes), {problem}"
         ) from error
     if not tensors:
+        found = f"the entries {list(content)}" if isinstance(content, dict) else type(content)
         raise InputError(
-            f"expected named tensors in {path}, found {_entries(content)}; give the file with the "
-            "weights, or save the dictionary of its tensors alone to a file"
+            f"expected named tensors in {path}, found {str(found)[:_SHOWN]}; give the file with "
+            "the weights, or save the dictionary of its tensors alone to a file"
         )
     _require_numbers(tensors, path)
     return Weights({name: tensor.float() for name, tensor in tensors.items()}, str(path))
@@ -176,16 +177,6 @@ def _unwrapped(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         if names:
             return _unwrapped({name[len(wrapper) + 1 :]: tensors[name] for name in names})
     return tensors
-
-
-def _entries(content: Any) -> str:
-    """Say what a file without named tensors holds."""
-    if not isinstance(content, dict):
-        return f"a {type(content).__name__}"
-    names = [
-        f"{k} ({', '.join(map(str, v))})" if isinstance(v, dict) else k for k, v in content.items()
-    ]
-    return f"the entries {', '.join(map(str, names))}"[:_SHOWN] if names else "nothing"
 
 
 def _require_numbers(tensors: dict[str, Tensor], path: Path) -> None:
