@@ -13,8 +13,9 @@ from minislam.parameters import parameter
 from minislam.priors.depth import SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeaturesConfig
 from minislam.priors.grid_flow import ClassicalFlowConfig
+from minislam.priors.networks.droid import DroidFlowConfig
 from minislam.priors.networks.table import NetworksConfig
-from minislam.tracking.config import TrackingConfig
+from minislam.tracking.config import TrackingConfig, paper_schedule
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 
 OTHER_PARTS = ("sequence", "input", "priors")  # of config.json, beside the settings
@@ -55,7 +56,12 @@ def _leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
 
 def _paper_settings() -> dict[str, Any]:
     """Return the values in which the paper and the official code differ from the default tree."""
-    paper = replace(SlamConfig(), mapping=paper_mapping(), uncertainty=paper_uncertainty())
+    paper = SlamConfig(
+        tracking=TrackingConfig(learned=paper_schedule()),
+        mapping=paper_mapping(),
+        uncertainty=paper_uncertainty(),
+        networks=NetworksConfig(DroidFlowConfig(chain_updates=1)),
+    )
     default = settings_of(SlamConfig())
     return {name: value for name, value in settings_of(paper).items() if value != default[name]}
 
@@ -83,7 +89,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mapping.keyframe_iterations": 10,
         "mapping.refine_iterations": 60,
         "mapping.image_scale": 1.0,
-        "networks.droid.updates": 1,
+        "tracking.learned.warmup_rounds": 2,
+        "tracking.learned.rounds": 1,
+        "tracking.learned.pose_rounds": 1,
         "networks.droid.chain_updates": 1,
         "networks.metric3d.size": (112, 168),
         "networks.depth_anything.shorter_side": 70,

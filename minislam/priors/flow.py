@@ -43,6 +43,8 @@ class ClassicalFlow(Stateful):
     result of an edge is kept, and measured again only if its start has moved.
     """
 
+    learned_confidence = False
+
     def __init__(self, config: ClassicalFlowConfig | None = None) -> None:
         # DIS splits the image in one stripe per OpenCV thread and does not propagate matches
         # across them: with more than one, the result would depend on the machine.
@@ -93,6 +95,9 @@ class ClassicalFlow(Stateful):
             [self._textures[source] for source in edges_source],
             predicted_targets.dtype,
         )
+
+    def disparity_damping(self, keyframes: int) -> None:
+        """Return None; see FlowEstimator."""
 
     def _has_moved(self, edge: Edge, start: np.ndarray) -> bool:
         if edge not in self._measured:

@@ -41,6 +41,7 @@ class FlowEstimator(Protocol):
     """
 
     stride: int  # px between neighbouring grid cells
+    learned_confidence: bool  # learned with a bundle adjustment: only its ratios count
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
@@ -55,6 +56,12 @@ class FlowEstimator(Protocol):
         predicted_targets: Tensor,  # (E, 2, N) px, present reprojection of every cell
     ) -> FlowMatches:
         """Match every cell of each source frame in the target frame of its edge."""
+
+    def disparity_damping(self, keyframes: int) -> Tensor | None:
+        """Return what damps the disparities (K, N) of all keyframes in Eq. (5) [px^2].
+
+        None: a fraction of the mean diagonal.
+        """
 
     def start_chain(self, image: Tensor) -> FlowChain:
         """Return a chain whose reference is this image (H, W, 3)."""

@@ -42,6 +42,7 @@ class BundleProblem:
     free_poses: Tensor  # (K,) bool
     free_disparities: Tensor  # (K,) bool
     robust: RobustKernel | None = None  # None: plain least squares
+    disparity_damping: Tensor | None = None  # (K, N) px^2; None: a fraction of the mean diagonal
     free_focal: bool = False  # f is one more unknown, not in the paper
 
 
@@ -270,7 +271,10 @@ def _damped_step(
     C = equations.disparity_diagonal
     observed = C > 0
     # Without this, cells that the flow hardly constrains would take steps far too long.
-    C = C * (1 + damping) + DISPARITY_DAMPING * C.sum() / observed.sum().clamp_min(1)
+    typical = DISPARITY_DAMPING * C.sum() / observed.sum().clamp_min(1)
+    if problem.disparity_damping is not None:  # learned: for cells that nothing else holds
+        typical = problem.disparity_damping * (problem.prior_weights == 0)
+    C = C * (1 + damping) + typical
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
     S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
     for source, rows, E in equations.source_blocks:

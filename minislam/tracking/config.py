@@ -1,8 +1,34 @@
 """Settings of the tracker."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from minislam.parameters import parameter
+
+
+@dataclass(frozen=True)
+class LearnedFlowConfig:
+    """What replaces the settings of the same names where the confidence of the flow is learned.
+
+    Flow and geometry take turns: one update of the flow, two Gauss-Newton steps, and again.
+    """
+
+    keyframe_flow: float = parameter(10.0, "as tracking.keyframe_flow [px]")
+    keyframe_flow_without_prior: float = parameter(18.0, "the same without depth prior [px]")
+    cull_fraction: float = parameter(0.3, "as tracking.cull_fraction [-]")
+    warmup_rounds: int = parameter(4, "turns before beta is known")
+    warmup_rounds_with_beta: int = parameter(2, "turns once beta is known")
+    warmup_iterations: int = parameter(2, "Gauss-Newton steps per turn of the warm-up")
+    window: int = parameter(10, "newest keyframes that the local BA moves")
+    rounds: int = parameter(4, "turns per keyframe")
+    active_edges: int = parameter(0, "edges that take turns with the newest keyframe's, at most")
+    iterations: int = parameter(2, "Gauss-Newton steps per turn")
+    global_iterations: int = parameter(2, "Gauss-Newton steps per turn of a global BA")
+    robust_scale: float = parameter(0.0, "as tracking.robust_scale: none is needed [px]")
+    motion_memory: float = parameter(0.0, "as tracking.motion_memory: none is needed [px]")
+    lambda_disparity_prior: float = parameter(0.02, "lambda_4, near the official code's [-]")
+    final_rounds: int = parameter(4, "turns of the final global BA")
+    pose_rounds: int = parameter(6, "turns per frame between keyframes, and before one is linked")
+    pose_iterations: int = parameter(2, "Gauss-Newton steps per turn of such a frame")
 
 
 @dataclass(frozen=True)
@@ -19,7 +45,7 @@ class TrackingConfig:
     cull_fraction: float = parameter(
         0.3,
         "a keyframe nearer to the last than this part of the flow that made it is left out [-]; "
-        "official code: 3 of 24 px",
+        "official code: 24 of 24 px",
     )
     recently_lost_frames: int = parameter(
         15, "a camera lost for longer counts as lost, no longer as recently lost [frames]"
@@ -27,12 +53,17 @@ class TrackingConfig:
     warmup_keyframes: int = parameter(12, "keyframes of the two-stage start, paper Sec. 3.3")
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
+    warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up")
     window: int = parameter(10, "newest keyframes that the local BA moves")
+    active_edges: int = parameter(
+        0, "older edges are measured again up to this number, with those of a new keyframe"
+    )
     min_link_ratio: float = parameter(
         0.1, "a link beyond the neighbourhood needs this much of its flow confirmed [-]"
     )
     rounds: int = parameter(2, "rounds of flow and BA per keyframe")
     iterations: int = parameter(3, "Gauss-Newton steps per round")
+    global_iterations: int = parameter(4, "Gauss-Newton steps per round of a global BA")
     robust_scale: float = parameter(
         1.0,
         "c: width of the robust weight inside Sigma, also in smaller images [px]; 0: least squares",
@@ -76,3 +107,29 @@ class TrackingConfig:
     loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
     final_rounds: int = parameter(2, "rounds of the final global BA, paper supplement")
     final_prior: bool = parameter(False, "keep the disparity prior in the final BA (an ablation)")
+    pose_rounds: int = parameter(1, "rounds of flow and pose per frame between keyframes")
+    pose_iterations: int = parameter(8, "Gauss-Newton steps per round of such a frame")
+    learned: LearnedFlowConfig = field(default_factory=LearnedFlowConfig)
+
+    def for_learned_flow(self) -> "TrackingConfig":
+        """Return the settings for a flow whose confidence is learned."""
+        return replace(self, **vars(self.learned))
+
+
+def paper_schedule() -> LearnedFlowConfig:
+    """Return the official counts for a learned flow.
+
+    The official code makes a keyframe at 24 px, 3 cells, in 512x384: that is 15 px in 320x240.
+    """
+    return LearnedFlowConfig(
+        keyframe_flow=15.0,
+        keyframe_flow_without_prior=15.0,
+        cull_fraction=1.0,
+        warmup_rounds=8 + 8,
+        warmup_rounds_with_beta=8,
+        window=25,
+        rounds=8 + 4,
+        active_edges=75,
+        final_rounds=7 + 12,
+        pose_rounds=12,
+    )

@@ -47,14 +47,8 @@ class FrameGraph(Stateful):
         An edge keeps its old flow if the new one matches clearly less: flow that started from a
         wrong pose fails, and the old flow is needed to correct that pose.
         """
-        measured = zip(
-            edges,
-            matches.targets,
-            matches.confidences,
-            matches.matched_ratios.tolist(),
-            strict=True,
-        )
-        for edge, target, confidence, ratio in measured:
+        measured = matches.targets, matches.confidences, matches.matched_ratios.tolist()
+        for edge, target, confidence, ratio in zip(edges, *measured, strict=True):
             position = self._position.setdefault(edge, len(self))
             if position == len(self):
                 self.edges_source.append(edge[0])
@@ -161,11 +155,8 @@ def flow_distances(
         both = []
         for source, target in ((this, all_keyframes), (all_keyframes, this)):
             motion = relative_transforms(T_camera_world, source, target).to(disparities.dtype)
-            both.append(
-                _directed_distances(
-                    motion, disparities[source], rays, pixels, camera, rotation_weight
-                )
-            )
+            view = rays, pixels, camera, rotation_weight
+            both.append(_directed_distances(motion, disparities[source], *view))
         distances[row] = distances[:, row] = 0.5 * (both[0] + both[1])
     return distances
 

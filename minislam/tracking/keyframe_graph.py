@@ -13,7 +13,12 @@ from minislam.geometry.camera import pixel_scale
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
 from minislam.records import AdjustmentCount, Frame
 from minislam.state.stateful import Stateful
-from minislam.tracking.bundle_adjustment import BundleReport, BundleState
+from minislam.tracking.bundle_adjustment import (
+    BundleReport,
+    BundleState,
+    motion_only_adjust,
+    residuals,
+)
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import (
     FrameGraph,
@@ -24,7 +29,12 @@ from minislam.tracking.frame_graph import (
 )
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
-from minislam.tracking.pose_from_flow import compose_matches, start_pose, warp_disparities
+from minislam.tracking.pose_from_flow import (
+    compose_matches,
+    motion_only_problem,
+    start_pose,
+    warp_disparities,
+)
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
 from minislam.tracking.safeguards.inverse_flow import inverted_targets
 from minislam.tracking.safeguards.robust import RobustKernel
@@ -37,6 +47,7 @@ PROXIMITY_DISTANCE = 120.0  # px at 320x240, largest flow distance of such a lin
 HORIZON = 3  # BA windows of keyframes among which a new one looks for such links
 GLOBAL_EDGES = 6  # further links per keyframe in a global BA
 GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
+ROBUST_NARROWING = 0.5  # between keyframes, because the structure is known by then [-]
 ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [-]
 
 
@@ -53,7 +64,8 @@ class KeyframeGraph(Stateful):
     focal_is_free: bool = False  # the motion has told it; adjustments of all keyframes refine it
 
     def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
-        self.config = config
+        self.is_learned = flow.learned_confidence  # then flow and geometry take turns
+        self.config = config.for_learned_flow() if self.is_learned else config
         self.grid = Grid.of(camera, flow.stride)
         self.keyframes = KeyframeStore(len(self.grid.rays))
         self.flow_to_next = []
@@ -123,6 +135,40 @@ class KeyframeGraph(Stateful):
         weights, robust = keyframes.cell_weights[newest] * trust, self.robust
         disparities = keyframes.disparities[newest]
         return start_pose(self.grid, matches, disparities, weights, last, starts, robust)
+
+    def fit_pose(
+        self,
+        image: Tensor,  # (H, W, 3), of no keyframe
+        around: list[int],  # keyframes that may show the same
+        start: Tensor,  # (4, 4)
+    ) -> tuple[Tensor, float]:
+        """Return the pose T_camera_world (4, 4) of an image, and its support, the mean weight.
+
+        Flow and pose take turns. The disparities are held.
+        """
+        keyframes, grid, newest, count = self.keyframes, self.grid, len(self.keyframes), len(around)
+        known, weights = keyframes.T_camera_world[around], keyframes.cell_weights[around]
+        robust = self.robust and self.robust.widened(ROBUST_NARROWING)
+        ends = torch.arange(count), torch.full((count,), count)
+        unused = torch.zeros(1, len(grid.rays))  # disparities of the image itself
+        disparities = torch.cat([keyframes.disparities[around], unused])
+        state = BundleState(torch.cat([known, start[None]]), disparities)
+        self.flow.add_frame(newest, image)
+        for _ in range(self.config.pose_rounds):
+            transforms = relative_transforms(state.T_camera_world, *ends).float()
+            predicted, _ = reproject(transforms, disparities[:-1], grid.rays, grid.camera)
+            matches = self.flow.match(around, [newest] * count, predicted)
+            measured = *ends, matches.targets, matches.confidences * weights[:, None]
+            problem = motion_only_problem(grid, *measured, torch.arange(count + 1) == count, robust)
+            if count == 1 and not self.is_learned:  # then it may follow a dynamic object
+                poses = known[0], list(state.T_camera_world[1:])
+                pose = start_pose(grid, matches, disparities[0], weights[0], *poses, self.robust)
+                state = BundleState(torch.cat([known, pose[None]]), disparities)
+            state, report = motion_only_adjust(problem, state, self.config.pose_iterations)
+        self.flow.remove_frame(newest)
+        self.count_adjustment(report)
+        _, final_weights = residuals(problem, state)
+        return state.T_camera_world[-1], float(final_weights.mean())
 
     def warp_disparities(self, keyframe: int, T_camera_world: Tensor) -> Tensor:  # (N,)
         """Warp the disparities of a keyframe to another camera pose (4, 4)."""
@@ -231,17 +277,14 @@ class KeyframeGraph(Stateful):
     def distance_to_newest(self, T_camera_world: Tensor) -> float:  # px
         """Return the flow distance of a pose (4, 4) from the newest keyframe."""
         pair = torch.stack([self.keyframes.T_camera_world[-1], T_camera_world])
-        return float(
-            self._flow_distances(pair, self.keyframes.disparities[-1:].expand(2, -1))[0, 1]
-        )
+        disparities = self.keyframes.disparities[-1:].expand(2, -1)
+        return float(self._flow_distances(pair, disparities)[0, 1])
 
     def _flow_distances(
         self, poses: Tensor, disparities: Tensor, rows: range | None = None
     ) -> Tensor:
-        grid = self.grid
-        return flow_distances(
-            poses, disparities, grid.rays, grid.pixels, grid.camera, ROTATION_WEIGHT, rows
-        )
+        view = self.grid.rays, self.grid.pixels, self.grid.camera
+        return flow_distances(poses, disparities, *view, ROTATION_WEIGHT, rows)
 
     def parallaxes(self, sources: Tensor, targets: Tensor) -> Tensor:  # (E,), (E,) -> (E,) px
         """Return the mean parallax of edges, from the present poses and disparities."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import FAR, both_directions, proximity_pairs
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.optimisation import FIRST_WIDENING, GLOBAL_ITERATIONS, adjust, bundle_problem
+from minislam.tracking.optimisation import FIRST_WIDENING, adjust, bundle_problem
 from minislam.tracking.reprojection import lengths
 
 LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code
@@ -58,9 +58,9 @@ def close_loops(graph: KeyframeGraph) -> bool:
         return False
     before, known = graph.state, len(graph.links)
     graph.match(edges)
-    adjust(graph, 0, GLOBAL_ITERATIONS, widening=FIRST_WIDENING)
+    adjust(graph, 0, config.global_iterations, widening=FIRST_WIDENING)
     graph.match(edges)
-    adjust(graph, 0, GLOBAL_ITERATIONS)
+    adjust(graph, 0, config.global_iterations)
     if _residual(graph, known) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
         return True
     graph.keyframes.set_geometry(before.T_camera_world, before.disparities)

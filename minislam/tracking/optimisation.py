@@ -13,8 +13,6 @@ from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 # A new keyframe may have so large an error that the robust weight takes its cells for outliers and
 # the error stays. So the weight is wide at first. [-]
 FIRST_WIDENING = 8.0
-GLOBAL_ITERATIONS = 4  # Gauss-Newton steps of an online global BA
-FINAL_ITERATIONS = 4  # Gauss-Newton steps per round of the final global BA
 
 
 def local_ba(graph: KeyframeGraph) -> None:
@@ -26,10 +24,12 @@ def local_ba(graph: KeyframeGraph) -> None:
     """
     config, newest = graph.config, len(graph.keyframes) - 1
     first_free = max(0, newest + 1 - config.window)
-    graph.match_composed(newest)
-    adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
+    if not graph.is_learned:
+        graph.match_composed(newest)
+        adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
     edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
     mask_priors(graph.keyframes, graph.grid, edges, config, first=newest)
+    edges += graph.links.edges()[max(0, len(graph.links) + len(edges) - config.active_edges) :]
     for _ in range(config.rounds):
         graph.match(edges)
         adjust(graph, first_free, config.iterations)
@@ -43,7 +43,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
     edges = graph.global_edges()
     if edges:
         graph.match(edges)
-    adjust(graph, 0, GLOBAL_ITERATIONS, free_focal=graph.focal_is_free)
+    adjust(graph, 0, graph.config.global_iterations, free_focal=graph.focal_is_free)
 
 
 def final_global_ba(
@@ -59,7 +59,7 @@ def final_global_ba(
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
     for done in range(config.final_rounds):
         graph.match(edges)
-        adjust(graph, 0, FINAL_ITERATIONS, lambda_prior, free_focal=graph.focal_is_free)
+        adjust(graph, 0, config.global_iterations, lambda_prior, free_focal=graph.focal_is_free)
         if progress:
             progress(done + 1, config.final_rounds)
 
@@ -68,7 +68,7 @@ def warm_up_ba(graph: KeyframeGraph, edges: list[Edge], rounds: int) -> None:
     """Adjust the keyframes of the warm-up together: rounds of flow and BA."""
     for _ in range(rounds):
         graph.match(edges)
-        adjust(graph, 0, 2 * graph.config.iterations, free_focal=graph.focal_is_free)
+        adjust(graph, 0, graph.config.warmup_iterations, free_focal=graph.focal_is_free)
 
 
 def adjust(
@@ -109,7 +109,9 @@ def bundle_problem(
     # Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a
     # dynamic object covers; a classical one does not, so the weight of the target counts as well.
     cell_weights = keyframes.cell_weights
-    seen = grid.sample(cell_weights[edges_target][..., None], targets.mT)[..., 0]
+    weights = cell_weights[sources]
+    if not graph.is_learned:
+        weights = weights * grid.sample(cell_weights[edges_target][..., None], targets.mT)[..., 0]
     prior = keyframes.prior_disparities
     if lambda_prior is None:
         lambda_prior = graph.config.lambda_disparity_prior
@@ -123,12 +125,13 @@ def bundle_problem(
         edges_source=sources,
         edges_target=edges_target,
         targets=targets,
-        weights=confidences * (cell_weights[sources] * seen)[:, None],
+        weights=confidences * weights[:, None],
         prior_disparities=prior,
         prior_weights=strength * (prior > 0) * keyframes.prior_masks,
         free_poses=free_poses,
         free_disparities=free,
         robust=graph.robust,
+        disparity_damping=graph.flow.disparity_damping(len(keyframes)),
     )
 
 

@@ -77,15 +77,11 @@ def start_pose(
     for widening in ROBUST_WIDENING if robust else (1.0,):
         candidates += starts
         count = len(candidates)
-        problem = motion_only_problem(
-            grid,
-            torch.zeros(count, dtype=torch.long),
-            torch.arange(1, count + 1),
-            matches.targets.expand(count, -1, -1),
-            (matches.confidences * cell_weights).expand(count, -1, -1),
-            free_poses=torch.arange(count + 1) > 0,
-            robust=robust and robust.widened(widening),
-        )
+        ends = torch.zeros(count, dtype=torch.long), torch.arange(1, count + 1)
+        weights = (matches.confidences * cell_weights).expand(count, -1, -1)
+        measured = *ends, matches.targets.expand(count, -1, -1), weights
+        kernel = robust and robust.widened(widening)
+        problem = motion_only_problem(grid, *measured, torch.arange(count + 1) > 0, kernel)
         poses = torch.stack([T_source_world, *candidates])
         state = BundleState(poses, disparities.expand(count + 1, -1))
         state, _ = motion_only_adjust(problem, state, POSE_ITERATIONS)

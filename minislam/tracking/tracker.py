@@ -27,6 +27,7 @@ from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
+from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.settling import Settling, certainty
 
@@ -80,8 +81,8 @@ class Tracker(Stateful):
         the warm-up and in the final adjustment. So online, a keyframe keeps the beta it had when
         it came, although the MLP learns on.
         """
-        self.config = config
         self.graph = KeyframeGraph(camera, config, flow)
+        self.config = config = self.graph.config  # for this kind of flow
         self.keyframes = self.graph.keyframes
         self.grid = self.graph.grid
         self.tracked = []
@@ -161,7 +162,8 @@ class Tracker(Stateful):
     def _advance(self, frame: Frame) -> tuple[FlowChain, FlowMatches]:
         """Return the chain extended to this frame, and the flow to it from the newest keyframe."""
         assert self._chain is not None, "there is a chain from the first frame on"
-        return self._chain.advance(frame.image)
+        chain, matches = self._chain.advance(frame.image)
+        return chain, judged_by_pose(self.graph, matches) if self.graph.is_learned else matches
 
     def _log_followed(self, frame: Frame, ratio: float) -> None:
         self._lost_in_a_row = 0
@@ -182,6 +184,8 @@ class Tracker(Stateful):
         if self.initialised:  # before, initialise() will estimate all poses together
             information = self._settling.information()
             pose = self.graph.start_pose(matches, certainty(information))
+            if self.graph.is_learned:
+                pose, _ = self.graph.fit_pose(frame.image, [len(self.keyframes) - 1], pose)
             if may_cull and self._is_culled(frame, pose):
                 return
             disparities = self._settling.hand_on(information, pose)
@@ -216,8 +220,7 @@ class Tracker(Stateful):
         """Close loops; every `global_interval` keyframes run online global BA."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
-        interval = config.global_interval
-        is_due = interval > 0 and count - self._last_global >= interval
+        is_due = 0 < config.global_interval <= count - self._last_global
         if is_due and not closed:
             online_global_ba(self.graph)
         if is_due or closed:

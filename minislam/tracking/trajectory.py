@@ -3,20 +3,13 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from minislam.geometry import se3_interpolate
 from minislam.records import Sequence, TrackedFrame, TrackingStatus
-from minislam.tracking.bundle_adjustment import BundleState, motion_only_adjust, residuals
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.pose_from_flow import motion_only_problem, start_pose
-from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.safeguards.pose_support import PoseFit, retry_doubtful
 from minislam.tracking.tracker import Tracker
-
-ITERATIONS = 8  # Gauss-Newton steps of six unknowns
-ROBUST_NARROWING = 0.5  # of the robust scale, because the structure is known by now [-]
 
 
 def pose_all_frames(
@@ -35,7 +28,8 @@ def pose_all_frames(
     others = {t.frame_index: t for t in followed if t.frame_index not in fits}
 
     def fit_from(index: int, start: Tensor) -> PoseFit:
-        return _fit_pose(graph, sequence, others[index], start)
+        image = sequence.frame(index).image
+        return PoseFit(*graph.fit_pose(image, _around(graph, others[index]), start))
 
     for done, (index, tracked) in enumerate(others.items()):
         fits[index] = fit_from(index, _interpolate(graph, tracked))
@@ -64,42 +58,3 @@ def _interpolate(graph: KeyframeGraph, tracked: TrackedFrame) -> Tensor:  # (4, 
         return known[0]
     first, second = (graph.keyframes.frames[k].timestamp for k in around)
     return se3_interpolate(known[0], known[1], (tracked.timestamp - first) / (second - first))
-
-
-def _fit_pose(
-    graph: KeyframeGraph, sequence: Sequence, tracked: TrackedFrame, start: Tensor
-) -> PoseFit:
-    """Estimate the pose of a frame from a start (4, 4)."""
-    keyframes, grid = graph.keyframes, graph.grid
-    around = _around(graph, tracked)
-    known = keyframes.T_camera_world[around]
-    newest, count = len(keyframes), len(around)
-    poses = torch.cat([known, start[None]])
-    disparities = keyframes.disparities[around]
-    sources, targets = torch.arange(count), torch.full((count,), count)
-
-    transforms = relative_transforms(poses, sources, targets).float()
-    predicted, _ = reproject(transforms, disparities, grid.rays, grid.camera)
-    graph.flow.add_frame(newest, sequence.frame(tracked.frame_index).image)
-    matches = graph.flow.match(around, [newest] * count, predicted)
-    graph.flow.remove_frame(newest)
-
-    cell_weights = keyframes.cell_weights[around]
-    problem = motion_only_problem(
-        grid,
-        sources,
-        targets,
-        matches.targets,
-        matches.confidences * cell_weights[:, None],
-        free_poses=torch.arange(count + 1) == count,
-        robust=graph.robust and graph.robust.widened(ROBUST_NARROWING),
-    )
-    if count == 1:  # no later keyframe constrains the pose, so it may follow a dynamic object
-        weights, robust = cell_weights[0], graph.robust
-        poses[-1] = start_pose(grid, matches, disparities[0], weights, known[0], [start], robust)
-    unused = torch.zeros(1, len(grid.rays))  # disparities of the frame itself
-    state = BundleState(poses, torch.cat([disparities, unused]))
-    state, report = motion_only_adjust(problem, state, ITERATIONS)
-    graph.count_adjustment(report)
-    _, final_weights = residuals(problem, state)
-    return PoseFit(state.T_camera_world[-1], float(final_weights.mean()))

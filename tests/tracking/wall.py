@@ -41,6 +41,7 @@ class TrueFlow:
     """Flow as the geometry says, wherever it is asked to start from."""
 
     stride = STRIDE
+    learned_confidence = False
 
     def __init__(self, ratios: dict[tuple[int, int], float] | None = None) -> None:
         self.numbers: dict[int, int] = {}  # of the frame that a keyframe is
@@ -64,6 +65,9 @@ class TrueFlow:
         confidences = seen[:, None].repeat(1, 2, 1).float()
         ratios = [self.ratios.get(edge, 1.0) for edge in zip(sources, targets, strict=True)]
         return FlowMatches(positions.float(), confidences, torch.tensor(ratios))
+
+    def disparity_damping(self, keyframes: int) -> None:
+        return None
 
     def start_chain(self, image: Tensor) -> FlowChain:
         raise NotImplementedError

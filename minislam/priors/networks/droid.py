@@ -1,10 +1,11 @@
 """DROID-SLAM's network behind the `FlowEstimator` interface, as in the paper.
 
-An edge keeps the hidden state of its recurrent unit as long as every call includes the edge. So a
-later result refines the earlier ones, while the geometry improves between the calls.
+A call updates the flow of its edges once; between two calls the geometry is adjusted. An edge keeps
+the hidden state of its recurrent unit from call to call: a later answer refines the earlier ones.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,31 +17,34 @@ from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid_network import (
     LEVELS,
     STRIDE,
-    EncodedFrames,
     cell_grid,
     correlation_pyramid,
-    encode,
+    damping,
+    encode_context,
+    encode_features,
     look_up,
     update,
 )
 from minislam.priors.networks.vit import normalise
-from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
+from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 
 _SMALLEST_GRID = 2 ** (LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
+# Least confidence of a matched cell, relative to the mean of its edge: the network learned to weigh
+# cells against each other in a bundle adjustment, so their ratios have a meaning. [-]
+_MATCHED = 0.1
+# The official code adds 0.2 eta to squared cells times 0.001 of the confidence; here it is px^2.
+_DAMPING = 0.2 * STRIDE**2 / 0.001
 
 
 @dataclass(frozen=True)
 class DroidFlowConfig:
     """How much work the network is given."""
 
-    updates: int = parameter(
-        2, "updates per match; with two rounds of flow and BA it makes the 4 of a CPU profile"
+    chain_updates: int = parameter(
+        3, "updates per frame, from the last frame's flow; 1: from the identity, official code"
     )
-    chain_updates: int = parameter(3, "updates per frame while following the camera")
+    kept_edges: int = parameter(75, "edges, those used last, that keep their hidden states")
     edges_per_batch: int = parameter(8, "edges in one pass, bounds the memory of correlations")
-    matched_confidence: float = parameter(
-        0.1, "least confidence of a cell that counts as matched [-], a guess without real weights"
-    )
 
 
 @dataclass(frozen=True)
@@ -49,16 +53,45 @@ class _EdgeState:
     target: Tensor  # (h, w, 2) cells
 
 
+class EncodedFrame:
+    """What the encoders make of an image: for a target, and for a source when it becomes one."""
+
+    def __init__(self, weights: Weights, image: Tensor) -> None:
+        self.image = image  # (H, W, 3)
+        self._weights, self._normalised = weights, normalise(image, weights.device)
+        self.features = encode_features(weights, self._normalised)  # (1, 128, h, w)
+
+    @cached_property
+    def context(self) -> tuple[Tensor, Tensor]:  # (1, 128, h, w) twice
+        """Return the first hidden state and the context of all updates."""
+        return encode_context(self._weights, self._normalised)
+
+
 class DroidFlow(Stateful):
     """Learned flow between registered keyframes, refined around a predicted reprojection."""
 
     stride = STRIDE
+    learned_confidence = True
 
     def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
         self.weights = weights
         self.config = config or DroidFlowConfig()
-        self._frames: dict[int, EncodedFrames] = {}
-        self._edges: dict[tuple[int, int], _EdgeState] = {}
+        self._frames: dict[int, EncodedFrame] = {}
+        self._edges: dict[tuple[int, int], _EdgeState] = {}  # the last ones were used last
+        self._dampings: dict[int, Tensor] = {}  # (N,) px^2
+        self._newest: EncodedFrame | None = None
+
+    @torch.no_grad()
+    def encode(self, image: Tensor) -> EncodedFrame:
+        """Return an image (H, W, 3) encoded; chain and keyframe share the newest one."""
+        if min(image.shape[:2]) <= STRIDE * (_SMALLEST_GRID - 1):
+            raise InputError(
+                f"expected images of more than {STRIDE * (_SMALLEST_GRID - 1)} px per side for "
+                f"DROID, found {image.shape[1]}x{image.shape[0]}; give a larger working size"
+            )
+        if self._newest is None or self._newest.image is not image:
+            self._newest = EncodedFrame(self.weights, image)
+        return self._newest
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
@@ -67,15 +100,18 @@ class DroidFlow(Stateful):
     def remove_frame(self, keyframe_index: int) -> None:
         """Forget a keyframe and the edges that touch it."""
         del self._frames[keyframe_index]
+        self._dampings.pop(keyframe_index, None)
         self._edges = {e: state for e, state in self._edges.items() if keyframe_index not in e}
 
     def saved_state(self) -> Tree:
         """Return the state: of the edges. The frames are encoded again."""
-        return {"edges": [[*edge, to_tree(state)] for edge, state in self._edges.items()]}
+        edges = [[*edge, to_tree(state)] for edge, state in self._edges.items()]
+        return {"edges": edges, "dampings": [list(item) for item in self._dampings.items()]}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
         self._edges = {(i, j): _EdgeState(**edge) for i, j, edge in state["edges"]}
+        self._dampings = dict(state["dampings"])
 
     @torch.no_grad()
     def match(
@@ -84,7 +120,7 @@ class DroidFlow(Stateful):
         edges_target: list[int],  # (E,) keyframe index
         predicted_targets: Tensor,  # (E, 2, N) px
     ) -> FlowMatches:
-        """Match every grid cell of each source in its target; see FlowEstimator.match."""
+        """Update the flow of these edges once; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
         height, width = self._frames[edges_source[0]].features.shape[2:]
         expected = predicted_targets.to(self.weights.device, torch.float32) / STRIDE
@@ -93,136 +129,128 @@ class DroidFlow(Stateful):
         confidences = []
         for start in range(0, len(edges), self.config.edges_per_batch):
             batch = edges[start : start + self.config.edges_per_batch]
-            found, confidence = self._refine(batch, expected[start : start + len(batch)])
+            found, confidence = self._update_edges(batch, expected[start : start + len(batch)])
             states |= dict(zip(batch, found, strict=True))
             confidences.append(confidence)
-        # Edges that are not in this call start anew next time. So memory is bounded.
-        self._edges = states
+        others = [(edge, state) for edge, state in self._edges.items() if edge not in states]
+        free = max(0, self.config.kept_edges - len(states))
+        self._edges = dict(others[max(0, len(others) - free) :]) | states
+        for source in dict.fromkeys(edges_source):
+            hidden = torch.stack([states[edge].hidden for edge in edges if edge[0] == source])
+            eta = self.damping(hidden).flatten()
+            self._dampings[source] = _DAMPING * eta.to(predicted_targets)
         targets = torch.stack([states[edge].target for edge in edges])
-        return self.as_matches(targets, torch.cat(confidences), predicted_targets)
+        return as_matches(targets, torch.cat(confidences), predicted_targets)
 
-    def _refine(
+    def disparity_damping(self, keyframes: int) -> Tensor:  # (K, N) px^2
+        """Return the damping of the disparities of all keyframes; see FlowEstimator."""
+        unknown = torch.zeros_like(next(iter(self._dampings.values())))
+        return torch.stack([self._dampings.get(k, unknown) for k in range(keyframes)])
+
+    def _update_edges(
         self,
         edges: list[tuple[int, int]],
         expected: Tensor,  # (E, h, w, 2) cells
     ) -> tuple[list[_EdgeState], Tensor]:
         """Return the new states of a batch of edges and their confidences (E, h, w, 2)."""
         sources = [self._frames[source] for source, _ in edges]
-        targets = torch.cat([self._frames[target].features for _, target in edges])
-        known = [self._edges.get(edge) for edge in edges]
-        hidden = [
-            state.hidden[None] if state else source.hidden
-            for state, source in zip(known, sources, strict=True)
+        known = [
+            self._edges.get(edge) or _EdgeState(source.context[0][0], where)
+            for edge, source, where in zip(edges, sources, expected, strict=True)
         ]
-        last = [
-            state.target if state else where for state, where in zip(known, expected, strict=True)
-        ]
-        refined = self.refine(
-            EncodedFrames(
-                torch.cat([source.features for source in sources]),
-                torch.cat(hidden),
-                torch.cat([source.context for source in sources]),
-            ),
-            targets,
+        hidden, targets, confidences = self.update(
+            torch.cat([source.features for source in sources]),
+            torch.cat([self._frames[target].features for _, target in edges]),
+            torch.stack([state.hidden for state in known]),
+            torch.cat([source.context[1] for source in sources]),
             expected,
-            torch.stack(last),
-            self.config.updates,
+            torch.stack([state.target for state in known]),
         )
-        return [_EdgeState(h, t) for h, t in zip(*refined[:2], strict=True)], refined[2]
-
-    def refine(
-        self,
-        source: EncodedFrames,  # of E edges
-        target_features: Tensor,  # (E, 128, h, w)
-        expected: Tensor,  # (E, h, w, 2) cells
-        last_target: Tensor,  # (E, h, w, 2) cells
-        updates: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Run updates; return hidden states, targets [cells] and confidences."""
-        pyramid = correlation_pyramid(source.features, target_features)
-        hidden = source.hidden
-        for _ in range(updates):
-            correlation = look_up(pyramid, expected)
-            answer = update(
-                self.weights, hidden, source.context, correlation, expected, last_target
-            )
-            hidden, last_target = answer.hidden, expected + answer.revision
-            expected = last_target  # the best guess until the geometry is updated
-        return hidden, last_target, answer.confidence
-
-    @torch.no_grad()
-    def encode(self, image: Tensor) -> EncodedFrames:
-        """Return features and context of an image (H, W, 3)."""
-        if min(image.shape[:2]) <= STRIDE * (_SMALLEST_GRID - 1):
-            raise InputError(
-                f"expected images of more than {STRIDE * (_SMALLEST_GRID - 1)} px per side for "
-                f"DROID, found {image.shape[1]}x{image.shape[0]}; give a larger working size"
-            )
-        return encode(self.weights, normalise(image, self.weights.device))
-
-    def as_matches(self, targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatches:
-        """Return targets [cells] and confidences (E, h, w, 2) as matches in px, like a tensor."""
-        size = targets.new_tensor([targets.shape[2] - 1, targets.shape[1] - 1])
-        inside = ((targets >= 0) & (targets <= size)).all(-1)
-        matched = inside & (confidences.mean(-1) >= self.config.matched_confidence)
-        ratios = matched.float().mean((1, 2))
-        targets, confidences = (x.flatten(1, 2).mT.contiguous() for x in (targets, confidences))
-        return FlowMatches(*(x.to(like) for x in (STRIDE * targets, confidences, ratios)))
+        return [_EdgeState(h, t) for h, t in zip(hidden, targets, strict=True)], confidences
 
     def start_chain(self, image: Tensor) -> "DroidChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
-        return DroidChain(self, self.encode(image), None, None)
+        return DroidChain(self, self.encode(image), self.encode(image), None)
 
+    @torch.no_grad()
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "DroidChain":
         """Return the chain whose saved state this is."""
-        reference = from_tree(EncodedFrames, state["_reference"], frame_of)
-        newest = from_tree(EncodedFrames, state["_newest"], frame_of)
+        reference, newest = (EncodedFrame(self.weights, image) for image in state["_images"])
         return DroidChain(self, reference, newest, state["_target"])
+
+    # The network --------------------------------------------------------------------------------
+
+    def update(
+        self,
+        source: Tensor,  # (E, 128, h, w) features
+        target: Tensor,  # (E, 128, h, w) features
+        hidden: Tensor,  # (E, 128, h, w)
+        context: Tensor,  # (E, 128, h, w)
+        expected: Tensor,  # (E, h, w, 2) cells
+        last_target: Tensor,  # (E, h, w, 2) cells
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Update edges once; return hidden states, targets [cells] and confidences."""
+        correlation = look_up(correlation_pyramid(source, target), expected)
+        answer = update(self.weights, hidden, context, correlation, expected, last_target)
+        return answer.hidden, expected + answer.revision, answer.confidence
+
+    def damping(self, hidden: Tensor) -> Tensor:  # (E, 128, h, w) of one source -> (h, w)
+        """Return how much the network would damp the disparities of a source."""
+        return damping(self.weights, hidden)
 
 
 class DroidChain(Stateful):
     """The flow from one reference frame to the newest; a `FlowChain` that never changes."""
 
-    _reference: EncodedFrames
-    _newest: EncodedFrames
+    _images: list[Tensor]  # (H, W, 3) of the reference and of the newest frame
     _target: Tensor | None  # (1, h, w, 2) cells, None: nothing has moved yet
 
     def __init__(
         self,
         flow: DroidFlow,
-        reference: EncodedFrames,
-        newest: EncodedFrames | None,
+        reference: EncodedFrame,
+        newest: EncodedFrame,
         target: Tensor | None,
     ) -> None:
-        self._flow = flow
-        self._reference = reference
-        self._newest = newest or reference
+        self._flow, self._reference, self._newest = flow, reference, newest
+        self._images = [reference.image, newest.image]
         self._target = target
 
     @torch.no_grad()
     def advance(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
-        newest = self._flow.encode(image)
-        reference = self._reference
-        expected = self._target
-        if expected is None:
-            height, width = reference.features.shape[2:]
-            expected = cell_grid(reference.features.new_zeros(1, height, width, 2))[None]
-        updates = self._flow.config.chain_updates
-        _, target, confidence = self._flow.refine(
-            reference, newest.features, expected, expected, updates
-        )
-        matches = self._flow.as_matches(target, confidence, image)
-        return DroidChain(self._flow, reference, newest, target), matches
+        flow, reference, newest = self._flow, self._reference, self._flow.encode(image)
+        hidden, context = reference.context
+        target, updates = self._target, flow.config.chain_updates
+        if target is None or updates == 1:
+            target = cell_grid(hidden.new_zeros(1, *hidden.shape[2:], 2))[None]
+        for _ in range(updates):
+            # Without geometry, the last answer is the best guess.
+            hidden, target, confidence = flow.update(
+                reference.features, newest.features, hidden, context, target, target
+            )
+        return DroidChain(flow, reference, newest, target), as_matches(target, confidence, image)
 
     def restart(self) -> "DroidChain":
         """Return a chain that starts at the newest frame."""
-        return DroidChain(self._flow, self._newest, None, None)
+        return DroidChain(self._flow, self._newest, self._newest, None)
+
+
+def as_matches(targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatches:
+    """Return targets [cells] and confidences (E, h, w, 2) as matches in px, like a tensor."""
+    size = targets.new_tensor([targets.shape[2] - 1, targets.shape[1] - 1])
+    inside = ((targets >= 0) & (targets <= size)).all(-1)
+    of_cells = confidences.mean(-1)
+    matched = inside & (of_cells >= _MATCHED * of_cells.mean((1, 2), keepdim=True))
+    ratios = matched.float().mean((1, 2))
+    targets, confidences = (x.flatten(1, 2).mT.contiguous() for x in (targets, confidences))
+    return FlowMatches(*(x.to(like) for x in (STRIDE * targets, confidences, ratios)))
 
 
 def build_droid(weights: Weights, config: DroidFlowConfig) -> DroidFlow:
     """Return the flow after one run on a tiny image, which asks for every tensor it needs."""
     flow = DroidFlow(weights, config)
     tiny = torch.zeros(STRIDE * _SMALLEST_GRID, STRIDE * _SMALLEST_GRID, 3)
-    flow.start_chain(tiny).advance(tiny)
-    return flow
+    flow.add_frame(0, tiny)
+    flow.match([0], [0], torch.zeros(1, 2, _SMALLEST_GRID**2))
+    return DroidFlow(weights, config)

@@ -20,16 +20,8 @@ CHANNELS = 128  # of features, hidden state and context
 LEVELS = 4  # of the correlation pyramid
 _HEAD = (2, 3)  # channels; a third of some checkpoints was of use in the training only
 RADIUS = 3  # cells looked at around the expected position, at every level
+_DAMPING_SCALE = 0.01  # of eta, as in the training
 _MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
-
-
-@dataclass(frozen=True)
-class EncodedFrames:
-    """What the encoder computes of B frames."""
-
-    features: Tensor  # (B, 128, h, w) compared between frames
-    hidden: Tensor  # (B, 128, h, w) initial hidden state of the recurrent unit
-    context: Tensor  # (B, 128, h, w) input of every update
 
 
 @dataclass(frozen=True)
@@ -41,11 +33,15 @@ class Update:
     confidence: Tensor  # (E, h, w, 2) in (0, 1), for u and v
 
 
-def encode(weights: Weights, image: Tensor) -> EncodedFrames:
-    """Return features, hidden state and context of normalised images (B, 3, H, W)."""
-    features = _encode(weights.below("fnet."), image, normalised=True)
+def encode_features(weights: Weights, image: Tensor) -> Tensor:  # (B, 128, h, w)
+    """Return what is compared between frames, of normalised images (B, 3, H, W)."""
+    return _encode(weights.below("fnet."), image, normalised=True)
+
+
+def encode_context(weights: Weights, image: Tensor) -> tuple[Tensor, Tensor]:  # (B, 128, h, w)
+    """Return what a source needs: the first hidden state, and the context of all its updates."""
     both = _encode(weights.below("cnet."), image, normalised=False)
-    return EncodedFrames(features, both[:, :CHANNELS].tanh(), both[:, CHANNELS:].relu())
+    return both[:, :CHANNELS].tanh(), both[:, CHANNELS:].relu()
 
 
 def _encode(weights: Weights, x: Tensor, normalised: bool) -> Tensor:
@@ -122,6 +118,17 @@ def update(
     revision = _two_convs(weights.below("delta."), hidden, _HEAD)[:, :2]
     confidence = _two_convs(weights.below("weight."), hidden, _HEAD)[:, :2].sigmoid()
     return Update(hidden, revision.permute(0, 2, 3, 1), confidence.permute(0, 2, 3, 1))
+
+
+def damping(
+    weights: Weights,
+    hidden: Tensor,  # (E, 128, h, w) of the edges of one source
+) -> Tensor:  # (h, w)
+    """Return eta, by which a bundle adjustment should damp the disparities of that source."""
+    weights = weights.below("update.agg.")
+    seen = weights.conv("conv1", hidden).relu().mean(0, keepdim=True)
+    features = weights.conv("conv2", seen).relu()
+    return _DAMPING_SCALE * functional.softplus(weights.conv("eta.0", features))[0, 0]
 
 
 def cell_grid(like: Tensor) -> Tensor:  # (h, w, 2) cells

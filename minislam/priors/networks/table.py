@@ -51,8 +51,8 @@ NETWORKS = (
     Network(
         "flow", "droid", "DROID-SLAM", ("update.gru.convz.weight",),
         lambda weights, config: build_droid(weights, config.droid),
-        # Damping and upsampling of a bundle adjustment that is not ours, and MegaSaM's own.
-        unneeded=("update.agg.", "update.agg_motion."),
+        # Upsampling of disparities, since the map takes denser depth; MegaSaM's own.
+        unneeded=("update.agg.upmask.", "update.agg_motion."),
     ),
     Network(
         "features", "dinov2", "DINOv2", ("blocks.0.ls1.gamma", "mask_token"),

@@ -1,18 +1,26 @@
-"""Poses between keyframes that little of the flow supports: other starts, or the frame is lost.
+"""Poses that little of the flow supports: other starts, or the frame is lost.
 
 In a wide gap between keyframes the interpolated pose may be too far off for the flow to find the
 true one. The pose of a neighbouring frame is a nearer start, once that frame is right itself.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from torch import Tensor
+
+from minislam.priors.interfaces import FlowMatches
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
 # Support of a pose, relative to the median of all frames between keyframes: [-]
 DOUBTFUL_SUPPORT = 0.5  # with less, other starts are tried
 LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
+# Residuals of a flow that a pose explains: the first updates go a part of the way, but that way.
+EXPLAINED = 3.0, 0.25  # px at 320x240, and part of the flow
+CHANCE = 0.25  # of the weight of a random flow is explained as well; .95 and more of a good one [-]
 
 
 @dataclass(frozen=True)
@@ -42,3 +50,22 @@ def retry_doubtful(
     for index in lost:
         del fits[index]
     return lost
+
+
+def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
+    """Return a learned flow (E = 1) from the newest keyframe, judged by the best pose for it.
+
+    Its matched ratio is the part of its weight that the pose explains beyond chance. How high a
+    learned confidence is says nothing, because the network learned only to weigh cells by it.
+    """
+    pose = graph.start_pose(matches, torch.ones(len(graph.grid.rays)))
+    ends = torch.stack([graph.keyframes.T_camera_world[-1], pose])
+    motion = relative_transforms(ends, torch.tensor([0]), torch.tensor([1])).float()
+    disparities = graph.keyframes.disparities[-1:]
+    predicted, _ = reproject(motion, disparities, graph.grid.rays, graph.grid.camera)
+    way = lengths(matches.targets - graph.grid.pixels.T)
+    allowed = EXPLAINED[0] * graph.pixel_scale + EXPLAINED[1] * way
+    weights = matches.confidences.mean(1)
+    explained = weights * (lengths(matches.targets - predicted) < allowed)
+    ratio = (explained.sum(1) / weights.sum(1) - CHANCE) / (1 - CHANCE)
+    return replace(matches, matched_ratios=ratio.clamp_min(0))

@@ -9,11 +9,12 @@ import torch
 
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid_network import (
-    EncodedFrames,
     Update,
     cell_grid,
     correlation_pyramid,
-    encode,
+    damping,
+    encode_context,
+    encode_features,
     look_up,
     update,
 )
@@ -61,20 +62,21 @@ def assert_golden(actual: torch.Tensor, name: str) -> None:
 
 @cache
 @torch.inference_mode()
-def encoded() -> EncodedFrames:
+def encoded() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return features, first hidden state and context of three images."""
     images = torch.cat([normalise(moving_image(f), torch.device("cpu")) for f in range(3)])
-    return encode(weights(), images)
+    return encode_features(weights(), images), *encode_context(weights(), images)
 
 
 @cache
 @torch.inference_mode()
 def updated(iteration: int) -> Update:
     """Return the update of the stored protocol, each iteration from the official state."""
-    frames = encoded()
-    pyramid = correlation_pyramid(frames.features[SOURCES], frames.features[TARGETS])
+    features, first_hidden, context = encoded()
+    pyramid = correlation_pyramid(features[SOURCES], features[TARGETS])
     expected = stored()[f"coords_it{iteration}"]
     if iteration == 1:
-        hidden = frames.hidden[SOURCES]
+        hidden = first_hidden[SOURCES]
         last_target = expected + torch.tensor([0.25, -0.5])
     else:
         hidden = updated(1).hidden
@@ -82,17 +84,15 @@ def updated(iteration: int) -> Update:
     correlation = look_up(pyramid, expected)
     if iteration == 1:
         assert_golden(correlation, "corr_it1")
-    return update(weights(), hidden, frames.context[SOURCES], correlation, expected, last_target)
+    return update(weights(), hidden, context[SOURCES], correlation, expected, last_target)
 
 
 # Known answers
 
 
 def test_encoders_are_those_of_the_official_code():
-    frames = encoded()
-    assert_golden(frames.features, "fmap")
-    assert_golden(frames.hidden, "net0")
-    assert_golden(frames.context, "inp")
+    for part, name in zip(encoded(), ("fmap", "net0", "inp"), strict=True):
+        assert_golden(part, name)
 
 
 @pytest.mark.parametrize("iteration", [1, 2])
@@ -103,13 +103,21 @@ def test_updates_are_those_of_the_official_code(iteration: int):
     assert_golden(found.confidence, f"weight_it{iteration}")
 
 
+@pytest.mark.parametrize("iteration", [1, 2])
+@torch.inference_mode()
+def test_damping_is_that_of_the_official_code(iteration: int):
+    hidden = updated(iteration).hidden
+    of_source = [hidden[[s == source for s in SOURCES]] for source in sorted(set(SOURCES))]
+    found = torch.stack([damping(weights(), edges) for edges in of_source])
+    assert_golden(found, f"eta_it{iteration}")
+
+
 @torch.inference_mode()
 def test_the_first_look_between_frames_is_that_of_the_official_code():
-    frames = encoded()
-    pyramid = correlation_pyramid(frames.features[:1], frames.features[1:2])
+    features, hidden, seen = (part[:1] for part in encoded())
+    pyramid = correlation_pyramid(features, encoded()[0][1:2])
     still = cell_grid(torch.zeros(1, 16, 20, 2))[None]
     correlation = look_up(pyramid, still)
-    hidden, seen = frames.hidden[:1], frames.context[:1]
     found = update(weights(), hidden, seen, correlation, still, still)
     assert_golden(found.revision, "mf_delta")
     assert_golden(found.confidence, "mf_weight")
@@ -145,10 +153,9 @@ def test_a_wider_head_of_a_checkpoint_is_cut():
 
 def test_edges_do_not_influence_each_other():
     found = updated(1)
-    frames = encoded()
-    pyramid = correlation_pyramid(frames.features[[2]], frames.features[[1]])
+    features, hidden, seen = (part[[2]] for part in encoded())
+    pyramid = correlation_pyramid(features, encoded()[0][[1]])
     expected = stored()["coords_it1"][3:]
     last_target = expected + torch.tensor([0.25, -0.5])
-    hidden, seen = frames.hidden[[2]], frames.context[[2]]
     alone = update(weights(), hidden, seen, look_up(pyramid, expected), expected, last_target)
     torch.testing.assert_close(alone.revision[0], found.revision[3], atol=1e-4, rtol=0)

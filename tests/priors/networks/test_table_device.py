@@ -49,6 +49,8 @@ def test_droid():
     flow = DroidFlow(meta_weights("droid"))
     frame = flow.encode(torch.zeros(64, 72, 3))
     where = cell_grid(torch.empty(1, 8, 9, 2, device=META))[None]
-    hidden, target, confidence = flow.refine(frame, frame.features, where, where, 2)
+    both = frame.features, frame.features
+    hidden, target, confidence = flow.update(*both, *frame.context, where, where)
+    assert flow.damping(hidden).device == META
     assert hidden.shape == (1, 128, 8, 9) and hidden.device == META
     assert target.shape == confidence.shape == (1, 8, 9, 2)
