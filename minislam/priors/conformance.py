@@ -65,6 +65,8 @@ def check_feature_extractor(features: Any, name: str = "the features") -> None:
 def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
     """Refuse an object that is no `FlowEstimator`; it is shown an image moved by SHIFT."""
     stride, images = _count(name, flow, "stride"), shifted_images()
+    learned = getattr(flow, "learned_confidence", None)
+    _expect(isinstance(learned, bool), f"{name} to say learned_confidence: True or False", learned)
     edges = [0, 1], [1, 0], CAMERA.pixel_grid(stride).flatten(0, 1).T.repeat(2, 1, 1)
     for index, image in enumerate(images):
         _call(name, flow, "add_frame", index, image)
@@ -75,6 +77,9 @@ def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
     again = _call(name, flow, "match", *edges)
     wanted = f"{name} to match as before after restore_state(saved_state())"
     _expect(torch.equal(first.targets, again.targets), wanted, "other targets; save all it changes")
+    damping = _call(name, flow, "disparity_damping", len(images))
+    if damping is not None:
+        _expect_tensor(f"{name} (disparity_damping)", damping, (len(images), edges[2].shape[2]))
     start, of_chain = _call(name, flow, "start_chain", images[0]), f"the chain of {name}"
     chain, matches = _call(of_chain, start, "advance", images[1])
     _expect_matches(of_chain, matches, 1, stride)
@@ -90,7 +95,7 @@ def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
         _call(name, flow, "remove_frame", index)
 
 
-def _expect(is_right: bool, wanted: str, found: str) -> None:
+def _expect(is_right: bool, wanted: str, found: object) -> None:
     if not is_right:
         raise InputError(f"expected {wanted}, found {found}")
 
