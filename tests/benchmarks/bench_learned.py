@@ -1,6 +1,6 @@
 """Print the accuracy of tracking on a learned flow: an oracle in the place of DROID's network.
 
-    python -m tests.benchmarks.bench_learned            about four minutes; --preset paper: six
+python -m tests.benchmarks.bench_learned            about four minutes; --preset paper: six
 """
 
 import argparse
