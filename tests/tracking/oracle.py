@@ -167,18 +167,32 @@ class OracleFlow(DroidFlow):
         return self._truth[source, target]
 
 
-def track(
+def new_tracker(
     clip: Clip, flow: FlowEstimator, config: TrackingConfig, with_depth: bool = True
 ) -> Tracker:
-    """Return a tracker after the whole clip; everything counts as static, as without beta."""
+    """Return a tracker for which everything is static, as without beta."""
     depth = SimulatedDepth(lambda index: clip.depth[index], seed=0) if with_depth else NoDepth()
     tracker = Tracker(clip.camera, config, flow, ClassicalFeatures(), depth, lambda index: ones)
     ones = torch.ones(tracker.grid.shape)
-    for index in range(len(clip.timestamps)):
+    return tracker
+
+
+def follow(tracker: Tracker, clip: Clip, frames: range) -> None:
+    """Show frames to a tracker."""
+    for index in frames:
         tracker.track(clip.frame(index))
-        if not tracker.initialised and len(tracker.keyframes) >= config.warmup_keyframes:
-            tracker.initialise()
-            tracker.refine_initialisation()
+        if not tracker.initialised:
+            if len(tracker.keyframes) >= tracker.config.warmup_keyframes:
+                tracker.initialise()
+                tracker.refine_initialisation()
+
+
+def track(
+    clip: Clip, flow: FlowEstimator, config: TrackingConfig, with_depth: bool = True
+) -> Tracker:
+    """Return a tracker after the whole clip."""
+    tracker = new_tracker(clip, flow, config, with_depth)
+    follow(tracker, clip, range(len(clip.timestamps)))
     if not tracker.initialised:
         tracker.initialise()
         tracker.refine_initialisation()

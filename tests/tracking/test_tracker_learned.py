@@ -3,11 +3,13 @@
 Only the ratios of learned confidences mean something, so their level decides nothing.
 """
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 from minislam.config import SlamConfig, preset
 from minislam.tracking.tracker import Tracker
@@ -57,3 +59,21 @@ def test_geometry_tells_which_frames_are_lost():
     assert lost(tracker) == list(BLACK)
     of_keyframes, of_all = oracle.errors(clip(), tracker)
     assert of_keyframes < 0.15 and of_all < 0.3
+
+
+def test_a_resumed_tracker_goes_on_in_the_same_way():
+    config = preset("laptop")
+    tracking = replace(config.tracking, warmup_keyframes=3)
+
+    def new() -> Tracker:
+        flow = oracle.OracleFlow(clip(), oracle.Skill(), config.networks.droid)
+        return oracle.new_tracker(clip(), flow, tracking)
+
+    first, second = new(), new()
+    oracle.follow(first, clip(), range(18))
+    second.restore_state(deepcopy(first.saved_state()), clip().frame)
+    for tracker in (first, second):
+        oracle.follow(tracker, clip(), range(18, 26))
+    assert first.initialised and len(first.keyframes) == len(second.keyframes) > 3
+    assert torch.equal(first.keyframes.T_camera_world, second.keyframes.T_camera_world)
+    assert torch.equal(first.keyframes.disparities, second.keyframes.disparities)

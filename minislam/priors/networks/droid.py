@@ -172,10 +172,9 @@ class DroidFlow(Stateful):
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
         return DroidChain(self, self.encode(image), self.encode(image), None)
 
-    @torch.no_grad()
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "DroidChain":
         """Return the chain whose saved state this is."""
-        reference, newest = (EncodedFrame(self.weights, image) for image in state["_images"])
+        reference, newest = (self.encode(image) for image in state["_images"])
         return DroidChain(self, reference, newest, state["_target"])
 
     # The network --------------------------------------------------------------------------------
