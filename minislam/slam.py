@@ -27,12 +27,12 @@ from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
+from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
     check_focal_length,
     seek_focal_length,
 )
-from minislam.tracking.safeguards.structure import agreed_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty import beta_of_mask, tracking_weight
@@ -98,6 +98,8 @@ class Slam(Stateful):
             self._initialise()
 
         self.steps.once("final adjustment", self._adjust_all)
+        if self.config.uncertainty.enabled:
+            self.steps.once("second adjustment", self._adjust_again)
         self.steps.once("all frames", self._pose_all_frames)
         if self.tracker.keyframes.known_prior < DENSE_PRIOR:
             self.steps.once("dense structure", self._rebuild_map)
@@ -155,25 +157,24 @@ class Slam(Stateful):
         self._move_map()
         self.focal_length = check_focal_length(self.tracker.graph)
 
-    def _rebuild_map(self) -> None:
-        """Build map and MLP anew on dense depth, which takes the poses of all frames.
+    def _adjust_again(self) -> None:
+        """Adjust all keyframes again, on what several views confirm to stand still."""
+        adjust_again(self.tracker, self.sequence, self.steps.on_progress)
+        self._move_map()
+        self.focal_length = check_focal_length(self.tracker.graph)
 
-        Known depths of a prior with holes stay as they are.
-        """
-        graph, keyframes = self.tracker.graph, self._keyframes()
-        disparities = [agreed_disparities(graph, index) for index in range(len(keyframes))]
+    def _rebuild_map(self) -> None:
+        """Build map and MLP anew on dense depth. Known depths of a prior with holes stay."""
         on_progress = self.steps.on_progress("dense depth")
-        keyframes = fill_depth(
-            keyframes, self.sequence, graph.grid.camera, self._poses, disparities, on_progress
-        )
+        swept = sweep_keyframes(self.tracker.graph, self.sequence, self._poses, on_progress)
         self.mapper = self._new_mapper()
+        keyframes = fill_depth(self._keyframes(), swept)
         self.mapper.initialise(keyframes, self.steps.on_progress("first map"))
 
     def _refine_map(self) -> None:
         stage = "refining the map"
-        done = self.steps.done(stage)
         iterations = self.config.mapping.refine_iterations
-        self.mapper.refine(iterations, self.steps.on_step(stage), done)
+        self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
         progress = self.steps.on_progress("posing all frames")

@@ -28,7 +28,7 @@ ALLOWED = {
     "uncertainty": [*FOUNDATION, "splatting", "priors"],
     "tracking": [*FOUNDATION, "splatting", "priors", "uncertainty"],
     "mapping": [*FOUNDATION, "splatting", "priors", "uncertainty"],
-    "stereo": FOUNDATION,
+    "stereo": [*FOUNDATION, "priors", "tracking"],
     "config": [*FOUNDATION, *ALGORITHMS],
     "data": FOUNDATION,
     "evaluation": FOUNDATION,

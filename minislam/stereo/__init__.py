@@ -6,4 +6,5 @@ Not a part of the paper, which takes its depth from a network. Read the files in
     aggregation        depths of neighbouring pixels fit together
     votes              which depths other views confirm: those of what stands still
     dense_structure    which frames are swept, and against which others
+    second_adjustment  the final adjustment again, on what is confirmed
 """

@@ -18,7 +18,7 @@ from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
 
 DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
-WIDTH = 160  # px of the images that are swept, at most
+WIDTH = 160  # px of the images that are swept for the map
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
@@ -32,24 +32,16 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 
 def fill_depth(
     keyframes: list[Keyframe],
-    sequence: Sequence,
-    camera: Camera,  # of its images
-    poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
-    disparities: list[Tensor],  # K x (n,) known inverse depths of the keyframes [1/world unit]
-    progress: Callable[[int, int], None] | None = None,
+    swept: list[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
 ) -> list[Keyframe]:
     """Return the keyframes with dense depth where theirs is unknown, and with confirmation."""
-    frames = [keyframe.frame_index for keyframe in keyframes]
-    found = dense_depths(
-        sequence, camera, poses, frames, [d.numpy() for d in disparities], progress
-    )
     return [
         replace(
             keyframe,
             depth=torch.where(keyframe.depth > 0, keyframe.depth, depth),
             confirmation=resample(confirmation, *keyframe.features.shape[:2]),
         )
-        for keyframe, (depth, confirmation) in zip(keyframes, found, strict=True)
+        for keyframe, (depth, confirmation) in zip(keyframes, swept, strict=True)
     ]
 
 
@@ -60,12 +52,13 @@ def dense_depths(
     keyframes: list[int],  # K frame indices, increasing
     disparities: list[np.ndarray],  # K x (n,) known inverse depths of the scene [1/world unit]
     progress: Callable[[int, int], None] | None = None,
+    width: int = WIDTH,  # px of the images that are swept, at most
 ) -> list[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe.
 
     The known inverse depths of a keyframe and its neighbours say how near the nearest plane is.
     """
-    sweeper = Sweeper(sequence, camera, poses)
+    sweeper = Sweeper(sequence, camera, poses, width)
     frames = swept_frames(keyframes, list(poses))
     swept: list[SweptView] = []
     for done, frame in enumerate(frames):
@@ -96,8 +89,10 @@ def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
 class Sweeper:
     """Sweeps single frames. It keeps the small grey images that it has read."""
 
-    def __init__(self, sequence: Sequence, camera: Camera, poses: dict[int, Tensor]) -> None:
-        width = min(WIDTH, camera.width)
+    def __init__(
+        self, sequence: Sequence, camera: Camera, poses: dict[int, Tensor], width: int = WIDTH
+    ) -> None:
+        width = min(width, camera.width)
         self.camera = camera.resized(width, max(1, round(width * camera.height / camera.width)))
         self._sequence = sequence
         self._poses = {index: pose.double().numpy() for index, pose in poses.items()}

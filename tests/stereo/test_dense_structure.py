@@ -126,9 +126,10 @@ def test_known_depth_stays_and_confirmation_comes_on_the_grid_of_the_features():
         )
         for k, index in enumerate((8, 16))
     ]
-    poses = {index: torch.from_numpy(pose(index)) for index in range(4, 21)}
-    sparse = [torch.from_numpy(1 / clip().depth[k][::8, ::8].reshape(-1)) for k in (8, 16)]
-    filled = fill_depth(keyframes, sequence(), camera(), poses, sparse)
+    swept = [
+        (torch.from_numpy(seen.depth), torch.from_numpy(seen.confirmation)) for seen in found()[1:3]
+    ]
+    filled = fill_depth(keyframes, swept)
     for before, after in zip(keyframes, filled, strict=True):
         assert torch.equal(after.depth[:60], known[:60]) and float((after.depth[60:] > 0).sum()) > 0
         assert after.confirmation.shape == (15, 20) and before.confirmation is None

@@ -1,0 +1,74 @@
+"""The second adjustment: bundle adjustment again, on what several views confirm to stand still.
+
+Residuals alone do not tell all that moves. A dynamic object that fills much of the view, or moves
+along the epipolar lines, keeps a part of its weight and bends the poses. But it is swept to depths
+on which no two views agree, even while the poses are a little wrong. So confirmation multiplies
+the static weight of each cell, and swept depth is the start, of one more final BA.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from minislam.records import Sequence
+from minislam.stereo.dense_structure import WIDTH, dense_depths
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import final_global_ba
+from minislam.tracking.safeguards.structure import agreed_disparities
+from minislam.tracking.tracker import Tracker
+from minislam.tracking.trajectory import pose_all_frames
+
+# Static weight of a cell that nothing confirms: where no cell is confirmed, all count alike. [-]
+UNCONFIRMED_WEIGHT = 0.02
+COARSE_WIDTH = 80  # px of the images that are swept: a weight per grid cell needs no more
+
+Progress = Callable[[int, int], None]  # called with the steps done and their number
+
+
+def adjust_again(
+    tracker: Tracker, sequence: Sequence, on_progress: Callable[[str], Progress]
+) -> None:
+    """Sweep the keyframes, then adjust them on what is confirmed, and judge them again.
+
+    A frame that finds no pose now may find one afterwards, so it is not yet logged as lost.
+    """
+    tracked = list(tracker.tracked)
+    poses = pose_all_frames(tracker, sequence, on_progress("posing all frames"))
+    tracker.tracked = tracked
+    on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
+    swept = sweep_keyframes(tracker.graph, sequence, poses, on_sweep, COARSE_WIDTH)
+    adjust_confirmed(tracker.graph, swept, on_round)
+    tracker.watch.conclude()
+
+
+def sweep_keyframes(
+    graph: KeyframeGraph,
+    sequence: Sequence,
+    poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
+    progress: Progress | None = None,
+    width: int = WIDTH,  # px of the images that are swept, at most
+) -> list[tuple[Tensor, Tensor]]:
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of the tracker's keyframes."""
+    frames = [frame.frame_index for frame in graph.keyframes.frames]
+    known = [agreed_disparities(graph, index).numpy() for index in range(len(frames))]
+    return dense_depths(sequence, graph.grid.camera, poses, frames, known, progress, width)
+
+
+def adjust_confirmed(
+    graph: KeyframeGraph,
+    swept: list[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
+    progress: Progress | None = None,
+) -> None:
+    """Adjust all keyframes on fresh flow. Each cell counts as far as it is confirmed."""
+    keyframes, stride = graph.keyframes, graph.grid.stride
+    depth, confirmation = (
+        torch.stack([image[::stride, ::stride].reshape(-1) for image in column])
+        for column in zip(*swept, strict=True)
+    )
+    weights = keyframes.static_weights * confirmation.clamp_min(UNCONFIRMED_WEIGHT)
+    for index, weight in enumerate(weights):
+        keyframes.set_static_weight(index, weight)
+    disparities = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), keyframes.disparities)
+    keyframes.set_geometry(keyframes.T_camera_world, disparities)
+    final_global_ba(graph, progress)

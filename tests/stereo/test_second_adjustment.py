@@ -1,0 +1,113 @@
+"""Keyframes that are adjusted again on what several views confirm to stand still."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from minislam.geometry import se3_inverse
+from minislam.priors.interfaces import FlowMatches
+from minislam.stereo import second_adjustment
+from minislam.stereo.second_adjustment import (
+    UNCONFIRMED_WEIGHT,
+    adjust_confirmed,
+    sweep_keyframes,
+)
+from minislam.tracking.frame_graph import neighbourhood_edges
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import final_global_ba
+from tests.tracking.scene import CAMERA
+from tests.tracking.wall import GRID, TrueFlow, true_graph, true_poses
+
+HALF = CAMERA.width // 2
+NUMBERS = [0, 3, 6, 9]
+
+
+class FlowOfAProcession(TrueFlow):
+    """True on the right; on the left, something moves slowly enough to look static."""
+
+    def match(self, sources: list[int], targets: list[int], predicted: Tensor) -> FlowMatches:
+        matches = super().match(sources, targets, predicted)
+        steps = torch.tensor(
+            [self.numbers[t] - self.numbers[s] for s, t in zip(sources, targets, strict=True)]
+        )
+        moved = 0.3 * steps[:, None] * (GRID.pixels[:, 0] < HALF)
+        matches.targets[:, 0] += moved
+        return matches
+
+
+def linked_graph() -> KeyframeGraph:
+    graph = true_graph(NUMBERS, flow=FlowOfAProcession())
+    graph.match(neighbourhood_edges(0, len(NUMBERS), 5))
+    return graph
+
+
+def swept(graph: KeyframeGraph) -> list[tuple[Tensor, Tensor]]:
+    """Return the true depth and confirmation of the right half, nothing of the left."""
+    confirmed = (torch.arange(CAMERA.width) >= HALF).float().expand(CAMERA.height, -1)
+    result = []
+    for disparities in graph.keyframes.disparities:
+        depth = (1 / disparities).reshape(GRID.shape)
+        depth = depth.repeat_interleave(GRID.stride, 0).repeat_interleave(GRID.stride, 1)
+        result.append((depth[: CAMERA.height, : CAMERA.width] * confirmed, confirmed))
+    return result
+
+
+def centre_error(graph: KeyframeGraph) -> float:
+    """Return the largest error of a camera centre, relative to the length of the path."""
+    estimate = se3_inverse(graph.keyframes.T_camera_world)[:, :3, 3]
+    truth = se3_inverse(true_poses()[NUMBERS])[:, :3, 3]
+    scale = (estimate * truth).sum() / estimate.square().sum()
+    return float((scale * estimate - truth).norm(dim=1).max() / truth[-1].norm())
+
+
+def test_what_is_not_confirmed_no_longer_bends_the_poses():
+    graph = linked_graph()
+    final_global_ba(graph)
+    bent = centre_error(graph)
+    graph = linked_graph()
+    adjust_confirmed(graph, swept(graph))
+    assert bent > 0.04 and centre_error(graph) < 0.005  # measured .056 and .0023
+
+
+def test_confirmation_becomes_the_weight_and_swept_depth_the_start(monkeypatch):
+    graph = linked_graph()
+    graph.keyframes.set_static_weight(1, torch.full_like(graph.keyframes.static_weights[1], 0.5))
+    images = swept(graph)
+    expected = graph.keyframes.disparities.clone()
+    right = GRID.pixels[:, 0] >= HALF
+    graph.keyframes.set_geometry(graph.keyframes.T_camera_world, 3 * expected)
+    monkeypatch.setattr(second_adjustment, "final_global_ba", lambda graph, progress: None)
+    adjust_confirmed(graph, images)
+    weights, disparities = graph.keyframes.static_weights, graph.keyframes.disparities
+    assert torch.allclose(disparities[:, right], expected[:, right])
+    assert torch.equal(disparities[:, ~right], 3 * expected[:, ~right])  # the sweep found nothing
+    assert (weights[0, right] == 1).all() and (weights[0, ~right] == UNCONFIRMED_WEIGHT).all()
+    assert torch.equal(weights[1], weights[0] / 2)  # beta, or a given mask, goes on counting
+
+
+def test_where_nothing_is_confirmed_all_cells_count_alike():
+    first, second = linked_graph(), linked_graph()
+    final_global_ba(first)
+    nothing = [(torch.zeros_like(c), torch.zeros_like(c)) for _, c in swept(second)]
+    adjust_confirmed(second, nothing)
+    poses = first.keyframes.T_camera_world
+    assert torch.allclose(poses, second.keyframes.T_camera_world, atol=1e-3)
+
+
+def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
+    told = {}
+
+    def dense_depths(sequence, camera, poses, keyframes, disparities, progress, width):
+        told.update(camera=camera, poses=poses, keyframes=keyframes, disparities=disparities)
+        return []
+
+    monkeypatch.setattr(second_adjustment, "dense_depths", dense_depths)
+    graph, poses = true_graph(NUMBERS), {0: torch.eye(4)}
+    sweep_keyframes(graph, SimpleNamespace(), poses)
+    assert told["camera"] == graph.grid.camera and told["poses"] is poses
+    assert told["keyframes"] == NUMBERS
+    nearest = [float(np.max(d)) for d in told["disparities"]]
+    assert nearest == pytest.approx(graph.keyframes.disparities.amax(1).tolist(), rel=0.2)
