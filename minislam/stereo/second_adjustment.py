@@ -27,7 +27,9 @@ Progress = Callable[[int, int], None]  # called with the steps done and their nu
 
 
 def adjust_again(
-    tracker: Tracker, sequence: Sequence, on_progress: Callable[[str], Progress]
+    tracker: Tracker,
+    sequence: Sequence,
+    on_progress: Callable[[str], Progress | None] = lambda stage: None,
 ) -> None:
     """Sweep the keyframes, then adjust them on what is confirmed, and judge them again.
 

@@ -26,6 +26,7 @@ from minislam.priors.depth import NoDepth, SimulatedDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame, Sequence, Trajectory
+from minislam.stereo.second_adjustment import adjust_again
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.safeguards.focal_length import check_focal_length
 from minislam.tracking.tracker import Tracker
@@ -60,7 +61,7 @@ class Piece:
 
 
 def followed(sequence: Sequence, with_prior: bool, warm_up: int) -> Tracker:
-    """Return a tracker that has followed the sequence, final adjustment included."""
+    """Return a tracker that has followed the sequence, final adjustments included."""
     depth = sequence.depth if isinstance(sequence, Piece) else sequence.ground_truth.depth
     prior = SimulatedDepth(depth, 0) if with_prior else NoDepth()
     config = TrackingConfig(warmup_keyframes=warm_up)
@@ -78,6 +79,8 @@ def followed(sequence: Sequence, with_prior: bool, warm_up: int) -> Tracker:
         tracker.refine_initialisation()
     tracker.end()
     tracker.finish()
+    if not with_prior:
+        adjust_again(tracker, sequence)
     return tracker
 
 
