@@ -26,6 +26,7 @@ from minislam.tracking.keyframe_selection import is_redundant, needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards.diagnostics import Watch
+from minislam.tracking.safeguards.first_frame import forget_start
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
@@ -53,7 +54,7 @@ class Tracker(Stateful):
                                                                   +---- old view or ---+
                                                                        known place
 
-    A frame of the warm-up that cannot be matched is lost, too, but the warm-up continues.
+    A frame of the warm-up that cannot be matched is lost, too; with many, the warm-up begins anew.
     """
 
     graph: KeyframeGraph
@@ -167,10 +168,9 @@ class Tracker(Stateful):
 
     def _log_followed(self, frame: Frame, ratio: float) -> None:
         self._lost_in_a_row = 0
-        status = TrackingStatus.INITIALISING
         if self.initialised:
             self.mode = Mode.TRACKING
-            status = TrackingStatus.OK
+        status = TrackingStatus.OK if self.initialised else TrackingStatus.INITIALISING
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
 
     # Keyframes ----------------------------------------------------------------------------------
@@ -240,6 +240,9 @@ class Tracker(Stateful):
             place = self._relocaliser.find(frame.image, features)
             if place is not None and self._resume(frame, place, features):
                 return
+        elif forget_start(self.graph, self.tracked, self._lost_in_a_row):
+            self._begin(frame)
+            return
         recently = self._lost_in_a_row <= self.config.recently_lost_frames
         status = TrackingStatus.RECENTLY_LOST if recently else TrackingStatus.LOST
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
@@ -266,9 +269,8 @@ class Tracker(Stateful):
             self._insert(*self._last_non_keyframe)
         if len(self.keyframes) < 2:
             raise TrackingLost(
-                "expected at least two frames that show the same scene, found "
-                f"{len(self.tracked)} of which none could be matched with the first; check that "
-                "the images are not blank and overlap"
+                "expected at least two frames that show the same scene, found none among "
+                f"{len(self.tracked)} frames; check that the images are not blank and overlap"
             )
         first_geometry(self.graph, self._motion.scale)
         self.mode = Mode.TRACKING
