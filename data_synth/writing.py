@@ -14,6 +14,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,7 @@ GENERATOR_VERSION = 10  # raise it whenever the same arguments give other files
 DEPTH_UNITS_PER_METRE = 5000  # of TUM RGB-D
 PNG_COMPRESSION = 1  # of 9: noise does not compress, and level 1 is several times faster
 RECORD = "synth.json"
+STALE = 24 * 3600.0  # s, after which nobody renders into a scratch folder any more
 IMAGE_FOLDERS = ("rgb", "depth", "masks", "static", "novel")
 
 
@@ -89,6 +91,9 @@ def cached_sequence(
     """
     root = Path(os.environ.get("MINISLAM_CACHE") or Path.home() / ".cache" / "minislam")
     folder = root / "synth" / f"{name}-{seed}-{frames}-{size[0]}x{size[1]}"
+    for scratch in root.glob("synth/.*-*-*-*x*-????????"):  # left by a killed process
+        if time.time() - scratch.stat().st_mtime > STALE and not scratch.is_symlink():
+            shutil.rmtree(scratch, ignore_errors=True)
     return write_sequence(name, seed, frames, size, folder, progress)
 
 

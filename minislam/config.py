@@ -3,13 +3,13 @@
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from minislam.errors import InputError
 from minislam.mapping.config import MappingConfig, paper_mapping
-from minislam.parameters import parameter
+from minislam.parameters import parameter, require_bounds
 from minislam.priors.depth import SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeaturesConfig
 from minislam.priors.grid_flow import ClassicalFlowConfig
@@ -18,6 +18,16 @@ from minislam.priors.networks.table import NetworksConfig
 from minislam.tracking.config import TrackingConfig, paper_schedule
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 
+# Settings of other rooms for which zero means nothing, and fractions. The bounds of all others
+# stand beside their meaning.
+_FROM_ONE = """
+keyframe_interval warmup_keyframes window rounds iterations global_iterations pose_rounds
+warmup_rounds warmup_iterations pose_iterations loop_min_gap rate_iterations insertion.cell
+density.interval droid.chain_updates droid.kept_edges droid.edges_per_batch
+metric3d.size depth_anything.shorter_side hidden_units""".split()
+_FRACTIONS = """
+cull_fraction min_link_ratio mask_min_similarity refine_full_fraction window_probability
+color_weight lambda_ssim insertion.opacity pose_refinement.fraction similarity""".split()
 OTHER_PARTS = ("sequence", "input", "priors")  # of config.json, beside the settings
 
 
@@ -25,11 +35,11 @@ OTHER_PARTS = ("sequence", "input", "priors")  # of config.json, beside the sett
 class SlamConfig:
     """The whole configuration. Names with dots reach every part: `tracking.window`."""
 
-    seed: int = parameter(0, "seed of every random draw: same seed, same bytes")
+    seed: int = parameter(0, "seed of every random draw: same seed, same bytes", most=2**63 - 1)
     checkpoint_fraction: float = parameter(
         0.01, "fraction of a run's time that writing checkpoints may take [-]; 0 writes none"
     )
-    threads: int = parameter(1, "threads of torch; more are slower on a busy machine")
+    threads: int = parameter(1, "threads of torch; more are slower on a busy machine", 1, 256)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
@@ -44,14 +54,14 @@ def settings_of(config: Any) -> dict[str, Any]:
     return {name: value for name, value, _ in _leaves(config)}
 
 
-def _leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
-    """Yield name, value and meaning of every setting in a tree of dataclasses."""
+def _leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
+    """Yield name, value, and meaning with bounds, of every setting in a tree of dataclasses."""
     for entry in fields(config):
         value = getattr(config, entry.name)
         if is_dataclass(value):
             yield from _leaves(value, f"{prefix}{entry.name}.")
         else:
-            yield prefix + entry.name, value, entry.metadata.get("meaning", "")
+            yield prefix + entry.name, value, entry.metadata
 
 
 def _paper_settings() -> dict[str, Any]:
@@ -99,6 +109,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
+def _bounds_of(name: str, metadata: Mapping[str, Any]) -> tuple[float, float]:
+    own = name.partition(".")[2].removeprefix("learned.")
+    least, most = metadata["least"], metadata["most"]
+    return (1 if own in _FROM_ONE else least), (1 if own in _FRACTIONS else most)
+
+
 def preset(name: str) -> SlamConfig:
     """Return a preset by name."""
     if name not in PRESETS:
@@ -108,17 +124,20 @@ def preset(name: str) -> SlamConfig:
 
 def meanings_of(config: Any) -> dict[str, str]:
     """Return the meaning of each value of a configuration, by its name with dots."""
-    return {name: meaning for name, _, meaning in _leaves(config)}
+    return {name: metadata["meaning"] for name, _, metadata in _leaves(config)}
 
 
 def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
     """Return the configuration with values replaced; they are given by their names with dots."""
     known = settings_of(config)
+    bounds = {name: _bounds_of(name, metadata) for name, _, metadata in _leaves(config)}
     for name, value in settings.items():
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
             raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
-        config = _replaced(config, name.split("."), _converted(name, value, known[name]))
+        converted = _converted(name, value, known[name])
+        require_bounds(name, converted, *bounds[name])
+        config = _replaced(config, name.split("."), converted)
     return config
 
 

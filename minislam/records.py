@@ -105,6 +105,8 @@ class Sequence(Protocol):
     camera: Camera  # of the undistorted images at the working size
     refines_focal: bool  # whether the focal length is to be estimated, the camera's is a guess
     warnings: list[str]  # what the user must know, for instance that the focal length is guessed
+    lost: list[tuple[float, str]]  # timestamp [s] and reason of frames that could not be decoded
+    checksums: dict[int, int]  # of the images read so far, by frame index
     ground_truth: GroundTruth | None
     depth_scale: float  # units of a stored depth image per metre
     opened_as: dict[str, Any]  # "sequence" and "input", the part of config.json that opens it

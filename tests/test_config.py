@@ -152,6 +152,31 @@ def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):
         with_settings(SlamConfig(), {name: value})
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("seed", -1), ("seed", 10**22), ("threads", 0), ("threads", 100_000),
+        ("checkpoint_fraction", -1), ("tracking.window", 0), ("tracking.window", -3),
+        ("tracking.window", 10**22), ("tracking.learned.window", 0),
+        ("mapping.init_iterations", -1), ("mapping.color_weight", 1.1), ("features.windows", "1,0"),
+        ("flow.workers", 0),
+    ],
+)  # fmt: skip
+def test_a_value_that_means_nothing_is_refused_with_its_bounds(name: str, value: object):
+    with pytest.raises(InputError, match=f"expected {name} of at least .* and at most"):
+        with_settings(SlamConfig(), {name: value})
+
+
+def test_zero_passes_where_it_means_none():
+    for name in ("tracking.global_interval", "mapping.refine_iterations", "checkpoint_fraction"):
+        assert settings_of(with_settings(SlamConfig(), {name: 0}))[name] == 0
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_lies_within_the_bounds(name: str):
+    with_settings(SlamConfig(), settings_of(preset(name)))
+
+
 @pytest.mark.parametrize("tree", [[1, 2], "tracking", None, 3])
 def test_settings_that_are_no_object_are_an_error(tree: object):
     with pytest.raises(InputError, match="as a JSON object"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import os
+import signal
 import sys
 import time
 import warnings
@@ -28,11 +29,12 @@ from minislam.cli.options import (
     source_of,
 )
 from minislam.cli.priors import add_priors_parser
-from minislam.cli.progress import ProgressLine
+from minislam.cli.progress import ProgressLine, ending_signals, say
 from minislam.cli.weights import add_weights_parser
 from minislam.errors import InputError, MinislamError
 
 DEMO_SEQUENCE, DEMO_FRAMES = "synth:crowd", 60
+LONGEST_TEXT = 300  # characters of a message that is not ours
 FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
 RUN_EPILOG = """\
 files of a run folder:
@@ -77,19 +79,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     warnings.formatwarning = lambda message, *_, **__: f"WARNING: {message}\n"
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller
+            setattr(sys, name, open(os.devnull, "w"))
+        if hasattr(getattr(sys, name), "reconfigure"):  # so that every file name can be printed
+            getattr(sys, name).reconfigure(errors="backslashreplace")
+    try:
+        with ending_signals(signal.default_int_handler):
+            exit_code = _command(sys.argv[1:] if arguments is None else list(arguments))
+            sys.stdout.flush()
+        return exit_code
+    except KeyboardInterrupt:
+        say("minislam: interrupted", "stderr")
+        return INTERRUPTED_EXIT
+    except BrokenPipeError:  # `minislam weights list | head`: the reader has seen enough
+        return FAILED_EXIT
+    except Exception as error:
+        if os.environ.get("MINISLAM_DEBUG"):
+            raise
+        say(f"minislam: {_sentence(error)}", "stderr")
+        return FAILED_EXIT
+    finally:
+        say("", end="")  # what is still in the buffer, or else nothing
+
+
+def _command(arguments: list[str]) -> int:
     args, unknown = _parser(arguments).parse_known_args(arguments)
     if unknown:
-        print(f"minislam: {_unknown_option(unknown[0], args)}", file=sys.stderr)
+        say(f"minislam: {_unknown_option(unknown[0], args)}", "stderr")
         return USAGE_EXIT
-    try:
-        return args.run(args)
-    except MinislamError as error:
-        print(f"minislam: {error}", file=sys.stderr)
-        return FAILED_EXIT
-    except KeyboardInterrupt:
-        print("minislam: interrupted", file=sys.stderr)
-        return INTERRUPTED_EXIT
+    return args.run(args)
+
+
+def _sentence(error: Exception) -> str:
+    """Return what an error says; one that is not ours gets the form of ours."""
+    if isinstance(error, MinislamError):
+        return str(error)
+    text = " ".join(str(error).split())[:LONGEST_TEXT]
+    return (
+        f"expected to finish this command, found {type(error).__name__}: {text}; check names, "
+        "permissions, space and settings, and set MINISLAM_DEBUG=1 to see where it happened"
+    )
 
 
 def _unknown_option(found: str, args: argparse.Namespace) -> str:
@@ -160,6 +190,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
 
 def _run(args: argparse.Namespace) -> int:
     from minislam.data import RunFolder, open_sequence
+    from minislam.data.run_folder import locked
     from minislam.runs.run import choose_priors, run_sequence
 
     if args.resume and args.output is None:
@@ -172,25 +203,25 @@ def _run(args: argparse.Namespace) -> int:
     sequence = open_sequence(source, input_options(args), partial(progress.show, "making frames"))
     choice = prior_choice(args, "simulated" if source.startswith("synth:") else "none")
     output = args.output or f"output/{sequence.name}_{time.strftime('%Y%m%d-%H%M%S')}"
-    print(sequence.description)
+    say(sequence.description)
     for warning in sequence.warnings:
-        print(f"WARNING: {warning}", file=sys.stderr)
+        say(f"WARNING: {warning}", "stderr")
     # Everything that may be wrong is checked before the files of an earlier run are removed.
+    sequence.check_masks()
     priors, lpips = choose_priors(choice, sequence, config), lpips_of(args, sequence.camera)
-    folder = RunFolder(output) if args.resume else RunFolder.create(output, args.overwrite)
-    with progress:
-        outcome = run_sequence(
-            sequence, config, choice, priors, folder, progress, lpips, args.resume
-        )
-    print(f"{outcome.state}:\n  focal length           {outcome.focal_length}")
+    with locked(output), progress:
+        images, resume = sequence.files(), args.resume
+        folder = RunFolder(output) if resume else RunFolder.create(output, args.overwrite, images)
+        outcome = run_sequence(sequence, config, choice, priors, folder, progress, lpips, resume)
+    say(f"{outcome.state}:\n  focal length           {outcome.focal_length}")
     for name, value in outcome.metrics.items():
-        print(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
+        say(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
     for warning in outcome.warnings:
         if warning not in sequence.warnings:
-            print(f"WARNING: {warning}", file=sys.stderr)
-    print(f"results in {folder.path}; open {folder.path}/report.html")
+            say(f"WARNING: {warning}", "stderr")
+    say(f"results in {folder.path}; open {folder.path}/report.html")
     if outcome.state == "interrupted":
-        print(f"to go on: minislam run --resume -o {folder.path}")
+        say(f"to go on: minislam run --resume -o {folder.path}")
     return outcome.exit_code
 
 

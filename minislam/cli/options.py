@@ -200,7 +200,7 @@ def settings(args: argparse.Namespace) -> SlamConfig:
     """Return the settings: the preset, over it the file of --config, over both single flags."""
     from minislam.config import preset
 
-    return _with_given(args, preset(args.preset or "laptop"))
+    return _with_given(args, preset("laptop" if args.preset is None else args.preset))
 
 
 def resumed_settings(args: argparse.Namespace) -> SlamConfig:
@@ -209,7 +209,7 @@ def resumed_settings(args: argparse.Namespace) -> SlamConfig:
     from minislam.data import RunFolder
 
     then = from_json(RunFolder(args.output).read_config())
-    now = settings_of(_with_given(args, preset(args.preset) if args.preset else then))
+    now = settings_of(_with_given(args, then if args.preset is None else preset(args.preset)))
     for name, value in settings_of(then).items():
         if now[name] != value:
             raise InputError(

@@ -1,20 +1,52 @@
-"""What a long command shows while it works, and how Ctrl-C ends it between two steps."""
+"""What a long command shows while it works, and how a signal ends it between two steps."""
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
 
 
+# What asks a program to end: Ctrl-C, a scheduler or `docker stop`, a closed terminal (not Windows).
+ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
+
+
+def say(text: str, stream: str = "stdout", end: str = "\n") -> None:
+    """Print on sys.stdout or sys.stderr. Where nothing can be written, nothing more is said.
+
+    A reader that ends (`| head`), a full disk or a closed stream is no reason to end a run.
+    """
+    try:
+        print(text, end=end, file=getattr(sys, stream), flush=True)
+    except (OSError, ValueError):  # ValueError: a closed file
+        setattr(sys, stream, open(os.devnull, "w"))
+
+
+@contextmanager
+def ending_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    """Handle what asks a program to end; what is ignored already (`nohup`) stays so."""
+    numbers = [getattr(signal, name) for name in ENDING if hasattr(signal, name)]
+    before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
 class ProgressLine:
     """One line per stage with rate and time left; off a terminal, a plain line every 10 %.
 
-    Inside `with`, the first Ctrl-C is deferred to the end of the current step, when the state is
-    consistent. A second Ctrl-C ends the program at once.
+    Inside `with`, the first Ctrl-C (or other signal of ENDING) is deferred to the end of the
+    current step, when the state is consistent. A second one ends the program at once.
     """
 
     def __init__(self) -> None:
@@ -24,11 +56,12 @@ class ProgressLine:
         self._should_stop = False
 
     def __enter__(self) -> ProgressLine:
-        self._handler_before = signal.signal(signal.SIGINT, self._interrupt)
+        self._signals = ending_signals(self._interrupt)
+        self._signals.__enter__()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        signal.signal(signal.SIGINT, self._handler_before)
+        self._signals.__exit__(None, None, None)
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of all steps of a stage are done. Stages may take turns."""
@@ -48,7 +81,7 @@ class ProgressLine:
     def warn(self, text: str) -> None:
         """Print a warning on a line of its own."""
         start = "\r\033[K" if self._terminal else ""
-        print(f"{start}WARNING: {text}", file=sys.stderr, flush=True)
+        say(f"{start}WARNING: {text}", "stderr")
 
     def should_stop(self) -> bool:
         """Tell whether Ctrl-C was pressed."""
@@ -57,10 +90,10 @@ class ProgressLine:
     def _print(self, stage: str, text: str, fraction: float) -> None:
         if self._terminal:
             end = "\n" if fraction >= 1 else ""
-            print(f"\r\033[K{text}", end=end, file=sys.stderr, flush=True)
+            say(f"\r\033[K{text}", "stderr", end)
         elif fraction >= 1 or fraction >= self._shown.get(stage, 0.0) + PLAIN_STEP:
             self._shown[stage] = fraction
-            print(text, file=sys.stderr, flush=True)
+            say(text, "stderr")
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self._should_stop:

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,12 +23,15 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
     """Open a file to be written as a whole or not at all.
 
     The bytes go to a temporary file in the same folder (os.replace is atomic only within one
-    file system), reach the disk (fsync), and then take the final name.
+    file system), reach the disk (fsync), and then take the final name. A link stays a link: the
+    file that it points to is replaced. Devices, pipes and folders are refused.
     """
-    path = Path(path)
-    temporary = path.with_name(path.name + ".tmp")
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise InputError(f"expected a file to write, but {path} is none; choose another name")
+    path = Path(os.path.realpath(path))
+    temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with open(temporary, "wb") as file:
+        with open(temporary, "xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -44,8 +48,11 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a UTF-8 text file atomically, with Unix line ends on every system."""
-    atomic_write(path, text.encode("utf-8"))
+    """Write a UTF-8 text file atomically, with Unix line ends on every system.
+
+    Bytes of a file name that are no UTF-8 become escapes, which JSON turns back into those bytes.
+    """
+    atomic_write(path, text.encode("utf-8", "backslashreplace"))
 
 
 def write_json(path: Path | str, content: Any) -> None:
@@ -80,7 +87,7 @@ def read_json(path: Path | str) -> Any:
     """Return the content of a JSON file."""
     try:
         return json.loads(read_text(path))
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also a number of 5000 digits
         raise InputError(
             f"expected JSON in {path}, but found a mistake: {error}; correct it or delete the file"
         ) from error

@@ -45,15 +45,23 @@ def read_video(path: Path, limit: int | None) -> Recording:
     if len(images) == 0:
         raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")
     warnings = []
-    rate = images.frame_rate
-    if not (math.isfinite(rate) and rate > 0):
-        rate = ASSUMED_FRAME_RATE
-        warnings.append(f"the frame rate of {path.name} is unknown: {rate:g} per second assumed")
+    rate, stamps, lost = images.frame_rate, images.timestamps, images.lost()
+    if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
+        if not (math.isfinite(rate) and rate > 0):
+            rate = ASSUMED_FRAME_RATE
+        stamps, lost = np.arange(len(images)) / rate, lost[:0]
+        warnings.append(f"{path.name} has no timestamps: {rate:g} frames per second assumed")
+    if len(images) < images.promised and len(images) != limit:
+        warnings.append(
+            f"{path.name} promises {images.promised} frames, of which {len(images)} can be "
+            f"decoded: it is damaged, cut or trimmed"
+        )
     return Recording(
         name=folder_name(path.with_suffix("")),
         kind="video",
         images=images,
-        timestamps=np.arange(len(images)) / rate,
+        timestamps=stamps,
+        lost=[(stamp, f"{path.name} is damaged there") for stamp in lost.tolist()],
         calibration=calibration_beside(path.parent, path.stem + ".calibration.txt"),
         noted_focal_length=noted_focal_length(path),
         notes=[f"{rate:g} frames per second"],

@@ -1,6 +1,10 @@
 """Decode the image files that cameras write, and encode PNG."""
 
+import os
 import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -74,11 +78,16 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def _decode(path: Path, mode: int) -> np.ndarray:
-    content = read_bytes(path)
+    content, decoded = read_bytes(path), None
     if _is_complete(content):
-        decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
-        if decoded is not None:
-            return decoded
+        with _said_on_stderr() as said, suppress(cv2.error):  # of a header that claims 10^10 px
+            decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
+        if b"extraneous" in said[0]:  # cameras pad some files so, and damage looks like it, too
+            warnings.warn(f"{path} may be damaged: {said[0].decode().strip()}", stacklevel=1)
+        elif said[0]:
+            decoded = None  # libjpeg has filled the rest with grey
+    if decoded is not None:
+        return decoded
     raise InputError(
         f"expected a whole PNG or JPEG image, but {path} ({len(content)} bytes) is damaged, cut "
         "short or of another kind; replace or remove it"
@@ -93,3 +102,21 @@ def _is_complete(content: bytes) -> bool:
         # A thumbnail in the header has its own end marker, so the LAST scan must be closed.
         return content.rfind(_JPEG_END_OF_IMAGE) > content.rfind(_JPEG_START_OF_SCAN) > 0
     return False
+
+
+@contextmanager
+def _said_on_stderr() -> Iterator[list[bytes]]:
+    """Collect what C code writes to standard error: libjpeg tells of damaged data only there."""
+    said: list[bytes] = []
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)  # what does not fit is dropped, rather than waited for
+    before = os.dup(2)
+    os.dup2(writer, 2)
+    try:
+        yield said
+    finally:
+        os.dup2(before, 2)
+        for descriptor in (before, writer):
+            os.close(descriptor)
+        with open(reader, "rb") as file:
+            said.append(file.read())

@@ -34,6 +34,7 @@ class Recording:
     mask_paths: list[Path | None] = field(default_factory=list)  # True on dynamic objects
     static_paths: list[Path | None] = field(default_factory=list)  # without dynamic objects
     novel_views: list[tuple[np.ndarray, Path]] = field(default_factory=list)  # (T_world_camera, .)
+    lost: list[tuple[float, str]] = field(default_factory=list)  # timestamp [s], reason
     notes: list[str] = field(default_factory=list)  # more for the description
     warnings: list[str] = field(default_factory=list)
 

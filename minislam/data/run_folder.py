@@ -1,7 +1,10 @@
 """The folder of one run: names and formats of its files. Each file is written atomically."""
 
 import io
+import os
 import re
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +29,36 @@ KEYFRAME_KINDS = ("input", "render", "depth", "beta")
 _FILES = (
     CONFIG, RUN, METRICS, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MLP, REPORT, CHECKPOINT
 )  # fmt: skip
-_FOLDERS = ("keyframes", "plots")
+KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
+PLOT_NAMES = ("ate_over_time", "trajectory", "losses", "gaussians", "health", "overview")
+_OURS = re.compile(  # every path that a run writes, inside its folder, also half-written
+    rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_({'|'.join(KEYFRAME_KINDS)})\.png|"
+    rf"{PLOTS}/({'|'.join(PLOT_NAMES)})\.png)(\.[0-9a-f]{{8}}\.tmp)?"
+)
+_CONFIG_PARTS = {"sequence", "input", "priors", "tracking", "mapping"}  # of every config.json
+
+
+@contextmanager
+def locked(path: Path | str) -> Iterator[None]:
+    """Keep other runs out of a folder inside a `with` block; what ends its process unlocks it.
+
+    The folder is made if it is missing. Windows, and some network drives, lock nothing.
+    """
+    with ExitStack() as stack:
+        # RunFolder says what is wrong with a folder that cannot be made or opened.
+        with suppress(OSError, ImportError):
+            import fcntl
+
+            Path(path).mkdir(parents=True, exist_ok=True)
+            stack.callback(os.close, folder := os.open(path, os.O_RDONLY))
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(
+                    f"expected {path} for this run alone, but another one is writing into it; wait "
+                    "for its end, or choose another --output"
+                ) from None
+        yield
 
 
 class RunFolder:
@@ -42,10 +74,16 @@ class RunFolder:
             )
 
     @classmethod
-    def create(cls, path: Path | str, overwrite: bool = False) -> "RunFolder":
+    def create(
+        cls,
+        path: Path | str,
+        overwrite: bool = False,
+        inputs: Sequence[Path] = (),  # images that the new run reads
+    ) -> "RunFolder":
         """Make a new run folder; with `overwrite`, the files of an earlier run are removed.
 
-        Files that no run writes are never removed.
+        Only a folder of an earlier run is touched, there only names that a run writes, none of
+        them through a link, and nothing at all if an input lies inside.
         """
         path = Path(path)
         if path.exists() and not path.is_dir():
@@ -58,12 +96,10 @@ class RunFolder:
                 "name or add --overwrite (or --resume, to go on with an interrupted run)"
             )
         try:
-            for folder in _FOLDERS:
+            for file in _files_of_a_run(path, inputs) if path.is_dir() else ():
+                file.unlink()
+            for folder in (KEYFRAMES, PLOTS):
                 (path / folder).mkdir(parents=True, exist_ok=True)
-                for image in (path / folder).glob("*.png"):
-                    image.unlink()
-            for name in _FILES:
-                (path / name).unlink(missing_ok=True)
         except OSError as error:
             raise InputError(
                 f"expected to be able to write into {path}, but the system says: "
@@ -92,7 +128,7 @@ class RunFolder:
         write_trajectory(self.path / KEYFRAME_TRAJECTORY, trajectory)
 
     def write_lost_frames(self, lost: list[tuple[int, float, str]]) -> None:
-        """Write (frame_index, timestamp [s], reason) of the frames without a pose."""
+        """Write (frame_index, timestamp [s], reason); the index is -1 if there is no image."""
         rows = [f"{index} {stamp:.6f} {reason}\n" for index, stamp, reason in lost]
         write_text(self.path / LOST_FRAMES, "# frame_index timestamp reason\n" + "".join(rows))
 
@@ -110,12 +146,12 @@ class RunFolder:
         """Write one picture of a keyframe: (H, W, 3) RGB in [0, 1]; kind is input, render ..."""
         assert kind in KEYFRAME_KINDS, kind
         name = f"{frame_index:06d}_{kind}.png"
-        atomic_write(self.path / "keyframes" / name, encode_png(np.asarray(image)))
+        atomic_write(self.path / KEYFRAMES / name, encode_png(np.asarray(image)))
 
     def write_plot(self, name: str, png: bytes) -> None:
         """Write the PNG bytes of a figure to plots/NAME.png."""
-        assert re.fullmatch(r"[\w-]+", name), name
-        atomic_write(self.path / "plots" / f"{name}.png", png)
+        assert name in PLOT_NAMES, name
+        atomic_write(self.path / PLOTS / f"{name}.png", png)
 
     def write_report(self, html: str) -> None:
         """Write the report to open in a browser."""
@@ -135,8 +171,11 @@ class RunFolder:
         return read_checkpoint(self.path / CHECKPOINT, gpu)
 
     def remove_checkpoint(self) -> None:
-        """Remove the checkpoint, which a finished run does not need."""
+        """Remove the checkpoint, which a finished run does not need, and half-written files."""
         (self.path / CHECKPOINT).unlink(missing_ok=True)
+        for file in self.path.rglob("*.tmp"):
+            if _OURS.fullmatch(file.relative_to(self.path).as_posix()):
+                file.unlink()
 
     def read_config(self) -> dict[str, Any]:
         """Return sequence, input, priors and settings."""
@@ -172,3 +211,21 @@ class RunFolder:
                 f"expected the weights of the uncertainty MLP in {self.path / MLP}, but the file "
                 "cannot be read; it is damaged or from another program"
             ) from error
+
+
+def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:
+    """Return the files that a run wrote into a folder, or refuse a folder that may be another's."""
+    entries = [*path.iterdir(), *path.glob(f"{KEYFRAMES}/*"), *path.glob(f"{PLOTS}/*")]
+    is_ours = {entry.name for entry in entries} <= {KEYFRAMES, PLOTS}
+    with suppress(InputError, TypeError):
+        is_ours = is_ours or _CONFIG_PARTS <= set(read_json(path / CONFIG))
+    links = [e for e in entries if e.is_symlink() and e.name in (*_FILES, KEYFRAMES, PLOTS)]
+    inside = [i for i in inputs if i.resolve().is_relative_to(path.resolve())]
+    if links or inside or not is_ours:
+        found = f"the link {links[0]}" if links else f"the input {inside[0]}" if inside else path
+        raise InputError(
+            f"expected the folder of an earlier run for --overwrite, without links and inputs of "
+            f"this one, found {found}; nothing was removed, choose another --output"
+        )
+    files = [entry for entry in entries if entry.is_file() and not entry.is_symlink()]
+    return [file for file in files if _OURS.fullmatch(file.relative_to(path).as_posix())]

@@ -1,8 +1,10 @@
 """Open a folder, a video, or a synthetic sequence by its name."""
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import torch
@@ -61,6 +63,14 @@ class RecordedSequence:
                 f"expected frames from number {options.start} on, but {recording.name} has "
                 f"{len(recording.images)}; choose a smaller start"
             )
+        stamps = recording.timestamps[self._chosen.start : self._chosen.stop : self._chosen.step]
+        if np.any(np.diff(np.round(stamps, 6)) <= 0):
+            raise InputError(
+                f"expected timestamps at least a microsecond apart, found closer ones in "
+                f"{recording.name}; name the images by seconds, or by numbers from 0"
+            )
+        self.lost = [row for row in recording.lost if stamps[0] < row[0] < stamps[-1]]
+        self.checksums: dict[int, int] = {}
         self._masks = recording.mask_paths
         if options.masks is not None:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
@@ -106,9 +116,21 @@ class RecordedSequence:
         """Return one frame; timestamps are those of the source, whatever the stride."""
         index = self.source_index(frame_index)
         raw = self._recording.images.read(index)
+        self.checksums[frame_index] = crc32(raw.tobytes())
         image = self._prepare.color(raw, self._recording.images.label(index))
         timestamp = float(self._recording.timestamps[index])
         return Frame(frame_index, timestamp, torch.from_numpy(image))
+
+    def check_masks(self) -> None:
+        """Read every mask once: a damaged one should be found before a run, not at its end."""
+        for frame_index in range(len(self)):
+            self.given_mask(frame_index)
+            if self.ground_truth is not None:
+                self.ground_truth.moving_mask(frame_index)
+
+    def files(self) -> list[Path]:
+        """Return the files of all images."""
+        return self._recording.images.paths
 
     def source_index(self, frame_index: int) -> int:
         """Return the position of a frame in the source, before start and stride."""
@@ -161,7 +183,7 @@ def _open_synthetic(
     import data_synth  # only here: real footage needs no scene generator
 
     name, _, seed = source.removeprefix("synth:").partition(":")
-    if name not in data_synth.SEQUENCES or not (seed == "" or seed.isdecimal()):
+    if name not in data_synth.SEQUENCES or not re.fullmatch(r"[0-9]{0,18}", seed):
         raise InputError(
             f"expected synth:NAME or synth:NAME:SEED with NAME one of "
             f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"

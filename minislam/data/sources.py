@@ -12,10 +12,15 @@ from minislam.errors import InputError
 
 # Assumed when neither the file names nor the container state the frame rate.
 ASSUMED_FRAME_RATE = 30.0  # frames per second
+_CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
 
 class ImageSource(Protocol):
     """Raw images in order, each of which can be read again."""
+
+    @property
+    def paths(self) -> list[Path]:
+        """Return the files that hold them."""
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -50,45 +55,67 @@ class VideoImages:
 
     The frame count in a container is an estimate, and seeking is inexact for many codecs.
     Therefore the frames are counted by reading through the file once, and reading an earlier
-    frame starts again at the beginning.
+    frame starts again at the beginning. What cannot be decoded is passed over.
     """
 
     def __init__(self, path: Path, limit: int | None = None) -> None:
-        self.path = path
+        self.path, self.paths = path, [path]
         self._capture = _open_capture(path)
-        self._next = 0  # the frame that the capture returns next
+        self._grabbed = 0  # calls of grab() since the start
+        self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self._count = 0
-        while (limit is None or self._count < limit) and self._capture.grab():
-            self._count += 1
+        self.promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less if unknown
+        stamps: list[float] = []
+        # A failed call is the end of the file, or damage with more frames behind it.
+        while self._grabbed < max(self.promised, len(stamps) + 1) and len(stamps) != limit:
+            if self._grab():
+                self._calls.append(self._grabbed)
+                stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+        self.timestamps = np.array(stamps)  # (N,) second, as the container has them
         self._rewind()
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._calls)
 
     def read(self, index: int) -> np.ndarray:
         """Return a raw image (H, W, 3) uint8 RGB; walking forward decodes every frame once."""
-        if index < self._next:
+        if self._calls[index] <= self._grabbed:
             self._rewind()
-        while self._next < index and self._capture.grab():
-            self._next += 1
-        whole, image = self._capture.read()
+        while self._grabbed < self._calls[index]:
+            self._grab()
+        whole, image = self._capture.retrieve()
         if not whole:
             raise InputError(
-                f"expected {self._count} readable frames, but {self.label(index)} cannot be "
+                f"expected {len(self)} readable frames, but {self.label(index)} cannot be "
                 "decoded; convert the video anew"
             )
-        self._next = index + 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def label(self, index: int) -> str:
         """Return how to call this frame in a message."""
         return f"frame {index} of {self.path}"
 
+    def lost(self) -> np.ndarray:  # (M,) second
+        """Return about when frames are missing between the decoded ones.
+
+        They leave gaps in the timestamps. Where the frame rate varies, gaps are no sign of loss,
+        and only the calls of grab() that failed count.
+        """
+        gaps = np.diff(self.timestamps) * self.frame_rate  # frames
+        missing = np.diff(self._calls) - 1
+        if self.promised > len(self) and np.median(np.abs(gaps - 1)) < _CONSTANT_RATE:
+            missing = np.maximum(missing, np.round(gaps).astype(int) - 1)
+        rows = zip(self.timestamps, self.timestamps[1:], missing, strict=False)
+        return np.concatenate([[], *(np.linspace(a, b, n + 2)[1:-1] for a, b, n in rows)])
+
+    def _grab(self) -> bool:
+        self._grabbed += 1
+        return self._capture.grab()
+
     def _rewind(self) -> None:
         self._capture.release()
         self._capture = _open_capture(self.path)
-        self._next = 0
+        self._grabbed = 0
 
 
 def _open_capture(path: Path) -> cv2.VideoCapture:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from minislam.data.calibration import Calibration
-from minislam.data.files import data_rows, finite_numbers, read_text
+from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
 from minislam.data.folder import calibration_beside, folder_name, stamps_of_names
 from minislam.data.images import list_images, read_color
 from minislam.data.known_cameras import bonn_camera_trajectory, is_bonn, known_camera
@@ -107,7 +107,7 @@ def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
     lists = [folder / "rgb.txt", folder / "groundtruth.txt"]
     for path in [*sorted(folder.glob("README*")), *lists]:
         if path.is_file():
-            head = read_text(path).splitlines()[:20]
+            head = read_bytes(path).decode("utf-8", "replace").splitlines()[:20]
             notes += head if path.name.startswith("README") else [x for x in head if x[:1] == "#"]
     found = next(filter(None, map(known_camera, notes)), None)
     height, width = read_color(image).shape[:2]

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from minislam.errors import InputError
 
+LONGEST_FOCAL = 1e6  # px; beyond it the field of view is nothing, and squares overflow
 REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that thresholds in pixels belong to
 
 
@@ -27,10 +28,10 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        if not (self.fx > 0 and self.fy > 0):
+        if not 0 < min(self.fx, self.fy) <= max(self.fx, self.fy) <= LONGEST_FOCAL:
             raise InputError(
-                f"expected positive focal lengths, found fx={self.fx} fy={self.fy}; "
-                "give them in pixels with --fx and --fy"
+                f"expected positive focal lengths up to {LONGEST_FOCAL:g}, found fx={self.fx} "
+                f"fy={self.fy}; give them in pixels with --fx and --fy"
             )
         if not (self.width >= 1 and self.height >= 1):
             raise InputError(

@@ -84,7 +84,7 @@ def choose_depth(
     makers: dict[str, Callable[[], Any]] = {
         "none": NoDepth,
         "simulated": lambda: _simulated_depth(sequence, seed, simulated),
-        "sensor": lambda: SensorDepth(sequence.sensor_depth),
+        "sensor": lambda: _sensor_depth(sequence),
         FOLDER: lambda: FileDepth(folder_of(choice.depth, DEPTH), 1 / sequence.depth_scale),
     }
     return _choose("depth", choice, networks, makers)
@@ -123,6 +123,15 @@ def _choose(
     raise InputError(
         f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
     )
+
+
+def _sensor_depth(sequence: Sequence) -> SensorDepth:
+    if all(sequence.sensor_depth(index) is None for index in range(len(sequence))):
+        raise InputError(
+            f"expected depth images of a sensor for --depth sensor, found none in {sequence.name}; "
+            "use --depth none or --depth files:FOLDER"
+        )
+    return SensorDepth(sequence.sensor_depth)
 
 
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:

@@ -20,6 +20,7 @@ from minislam.priors.files import FrameFiles, read_array
 from minislam.records import Frame
 
 _FIELD_CELLS = 4  # bumps of the smooth error along the shorter image side
+_RANGE = (1e-4, 1e5)  # world units; what is nearer or farther is no depth of a scene
 _GROSS_ERROR = 0.3  # relative error at a gross error, of either sign
 _GROSS_RADIUS = 0.12  # shorter image sides, radius of a gross error
 _ASPECT_TOLERANCE = 0.02  # relative; rounding a resized image to whole pixels stays below it
@@ -146,7 +147,7 @@ def _smooth_noise(width: int, height: int, source: np.random.Generator) -> np.nd
 
 def _read_npy(path: Path) -> np.ndarray:
     depth = np.squeeze(read_array(path, "depth"))
-    if depth.ndim != 2:
+    if depth.ndim != 2 or depth.size == 0:
         raise InputError(
             f"expected depth of shape (H, W) in {path}, found {depth.dtype} of shape "
             f"{depth.shape}; store one depth map in world units per file"
@@ -167,5 +168,11 @@ def _as_depth(depth: np.ndarray, frame: Frame, name: str) -> Tensor:
     if depth.shape != (height, width):
         # Not bilinear: a mean over an object's edge is a depth where nothing is.
         depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    usable = np.isfinite(depth) & (depth > 0)
+    known = np.isfinite(depth) & (depth > 0)
+    usable = known & (depth > _RANGE[0]) & (depth < _RANGE[1])
+    if known.any() and not usable.any():
+        raise InputError(
+            f"expected depths of {_RANGE[0]:g} to {_RANGE[1]:g} world units in {name}, found "
+            f"{depth[known].min():g} to {depth[known].max():g}; write metres"
+        )
     return torch.from_numpy(np.where(usable, depth, np.float32(0))).to(frame.image.device)

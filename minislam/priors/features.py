@@ -39,7 +39,7 @@ class ClassicalFeaturesConfig:
     """Settings of the classical features."""
 
     windows: tuple[int, ...] = parameter(
-        (1, 3, 5), "sides of the square windows whose statistics are taken [cells]"
+        (1, 3, 5), "sides of the square windows whose statistics are taken [cells]", 1, 999
     )
 
 

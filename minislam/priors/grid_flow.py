@@ -26,11 +26,13 @@ TEXTURE_SCALE = 2e-4  # 1/px^2, smaller eigenvalue of the structure tensor that 
 class ClassicalFlowConfig:
     """Settings of the classical flow."""
 
-    stride: int = parameter(8, "distance between grid cells [px], as DROID-SLAM")
+    stride: int = parameter(8, "distance between grid cells [px], as DROID-SLAM", least=1)
     start_tolerance: float = parameter(
         0.25, "an edge is measured again if its start has moved by this (median) [px]; 0: always"
     )
-    workers: int = parameter(2, "threads that compute flows side by side; no effect on the result")
+    workers: int = parameter(
+        2, "threads that compute flows side by side; no effect on the result", 1, 256
+    )
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ _OPAQUE = 0.5  # a less opaque pixel shows a gap rather than a surface
 
 
 def run_facts(
-    slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int
+    slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int | None
 ) -> dict[str, Any]:
     """Return the content of run.json: the command, how long the run took, and how it ended."""
     failed, adjustments = failed_adjustments(slam)

@@ -5,12 +5,11 @@ import json
 import time
 from dataclasses import asdict
 from typing import Any
-from zlib import crc32
 
 import minislam
 from minislam.config import SlamConfig, as_json, flattened
 from minislam.data import RunFolder
-from minislam.errors import InputError
+from minislam.errors import InputError, MinislamError
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
 from minislam.slam import Slam
@@ -47,9 +46,14 @@ class Checkpoints:
         is_due = begun - self._last >= self._cost / self._fraction
         if not (is_due or force):
             return
-        times = {"run_seconds": self.run_seconds, "checkpoint_seconds": self.seconds}
+        tree = self._origin | {
+            "run_seconds": self.run_seconds,
+            "checkpoint_seconds": self.seconds,
+            "checksums": {str(index): sum for index, sum in slam.sequence.checksums.items()},
+            "slam": slam.saved_state(),
+        }
         try:
-            self._folder.write_checkpoint(self._origin | times | {"slam": slam.saved_state()})
+            self._folder.write_checkpoint(tree)
             self.problem = None
         except InputError as error:
             self.problem = f"the last checkpoint is older than this state: {error}"
@@ -62,8 +66,33 @@ class Checkpoints:
 
         What a GPU began may go on without one, no longer to the same bytes.
         """
-        device = self._origin["priors"]["device"]
+        device, where = self._origin["priors"]["device"], self._folder.path
         found = self._folder.read_checkpoint(device)
+        try:
+            self._require_same(found, device)
+            for index, checksum in found["checksums"].items():
+                slam.sequence.frame(int(index))
+                if slam.sequence.checksums[int(index)] != checksum:
+                    raise InputError(
+                        f"expected frame {index} as the interrupted run in {where} read it, found "
+                        "another image; restore it, or start anew in another folder"
+                    )
+            slam.restore_state(found["slam"], functools.cache(slam.sequence.frame))
+            self._start -= float(found["run_seconds"])
+            self.seconds = float(found["checkpoint_seconds"])
+            steps, frames = slam.steps.saved_state()["_done"], len(slam.tracker.tracked)
+            most = max(frames, slam.config.mapping.refine_iterations)
+            if steps.get("tracking and mapping", 0) != frames or max(steps.values()) > most:
+                raise ValueError(f"{steps} for {frames} frames")
+        except MinislamError:
+            raise
+        except Exception as error:  # parts are missing, or have another type or shape
+            raise InputError(
+                f"expected the whole state of a run in the checkpoint of {where}, found {error!r}; "
+                "it is damaged or of another program: start again with --overwrite"
+            ) from error
+
+    def _require_same(self, found: dict[str, Any], device: str) -> None:
         then = flattened({name: found.get(name) for name in self._origin})
         if device == "cpu":
             then["priors.device"] = "cpu"
@@ -74,9 +103,6 @@ class Checkpoints:
                     f"{self._folder.path}, found {now}; repeat its command with --resume, or start "
                     "anew in another folder"
                 )
-        slam.restore_state(found["slam"], functools.cache(slam.sequence.frame))
-        self._start -= found["run_seconds"]
-        self.seconds = found["checkpoint_seconds"]
 
 
 def _origin(sequence: Sequence, config: SlamConfig, choice: PriorChoice) -> dict[str, Any]:
@@ -88,7 +114,6 @@ def _origin(sequence: Sequence, config: SlamConfig, choice: PriorChoice) -> dict
             "description": sequence.description,
             "frames": len(sequence),
             "camera": asdict(sequence.camera),
-            "first_image": crc32(sequence.frame(0).image.numpy().tobytes()),
         },
         "priors": asdict(choice),
         "settings": as_json(config),

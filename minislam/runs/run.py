@@ -1,13 +1,15 @@
 """One run from a name to a folder: read the sequence, do SLAM, measure it, write everything."""
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from operator import itemgetter
 from pathlib import Path
 
 import torch
 
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
-from minislam.errors import InputError, MinislamError
+from minislam.errors import InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.files import FILES
@@ -82,27 +84,31 @@ def run_sequence(
     if resume:
         checkpoints.restore(slam)
     folder.write_config({**sequence.opened_as, "priors": asdict(choice), **as_json(config)})
+    folder.write_run(run_facts(slam, choice, checkpoints, "running", None))
     interrupted = False
     try:
-        slam.run()
-    except KeyboardInterrupt:
-        interrupted = True
-        if not slam.mapper.keyframes:  # there is no map to write yet
+        try:
+            slam.run()
+        except KeyboardInterrupt:
+            if not slam.mapper.keyframes:  # there is no map to write yet
+                raise
+            interrupted = True
+        seconds = checkpoints.run_seconds
+        state, exit_code = _ending(slam, interrupted)
+        facts = run_facts(slam, choice, checkpoints, state, exit_code)
+        _write_estimates(folder, slam)
+        metrics = measure(slam, seconds, lpips)
+        folder.write_metrics(metrics)
+        write_pictures(folder, slam, metrics, facts["warnings"])
+        folder.write_run(facts)
+    except (Exception, KeyboardInterrupt) as error:
+        state, exit_code = f"failed: {str(error) or repr(error)}", FAILED_EXIT
+        if isinstance(error, KeyboardInterrupt):
+            state, exit_code = "interrupted", INTERRUPTED_EXIT
+        with suppress(Exception):  # a full disk: the first error is the one to hear of
+            folder.write_run(run_facts(slam, choice, checkpoints, state, exit_code))
             _write_trajectories(folder, slam)
-            folder.write_run(run_facts(slam, choice, checkpoints, "interrupted", INTERRUPTED_EXIT))
-            raise
-    except MinislamError as error:
-        _write_trajectories(folder, slam)
-        folder.write_run(run_facts(slam, choice, checkpoints, f"failed: {error}", FAILED_EXIT))
         raise
-    seconds = checkpoints.run_seconds
-    state, exit_code = _ending(slam, interrupted)
-    facts = run_facts(slam, choice, checkpoints, state, exit_code)
-    _write_estimates(folder, slam)
-    metrics = measure(slam, seconds, lpips)
-    folder.write_metrics(metrics)
-    write_pictures(folder, slam, metrics, facts["warnings"])
-    folder.write_run(facts)
     if not interrupted:
         folder.remove_checkpoint()
     return RunOutcome(metrics, focal_length_note(slam), facts["warnings"], exit_code, state)
@@ -117,7 +123,7 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
         return "finished, most bundle adjustments failed", LOST_EXIT
     if slam.tracker.watch.is_broken:
         return "finished, broken", LOST_EXIT
-    if slam.lost_frames():
+    if slam.lost_frames() or slam.sequence.lost:
         return "finished, partly lost", LOST_EXIT
     return "finished", 0
 
@@ -127,7 +133,8 @@ def _write_trajectories(folder: RunFolder, slam: Slam) -> None:
     if slam.tracker.initialised:
         folder.write_trajectory(slam.trajectory())
         folder.write_keyframe_trajectory(slam.keyframe_trajectory())
-        folder.write_lost_frames(slam.lost_frames())
+        undecoded = [(-1, stamp, reason) for stamp, reason in slam.sequence.lost]
+        folder.write_lost_frames(sorted([*slam.lost_frames(), *undecoded], key=itemgetter(1)))
 
 
 def _write_estimates(folder: RunFolder, slam: Slam) -> None:

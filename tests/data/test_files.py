@@ -64,7 +64,32 @@ def test_a_writer_killed_before_the_exchange_leaves_the_old_file(tmp_path: Path)
     assert path.read_bytes() == b"old"
     atomic_write(path, b"newer")  # what the dead writer left is no obstacle
     assert path.read_bytes() == b"newer"
-    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_stays_a_link_and_a_device_stays_a_device(tmp_path: Path):
+    (tmp_path / "target").write_text("old")
+    (tmp_path / "link").symlink_to("target")
+    atomic_write(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "target").read_bytes() == b"new"
+    os.mkfifo(tmp_path / "pipe")
+    for special in (tmp_path / "pipe", Path(os.devnull), tmp_path):
+        with pytest.raises(InputError, match=r"but .* is none; choose another name"):
+            atomic_write(special, b"new")
+    assert (tmp_path / "pipe").is_fifo() and not Path(os.devnull).is_file()
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path: Path):
+    with files.atomic_file(tmp_path / "a") as first:
+        first.write(b"first")
+        atomic_write(tmp_path / "a", b"second")
+    assert (tmp_path / "a").read_bytes() == b"first"
+    assert list(tmp_path.iterdir()) == [tmp_path / "a"]
+
+
+def test_a_name_that_is_no_utf_8_comes_back_from_json(tmp_path: Path):
+    name = os.fsdecode(b"bad\xff")
+    write_json(tmp_path / "a.json", {"command": [name]})
+    assert read_json(tmp_path / "a.json")["command"] == [name]
 
 
 def test_a_failed_exchange_leaves_no_temporary_file(tmp_path: Path, monkeypatch):
@@ -102,6 +127,9 @@ def test_missing_and_binary_files_are_named(tmp_path: Path):
 def test_broken_json_is_named(tmp_path: Path):
     (tmp_path / "c.json").write_text('{"a": 1,}')
     with pytest.raises(InputError, match=r"c\.json.*line 1"):
+        read_json(tmp_path / "c.json")
+    (tmp_path / "c.json").write_text('{"seed": ' + "9" * 5000 + "}")
+    with pytest.raises(InputError, match=r"c\.json.*digits"):
         read_json(tmp_path / "c.json")
 
 

@@ -1,5 +1,8 @@
 """Pictures as cameras write them: accepted kinds, and damaged files."""
 
+import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import cv2
@@ -110,6 +113,57 @@ def test_a_cut_jpeg_with_a_whole_thumbnail_is_refused(tmp_path: Path):
     (tmp_path / "cut.jpg").write_bytes(whole[:-40])
     with pytest.raises(InputError, match="cut"):
         read_color(tmp_path / "cut.jpg")
+
+
+def jpeg(tmp_path: Path, seed: int = 0) -> bytes:
+    """Return a file whose scan fills most of it."""
+    noise = np.random.default_rng(seed).integers(0, 256, (64, 96, 3)).astype(np.uint8)
+    return save(tmp_path / f"{seed}.jpg", noise).read_bytes()
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.9])
+def test_a_jpeg_cut_in_its_scan_with_its_end_marker_is_refused(tmp_path: Path, kept: float):
+    content = jpeg(tmp_path)
+    start = content.rfind(b"\xff\xda")
+    rest = content[start : start + int(kept * (len(content) - start))]
+    (tmp_path / "cut.jpg").write_bytes(content[:start] + rest + b"\xff\xd9")
+    with pytest.raises(InputError, match=r"cut\.jpg"):
+        read_color(tmp_path / "cut.jpg")
+
+
+def test_a_jpeg_with_flipped_bytes_is_refused_or_warned_of(tmp_path: Path):
+    whole, silent = jpeg(tmp_path), 0
+    for seed in range(20):
+        content, rng = bytearray(whole), np.random.default_rng(seed)
+        for place in rng.integers(whole.rfind(b"\xff\xda") + 20, len(whole) - 2, 5):
+            content[place] ^= 0x55
+        (tmp_path / "flipped.jpg").write_bytes(content)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            try:
+                read_color(tmp_path / "flipped.jpg")
+                silent += not any("flipped.jpg may be damaged" in str(w.message) for w in said)
+            except InputError:
+                pass
+    assert silent <= 2  # a flip can give another whole image, which nobody can tell
+
+
+def test_what_a_decoder_says_stays_off_the_screen(tmp_path: Path, capfd):
+    content = jpeg(tmp_path)
+    (tmp_path / "padded.jpg").write_bytes(content[:-2] + bytes(8) + content[-2:])
+    with pytest.warns(UserWarning, match=r"padded\.jpg may be damaged: .* extraneous bytes"):
+        image = read_color(tmp_path / "padded.jpg")
+    np.testing.assert_array_equal(image, read_color(tmp_path / "0.jpg"))
+    assert capfd.readouterr().err == ""
+
+
+def test_a_header_that_claims_ten_giga_pixels_is_refused(tmp_path: Path):
+    content = bytearray(save(tmp_path / "a.png", picture(0)).read_bytes())
+    content[16:24] = struct.pack(">II", 100_000, 100_000)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.png .* is damaged"):
+        read_color(tmp_path / "a.png")
 
 
 def test_colour_is_no_depth(tmp_path: Path):

@@ -13,6 +13,7 @@ from minislam.errors import InputError
     [
         ("start", -1), ("stride", 0), ("max_frames", 0), ("size", (8, 240)), ("fx", float("nan")),
         ("depth_scale", 0.0), ("pixels", 0),
+        ("size", (100_000, 100_000)), ("pixels", 10**10), ("fx", 1e300),
     ],
 )  # fmt: skip
 def test_impossible_options_are_refused(field: str, value: object):

@@ -1,5 +1,6 @@
 """A run folder: what is written, what is refused, what is left alone."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,17 +9,19 @@ import torch
 
 from minislam.data.images import read_color
 from minislam.data.ply import GaussianArrays
-from minislam.data.run_folder import RunFolder
+from minislam.data.run_folder import RunFolder, locked
 from minislam.errors import InputError
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
 from tests.recordings import picture, save
 
+CONFIG = {"sequence": "desk", "input": {}, "priors": {}, "tracking": {"window": 8}, "mapping": {}}
+
 
 def fill(run: RunFolder) -> None:
     trajectory = Trajectory(np.arange(3.0), random_transforms(3, "normal", 0).numpy())
     ones = np.ones((2, 3), np.float32)
-    run.write_config({"tracking": {"window": 8}})
+    run.write_config(CONFIG)
     run.write_run({"seed": 0, "state": "ok"})
     run.write_metrics({"ate_rmse_world_units": 0.01})
     run.write_trajectory(trajectory)
@@ -50,7 +53,7 @@ def test_the_files_of_a_run(tmp_path: Path):
 def test_everything_can_be_read_back(tmp_path: Path):
     fill(RunFolder.create(tmp_path / "out"))
     run = RunFolder(tmp_path / "out")
-    assert run.read_config() == {"tracking": {"window": 8}}
+    assert run.read_config() == CONFIG
     assert run.read_run()["state"] == "ok"
     assert run.read_metrics() == {"ate_rmse_world_units": 0.01}
     assert len(run.read_trajectory()) == len(run.read_keyframe_trajectory()) == 3
@@ -81,6 +84,77 @@ def test_results_are_replaced_only_when_asked_and_foreign_files_never(tmp_path: 
     RunFolder.create(tmp_path / "out", overwrite=True)
     left = [path.name for path in (tmp_path / "out").rglob("*") if path.is_file()]
     assert left == ["notes.txt"]
+
+
+def picture_of_mine(folder: Path) -> None:
+    """A folder of the user's own pictures."""
+    (folder / "keyframes").mkdir(parents=True)
+    (folder / "keyframes/000001_input.png").write_text("mine")
+
+
+def foreign_config(folder: Path) -> None:
+    """A folder of another program that has a config.json, too."""
+    picture_of_mine(folder)
+    (folder / "config.json").write_text('{"tracking": {}, "mapping": {}}')
+
+
+def linked_pictures(folder: Path) -> None:
+    """A run folder whose pictures are somewhere else."""
+    fill(RunFolder.create(folder))
+    shutil.move(folder / "keyframes", folder.parent / "photos")
+    (folder / "keyframes").symlink_to(folder.parent / "photos")
+
+
+def linked_map(folder: Path) -> None:
+    """A run folder whose map is somewhere else."""
+    fill(RunFolder.create(folder))
+    shutil.move(folder / "map.ply", folder.parent)
+    (folder / "map.ply").symlink_to(folder.parent / "map.ply")
+
+
+@pytest.mark.parametrize("make", [picture_of_mine, foreign_config, linked_pictures, linked_map])
+def test_a_folder_that_may_be_another_s_is_left_alone(make, tmp_path: Path):
+    make(tmp_path / "out")
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    with pytest.raises(InputError, match="nothing was removed"):
+        RunFolder.create(tmp_path / "out", overwrite=True)
+    after = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    assert after == before
+
+
+def test_an_input_inside_is_left_alone(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "out")
+    fill(run)
+    (tmp_path / "photos").symlink_to(run.path / "keyframes")
+    for name in ("out/keyframes/000123_input.png", "photos/000123_input.png", "out"):
+        with pytest.raises(InputError, match=r"found the input .*; nothing was removed"):
+            RunFolder.create(run.path, overwrite=True, inputs=[tmp_path / name])
+    assert (run.path / "keyframes/000123_input.png").is_file()
+    RunFolder.create(run.path, overwrite=True, inputs=[tmp_path, tmp_path / "other"])
+
+
+def test_only_names_that_a_run_writes_are_removed(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "out")
+    fill(run)
+    mine = ["keyframes/holiday.png", "plots/thesis.png", "map.ply.tmp", "notes/map.ply"]
+    ours = ["keyframes/0000123_beta.png", "map.ply.0123abcd.tmp", "plots/health.png.0123abcd.tmp"]
+    for name in [*mine, *ours]:
+        (run.path / name).parent.mkdir(exist_ok=True)
+        (run.path / name).write_text("x")
+    RunFolder.create(run.path, overwrite=True)
+    left = {path.relative_to(run.path).as_posix() for path in run.path.rglob("*.*")}
+    assert left == set(mine)
+
+
+def test_a_folder_is_locked_for_one_run_and_unlocked_by_its_end(tmp_path: Path):
+    with locked(tmp_path / "out"):
+        with pytest.raises(InputError, match="another one is writing"), locked(tmp_path / "out"):
+            pass
+        with locked(tmp_path / "other"):
+            pass
+    with locked(tmp_path / "out"):
+        RunFolder.create(tmp_path / "out")
+    assert not [path for path in (tmp_path / "out").iterdir() if path.is_file()]
 
 
 def test_an_empty_folder_is_accepted(tmp_path: Path):

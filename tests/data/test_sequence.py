@@ -174,3 +174,36 @@ def test_a_frame_outside_the_sequence_is_an_index_error(tmp_path: Path):
     for index in (-1, 6):
         with pytest.raises(IndexError):
             sequence.frame(index)
+
+
+def test_timestamps_that_files_cannot_tell_apart_are_refused_before_a_run(tmp_path: Path):
+    for number in range(1, 4):
+        save(tmp_path / f"close/0.{number:07d}.png", picture(number))
+    with pytest.raises(InputError, match="timestamps at least a microsecond apart"):
+        open_sequence(str(tmp_path / "close"))
+
+
+def test_a_damaged_mask_is_found_before_a_run(tmp_path: Path):
+    sequence = open_sequence(str(tum_folder(tmp_path / "desk")))
+    sequence.check_masks()
+    mask = tmp_path / "desk/masks/100.200000.png"
+    mask.write_bytes(mask.read_bytes()[:30])
+    with pytest.raises(InputError, match=r"masks/100\.200000\.png .* is damaged"):
+        sequence.check_masks()
+
+
+def test_every_image_is_named_and_every_image_that_was_read_has_a_checksum(tmp_path: Path):
+    folder = tum_folder(tmp_path / "desk")
+    sequence = open_sequence(str(folder))
+    assert sequence.files() == sorted(folder.glob("rgb/*.png"))
+    before = dict(sequence.checksums)
+    sequence.frame(3), sequence.frame(1)
+    assert set(sequence.checksums) - set(before) == {1, 3}
+    assert len(set(sequence.checksums.values())) == len(sequence.checksums)
+
+
+def test_a_binary_readme_is_no_reason_to_refuse_a_folder(tmp_path: Path):
+    folder = tum_folder(tmp_path / "desk")
+    (folder / "calibration.txt").unlink()
+    (folder / "README.dat").write_bytes(b"\xff\xfe\x00\x80" * 9)
+    assert len(open_sequence(str(folder))) == 6

@@ -3,9 +3,11 @@
 import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from minislam.data import InputOptions, RecordedSequence, sources
 from minislam.data.folder import read_video
 from minislam.data.sources import VideoImages
 from minislam.errors import InputError
@@ -47,6 +49,93 @@ def test_a_video_filmed_upright_is_turned(tmp_path: Path):
     image = VideoImages(tmp_path / "turned.mp4").read(0)
     assert image.shape == (96, 64, 3)
     assert image[5, 55, 0] > 180  # the red corner went from the upper left to the upper right
+
+
+# Damage
+
+
+def long_video(path: Path, rate: float = 30) -> Path:
+    """Write 60 frames of a moving texture, compressed to about a kilobyte each."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), rate, (96, 64))
+    texture = np.random.default_rng(0).integers(0, 256, (8, 24, 3)).astype(np.uint8)
+    texture = cv2.resize(texture, (288, 64), interpolation=cv2.INTER_CUBIC)
+    for number in range(60):
+        writer.write(np.ascontiguousarray(texture[:, 3 * number : 3 * number + 96]))
+    writer.release()
+    return path
+
+
+def test_frames_lost_in_the_middle_are_listed_and_those_behind_are_read(tmp_path: Path):
+    content = long_video(tmp_path / "whole.mkv").read_bytes()
+    middle = len(content) // 2
+    (tmp_path / "hole.mkv").write_bytes(content[:middle] + content[middle + 4096 :])
+    recording = read_video(tmp_path / "hole.mkv", None)
+    count, lost = len(recording.images), [stamp for stamp, _ in recording.lost]
+    assert 30 < count < 60 and count + len(lost) == 60
+    assert recording.timestamps[-1] == pytest.approx(59 / 30, abs=1e-3)  # behind the hole
+    stamps = np.sort(np.concatenate([recording.timestamps, lost]))
+    np.testing.assert_allclose(stamps, np.arange(60) / 30, atol=2e-3)
+    assert f"hole.mkv promises 60 frames, of which {count} can be decoded" in recording.warnings[0]
+    sequence = RecordedSequence(recording, InputOptions(), "hole.mkv")
+    assert sequence.lost == recording.lost and len(sequence) == count
+    part = RecordedSequence(recording, InputOptions(max_frames=10), "hole.mkv")
+    assert part.lost == []  # nothing is lost of the frames that are asked for
+
+
+def test_a_cut_video_is_warned_of(tmp_path: Path):
+    content = long_video(tmp_path / "whole.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(content[: int(0.6 * len(content))])
+    recording = read_video(tmp_path / "cut.avi", None)
+    assert 20 < len(recording.images) < 60 and recording.lost == []
+    assert "promises 60 frames" in recording.warnings[0]
+    assert read_video(tmp_path / "cut.avi", 10).warnings == []
+
+
+def test_a_whole_video_is_not_warned_of(tmp_path: Path):
+    for name in ("a.mp4", "a.mkv", "a.avi"):
+        recording = read_video(long_video(tmp_path / name), None)
+        assert (recording.warnings, recording.lost, len(recording.images)) == ([], [], 60)
+
+
+class Capture:
+    """A video of six frames of varying distance; the third cannot be decoded."""
+
+    stamps = (0.0, 0.1, None, 0.2, 0.233, 0.4)
+
+    def __init__(self) -> None:
+        self.next = 0
+
+    def get(self, what: int) -> float:
+        if what == cv2.CAP_PROP_POS_MSEC:
+            return 1000 * self.stamps[self.next - 1]
+        return {cv2.CAP_PROP_FPS: 30, cv2.CAP_PROP_FRAME_COUNT: len(self.stamps)}[what]
+
+    def grab(self) -> bool:
+        self.next += 1
+        return self.next <= len(self.stamps) and self.stamps[self.next - 1] is not None
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.full((64, 96, 3), self.next, np.uint8)
+
+    def release(self) -> None:
+        pass
+
+
+def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(monkeypatch):
+    monkeypatch.setattr(sources, "_open_capture", lambda path: Capture())
+    recording = read_video(Path("phone.mp4"), None)
+    np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2, 0.233, 0.4])
+    assert [recording.images.read(k)[0, 0, 0] for k in (0, 2, 4, 1)] == [1, 4, 6, 2]
+    assert recording.lost == [(pytest.approx(0.15), "phone.mp4 is damaged there")]
+    assert "promises 6 frames, of which 5 can be decoded" in recording.warnings[0]
+
+
+def test_without_timestamps_the_frame_rate_is_taken_and_said(monkeypatch):
+    monkeypatch.setattr(sources, "_open_capture", lambda path: Capture())
+    monkeypatch.setattr(Capture, "stamps", (0.0,) * 6)
+    recording = read_video(Path("old.avi"), None)
+    np.testing.assert_allclose(recording.timestamps, np.arange(6) / 30)
+    assert recording.warnings == ["old.avi has no timestamps: 30 frames per second assumed"]
 
 
 # Errors

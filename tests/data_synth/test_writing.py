@@ -1,6 +1,7 @@
 """The folder on disk: layout, values, caching, refusal, and the command line."""
 
 import json
+import os
 
 import cv2
 import numpy as np
@@ -163,3 +164,13 @@ def test_a_missing_name_or_folder_is_a_usage_error():
     with pytest.raises(SystemExit) as stopped:
         main(["crowd"])
     assert stopped.value.code == 2
+
+
+def test_what_a_killed_process_left_in_the_cache_is_removed_after_a_day(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path))
+    old, new = (tmp_path / f"synth/.ball-9-60-96x72-{name}" for name in ("_r8tpw0q", "abcdefgh"))
+    for folder in (old, new):
+        (folder / "rgb").mkdir(parents=True)
+    os.utime(old, (0, 0))
+    cached_sequence("ball", 0, 1, (32, 24))
+    assert new.exists() and not old.exists()

@@ -1,5 +1,6 @@
 """Priors are chosen by name; what does not fit together is refused in one sentence."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,9 +21,13 @@ class Recorded:
 
     name = "desk"
     ground_truth = None
+    with_depth = 1  # the frame of which a sensor measured the depth
 
-    def sensor_depth(self, frame_index: int) -> None:
-        return None
+    def __len__(self) -> int:
+        return 2
+
+    def sensor_depth(self, frame_index: int) -> np.ndarray | None:
+        return np.ones((3, 4)) if frame_index == self.with_depth else None
 
 
 def flow(**flags: str):
@@ -71,3 +76,9 @@ def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match="expected a GPU that this torch can use"):
         flow(flow="droid", flow_weights="droid.pth", device="cuda")
+
+
+def test_a_sensor_that_measured_nothing_is_no_prior(monkeypatch):
+    monkeypatch.setattr(Recorded, "with_depth", None)
+    with pytest.raises(InputError, match=r"depth images of a sensor .* found none in desk"):
+        depth(depth="sensor")

@@ -42,7 +42,7 @@ def checkpoints(folder: Folder, fraction: str) -> resume.Checkpoints:
     return resume.Checkpoints(folder, sequence, config, PriorChoice())
 
 
-SLAM = SimpleNamespace(saved_state=dict)
+SLAM = SimpleNamespace(saved_state=dict, sequence=SimpleNamespace(checksums={}))
 
 
 def test_checkpoints_take_no_larger_fraction_of_the_time(root: Path, clock: SimpleNamespace):

@@ -1,0 +1,137 @@
+"""However the command line ends: one sentence, run.json says how, nothing is lost."""
+
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from minislam.cli.main import main
+from minislam.data.run_folder import locked
+from minislam.slam import Slam
+from tests.recordings import save
+
+pytestmark = pytest.mark.slow
+
+TEXTURE = np.random.default_rng(0).integers(0, 256, (20, 27, 3)).astype(np.uint8)
+
+
+def texture(shift: int) -> np.ndarray:
+    """Return a crop of a blotchy picture, moved by `shift` px: (72, 96, 3) uint8."""
+    large = cv2.resize(TEXTURE, (216, 160), interpolation=cv2.INTER_CUBIC)
+    return large[20:92, 20 + shift : 116 + shift]
+
+
+def images(folder: Path, pictures: list[np.ndarray]) -> Path:
+    for number, image in enumerate(pictures):
+        save(folder / f"{number:02d}.png", image)
+    return folder
+
+
+def run(*arguments: object) -> int:
+    return main(["run", "--preset", "test", *map(str, arguments)])
+
+
+def the_sentence(capsys: pytest.CaptureFixture[str]) -> str:
+    """Return what was said on stderr, which is one line of one sentence besides warnings."""
+    lines = capsys.readouterr().err.splitlines()
+    said = [line for line in lines if line.startswith("minislam: ")]
+    assert len(said) == 1, lines
+    assert not any("Traceback" in line for line in lines)
+    assert re.match(r"minislam: expected .*[^.]$", said[0]), said[0]
+    return said[0]
+
+
+# The net: whatever else goes wrong
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(28, "No space left"), MemoryError("9 TB"), OverflowError("fx**2"), cv2.error("alloc")],
+)
+def test_a_foreign_error_is_one_sentence_too(error: Exception, tmp_path: Path, monkeypatch, capsys):
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(Slam, "run", fail)
+    source, out = images(tmp_path / "input", [texture(0), texture(3)]), tmp_path / "out"
+    assert run(source, "-o", out) == 1
+    said = the_sentence(capsys)
+    assert type(error).__name__ in said and "set MINISLAM_DEBUG=1" in said
+    assert json.loads((out / "run.json").read_text())["state"] == f"failed: {error}"
+    monkeypatch.setenv("MINISLAM_DEBUG", "1")
+    with pytest.raises(type(error)):
+        run(source, "-o", tmp_path / "again")
+
+
+@pytest.mark.parametrize("source", ["~nouserhere/x", "a" * 5000, "a\0b"])
+def test_a_name_that_no_system_knows_is_one_sentence(source: str, tmp_path: Path, capsys):
+    assert run(source, "-o", tmp_path / "out") == 1
+    assert len(the_sentence(capsys)) < 600
+    assert run(images(tmp_path / "input", [texture(0)]), "-o", tmp_path / source) == 1
+    the_sentence(capsys)
+
+
+def full_device() -> io.TextIOWrapper:
+    return io.TextIOWrapper(open("/dev/full", "wb", buffering=0), write_through=True)
+
+
+def test_the_end_of_a_reader_is_no_error():
+    command = f"{sys.executable} -m minislam weights list | true"
+    assert subprocess.run(["bash", "-c", command], capture_output=True).stderr == b""
+
+
+def test_numbers_that_cannot_be_printed_are_an_error(tmp_path: Path, monkeypatch, capsys):
+    path = tmp_path / "a.txt"
+    path.write_text("".join(f"{k} {k} {k * k % 5} 0 0 0 0 1\n" for k in range(6)))
+    with full_device() as full, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", full)
+        assert main(["eval", str(path), str(path)]) == 1
+    assert "No space left" in the_sentence(capsys)
+
+
+def test_a_run_of_a_strange_name_that_nobody_listens_to_and_its_pictures(
+    tmp_path: Path, monkeypatch, capsys
+):
+    source, out = images(tmp_path / "in", [texture(0), texture(3)]), tmp_path / "out"
+    source = source.rename(tmp_path / os.fsdecode(b"bad\xff"))  # no UTF-8
+    with full_device() as full, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", full)
+        patch.setattr(sys, "stderr", None)  # 2>&-
+        assert run(source, "-o", out, "--mapping.refine_iterations", "2") == 0
+    assert json.loads((out / "run.json").read_text())["state"] == "finished"
+    assert json.loads((out / "config.json").read_text())["sequence"] == str(source)
+
+    before = {path: path.is_file() and path.read_bytes() for path in out.rglob("*")}
+    assert run(out / "keyframes", "-o", out, "--overwrite") == 1
+    assert "nothing was removed" in the_sentence(capsys)
+    assert {path: path.is_file() and path.read_bytes() for path in out.rglob("*")} == before
+
+
+def test_a_folder_with_a_run_in_it_is_refused(tmp_path: Path, capsys):
+    source = images(tmp_path / "in", [texture(0), texture(3)])
+    with locked(tmp_path / "out"):
+        assert run(source, "-o", tmp_path / "out") == 1
+    assert "another one is writing into it" in the_sentence(capsys)
+    assert not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("depth", [1e30, 1e-30])
+def test_a_depth_that_is_none_is_refused_at_once(depth: float, tmp_path: Path, capsys):
+    source = images(tmp_path / "in", [texture(0), texture(3)])
+    for number in range(2):
+        save_depth(tmp_path / f"depth/{number:05d}.npy", np.full((72, 96), depth))
+    options = ["--depth", f"files:{tmp_path / 'depth'}", "-o", tmp_path / "out"]
+    assert run(source, *options) == 1
+    assert "expected depths of 0.0001 to 100000 world units in" in the_sentence(capsys)
+
+
+def save_depth(path: Path, depth: np.ndarray) -> None:
+    path.parent.mkdir(exist_ok=True)
+    np.save(path, depth.astype(np.float32))
