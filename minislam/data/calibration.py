@@ -86,9 +86,4 @@ def parse_calibration(text: str, name: str) -> Calibration:
                 f"expected width and height as positive whole numbers, found {fields[4]} and "
                 f"{fields[5]} in {name}; correct them"
             )
-    if min(fx, fy) <= 0:
-        raise InputError(
-            f"expected positive focal lengths, found fx={fields[0]} fy={fields[1]} in {name}; "
-            "give them in pixels"
-        )
     return Calibration(fx, fy, cx, cy, size, BrownDistortion(*rest[2:]), name)

@@ -12,6 +12,7 @@ from minislam.errors import InputError
 
 # Assumed when neither the file names nor the container state the frame rate.
 ASSUMED_FRAME_RATE = 30.0  # frames per second
+_MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
 
@@ -67,8 +68,11 @@ class VideoImages:
         self.promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less if unknown
         stamps: list[float] = []
         # A failed call is the end of the file, or damage with more frames behind it.
-        while self._grabbed < max(self.promised, len(stamps) + 1) and len(stamps) != limit:
+        failures = 0
+        while len(stamps) != limit and failures < _MOST_FAILURES:
+            failures += 1
             if self._grab():
+                failures = 0
                 self._calls.append(self._grabbed)
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
@@ -103,7 +107,7 @@ class VideoImages:
         """
         gaps = np.diff(self.timestamps) * self.frame_rate  # frames
         missing = np.diff(self._calls) - 1
-        if self.promised > len(self) and np.median(np.abs(gaps - 1)) < _CONSTANT_RATE:
+        if self.promised > len(self) > 1 and np.median(np.abs(gaps - 1)) < _CONSTANT_RATE:
             missing = np.maximum(missing, np.round(gaps).astype(int) - 1)
         rows = zip(self.timestamps, self.timestamps[1:], missing, strict=False)
         return np.concatenate([[], *(np.linspace(a, b, n + 2)[1:-1] for a, b, n in rows)])

@@ -91,11 +91,6 @@ class FileDepth:
         png_unit: float = 1 / 5000,  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
     ) -> None:
         self.png_unit = png_unit
-        if not png_unit > 0:
-            raise InputError(
-                f"expected a positive world unit per count for depth .png files, found {png_unit}; "
-                "for TUM and Bonn give 0.0002"
-            )
         self._files = FrameFiles(folder, "depth", (".npy", ".png"))
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:

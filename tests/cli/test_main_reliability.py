@@ -120,18 +120,3 @@ def test_a_folder_with_a_run_in_it_is_refused(tmp_path: Path, capsys):
         assert run(source, "-o", tmp_path / "out") == 1
     assert "another one is writing into it" in the_sentence(capsys)
     assert not list((tmp_path / "out").iterdir())
-
-
-@pytest.mark.parametrize("depth", [1e30, 1e-30])
-def test_a_depth_that_is_none_is_refused_at_once(depth: float, tmp_path: Path, capsys):
-    source = images(tmp_path / "in", [texture(0), texture(3)])
-    for number in range(2):
-        save_depth(tmp_path / f"depth/{number:05d}.npy", np.full((72, 96), depth))
-    options = ["--depth", f"files:{tmp_path / 'depth'}", "-o", tmp_path / "out"]
-    assert run(source, *options) == 1
-    assert "expected depths of 0.0001 to 100000 world units in" in the_sentence(capsys)
-
-
-def save_depth(path: Path, depth: np.ndarray) -> None:
-    path.parent.mkdir(exist_ok=True)
-    np.save(path, depth.astype(np.float32))

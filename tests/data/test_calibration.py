@@ -59,13 +59,14 @@ def test_a_noted_focal_length_comes_before_the_guess():
         ("500 nan 320 240", "finite"),
         ("-500 500 320 240", "positive focal"),
         ("500 0 320 240", "positive focal"),
+        ("1e300 1e300 320 240", r"positive focal lengths up to 1e\+06"),
         ("500 500 320 240 640.5 480", "whole"),
         ("500 500 320 240 0 480", "whole"),
     ],
 )
 def test_wrong_calibrations_name_the_file(text: str, message: str):
     with pytest.raises(InputError, match=message) as caught:
-        parse_calibration(text, "kinect.txt")
+        parse_calibration(text, "kinect.txt").camera_for(640, 480)
     assert "kinect.txt" in str(caught.value)
 
 

@@ -164,11 +164,25 @@ def test_bad_folders_are_refused_in_one_sentence(tmp_path: Path, write, sentence
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_folder_and_a_zero_unit_are_refused(tmp_path: Path):
+def test_a_missing_folder_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="found nothing at"):
         FileDepth(tmp_path / "none")
-    with pytest.raises(InputError, match=r"positive world unit .* found 0"):
-        FileDepth(tmp_path, png_unit=0)
+
+
+def test_an_empty_or_endless_array_and_depths_of_no_scene_are_refused(tmp_path: Path):
+    np.save(tmp_path / "0.npy", np.zeros((0, 0), np.float32))
+    with pytest.raises(InputError, match=r"expected depth of shape \(H, W\)"):
+        FileDepth(tmp_path)(frame(0), CAMERA)
+    header = "{'descr': '<f4', 'fortran_order': False, 'shape': (10**6, 10**6), }"
+    header = header.replace("10**6", "1000000").ljust(117) + "\n"
+    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
+    (tmp_path / "0.npy").write_bytes(content)  # 4 TB
+    with pytest.raises(InputError, match="unreadable file"):
+        FileDepth(tmp_path)(frame(0), CAMERA)
+    for depth in (1e30, 1e-30):
+        np.save(tmp_path / "0.npy", np.full((CAMERA.height, CAMERA.width), depth, np.float32))
+        with pytest.raises(InputError, match=r"expected depths of 0\.0001 to 100000 world units"):
+            FileDepth(tmp_path)(frame(0), CAMERA)
 
 
 # The other two
