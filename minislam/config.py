@@ -18,8 +18,7 @@ from minislam.priors.networks.table import NetworksConfig
 from minislam.tracking.config import TrackingConfig, paper_schedule
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 
-# Settings of other rooms for which zero means nothing, and fractions. The bounds of all others
-# stand beside their meaning.
+# Settings for which zero means nothing, and fractions. Other bounds stand beside the meaning.
 _FROM_ONE = """
 keyframe_interval warmup_keyframes window rounds iterations global_iterations pose_rounds
 warmup_rounds warmup_iterations pose_iterations loop_min_gap rate_iterations insertion.cell
@@ -109,12 +108,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def _bounds_of(name: str, metadata: Mapping[str, Any]) -> tuple[float, float]:
-    own = name.partition(".")[2].removeprefix("learned.")
-    least, most = metadata["least"], metadata["most"]
-    return (1 if own in _FROM_ONE else least), (1 if own in _FRACTIONS else most)
-
-
 def preset(name: str) -> SlamConfig:
     """Return a preset by name."""
     if name not in PRESETS:
@@ -130,13 +123,16 @@ def meanings_of(config: Any) -> dict[str, str]:
 def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
     """Return the configuration with values replaced; they are given by their names with dots."""
     known = settings_of(config)
-    bounds = {name: _bounds_of(name, metadata) for name, _, metadata in _leaves(config)}
+    metadata = {name: metadata for name, _, metadata in _leaves(config)}
     for name, value in settings.items():
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
             raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
         converted = _converted(name, value, known[name])
-        require_bounds(name, converted, *bounds[name])
+        own = name.partition(".")[2].removeprefix("learned.")
+        least = 1 if own in _FROM_ONE else metadata[name]["least"]
+        most = 1 if own in _FRACTIONS else metadata[name]["most"]
+        require_bounds(name, converted, least, most)
         config = _replaced(config, name.split("."), converted)
     return config
 

@@ -9,10 +9,7 @@ MOST = 1e9  # no setting of the package is larger, where it does not say so
 
 
 def parameter(default: Any, meaning: str, least: float = 0, most: float = MOST) -> Any:
-    """Return a dataclass field whose meaning (symbol, unit, source) is also its help text.
-
-    Numbers below `least` or above `most` are refused; a tuple, if one of its numbers is.
-    """
+    """Return a dataclass field; its meaning (symbol, unit, source) is also its help text."""
     return field(default=default, metadata={"meaning": meaning, "least": least, "most": most})
 
 

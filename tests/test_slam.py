@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from minislam.cli.main import main
 from minislam.config import from_json, preset, with_settings
@@ -188,7 +189,7 @@ def test_pictures_and_report_are_there(finished: RunFolder):
 
 
 def test_the_weights_of_the_mlp_can_be_used_again(with_depth: RunFolder):
-    state = with_depth.read_mlp()
+    state = torch.load(with_depth.path / "uncertainty_mlp.pt", weights_only=True)
     config = from_json(with_depth.read_config()).uncertainty
     dimension = ClassicalFeatures().dimension
     mlp = UncertaintyTrainer(dimension, config, seed=3).mlp

@@ -34,7 +34,6 @@ from minislam.cli.weights import add_weights_parser
 from minislam.errors import InputError, MinislamError
 
 DEMO_SEQUENCE, DEMO_FRAMES = "synth:crowd", 60
-LONGEST_TEXT = 300  # characters of a message that is not ours
 FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
 RUN_EPILOG = """\
 files of a run folder:
@@ -97,7 +96,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if os.environ.get("MINISLAM_DEBUG"):
             raise
-        say(f"minislam: {_sentence(error)}", "stderr")
+        text = str(error)
+        if not isinstance(error, MinislamError):
+            text = (
+                f"expected to finish this command, found {type(error).__name__}: "
+                f"{' '.join(text.split())[:300]}; check names, permissions, space and "
+                "settings, and set MINISLAM_DEBUG=1 to see where it happened"
+            )
+        say(f"minislam: {text}", "stderr")
         return FAILED_EXIT
     finally:
         say("", end="")  # what is still in the buffer, or else nothing
@@ -109,17 +115,6 @@ def _command(arguments: list[str]) -> int:
         say(f"minislam: {_unknown_option(unknown[0], args)}", "stderr")
         return USAGE_EXIT
     return args.run(args)
-
-
-def _sentence(error: Exception) -> str:
-    """Return what an error says; one that is not ours gets the form of ours."""
-    if isinstance(error, MinislamError):
-        return str(error)
-    text = " ".join(str(error).split())[:LONGEST_TEXT]
-    return (
-        f"expected to finish this command, found {type(error).__name__}: {text}; check names, "
-        "permissions, space and settings, and set MINISLAM_DEBUG=1 to see where it happened"
-    )
 
 
 def _unknown_option(found: str, args: argparse.Namespace) -> str:
@@ -145,11 +140,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     )
     demo.add_argument("-o", "--output", default="output/demo", help="run folder, output/demo")
     demo.set_defaults(
-        run=_run,
-        sequence=DEMO_SEQUENCE,
-        max_frames=DEMO_FRAMES,
-        overwrite=True,
-        resume=False,
+        run=_run, sequence=DEMO_SEQUENCE, max_frames=DEMO_FRAMES, overwrite=True, resume=False
     )
 
     run = commands.add_parser(
@@ -207,10 +198,11 @@ def _run(args: argparse.Namespace) -> int:
     for warning in sequence.warnings:
         say(f"WARNING: {warning}", "stderr")
     # Everything that may be wrong is checked before the files of an earlier run are removed.
-    sequence.check_masks()
+    for index in range(len(sequence)):
+        sequence.given_mask(index)
     priors, lpips = choose_priors(choice, sequence, config), lpips_of(args, sequence.camera)
-    with locked(output), progress:
-        images, resume = sequence.files(), args.resume
+    with locked(output), ending_signals(progress.interrupt):
+        images, resume = sequence.files, args.resume
         folder = RunFolder(output) if resume else RunFolder.create(output, args.overwrite, images)
         outcome = run_sequence(sequence, config, choice, priors, folder, progress, lpips, resume)
     say(f"{outcome.state}:\n  focal length           {outcome.focal_length}")

@@ -125,13 +125,7 @@ def _claim(folder: Path, index: str) -> None:
     from minislam.data.files import read_text, write_text
     from minislam.priors.files import INDEX
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"expected to be able to make the folder {folder}, but the system says: "
-            f"{error.strerror}; choose another --out"
-        ) from error
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / INDEX
     if any(folder.iterdir()) and not (path.exists() and read_text(path) == index):
         raise InputError(

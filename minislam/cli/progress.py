@@ -18,10 +18,7 @@ ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 def say(text: str, stream: str = "stdout", end: str = "\n") -> None:
-    """Print on sys.stdout or sys.stderr. Where nothing can be written, nothing more is said.
-
-    A reader that ends (`| head`), a full disk or a closed stream is no reason to end a run.
-    """
+    """Print, but let no reader that ends (`| head`), no full disk, no closed stream end a run."""
     try:
         print(text, end=end, file=getattr(sys, stream), flush=True)
     except (OSError, ValueError):  # ValueError: a closed file
@@ -45,8 +42,8 @@ def ending_signals(handler: Callable[[int, FrameType | None], object]) -> Iterat
 class ProgressLine:
     """One line per stage with rate and time left; off a terminal, a plain line every 10 %.
 
-    Inside `with`, the first Ctrl-C (or other signal of ENDING) is deferred to the end of the
-    current step, when the state is consistent. A second one ends the program at once.
+    The first signal that comes to `interrupt` is deferred to the end of the current step, when
+    the state is consistent. A second one ends the program at once.
     """
 
     def __init__(self) -> None:
@@ -54,14 +51,6 @@ class ProgressLine:
         self._shown: dict[str, float] = {}  # stage: fraction done in the last plain line
         self._terminal = sys.stderr.isatty()
         self._should_stop = False
-
-    def __enter__(self) -> ProgressLine:
-        self._signals = ending_signals(self._interrupt)
-        self._signals.__enter__()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._signals.__exit__(None, None, None)
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of all steps of a stage are done. Stages may take turns."""
@@ -95,7 +84,8 @@ class ProgressLine:
             self._shown[stage] = fraction
             say(text, "stderr")
 
-    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal."""
         if self._should_stop:
             raise KeyboardInterrupt
         self._should_stop = True

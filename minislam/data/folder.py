@@ -54,7 +54,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
     if len(images) < images.promised and len(images) != limit:
         warnings.append(
             f"{path.name} promises {images.promised} frames, of which {len(images)} can be "
-            f"decoded: it is damaged, cut or trimmed"
+            "decoded: it is damaged, cut or trimmed"
         )
     return Recording(
         name=folder_name(path.with_suffix("")),

@@ -3,8 +3,7 @@
 import os
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -80,11 +79,10 @@ def encode_png(image: np.ndarray) -> bytes:
 def _decode(path: Path, mode: int) -> np.ndarray:
     content, decoded = read_bytes(path), None
     if _is_complete(content):
-        with _said_on_stderr() as said, suppress(cv2.error):  # of a header that claims 10^10 px
-            decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
-        if b"extraneous" in said[0]:  # cameras pad some files so, and damage looks like it, too
-            warnings.warn(f"{path} may be damaged: {said[0].decode().strip()}", stacklevel=1)
-        elif said[0]:
+        decoded, said = _decoded(content, mode)
+        if b"extraneous" in said:  # cameras pad some files so, and damage looks like it, too
+            warnings.warn(f"{path} may be damaged: {said.decode().strip()}", stacklevel=1)
+        elif said:
             decoded = None  # libjpeg has filled the rest with grey
     if decoded is not None:
         return decoded
@@ -104,19 +102,19 @@ def _is_complete(content: bytes) -> bool:
     return False
 
 
-@contextmanager
-def _said_on_stderr() -> Iterator[list[bytes]]:
-    """Collect what C code writes to standard error: libjpeg tells of damaged data only there."""
-    said: list[bytes] = []
+def _decoded(content: bytes, mode: int) -> tuple[np.ndarray | None, bytes]:
+    """Decode, and catch what libjpeg writes to standard error: only there it tells of damage."""
     reader, writer = os.pipe()
     os.set_blocking(writer, False)  # what does not fit is dropped, rather than waited for
     before = os.dup(2)
     os.dup2(writer, 2)
+    image = None
     try:
-        yield said
+        with suppress(cv2.error):  # of a header that claims 10^10 px
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
     finally:
         os.dup2(before, 2)
-        for descriptor in (before, writer):
-            os.close(descriptor)
-        with open(reader, "rb") as file:
-            said.append(file.read())
+        os.close(before)
+        os.close(writer)
+    with open(reader, "rb") as file:
+        return image, file.read()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
-from minislam.data.files import atomic_write, read_bytes, read_json, write_json, write_text
+from minislam.data.files import atomic_write, read_json, write_json, write_text
 from minislam.data.images import encode_png
 from minislam.data.ply import GaussianArrays, read_ply, write_ply
 from minislam.data.trajectory import read_trajectory, write_trajectory
@@ -40,10 +40,7 @@ _CONFIG_PARTS = {"sequence", "input", "priors", "tracking", "mapping"}  # of eve
 
 @contextmanager
 def locked(path: Path | str) -> Iterator[None]:
-    """Keep other runs out of a folder inside a `with` block; what ends its process unlocks it.
-
-    The folder is made if it is missing. Windows, and some network drives, lock nothing.
-    """
+    """Make a folder, and keep other runs out of it while it is used (not on Windows)."""
     with ExitStack() as stack:
         # RunFolder says what is wrong with a folder that cannot be made or opened.
         with suppress(OSError, ImportError):
@@ -95,16 +92,10 @@ class RunFolder:
                 f"expected a new or empty output folder, but {path} holds files; choose another "
                 "name or add --overwrite (or --resume, to go on with an interrupted run)"
             )
-        try:
-            for file in _files_of_a_run(path, inputs) if path.is_dir() else ():
-                file.unlink()
-            for folder in (KEYFRAMES, PLOTS):
-                (path / folder).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"expected to be able to write into {path}, but the system says: "
-                f"{error.strerror}; choose another output folder"
-            ) from error
+        for file in _files_of_a_run(path, inputs) if path.is_dir() else ():
+            file.unlink()
+        for folder in (KEYFRAMES, PLOTS):
+            (path / folder).mkdir(parents=True, exist_ok=True)
         return cls(path)
 
     def write_config(self, config: dict[str, Any]) -> None:
@@ -201,17 +192,6 @@ class RunFolder:
         """Return the Gaussian map."""
         return read_ply(self.path / MAP)
 
-    def read_mlp(self) -> dict[str, Tensor]:
-        """Return the weights of the uncertainty MLP."""
-        content = read_bytes(self.path / MLP)
-        try:
-            return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        except Exception as error:  # damaged bytes fail inside torch in many different ways
-            raise InputError(
-                f"expected the weights of the uncertainty MLP in {self.path / MLP}, but the file "
-                "cannot be read; it is damaged or from another program"
-            ) from error
-
 
 def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:
     """Return the files that a run wrote into a folder, or refuse a folder that may be another's."""
@@ -219,13 +199,13 @@ def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:
     is_ours = {entry.name for entry in entries} <= {KEYFRAMES, PLOTS}
     with suppress(InputError, TypeError):
         is_ours = is_ours or _CONFIG_PARTS <= set(read_json(path / CONFIG))
-    links = [e for e in entries if e.is_symlink() and e.name in (*_FILES, KEYFRAMES, PLOTS)]
-    inside = [i for i in inputs if i.resolve().is_relative_to(path.resolve())]
-    if links or inside or not is_ours:
-        found = f"the link {links[0]}" if links else f"the input {inside[0]}" if inside else path
+    wrong = [e for e in entries if e.is_symlink() and e.name in (*_FILES, KEYFRAMES, PLOTS)]
+    wrong += [i for i in inputs if i.resolve().is_relative_to(path.resolve())]
+    if wrong or not is_ours:
         raise InputError(
-            f"expected the folder of an earlier run for --overwrite, without links and inputs of "
-            f"this one, found {found}; nothing was removed, choose another --output"
+            "expected the folder of an earlier run for --overwrite, without links and without "
+            f"images of this one, found {[*wrong, path][0]}; nothing was removed, choose another "
+            "--output"
         )
     files = [entry for entry in entries if entry.is_file() and not entry.is_symlink()]
     return [file for file in files if _OURS.fullmatch(file.relative_to(path).as_posix())]

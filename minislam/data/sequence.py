@@ -71,6 +71,7 @@ class RecordedSequence:
             )
         self.lost = [row for row in recording.lost if stamps[0] < row[0] < stamps[-1]]
         self.checksums: dict[int, int] = {}
+        self.files = recording.images.paths  # of all images
         self._masks = recording.mask_paths
         if options.masks is not None:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
@@ -120,17 +121,6 @@ class RecordedSequence:
         image = self._prepare.color(raw, self._recording.images.label(index))
         timestamp = float(self._recording.timestamps[index])
         return Frame(frame_index, timestamp, torch.from_numpy(image))
-
-    def check_masks(self) -> None:
-        """Read every mask once: a damaged one should be found before a run, not at its end."""
-        for frame_index in range(len(self)):
-            self.given_mask(frame_index)
-            if self.ground_truth is not None:
-                self.ground_truth.moving_mask(frame_index)
-
-    def files(self) -> list[Path]:
-        """Return the files of all images."""
-        return self._recording.images.paths
 
     def source_index(self, frame_index: int) -> int:
         """Return the position of a frame in the source, before start and stride."""

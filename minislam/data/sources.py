@@ -19,9 +19,7 @@ _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 class ImageSource(Protocol):
     """Raw images in order, each of which can be read again."""
 
-    @property
-    def paths(self) -> list[Path]:
-        """Return the files that hold them."""
+    paths: list[Path]  # the files that hold them
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -33,7 +31,7 @@ class ImageSource(Protocol):
         """Return how to call this image in a message."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class FileImages:
     """Images that are files."""
 
@@ -67,12 +65,10 @@ class VideoImages:
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
         self.promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less if unknown
         stamps: list[float] = []
-        # A failed call is the end of the file, or damage with more frames behind it.
-        failures = 0
-        while len(stamps) != limit and failures < _MOST_FAILURES:
-            failures += 1
+        last = 0  # A failed call is the end of the file, or damage with more frames behind it.
+        while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
             if self._grab():
-                failures = 0
+                last = self._grabbed
                 self._calls.append(self._grabbed)
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
@@ -87,12 +83,7 @@ class VideoImages:
             self._rewind()
         while self._grabbed < self._calls[index]:
             self._grab()
-        whole, image = self._capture.retrieve()
-        if not whole:
-            raise InputError(
-                f"expected {len(self)} readable frames, but {self.label(index)} cannot be "
-                "decoded; convert the video anew"
-            )
+        _, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def label(self, index: int) -> str:
@@ -102,8 +93,7 @@ class VideoImages:
     def lost(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing between the decoded ones.
 
-        They leave gaps in the timestamps. Where the frame rate varies, gaps are no sign of loss,
-        and only the calls of grab() that failed count.
+        They leave gaps in the timestamps, but where the rate varies, only failed calls tell.
         """
         gaps = np.diff(self.timestamps) * self.frame_rate  # frames
         missing = np.diff(self._calls) - 1

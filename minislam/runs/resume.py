@@ -69,7 +69,16 @@ class Checkpoints:
         device, where = self._origin["priors"]["device"], self._folder.path
         found = self._folder.read_checkpoint(device)
         try:
-            self._require_same(found, device)
+            then = flattened({name: found.get(name) for name in self._origin})
+            if device == "cpu":
+                then["priors.device"] = "cpu"
+            for name, now in flattened(self._origin).items():
+                if then.get(name) != now:
+                    raise InputError(
+                        f"expected {name} = {then.get(name)} like the interrupted run in {where}, "
+                        f"found {now}; repeat its command with --resume, or start anew in another "
+                        "folder"
+                    )
             for index, checksum in found["checksums"].items():
                 slam.sequence.frame(int(index))
                 if slam.sequence.checksums[int(index)] != checksum:
@@ -91,18 +100,6 @@ class Checkpoints:
                 f"expected the whole state of a run in the checkpoint of {where}, found {error!r}; "
                 "it is damaged or of another program: start again with --overwrite"
             ) from error
-
-    def _require_same(self, found: dict[str, Any], device: str) -> None:
-        then = flattened({name: found.get(name) for name in self._origin})
-        if device == "cpu":
-            then["priors.device"] = "cpu"
-        for name, now in flattened(self._origin).items():
-            if then.get(name) != now:
-                raise InputError(
-                    f"expected {name} = {then.get(name)} like the interrupted run in "
-                    f"{self._folder.path}, found {now}; repeat its command with --resume, or start "
-                    "anew in another folder"
-                )
 
 
 def _origin(sequence: Sequence, config: SlamConfig, choice: PriorChoice) -> dict[str, Any]:

@@ -20,9 +20,10 @@ class UncertaintyConfig:
         1,
         "the grid of beta is n times as fine, and its features cost n^2 times as much; paper"
         " supplement, high-resolution uncertainty map",
+        least=1,
     )
     hidden_units: int = parameter(64, "width of the two hidden layers [units], official")
-    dropout: float = parameter(0.2, "fraction of hidden units dropped in training [0, 1), official")
+    dropout: float = parameter(0.2, "hidden units dropped in training [-], official", most=0.99)
     learning_rate: float = parameter(
         2e-3, "Adam step of the MLP [1]; official 4e-4 for some 10^4 iterations, ours run 10^3"
     )
@@ -61,20 +62,10 @@ class UncertaintyConfig:
         return self.enabled and not self.given_masks
 
     def __post_init__(self) -> None:
-        if self.grid_factor < 1:
-            raise InputError(
-                f"expected a grid at least as fine as the extractor's, found a factor of "
-                f"{self.grid_factor}; set uncertainty.grid_factor to 1 or 2"
-            )
         if self.median_size < 1 or self.median_size % 2 == 0:
             raise InputError(
                 f"expected an odd median window of at least 1 cell, found {self.median_size}; "
                 "set uncertainty.median_size to 1, 3 or 5"
-            )
-        if not 0 <= self.dropout < 1:
-            raise InputError(
-                f"expected a dropout fraction in [0, 1), found {self.dropout}; "
-                "set uncertainty.dropout, 0.2 by default"
             )
 
 

@@ -34,7 +34,8 @@ def test_a_warning_has_a_line_of_its_own(capsys):
 def test_a_signal_waits_for_the_end_of_a_step_and_a_second_does_not(name: str, capsys):
     number = getattr(signal, name)
     before = signal.getsignal(number)
-    with ProgressLine() as progress:
+    progress = ProgressLine()
+    with ending_signals(progress.interrupt):
         assert not progress.should_stop()
         signal.raise_signal(number)
         assert progress.should_stop()

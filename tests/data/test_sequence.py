@@ -183,19 +183,10 @@ def test_timestamps_that_files_cannot_tell_apart_are_refused_before_a_run(tmp_pa
         open_sequence(str(tmp_path / "close"))
 
 
-def test_a_damaged_mask_is_found_before_a_run(tmp_path: Path):
-    sequence = open_sequence(str(tum_folder(tmp_path / "desk")))
-    sequence.check_masks()
-    mask = tmp_path / "desk/masks/100.200000.png"
-    mask.write_bytes(mask.read_bytes()[:30])
-    with pytest.raises(InputError, match=r"masks/100\.200000\.png .* is damaged"):
-        sequence.check_masks()
-
-
 def test_every_image_is_named_and_every_image_that_was_read_has_a_checksum(tmp_path: Path):
     folder = tum_folder(tmp_path / "desk")
     sequence = open_sequence(str(folder))
-    assert sequence.files() == sorted(folder.glob("rgb/*.png"))
+    assert sequence.files == sorted(folder.glob("rgb/*.png"))
     before = dict(sequence.checksums)
     sequence.frame(3), sequence.frame(1)
     assert set(sequence.checksums) - set(before) == {1, 3}
