@@ -16,7 +16,7 @@ import torch
 
 from minislam.cli.main import main
 from minislam.config import from_json, preset, with_settings
-from minislam.data import InputOptions, RunFolder, open_sequence
+from minislam.data import InputOptions, RunFolder, open_sequence, read_ply, read_trajectory
 from minislam.evaluation import absolute_trajectory_error
 from minislam.priors.features import ClassicalFeatures
 from minislam.uncertainty import UncertaintyTrainer
@@ -123,7 +123,7 @@ def test_every_frame_has_a_pose_at_its_own_time(finished: RunFolder):
     np.testing.assert_allclose(
         rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-5
     )
-    keyframes = finished.read_keyframe_trajectory()
+    keyframes = read_trajectory(finished.path / "keyframe_trajectory.txt")
     assert 6 <= len(keyframes) <= FRAMES
     chosen = np.searchsorted(trajectory.timestamps, keyframes.timestamps - 1e-6)
     np.testing.assert_allclose(
@@ -141,14 +141,14 @@ def test_the_ate_in_the_metrics_is_that_of_the_written_file(root: Path, with_dep
 
 def test_the_map_has_the_properties_that_viewers_expect(finished: RunFolder):
     content = (finished.path / "map.ply").read_bytes()
-    count = len(finished.read_map())
+    count = len(read_ply(finished.path / "map.ply"))
     header = INRIA_HEADER.format(count=count).encode()
     assert count > 300 and content.startswith(header)
     assert len(content) == len(header) + count * 17 * 4
 
 
 def test_the_map_holds_logits_and_logarithms(with_depth: RunFolder):
-    gaussians = with_depth.read_map()
+    gaussians = read_ply(with_depth.path / "map.ply")
     assert gaussians.opacity_logits.max() > 1.5  # an opacity of 0.9 would be 2.2
     # The room is a few metres wide and a Gaussian a few centimetres: exp(-4) m, not -4 m.
     assert -7 < np.median(gaussians.log_scales) < -1
@@ -169,8 +169,8 @@ def test_run_json_says_what_was_done(with_depth: RunFolder):
         "simulated",
     )
     assert facts["frames"] == FRAMES and facts["lost_frames"] == 0
-    assert facts["keyframes"] == len(with_depth.read_keyframe_trajectory())
-    assert facts["gaussians"] == len(with_depth.read_map())
+    assert facts["keyframes"] == len(read_trajectory(with_depth.path / "keyframe_trajectory.txt"))
+    assert facts["gaussians"] == len(read_ply(with_depth.path / "map.ply"))
     stages = {name: value for name, value in facts["seconds"].items() if name != "total"}
     assert 0.5 * facts["seconds"]["total"] < sum(stages.values()) <= facts["seconds"]["total"]
 
@@ -179,7 +179,7 @@ def test_pictures_and_report_are_there(finished: RunFolder):
     plots = {path.stem for path in (finished.path / "plots").iterdir()}
     always = {"ate_over_time", "gaussians", "health", "losses", "overview", "trajectory"}
     assert plots == always
-    keyframes = len(finished.read_keyframe_trajectory())
+    keyframes = len(read_trajectory(finished.path / "keyframe_trajectory.txt"))
     pictures = sorted((finished.path / "keyframes").glob("*.png"))
     assert len(pictures) == 4 * keyframes
     assert cv2.imread(str(pictures[0])).shape == (72, 96, 3)
@@ -224,6 +224,10 @@ def test_ctrl_c_leaves_what_was_done_so_far(with_depth, root: Path):
     facts = folder.read_run()
     assert (facts["state"], facts["exit_code"]) == ("interrupted", 130)
     assert 6 <= facts["keyframes"] <= facts["frames"] < FRAMES
-    assert len(folder.read_trajectory()) == len(folder.read_keyframe_trajectory()) >= 6
-    assert len(folder.read_map()) > 0 and list(folder.read_metrics()) == METRICS
+    assert (
+        len(folder.read_trajectory())
+        == len(read_trajectory(folder.path / "keyframe_trajectory.txt"))
+        >= 6
+    )
+    assert len(read_ply(folder.path / "map.ply")) > 0 and list(folder.read_metrics()) == METRICS
     assert (folder.path / "report.html").exists()

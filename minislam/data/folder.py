@@ -53,8 +53,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
         warnings.append(f"{path.name} has no timestamps: {rate:g} frames per second assumed")
     if len(images) < images.promised and len(images) != limit:
         warnings.append(
-            f"{path.name} promises {images.promised} frames, of which {len(images)} can be "
-            "decoded: it is damaged, cut or trimmed"
+            f"{path.name} promises {images.promised} frames, but only {len(images)} can be decoded"
         )
     return Recording(
         name=folder_name(path.with_suffix("")),

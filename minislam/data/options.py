@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 
-from minislam.data.preparation import MAXIMUM_SIDE, MINIMUM_SIDE
+from minislam.data.preparation import MINIMUM_SIDE
 from minislam.errors import InputError
 from minislam.parameters import parameter, require_bounds
 
@@ -17,9 +17,7 @@ class InputOptions:
     stride: int = parameter(1, "use every n-th frame of the source [frame]", least=1)
     max_frames: int | None = parameter(None, "use so many frames at most, none: all [frame]", 1)
     size: tuple[int, int] | None = parameter(
-        None,
-        "working width and height, none: keep the aspect and choose by `pixels` [px]",
-        *(MINIMUM_SIDE, MAXIMUM_SIDE),
+        None, "working size, none: keep the aspect and choose by `pixels` [px]", MINIMUM_SIDE, 16384
     )
     pixels: int = parameter(
         320 * 240, "about width * height of the chosen working size [px]", MINIMUM_SIDE**2

@@ -9,7 +9,6 @@ from minislam.geometry import BrownDistortion, Camera
 # Trackers, networks and feature grids work on cells of 8 px, so both sides are multiples of it.
 SIZE_MULTIPLE = 8  # px
 MINIMUM_SIDE = 16  # px; smaller images hold no pair of grid cells
-MAXIMUM_SIDE = 16384  # px; one larger image would fill the memory
 
 
 class ImagePreparation:

@@ -15,7 +15,7 @@ from torch import Tensor
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.files import atomic_write, read_json, write_json, write_text
 from minislam.data.images import encode_png
-from minislam.data.ply import GaussianArrays, read_ply, write_ply
+from minislam.data.ply import GaussianArrays, write_ply
 from minislam.data.trajectory import read_trajectory, write_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
@@ -77,11 +77,7 @@ class RunFolder:
         overwrite: bool = False,
         inputs: Sequence[Path] = (),  # images that the new run reads
     ) -> "RunFolder":
-        """Make a new run folder; with `overwrite`, the files of an earlier run are removed.
-
-        Only a folder of an earlier run is touched, there only names that a run writes, none of
-        them through a link, and nothing at all if an input lies inside.
-        """
+        """Make a new run folder; with `overwrite`, remove what an earlier run wrote, only that."""
         path = Path(path)
         if path.exists() and not path.is_dir():
             raise InputError(
@@ -183,14 +179,6 @@ class RunFolder:
     def read_trajectory(self) -> Trajectory:
         """Return the poses of all tracked frames."""
         return read_trajectory(self.path / TRAJECTORY)
-
-    def read_keyframe_trajectory(self) -> Trajectory:
-        """Return the poses of the keyframes."""
-        return read_trajectory(self.path / KEYFRAME_TRAJECTORY)
-
-    def read_map(self) -> GaussianArrays:
-        """Return the Gaussian map."""
-        return read_ply(self.path / MAP)
 
 
 def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:

@@ -67,7 +67,8 @@ class VideoImages:
         stamps: list[float] = []
         last = 0  # A failed call is the end of the file, or damage with more frames behind it.
         while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
-            if self._grab():
+            self._grabbed += 1
+            if self._capture.grab():
                 last = self._grabbed
                 self._calls.append(self._grabbed)
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
@@ -82,7 +83,8 @@ class VideoImages:
         if self._calls[index] <= self._grabbed:
             self._rewind()
         while self._grabbed < self._calls[index]:
-            self._grab()
+            self._capture.grab()
+            self._grabbed += 1
         _, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
@@ -91,20 +93,13 @@ class VideoImages:
         return f"frame {index} of {self.path}"
 
     def lost(self) -> np.ndarray:  # (M,) second
-        """Return about when frames are missing between the decoded ones.
-
-        They leave gaps in the timestamps, but where the rate varies, only failed calls tell.
-        """
+        """Return about when frames are missing: gaps of a constant rate, or calls that failed."""
         gaps = np.diff(self.timestamps) * self.frame_rate  # frames
         missing = np.diff(self._calls) - 1
         if self.promised > len(self) > 1 and np.median(np.abs(gaps - 1)) < _CONSTANT_RATE:
             missing = np.maximum(missing, np.round(gaps).astype(int) - 1)
         rows = zip(self.timestamps, self.timestamps[1:], missing, strict=False)
         return np.concatenate([[], *(np.linspace(a, b, n + 2)[1:-1] for a, b, n in rows)])
-
-    def _grab(self) -> bool:
-        self._grabbed += 1
-        return self._capture.grab()
 
     def _rewind(self) -> None:
         self._capture.release()

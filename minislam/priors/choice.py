@@ -128,8 +128,7 @@ def _choose(
 def _sensor_depth(sequence: Sequence) -> SensorDepth:
     if all(sequence.sensor_depth(index) is None for index in range(len(sequence))):
         raise InputError(
-            f"expected depth images of a sensor for --depth sensor, found none in {sequence.name}; "
-            "use --depth none or --depth files:FOLDER"
+            f"expected a sensor's depth in {sequence.name}, found none; use another --depth"
         )
     return SensorDepth(sequence.sensor_depth)
 

@@ -68,10 +68,7 @@ def run_sequence(
     lpips: Lpips | None = None,
     resume: bool = False,
 ) -> RunOutcome:
-    """Run SLAM on a sequence and write the run folder, also when it is interrupted.
-
-    With `resume`, an interrupted run goes on from the checkpoint in its folder.
-    """
+    """Run SLAM, or with `resume` the rest of it, and write the folder, however the run ends."""
     torch.set_num_threads(config.threads)
     checkpoints = Checkpoints(folder, sequence, config, choice)
     alarms = Alarms(observer or SilentObserver())
@@ -93,11 +90,10 @@ def run_sequence(
             if not slam.mapper.keyframes:  # there is no map to write yet
                 raise
             interrupted = True
-        seconds = checkpoints.run_seconds
         state, exit_code = _ending(slam, interrupted)
         facts = run_facts(slam, choice, checkpoints, state, exit_code)
         _write_estimates(folder, slam)
-        metrics = measure(slam, seconds, lpips)
+        metrics = measure(slam, facts["seconds"]["total"], lpips)
         folder.write_metrics(metrics)
         write_pictures(folder, slam, metrics, facts["warnings"])
         folder.write_run(facts)

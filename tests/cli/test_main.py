@@ -239,7 +239,7 @@ def test_a_wrong_depth_costs_no_earlier_run_its_files(depth: str, tmp_path: Path
         (["--tracking.window", "0"], "tracking.window of at least 1"),
         (["--size", "100000x100000"], "size of at least 16 and at most 16384"),
         (["--fx", "1e300"], "fx of at least 0 and at most"),
-        (["--depth", "sensor"], "expected depth images of a sensor for --depth sensor, found none"),
+        (["--depth", "sensor"], "expected a sensor's depth in input, found none"),
     ],
 )
 def test_a_wrong_setting_is_one_sentence(arguments: list[str], words: str, tmp_path: Path, capsys):

@@ -75,7 +75,7 @@ def test_frames_lost_in_the_middle_are_listed_and_those_behind_are_read(tmp_path
     assert recording.timestamps[-1] == pytest.approx(59 / 30, abs=1e-3)  # behind the hole
     stamps = np.sort(np.concatenate([recording.timestamps, lost]))
     np.testing.assert_allclose(stamps, np.arange(60) / 30, atol=2e-3)
-    assert f"hole.mkv promises 60 frames, of which {count} can be decoded" in recording.warnings[0]
+    assert f"hole.mkv promises 60 frames, but only {count} can be decoded" in recording.warnings[0]
     sequence = RecordedSequence(recording, InputOptions(), "hole.mkv")
     assert sequence.lost == recording.lost and len(sequence) == count
     part = RecordedSequence(recording, InputOptions(max_frames=10), "hole.mkv")
@@ -127,7 +127,7 @@ def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(mo
     np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2, 0.233, 0.4])
     assert [recording.images.read(k)[0, 0, 0] for k in (0, 2, 4, 1)] == [1, 4, 6, 2]
     assert recording.lost == [(pytest.approx(0.15), "phone.mp4 is damaged there")]
-    assert "promises 6 frames, of which 5 can be decoded" in recording.warnings[0]
+    assert "promises 6 frames, but only 5 can be decoded" in recording.warnings[0]
 
 
 def test_without_timestamps_the_frame_rate_is_taken_and_said(monkeypatch):

@@ -80,5 +80,5 @@ def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_sensor_that_measured_nothing_is_no_prior(monkeypatch):
     monkeypatch.setattr(Recorded, "with_depth", None)
-    with pytest.raises(InputError, match=r"depth images of a sensor .* found none in desk"):
+    with pytest.raises(InputError, match=r"a sensor's depth in desk, found none"):
         depth(depth="sensor")
