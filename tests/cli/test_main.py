@@ -146,8 +146,8 @@ INPUTS: list[tuple[Callable[[Path], Path], str]] = [
     (text_named_mp4, r"\(8 bytes\) cannot be opened as one"),
     (half_a_video, r"\(600 bytes\) cannot be opened as one"),
     (truth_with_nan, r"finite numbers in line 4 of .*groundtruth\.txt"),
-    (lambda path: images(path, [texture(0)]), "at least two frames.* found 1 "),
-    (lambda path: images(path, [0 * texture(0)] * 8), "at least two frames.* found 8 "),
+    (lambda path: images(path, [texture(0)]), "at least two frames.* among 1 "),
+    (lambda path: images(path, [0 * texture(0)] * 8), "at least two frames.* among 8 "),
     (lambda path: Path("synth:nothing"), "with NAME one of .*crowd.* found synth:nothing"),
     (lambda path: Path("synth:crowd:-1"), "found synth:crowd:-1"),
 ]
