@@ -142,7 +142,7 @@ class Wrong(ClassicalFlow):
         (object(), "whole number stride >= 1"),
         (type("F", (), {"stride": 8})(), "say learned_confidence: True or False, found None"),
         (type("F", (Wrong,), {"disparity_damping": lambda s, k: torch.ones(k, 1)})(),
-         "(disparity_damping) to return a finite tensor (2, 240)"),
+         "(disparity_damping) to return a finite tensor (2, 560)"),
     ],
 )  # fmt: skip
 def test_a_wrong_flow_is_one_sentence(flow, words: str):
