@@ -3,50 +3,19 @@
 import io
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 from minislam.cli.main import main
 from minislam.data.run_folder import locked
 from minislam.slam import Slam
-from tests.recordings import save
+from tests.cli.test_main import images, run, texture, the_sentence
 
 pytestmark = pytest.mark.slow
-
-TEXTURE = np.random.default_rng(0).integers(0, 256, (20, 27, 3)).astype(np.uint8)
-
-
-def texture(shift: int) -> np.ndarray:
-    """Return a crop of a blotchy picture, moved by `shift` px: (72, 96, 3) uint8."""
-    large = cv2.resize(TEXTURE, (216, 160), interpolation=cv2.INTER_CUBIC)
-    return large[20:92, 20 + shift : 116 + shift]
-
-
-def images(folder: Path, pictures: list[np.ndarray]) -> Path:
-    for number, image in enumerate(pictures):
-        save(folder / f"{number:02d}.png", image)
-    return folder
-
-
-def run(*arguments: object) -> int:
-    return main(["run", "--preset", "test", *map(str, arguments)])
-
-
-def the_sentence(capsys: pytest.CaptureFixture[str]) -> str:
-    """Return what was said on stderr, which is one line of one sentence besides warnings."""
-    lines = capsys.readouterr().err.splitlines()
-    said = [line for line in lines if line.startswith("minislam: ")]
-    assert len(said) == 1, lines
-    assert not any("Traceback" in line for line in lines)
-    assert re.match(r"minislam: expected .*[^.]$", said[0]), said[0]
-    return said[0]
-
 
 # The net: whatever else goes wrong
 
