@@ -18,15 +18,6 @@ from minislam.priors.networks.table import NetworksConfig
 from minislam.tracking.config import TrackingConfig, paper_schedule
 from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
 
-# Settings for which zero means nothing, and fractions. Other bounds stand beside the meaning.
-_FROM_ONE = """
-keyframe_interval warmup_keyframes window rounds iterations global_iterations pose_rounds
-warmup_rounds warmup_iterations pose_iterations loop_min_gap rate_iterations insertion.cell
-density.interval droid.chain_updates droid.kept_edges droid.edges_per_batch
-metric3d.size depth_anything.shorter_side hidden_units""".split()
-_FRACTIONS = """
-cull_fraction min_link_ratio mask_min_similarity refine_full_fraction window_probability
-color_weight lambda_ssim insertion.opacity pose_refinement.fraction similarity""".split()
 OTHER_PARTS = ("sequence", "input", "priors")  # of config.json, beside the settings
 
 
@@ -129,10 +120,7 @@ def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
             raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
         converted = _converted(name, value, known[name])
-        own = name.partition(".")[2].removeprefix("learned.")
-        least = 1 if own in _FROM_ONE else metadata[name]["least"]
-        most = 1 if own in _FRACTIONS else metadata[name]["most"]
-        require_bounds(name, converted, least, most)
+        require_bounds(name, converted, metadata[name]["least"], metadata[name]["most"])
         config = _replaced(config, name.split("."), converted)
     return config
 

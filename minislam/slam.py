@@ -155,13 +155,11 @@ class Slam(Stateful):
         seek_focal_length(self.tracker.graph)
         self.tracker.finish(self.steps.on_progress("final adjustment"))
         self._move_map()
-        self.focal_length = check_focal_length(self.tracker.graph)
 
     def _adjust_again(self) -> None:
         """Adjust all keyframes again, on what several views confirm to stand still."""
         adjust_again(self.tracker, self.sequence, self.steps.on_progress)
         self._move_map()
-        self.focal_length = check_focal_length(self.tracker.graph)
 
     def _rebuild_map(self) -> None:
         """Build map and MLP anew on dense depth. Known depths of a prior with holes stay."""
@@ -177,6 +175,7 @@ class Slam(Stateful):
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
+        self.focal_length = check_focal_length(self.tracker.graph)  # the last adjustment is done
         progress = self.steps.on_progress("posing all frames")
         self._poses = pose_all_frames(self.tracker, self.sequence, progress)
 

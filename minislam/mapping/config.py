@@ -11,16 +11,16 @@ from minislam.splatting import LearningRates
 class InsertionConfig:
     """How densely a keyframe adds Gaussians, and how they start."""
 
-    cell: int = parameter(3, "one Gaussian per square cell of this side [px of the full image]")
+    cell: int = parameter(3, "one Gaussian per square cell of this side [px of the full image]", 1)
     footprint: float = parameter(0.6, "first scale over the side of a cell seen at its depth [1]")
-    opacity: float = parameter(0.9, "first opacity (0, 1); official 0.5")
+    opacity: float = parameter(0.9, "first opacity; official 0.5", 0.01, 0.99)
 
 
 @dataclass(frozen=True)
 class DensityConfig:
     """When Gaussians are cloned, split and removed."""
 
-    interval: int = parameter(100, "iterations between two rounds, official in initialisation")
+    interval: int = parameter(100, "iterations between two rounds, official in initialisation", 1)
     gradient: float = parameter(
         2e-4,
         "Gaussians of a larger mean screen gradient are cloned or split [1 per half image],"
@@ -53,6 +53,7 @@ class PoseRefinementConfig:
         0.75,
         "fraction of the way from the pose by flow to the pose by re-rendering [0, 1]; official 1."
         " Both are measurements with errors of their own, so a mean is kept",
+        most=1,
     )
 
 
@@ -71,7 +72,7 @@ class MappingConfig:
     )
     refine_iterations: int = parameter(700, "iterations at the end; official 20000, fast 3000")
     refine_full_fraction: float = parameter(
-        0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1"
+        0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1
     )
     freeze_iterations: int = parameter(
         5, "iterations without MLP training after a change of density; official 20 of 450"
@@ -79,13 +80,13 @@ class MappingConfig:
 
     window_size: int = parameter(10, "most keyframes in the local window, official")
     window_probability: float = parameter(
-        0.5, "probability that an iteration takes a keyframe of the window, paper 3.4"
+        0.5, "probability that an iteration takes a keyframe of the window, paper 3.4", most=1
     )
 
     color_weight: float = parameter(
-        0.8, "alpha: lambda_5 = alpha / 2, lambda_6 = (1 - alpha) / 2; official 0.5 or 0.8"
+        0.8, "alpha: lambda_5 = alpha / 2, lambda_6 = (1 - alpha) / 2; official 0.5 or 0.8", most=1
     )
-    lambda_ssim: float = parameter(0.2, "weight of SSIM in L_color, Eq. (7), official")
+    lambda_ssim: float = parameter(0.2, "weight of SSIM in L_color, Eq. (7), official", most=1)
     lambda_isotropic: float = parameter(10.0, "lambda_7: weight of L_iso [1 per m], official")
     mean_background: bool = parameter(
         True,
@@ -100,7 +101,7 @@ class MappingConfig:
         0.1,
         "last step of the means over the first, log-linear over `rate_iterations`; official 0.01",
     )
-    rate_iterations: int = parameter(1500, "iterations of that decay; official 30000")
+    rate_iterations: int = parameter(1500, "iterations of that decay; official 30000", 1)
     quats_rate: float = parameter(2e-2, "Adam step of the quaternions; official 1e-3")
     log_scales_rate: float = parameter(2e-2, "Adam step of the log-scales; official 6e-3")
     opacity_rate: float = parameter(5e-2, "Adam step of the opacity logits, official")

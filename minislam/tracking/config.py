@@ -14,21 +14,23 @@ class LearnedFlowConfig:
 
     keyframe_flow: float = parameter(10.0, "as tracking.keyframe_flow [px]")
     keyframe_flow_without_prior: float = parameter(18.0, "the same without depth prior [px]")
-    cull_fraction: float = parameter(0.3, "as tracking.cull_fraction [-]")
-    warmup_rounds: int = parameter(4, "turns before beta is known")
+    cull_fraction: float = parameter(0.3, "as tracking.cull_fraction [-]", most=1)
+    warmup_rounds: int = parameter(4, "turns before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "turns once beta is known")
-    warmup_iterations: int = parameter(2, "Gauss-Newton steps per turn of the warm-up")
-    window: int = parameter(10, "newest keyframes that the local BA moves")
-    rounds: int = parameter(4, "turns per keyframe")
+    warmup_iterations: int = parameter(2, "Gauss-Newton steps per turn of the warm-up", 1)
+    window: int = parameter(10, "newest keyframes that the local BA moves", 1)
+    rounds: int = parameter(4, "turns per keyframe", 1)
     active_edges: int = parameter(0, "edges that take turns with the newest keyframe's, at most")
-    iterations: int = parameter(2, "Gauss-Newton steps per turn")
-    global_iterations: int = parameter(2, "Gauss-Newton steps per turn of a global BA")
+    iterations: int = parameter(2, "Gauss-Newton steps per turn", 1)
+    global_iterations: int = parameter(2, "Gauss-Newton steps per turn of a global BA", 1)
     robust_scale: float = parameter(0.0, "as tracking.robust_scale: none is needed [px]")
     motion_memory: float = parameter(0.0, "as tracking.motion_memory: none is needed [px]")
     lambda_disparity_prior: float = parameter(0.02, "lambda_4, near the official code's [-]")
     final_rounds: int = parameter(4, "turns of the final global BA")
-    pose_rounds: int = parameter(6, "turns per frame between keyframes, and before one is linked")
-    pose_iterations: int = parameter(2, "Gauss-Newton steps per turn of such a frame")
+    pose_rounds: int = parameter(
+        6, "turns per frame between keyframes, and before one is linked", 1
+    )
+    pose_iterations: int = parameter(2, "Gauss-Newton steps per turn of such a frame", 1)
 
 
 @dataclass(frozen=True)
@@ -40,30 +42,31 @@ class TrackingConfig:
         18.0, "the same where no depth prior is known and depth needs parallax [px]"
     )
     keyframe_interval: int = parameter(
-        8, "a keyframe at the latest after so many frames [frames], paper supplement"
+        8, "a keyframe at the latest after so many frames [frames], paper supplement", 1
     )
     cull_fraction: float = parameter(
         0.3,
         "a keyframe nearer to the last than this part of the flow that made it is left out [-]; "
         "official code: 24 of 24 px",
+        most=1,
     )
     recently_lost_frames: int = parameter(
         15, "a camera lost for longer counts as lost, no longer as recently lost [frames]"
     )
-    warmup_keyframes: int = parameter(12, "keyframes of the two-stage start, paper Sec. 3.3")
-    warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known")
+    warmup_keyframes: int = parameter(12, "keyframes of the two-stage start, paper Sec. 3.3", 1)
+    warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
-    warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up")
-    window: int = parameter(10, "newest keyframes that the local BA moves")
+    warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up", 1)
+    window: int = parameter(10, "newest keyframes that the local BA moves", 1)
     active_edges: int = parameter(
         0, "older edges are measured again up to this number, with those of a new keyframe"
     )
     min_link_ratio: float = parameter(
-        0.1, "a link beyond the neighbourhood needs this much of its flow confirmed [-]"
+        0.1, "a link beyond the neighbourhood needs this much of its flow confirmed [-]", most=1
     )
-    rounds: int = parameter(2, "rounds of flow and BA per keyframe")
-    iterations: int = parameter(3, "Gauss-Newton steps per round")
-    global_iterations: int = parameter(4, "Gauss-Newton steps per round of a global BA")
+    rounds: int = parameter(2, "rounds of flow and BA per keyframe", 1)
+    iterations: int = parameter(3, "Gauss-Newton steps per round", 1)
+    global_iterations: int = parameter(4, "Gauss-Newton steps per round of a global BA", 1)
     robust_scale: float = parameter(
         1.0,
         "c: width of the robust weight inside Sigma, also in smaller images [px]; 0: least squares",
@@ -89,7 +92,7 @@ class TrackingConfig:
         0.02, "epsilon: relative difference of depths that still agree [-], Eq. (8)"
     )
     mask_min_similarity: float = parameter(
-        0.9, "gamma: cosine of features that show the same thing [-], Eq. (8)"
+        0.9, "gamma: cosine of features that show the same thing [-], Eq. (8)", most=1
     )
     mask_min_corresponding: int = parameter(
         2, "views that must see a cell to judge it: more than one, paper supplement"
@@ -102,13 +105,13 @@ class TrackingConfig:
         20, "keyframes between two online global BAs; 0: none [keyframes], paper supplement"
     )
     loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
-    loop_min_gap: int = parameter(20, "keyframes between the ends of a loop, official code")
+    loop_min_gap: int = parameter(20, "keyframes between the ends of a loop, official code", 1)
     loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")
     loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
     final_rounds: int = parameter(2, "rounds of the final global BA, paper supplement")
     final_prior: bool = parameter(False, "keep the disparity prior in the final BA (an ablation)")
-    pose_rounds: int = parameter(1, "rounds of flow and pose per frame between keyframes")
-    pose_iterations: int = parameter(8, "Gauss-Newton steps per round of such a frame")
+    pose_rounds: int = parameter(1, "rounds of flow and pose per frame between keyframes", 1)
+    pose_iterations: int = parameter(8, "Gauss-Newton steps per round of such a frame", 1)
     learned: LearnedFlowConfig = field(default_factory=LearnedFlowConfig)
 
     def for_learned_flow(self) -> "TrackingConfig":

@@ -20,9 +20,9 @@ class UncertaintyConfig:
         1,
         "the grid of beta is n times as fine, and its features cost n^2 times as much; paper"
         " supplement, high-resolution uncertainty map",
-        least=1,
+        1,
     )
-    hidden_units: int = parameter(64, "width of the two hidden layers [units], official")
+    hidden_units: int = parameter(64, "width of the two hidden layers [units], official", 1)
     dropout: float = parameter(0.2, "hidden units dropped in training [-], official", most=0.99)
     learning_rate: float = parameter(
         2e-3, "Adam step of the MLP [1]; official 4e-4 for some 10^4 iterations, ours run 10^3"
@@ -47,7 +47,9 @@ class UncertaintyConfig:
         3, "window of the median filter [cells], odd; official 5 on a grid twice as fine"
     )
 
-    similarity: float = parameter(0.75, "cosine above which features are similar [1], official")
+    similarity: float = parameter(
+        0.75, "cosine above which features are similar [1], official", most=1
+    )
     neighbours: int = parameter(128, "most similar cells that enter L_reg_V [cells], official")
     variance_samples: int = parameter(
         350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes"

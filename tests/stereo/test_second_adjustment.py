@@ -11,7 +11,9 @@ from minislam.geometry import se3_inverse
 from minislam.priors.interfaces import FlowMatches
 from minislam.stereo import second_adjustment
 from minislam.stereo.second_adjustment import (
+    COARSE_WIDTH,
     UNCONFIRMED_WEIGHT,
+    adjust_again,
     adjust_confirmed,
     sweep_keyframes,
 )
@@ -111,3 +113,23 @@ def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
     assert told["keyframes"] == NUMBERS
     nearest = [float(np.max(d)) for d in told["disparities"]]
     assert nearest == pytest.approx(graph.keyframes.disparities.amax(1).tolist(), rel=0.2)
+
+
+def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatch):
+    graph, done = linked_graph(), []
+    tracker = SimpleNamespace(graph=graph, tracked=["followed"], watch=SimpleNamespace())
+    tracker.watch.conclude = lambda: done.append(("judged", graph.keyframes.static_weights.min()))
+
+    def pose_all_frames(tracker, sequence, progress):
+        tracker.tracked[0] = "lost"
+        return {0: torch.eye(4)}
+
+    def sweep(graph, sequence, poses, progress, width):
+        done.append((sorted(poses), width))
+        return swept(graph)
+
+    monkeypatch.setattr(second_adjustment, "pose_all_frames", pose_all_frames)
+    monkeypatch.setattr(second_adjustment, "sweep_keyframes", sweep)
+    adjust_again(tracker, SimpleNamespace())
+    assert tracker.tracked == ["followed"]
+    assert done == [([0], COARSE_WIDTH), ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end

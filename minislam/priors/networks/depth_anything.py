@@ -31,7 +31,7 @@ _TAPS = {12: (2, 5, 8, 11), 24: (4, 11, 17, 23)}  # by the number of blocks: S a
 class DepthAnythingConfig:
     """Size of the input, and scale of the output."""
 
-    shorter_side: int = parameter(SHORTER_SIDE, "shorter side of what it sees [px], official")
+    shorter_side: int = parameter(SHORTER_SIDE, "shorter side of what it sees [px], official", 1)
     depth_limit: float = parameter(
         0.0, "largest depth of the training [m]; 0: as the official file name says (20 or 80)"
     )

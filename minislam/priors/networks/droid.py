@@ -41,10 +41,12 @@ class DroidFlowConfig:
     """How much work the network is given."""
 
     chain_updates: int = parameter(
-        3, "updates per frame, from the last frame's flow; 1: from the identity, official code"
+        3,
+        "updates per frame, from the last frame's flow; 1: from the identity, official code",
+        1,
     )
-    kept_edges: int = parameter(75, "edges, those used last, that keep their hidden states")
-    edges_per_batch: int = parameter(8, "edges in one pass, bounds the memory of correlations")
+    kept_edges: int = parameter(75, "edges, those used last, that keep their hidden states", 1)
+    edges_per_batch: int = parameter(8, "edges in one pass, bounds the memory of correlations", 1)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,9 @@ class Metric3DConfig:
     """Size of the input."""
 
     size: tuple[int, int] = parameter(
-        NETWORK_SIZE, "rows and columns it sees [px], official; multiples of 28, half costs a fifth"
+        NETWORK_SIZE,
+        "rows and columns it sees [px], official; multiples of 28, half costs a fifth",
+        1,
     )
 
 

@@ -34,10 +34,7 @@ def test_an_unusable_start_is_lost_and_the_rest_is_followed(start, lost):
     tracker = new_tracker(with_depth=True, shown=shown)
     run(tracker, renumbered(start + images))
     assert lost_frames(tracker) == lost
-    assert {tracker.tracked[index].status for index in lost} <= {
-        TrackingStatus.LOST,
-        TrackingStatus.RECENTLY_LOST,
-    }
+    assert {tracker.tracked[index].status for index in lost} == {TrackingStatus.LOST}
     assert tracker.keyframes.frames[0].frame_index == lost[-1] + 1
     estimate, truth = centres(tracker, shown)
     error = (torch.from_numpy(estimate - truth)).norm(dim=1).max()
