@@ -1,11 +1,14 @@
-"""Input options: which frames to read, at which size, with which camera."""
+"""Input options: which frames to read, at which size, with which camera. They need no torch."""
 
+import re
 from dataclasses import dataclass, fields
+from pathlib import Path
 
-from minislam.data.preparation import MINIMUM_SIDE
 from minislam.errors import InputError
 from minislam.parameters import parameter, require_bounds
 
+SYNTHETIC = "synth:"  # before the name of a synthetic sequence
+MINIMUM_SIDE = 16  # px; smaller images hold no pair of grid cells
 FOCAL_MODES = ("fixed", "refine", "auto")
 
 
@@ -49,3 +52,21 @@ class InputOptions:
             require_bounds(field.name, getattr(self, field.name), *bounds)
         if self.focal not in FOCAL_MODES:
             raise InputError(f"expected focal as {', '.join(FOCAL_MODES)}, found {self.focal!r}")
+
+
+def require_source(source: str) -> None:
+    """Refuse a sequence that does not exist, before anything is loaded or rendered."""
+    if source.startswith(SYNTHETIC):
+        import data_synth  # only here: real footage needs no scene generator
+
+        name, _, seed = source.removeprefix(SYNTHETIC).partition(":")
+        if name not in data_synth.SEQUENCES or not re.fullmatch(r"[0-9]{0,18}", seed):
+            raise InputError(
+                f"expected synth:NAME or synth:NAME:SEED with NAME one of "
+                f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"
+            )
+    elif not Path(source).expanduser().exists():
+        raise InputError(
+            f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
+            f"{source} does not exist; check the path"
+        )

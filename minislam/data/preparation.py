@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 
+from minislam.data.options import MINIMUM_SIDE
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
 
 # Trackers, networks and feature grids work on cells of 8 px, so both sides are multiples of it.
 SIZE_MULTIPLE = 8  # px
-MINIMUM_SIDE = 16  # px; smaller images hold no pair of grid cells
 
 
 class ImagePreparation:

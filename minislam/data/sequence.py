@@ -1,6 +1,5 @@
 """Open a folder, a video, or a synthetic sequence by its name."""
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.folder import read_image_folder, read_video
 from minislam.data.images import read_depth, read_mask
-from minislam.data.options import InputOptions
+from minislam.data.options import SYNTHETIC, InputOptions, require_source
 from minislam.data.preparation import ImagePreparation
 from minislam.data.recording import RecordedTruth, Recording, mask_files, path_of
 from minislam.data.tum import is_tum_folder, read_tum_folder
@@ -32,7 +31,8 @@ def open_sequence(
     A folder is recognised by its content, not by its name.
     """
     options = options or InputOptions()
-    if source.startswith("synth:"):
+    require_source(source)
+    if source.startswith(SYNTHETIC):
         return _open_synthetic(source, options, progress)
     path = Path(source).expanduser()
     if path.is_file():
@@ -40,11 +40,6 @@ def open_sequence(
         if options.max_frames is not None:
             last = options.start + options.stride * (options.max_frames - 1) + 1
         return RecordedSequence(read_video(path, last), options, source)
-    if not path.is_dir():
-        raise InputError(
-            f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
-            f"{source} does not exist; check the path"
-        )
     recording = read_tum_folder(path) if is_tum_folder(path) else read_image_folder(path)
     return RecordedSequence(recording, options, source)
 
@@ -172,12 +167,7 @@ def _open_synthetic(
     """Render a synthetic sequence, or take it from the cache, and open it."""
     import data_synth  # only here: real footage needs no scene generator
 
-    name, _, seed = source.removeprefix("synth:").partition(":")
-    if name not in data_synth.SEQUENCES or not re.fullmatch(r"[0-9]{0,18}", seed):
-        raise InputError(
-            f"expected synth:NAME or synth:NAME:SEED with NAME one of "
-            f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"
-        )
+    name, _, seed = source.removeprefix(SYNTHETIC).partition(":")
     frames = data_synth.default_frames(name)
     if options.max_frames is not None:
         frames = options.start + options.stride * options.max_frames

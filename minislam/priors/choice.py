@@ -17,16 +17,14 @@ from minislam.priors.depth import (
     SimulatedDepthConfig,
 )
 from minislam.priors.features import ClassicalFeatures, ClassicalFeaturesConfig
-from minislam.priors.files import DEPTH, FEATURES, FILES, FileFeatures, folder_of
+from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.priors.networks.published import find_weights
-from minislam.priors.networks.table import NETWORKS, NetworksConfig, find_network, load_network
-from minislam.priors.plugins import PYTHON, load_plugin, plugin_names
+from minislam.priors.names import FILES, FOLDER, require_prior
+from minislam.priors.networks.table import NetworksConfig, find_network, load_network
+from minislam.priors.plugins import load_plugin
 from minislam.records import Sequence
-
-FOLDER = f"{FILES}FOLDER"
 
 
 @dataclass(frozen=True)
@@ -97,32 +95,15 @@ def _choose(
     makers: dict[str, Callable[[], Any]],  # by name, of what needs no weights
 ) -> Any:
     """Return the prior that --KIND and --KIND-weights name."""
-    name, weights = getattr(choice, kind), getattr(choice, f"{kind}_weights")
+    name = getattr(choice, kind)
+    weights = require_prior(kind, name, getattr(choice, f"{kind}_weights"))
     network = find_network(kind, name)
     if network is not None:
-        weights = find_weights(f"--{kind} {name}", weights)
-        if weights is None:
-            raise InputError(
-                f"expected --{kind}-weights FILE with --{kind} {name}, found none; fetch it with "
-                f"minislam weights fetch {name}, or give an official checkpoint"
-            )
-        return load_network(network, Path(weights).expanduser(), choice.device, networks)
+        return load_network(network, Path(str(weights)).expanduser(), choice.device, networks)
     maker = makers.get(FOLDER if name.startswith(FILES) else name)
     if maker is not None and weights is None:
         return maker()
-    plugin = load_plugin(kind, name, choice.device, weights)
-    if plugin is not None:
-        return plugin
-    learned = [network.name for network in NETWORKS if network.kind == kind]
-    if weights is not None:
-        raise InputError(
-            f"expected --{kind} {' or '.join(learned)} with --{kind}-weights, found --{kind} "
-            f"{name}; name the network of {weights}"
-        )
-    known = ", ".join([*makers, *learned, *plugin_names(kind)])
-    raise InputError(
-        f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
-    )
+    return load_plugin(kind, name, choice.device, weights)
 
 
 def _sensor_depth(sequence: Sequence) -> SensorDepth:

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.priors.names import FILES
 from minislam.records import Frame
 
-FILES = "files:"  # before the name of a folder on the command line
 INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
 FEATURES, DEPTH = "features", "depth"  # folders of one sequence's priors
 _ALSO_DEPTH = "depths"  # the folder's name where WildGS-SLAM writes its own

@@ -16,18 +16,13 @@ from minislam.priors.conformance import (
     check_feature_extractor,
     check_flow_estimator,
 )
+from minislam.priors.names import PYTHON
 
-PYTHON = "python:"  # before MODULE:FACTORY
 _CHECKS = {
     "flow": check_flow_estimator,
     "features": check_feature_extractor,
     "depth": check_depth_prior,
 }
-
-
-def plugin_names(kind: str) -> list[str]:
-    """Return the names that installed packages give to priors of a kind."""
-    return sorted({entry.name for entry in entry_points(group=f"minislam.{kind}")})
 
 
 def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any | None:

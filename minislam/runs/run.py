@@ -12,7 +12,7 @@ from minislam.data import GaussianArrays, RunFolder
 from minislam.errors import InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
-from minislam.priors.files import FILES
+from minislam.priors.names import FILES
 from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.priors.networks.published import find_weights
 from minislam.records import Sequence

@@ -7,7 +7,8 @@ import pytest
 
 from minislam.errors import InputError
 from minislam.priors.depth import NoDepth
-from minislam.priors.plugins import load_plugin, plugin_names
+from minislam.priors.names import plugin_names
+from minislam.priors.plugins import load_plugin
 
 MODULE = """\
 class Plane:

@@ -1,0 +1,61 @@
+"""Which priors there are, by the values of --flow, --features and --depth. This needs no torch."""
+
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from minislam.errors import InputError
+from minislam.priors.networks.published import find_weights, published_files
+
+FILES = "files:"  # before the name of a folder of results made elsewhere
+PYTHON = "python:"  # before MODULE:FACTORY
+FOLDER = f"{FILES}FOLDER"
+BUILT_IN = {
+    "flow": ("classical",),
+    "features": ("classical", FOLDER),
+    "depth": ("none", "simulated", "sensor", FOLDER),
+}
+
+
+def plugin_names(kind: str) -> list[str]:
+    """Return the names that installed packages give to priors of a kind."""
+    return sorted({entry.name for entry in entry_points(group=f"minislam.{kind}")})
+
+
+def require_prior(kind: str, name: str, weights: str | None) -> str | None:
+    """Return the file that --KIND NAME reads, None if it needs none.
+
+    Refuse a name that is unknown and weights that are missing, before anything is loaded.
+    """
+    uses = [row.use.split() for row in published_files().values()]
+    learned = list(dict.fromkeys(use[-1] for use in uses if use[0] == f"--{kind}"))
+    if name in learned:
+        file = find_weights(f"--{kind} {name}", weights)
+        if file is None:
+            raise InputError(
+                f"expected --{kind}-weights FILE with --{kind} {name}, found none; fetch it with "
+                f"minislam weights fetch {name}, or give an official checkpoint"
+            )
+        if not Path(file).expanduser().is_file():
+            raise InputError(
+                f"expected an official checkpoint of {name}, found nothing at {file}; check the "
+                "path, or name one of minislam weights list"
+            )
+        return file
+    if name.startswith(PYTHON) or name in plugin_names(kind):
+        return weights
+    if weights is not None:
+        raise InputError(
+            f"expected --{kind} {' or '.join(learned)} with --{kind}-weights, found --{kind} "
+            f"{name}; name the network of {weights}"
+        )
+    if (FOLDER if name.startswith(FILES) else name) not in BUILT_IN[kind]:
+        known = ", ".join([*BUILT_IN[kind], *learned, *plugin_names(kind)])
+        raise InputError(
+            f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
+        )
+    folder = Path(name.removeprefix(FILES)).expanduser()
+    if name.startswith(FILES) and not folder.is_dir():
+        raise InputError(
+            f"expected a folder of {kind} files, found nothing at {folder}; check the path"
+        )
+    return None
