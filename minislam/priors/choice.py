@@ -1,11 +1,8 @@
 """Choose flow, features and depth by their names on the command line; load and check them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
@@ -21,33 +18,10 @@ from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.priors.names import FILES, FOLDER, require_prior
+from minislam.priors.names import FILES, FOLDER, PriorChoice, require_prior
 from minislam.priors.networks.table import NetworksConfig, find_network, load_network
 from minislam.priors.plugins import load_plugin
 from minislam.records import Sequence
-
-
-@dataclass(frozen=True)
-class PriorChoice:
-    """Which priors a run uses: the values of the flags of these names."""
-
-    flow: str = "classical"
-    flow_weights: str | None = None
-    features: str = "classical"
-    features_weights: str | None = None
-    depth: str = "none"
-    depth_weights: str | None = None
-    device: str = "cpu"  # where networks run, cpu or cuda; everything else stays on the CPU
-
-    def __post_init__(self) -> None:
-        """Refuse a device that is not there."""
-        if self.device not in ("cpu", "cuda"):
-            raise InputError(f"expected --device cpu or cuda, found {self.device!r}; choose one")
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise InputError(
-                "expected a GPU that this torch can use for --device cuda, found none; say "
-                "--device cpu, or make the priors elsewhere with minislam priors"
-            )
 
 
 def choose_flow(

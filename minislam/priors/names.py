@@ -1,5 +1,6 @@
 """Which priors there are, by the values of --flow, --features and --depth. This needs no torch."""
 
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -14,6 +15,29 @@ BUILT_IN = {
     "features": ("classical", FOLDER),
     "depth": ("none", "simulated", "sensor", FOLDER),
 }
+
+
+@dataclass(frozen=True)
+class PriorChoice:
+    """Which priors a run uses: the values of the flags of these names."""
+
+    flow: str = "classical"
+    flow_weights: str | None = None
+    features: str = "classical"
+    features_weights: str | None = None
+    depth: str = "none"
+    depth_weights: str | None = None
+    device: str = "cpu"  # where networks run, cpu or cuda; everything else stays on the CPU
+
+    def __post_init__(self) -> None:
+        """Refuse a device that is not there."""
+        if self.device not in ("cpu", "cuda"):
+            raise InputError(f"expected --device cpu or cuda, found {self.device!r}; choose one")
+        if self.device == "cuda" and not _has_gpu():
+            raise InputError(
+                "expected a GPU that this torch can use for --device cuda, found none; say "
+                "--device cpu, or make the priors elsewhere with minislam priors"
+            )
 
 
 def plugin_names(kind: str) -> list[str]:
@@ -59,3 +83,15 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
             f"expected a folder of {kind} files, found nothing at {folder}; check the path"
         )
     return None
+
+
+def require_priors(choice: PriorChoice) -> None:
+    """Refuse a choice with a name that is unknown or with weights that are missing."""
+    for kind in BUILT_IN:
+        require_prior(kind, getattr(choice, kind), getattr(choice, f"{kind}_weights"))
+
+
+def _has_gpu() -> bool:
+    import torch  # only where a GPU is asked for
+
+    return torch.cuda.is_available()
