@@ -19,11 +19,13 @@ from minislam.viz.style import (
     show_figure,
     show_image,
 )
+from minislam.viz.viewer import build_viewer
 
 __all__ = [
     "ate_over_time",
     "beta_to_rgb",
     "build_report",
+    "build_viewer",
     "depth_to_rgb",
     "figure_png",
     "keyframe_health",
