@@ -1,14 +1,14 @@
-"""Notebooks as files: where they are, how one is stored, and how a student copy is made."""
+"""Notebooks as files: where they are, and how one is stored."""
 
 import copy
 import json
 import re
 from pathlib import Path
 
+from minislam.cli.notebooks import SOLUTION
+
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-
-SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
 
 
 def load(path: Path) -> dict:
@@ -54,18 +54,3 @@ def with_joined_streams(outputs: list[dict]) -> list[dict]:
         else:
             joined.append(output)
     return joined
-
-
-def without_solutions(notebook: dict) -> dict:
-    """Return the copy for students: each solution becomes `raise NotImplementedError`."""
-    result = copy.deepcopy(notebook)
-    for cell in result["cells"]:
-        if cell["cell_type"] == "code":
-            text = SOLUTION.sub(r"\1raise NotImplementedError  # your code here", source(cell))
-            cell["source"] = text.splitlines(keepends=True)
-            cell["outputs"], cell["execution_count"] = [], None
-    return result
-
-
-def as_text(notebook: dict) -> str:
-    return json.dumps(notebook, indent=1, ensure_ascii=False, sort_keys=True) + "\n"

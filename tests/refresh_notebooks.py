@@ -2,7 +2,6 @@
 
 python -m tests.refresh_notebooks                    all of them
 python -m tests.refresh_notebooks 01 03              those whose names start so
-python -m tests.refresh_notebooks --student out/     copies without solutions, not run
 """
 
 import os
@@ -10,7 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.notebook_files import NOTEBOOKS, ROOT, as_text, cleaned, load, without_solutions
+from minislam.cli.notebooks import as_text
+from tests.notebook_files import NOTEBOOKS, ROOT, cleaned, load
 
 
 def execute(path: Path) -> None:
@@ -28,12 +28,6 @@ def store(path: Path, notebook: dict) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    if arguments[:1] == ["--student"]:
-        folder = Path(arguments[1])
-        folder.mkdir(parents=True, exist_ok=True)
-        for path in NOTEBOOKS:
-            store(folder / path.name, without_solutions(load(path)))
-        return
     for path in NOTEBOOKS:
         if not arguments or path.name.startswith(tuple(arguments)):
             print(path.name, flush=True)

@@ -12,17 +12,8 @@ from pathlib import Path
 import pytest
 
 from minislam.checks.grading import NOT_YET, PASSED
-from tests.notebook_files import (
-    NOTEBOOKS,
-    ROOT,
-    as_text,
-    cleaned,
-    is_exercise,
-    load,
-    prose,
-    source,
-    without_solutions,
-)
+from minislam.cli.notebooks import as_text, without_solutions
+from tests.notebook_files import NOTEBOOKS, ROOT, cleaned, is_exercise, load, prose, source
 
 LARGEST = 500_000  # bytes
 MOST_CELLS = 40

@@ -1,4 +1,4 @@
-"""The command line, `minislam demo | run | priors | weights | eval | doctor`; `main` first."""
+"""The command line, `minislam demo | run | bench | notebooks | ...`; `main` first."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from collections.abc import Sequence
 from functools import partial
 
 import minislam
+from minislam.cli.bench import add_bench_parser
 from minislam.cli.doctor import add_doctor_parser
 from minislam.cli.evaluate import add_eval_parser
+from minislam.cli.notebooks import add_notebooks_parser
 from minislam.cli.options import (
     add_flow,
     add_input,
@@ -174,6 +176,8 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         add_priors(priors, default_depth="none")
         add_settings(priors)
     add_weights_parser(commands)
+    add_bench_parser(commands)
+    add_notebooks_parser(commands)
     add_eval_parser(commands)
     add_doctor_parser(commands)
     return parser

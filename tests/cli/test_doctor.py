@@ -1,7 +1,11 @@
 """Doctor tries the installation out, and says if something is wrong with it."""
 
+import os
+from pathlib import Path
+
 import pytest
 
+from minislam.cli import doctor
 from minislam.cli.main import main
 from minislam.priors import conformance
 
@@ -16,3 +20,38 @@ def test_a_flow_that_is_wrong_is_one_sentence(monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.setattr(conformance, "flow_error", lambda *_: float("nan"))
     assert main(["doctor"]) == 1
     assert "expected the self-test to be exact to 0.1 px, found nan px" in capsys.readouterr().err
+
+
+class Package:
+    """What importlib.metadata tells of an installed package."""
+
+    def __init__(self, name: str) -> None:
+        self.metadata = {"Name": name}
+
+
+@pytest.mark.parametrize(
+    ("names", "warned"),
+    [
+        (["torch", "opencv-python-headless"], False),
+        (["opencv-python-headless", "OpenCV-Python", "torch"], True),
+    ],
+)
+def test_two_packages_of_opencv_are_warned_of(monkeypatch, names: list[str], warned: bool):
+    monkeypatch.setattr(doctor, "distributions", lambda: map(Package, names))
+    found = doctor.opencv_warnings()
+    assert bool(found) == warned
+    assert not warned or "opencv-python, opencv-python-headless share one folder" in found[0]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the stand-in for nvidia-smi is a shell script")
+def test_a_gpu_that_torch_does_not_see_is_warned_of(tmp_path: Path, monkeypatch):
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\necho 'GPU 0: NVIDIA A100 (UUID: GPU-1)'\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert doctor.gpu_warnings(torch_sees_one=True) == []
+    assert "torch sees no GPU 0: NVIDIA A100: install" in doctor.gpu_warnings(False)[0]
+    tool.write_text("#!/bin/sh\necho 'No devices were found'; exit 6\n")
+    assert doctor.gpu_warnings(False) == []
+    tool.unlink()
+    assert doctor.gpu_warnings(False) == []

@@ -1,0 +1,144 @@
+"""The sub-command `minislam bench`: run benchmarks, and set their errors beside the paper's.
+
+Each sequence is a `minislam run` in a process of its own: the memory or the crash of one does not
+touch the next.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from minislam.cli.progress import ending_signals, say
+from minislam.errors import InputError
+
+USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
+LOST_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 3, 2, 130
+LEGEND = """\
+RMSE of the ATE over all frames, for minislam after a Sim(3) alignment. F: failed. -: no number.
+*: frames were lost or the geometry broke (minislam), run by the authors of the paper (others)."""
+
+
+def add_bench_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Add `bench` to the sub-commands of a parser."""
+    parser = subparsers.add_parser(
+        "bench",
+        help="run the sequences of benchmarks, and compare with the published errors",
+        usage=USAGE,
+        description="Run every sequence (TUM, Bonn, Wild-SLAM MoCap) in the folders, and print its "
+        "ATE below the published ones. The same command again goes on: a finished sequence is not "
+        "repeated, an interrupted one is resumed. OUT (output/bench) gets a run folder for each "
+        "sequence, bench.csv and bench.md.",
+    )
+    parser.add_argument("folders", nargs="+", metavar="FOLDER", help="a sequence, or its parents")
+    parser.add_argument("options", nargs=argparse.REMAINDER, help="-o OUT, options of minislam run")
+    parser.set_defaults(run=run_bench)
+
+
+def run_bench(args: argparse.Namespace) -> int:
+    """Run what is not finished, print and write the tables; return the exit code."""
+    own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
+    own.add_argument("-o", "--output", default="output/bench")
+    given, options = own.parse_known_args(args.options)
+    sequences, output = find_sequences(args.folders), Path(given.output)
+    _require_same(output / "options.json", options)
+    ours: dict[str, str] = {}
+    tables, code = "", 0
+    for number, (name, path) in enumerate(sequences.items(), start=1):
+        say(f"== {number} of {len(sequences)}: {name}")
+        code = _run(path, output / name, options)
+        if code in (USAGE_EXIT, INTERRUPTED_EXIT):  # a wrong option is wrong for every sequence
+            break
+        ours[name] = _ate(output / name, code)
+        tables = _write_tables(output, ours)
+    if tables:
+        say(f"\n{tables}\nin {output}/bench.md and {output}/bench.csv")
+    return code if len(ours) < len(sequences) else int("F" in ours.values())
+
+
+def find_sequences(folders: list[str]) -> dict[str, Path]:
+    """Return the sequences that folders are, or hold one or two levels below, by their names."""
+    from minislam.data.tum import is_tum_folder
+
+    found: dict[str, Path] = {}
+    for folder in map(Path, folders):
+        inside = [folder, *sorted(folder.glob("*")), *sorted(folder.glob("*/*"))]
+        paths = [path for path in inside if path.is_dir() and is_tum_folder(path)]
+        names = [path.resolve().name for path in paths]
+        if not paths or len({*names, *found}) < len(names) + len(found):
+            raise InputError(
+                f"expected sequences (folders with rgb.txt, or rgb/ with times as names) in "
+                f"{folder}, each of another name, found {', '.join(names) or 'none'}; check the "
+                "path, and bench sequences of the same name in two commands"
+            )
+        found |= dict(zip(names, paths, strict=True))
+    return found
+
+
+def _require_same(path: Path, options: list[str]) -> None:
+    """Note the options of a bench; refuse others later, because a table is of one kind of run."""
+    from minislam.data.files import read_json, write_json
+
+    if path.exists() and (then := read_json(path)) != options:
+        raise InputError(
+            f"expected the options of the bench in {path.parent}, {then}, found {options}; repeat "
+            "those, or give another -o"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, options)
+
+
+def _run(path: Path, folder: Path, options: list[str]) -> int:
+    """Run a sequence, or the rest of it; return the exit code, that of a finished run at once."""
+    from minislam.data import RunFolder
+
+    if (folder / "run.json").exists():
+        facts = RunFolder(folder).read_run()
+        if facts["state"].startswith("finished"):
+            return facts["exit_code"]
+    how = "--resume" if (folder / "checkpoint.npz").exists() else "--overwrite"
+    command = [sys.executable, "-m", "minislam", "run", str(path), "-o", str(folder), how, *options]
+    # A signal reaches the run through us alone, so that the run saves what it has, and ends.
+    process = subprocess.Popen(command, start_new_session=True)
+    caught: list[int] = []
+
+    def forward(number: int, *_: object) -> None:
+        caught.append(number)
+        if os.name == "posix":  # on Windows a console tells both
+            process.send_signal(number)
+
+    with ending_signals(forward):
+        code = process.wait()
+    return INTERRUPTED_EXIT if caught else code
+
+
+def _ate(folder: Path, code: int) -> str:
+    """Return the error of a run as the tables show it."""
+    from minislam.data import RunFolder
+
+    if code not in (0, LOST_EXIT):
+        return "F"
+    ate_cm = RunFolder(folder).read_metrics()["ate_all_cm"]
+    return "-" if ate_cm is None else f"{ate_cm:.2f}{'*' if code else ''}"
+
+
+def _write_tables(output: Path, ours: dict[str, str]) -> str:
+    """Write bench.csv and bench.md; return the latter."""
+    from minislam.data.files import write_text
+    from minislam.evaluation.published import compare
+
+    text, file = "", io.StringIO()
+    for dataset, rows in compare(ours).items():
+        csv.writer(file, lineterminator="\n").writerows([[dataset], *rows])
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        rows.insert(1, ["-" * width for width in widths])
+        lines = [" | ".join(map(str.ljust, row, widths)) for row in rows]
+        text += "\n".join([f"{dataset}:\n", *(f"| {line} |" for line in lines), "\n"])
+    write_text(output / "bench.csv", file.getvalue())
+    write_text(output / "bench.md", text + LEGEND + "\n")
+    return text + LEGEND

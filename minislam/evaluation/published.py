@@ -1,0 +1,59 @@
+"""The ATE that the paper prints for each system it compares with, and ours beside it.
+
+Columns of published.csv: table (of the paper; 8 and 10 are in the supplement, counted on); dataset;
+sequence, as printed, "Avg." for the printed mean; folder, as the makers of the sequence call it;
+input of the system; system; ate_cm, as printed: RMSE over all frames [cm], F failed, - not
+reported, * run by the authors of the paper.
+"""
+
+import csv
+from pathlib import Path
+
+OTHER = "other sequences"  # that the paper has no number for
+
+
+def published_errors() -> list[dict[str, str]]:
+    """Return the rows of published.csv, in the paper's order."""
+    text = Path(__file__).with_name("published.csv").read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
+
+
+def compare(ours: dict[str, str]) -> dict[str, list[list[str]]]:
+    """Return for each dataset a table: a header, the published systems, minislam.
+
+    `ours` has an ATE [cm] for each sequence, by the name of its folder, written as in the paper. A
+    mean is over the columns shown, "-" where one of them has no number.
+    """
+    rows, tables = published_errors(), {}
+    known = {_plain(row["folder"]): row for row in rows}
+    place = {name: known.get(_plain(name), {"dataset": OTHER, "sequence": name}) for name in ours}
+    for dataset in dict.fromkeys(found["dataset"] for found in place.values()):
+        mine = {
+            at["sequence"]: ours[name] for name, at in place.items() if at["dataset"] == dataset
+        }
+        systems: dict[tuple[str, str], dict[str, str]] = {}
+        for row in rows:
+            if (
+                row["dataset"] == dataset
+                and mine.keys() & {row["sequence"]}
+                and row["ate_cm"] != "-"
+            ):
+                key = row["system"], row["input"]
+                systems.setdefault(key, dict.fromkeys(mine, "-"))[row["sequence"]] = row["ate_cm"]
+        systems["minislam", "Monocular"] = mine
+        lines = [
+            [*key, *errors.values(), _mean([*errors.values()])] for key, errors in systems.items()
+        ]
+        tables[dataset] = [["ATE [cm]", "input", *mine, "mean"], *lines]
+    return tables
+
+
+def _plain(folder: str) -> str:
+    return folder.casefold().removeprefix("rgbd_dataset_")
+
+
+def _mean(cells: list[str]) -> str:
+    try:
+        return f"{sum(float(cell.rstrip('*')) for cell in cells) / len(cells):.2f}"
+    except ValueError:  # a failure, or a number that is not known
+        return "-"
