@@ -15,9 +15,8 @@ from minislam.cli import bench
 from minislam.cli.main import main
 from tests.recordings import tum_folder
 
-pytestmark = [
-    pytest.mark.skipif(os.name != "posix", reason="the stand-in for Python is a script"),
-]
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Python is a script")
+PYTHON = sys.executable
 
 # Instead of `python -m minislam run SEQUENCE -o FOLDER HOW ...`: notes the command, and ends as
 # the name of the sequence says.
@@ -50,7 +49,7 @@ class Bench:
     def __init__(self, root: Path) -> None:
         self.data, self.out, self.calls = root / "data", root / "out", root / "calls"
         self.python = root / "python"
-        self.python.write_text(STAND_IN.format(python=sys.executable, calls=str(self.calls)))
+        self.python.write_text(STAND_IN.format(python=PYTHON, calls=str(self.calls)))
         self.python.chmod(self.python.stat().st_mode | stat.S_IEXEC)
 
     def sequence(self, name: str) -> None:
@@ -108,9 +107,9 @@ def test_an_interrupted_bench_keeps_its_tables_and_goes_on(made: Bench):
         made.sequence(name)
     text = f"import sys; from minislam.cli.main import main; sys.executable = {str(made.python)!r}"
     arguments = ["bench", str(made.data), "-o", str(made.out)]
-    command = [sys.executable, "-c", f"{text}; sys.exit(main({arguments!r}))"]
+    command = [PYTHON, "-c", f"{text}; sys.exit(main({arguments!r}))"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        for _ in range(600):
+        for _ in range(300):
             if (made.out / "slow/checkpoint.npz").exists():
                 break
             time.sleep(0.1)
@@ -147,7 +146,6 @@ def test_folders_without_sequences_and_equal_names_are_one_sentence(made: Bench,
     made.sequence("b/crowd")
     assert made.run() == 1
     assert "found crowd, crowd" in capsys.readouterr().err
-    assert main(["bench"]) == 2
 
 
 @pytest.mark.slow
