@@ -42,22 +42,30 @@ def add_bench_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run_bench(args: argparse.Namespace) -> int:
     """Run what is not finished, print and write the tables; return the exit code."""
+    from minislam.data.files import read_json, write_json
+
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
-    own.add_argument("-o", "--output", default="output/bench")
+    own.add_argument("-o", "--output", default="output/bench", type=Path)
     given, options = own.parse_known_args(args.options)
-    sequences, output = find_sequences(args.folders), Path(given.output)
-    _require_same(output / "options.json", options)
+    sequences, noted = find_sequences(args.folders), given.output / "options.json"
+    if noted.exists() and (then := read_json(noted)) != options:
+        raise InputError(
+            f"expected the options of the bench in {given.output}, {then}, found {options}; repeat "
+            "those, because a table is of one kind of run, or give another -o"
+        )
+    given.output.mkdir(parents=True, exist_ok=True)
+    write_json(noted, options)
     ours: dict[str, str] = {}
     tables, code = "", 0
     for number, (name, path) in enumerate(sequences.items(), start=1):
         say(f"== {number} of {len(sequences)}: {name}")
-        code = _run(path, output / name, options)
+        code, ate_cm = _run(path, given.output / name, options)
         if code in (USAGE_EXIT, INTERRUPTED_EXIT):  # a wrong option is wrong for every sequence
             break
-        ours[name] = _ate(output / name, code)
-        tables = _write_tables(output, ours)
+        ours[name] = ate_cm
+        tables = _write_tables(given.output, ours)
     if tables:
-        say(f"\n{tables}\nin {output}/bench.md and {output}/bench.csv")
+        say(f"\n{tables}\nin {given.output}/bench.md and {given.output}/bench.csv")
     return code if len(ours) < len(sequences) else int("F" in ours.values())
 
 
@@ -80,31 +88,27 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
     return found
 
 
-def _require_same(path: Path, options: list[str]) -> None:
-    """Note the options of a bench; refuse others later, because a table is of one kind of run."""
-    from minislam.data.files import read_json, write_json
+def _run(path: Path, folder: Path, options: list[str]) -> tuple[int, str]:
+    """Run a sequence, or the rest of it, if it is not finished; return exit code and ATE."""
+    from minislam.data.files import read_json
 
-    if path.exists() and (then := read_json(path)) != options:
-        raise InputError(
-            f"expected the options of the bench in {path.parent}, {then}, found {options}; repeat "
-            "those, or give another -o"
-        )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, options)
+    facts, code = folder / "run.json", 0
+    if facts.exists() and str(read_json(facts)["state"]).startswith("finished"):
+        code = read_json(facts)["exit_code"]
+    else:
+        how = "--resume" if (folder / "checkpoint.npz").exists() else "--overwrite"
+        code = _wait_for(["run", str(path), "-o", str(folder), how, *options])
+    if code not in (0, LOST_EXIT):
+        return code, "F"
+    ate_cm = read_json(folder / "metrics.json")["ate_all_cm"]
+    return code, "-" if ate_cm is None else f"{ate_cm:.2f}{'*' if code else ''}"
 
 
-def _run(path: Path, folder: Path, options: list[str]) -> int:
-    """Run a sequence, or the rest of it; return the exit code, that of a finished run at once."""
-    from minislam.data import RunFolder
-
-    if (folder / "run.json").exists():
-        facts = RunFolder(folder).read_run()
-        if facts["state"].startswith("finished"):
-            return facts["exit_code"]
-    how = "--resume" if (folder / "checkpoint.npz").exists() else "--overwrite"
-    command = [sys.executable, "-m", "minislam", "run", str(path), "-o", str(folder), how, *options]
-    # A signal reaches the run through us alone, so that the run saves what it has, and ends.
-    process = subprocess.Popen(command, start_new_session=True)
+def _wait_for(arguments: list[str]) -> int:
+    """Run minislam in a process of its own; a signal reaches it through us alone, and ends it."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "minislam", *arguments], start_new_session=True
+    )
     caught: list[int] = []
 
     def forward(number: int, *_: object) -> None:
@@ -117,16 +121,6 @@ def _run(path: Path, folder: Path, options: list[str]) -> int:
     return INTERRUPTED_EXIT if caught else code
 
 
-def _ate(folder: Path, code: int) -> str:
-    """Return the error of a run as the tables show it."""
-    from minislam.data import RunFolder
-
-    if code not in (0, LOST_EXIT):
-        return "F"
-    ate_cm = RunFolder(folder).read_metrics()["ate_all_cm"]
-    return "-" if ate_cm is None else f"{ate_cm:.2f}{'*' if code else ''}"
-
-
 def _write_tables(output: Path, ours: dict[str, str]) -> str:
     """Write bench.csv and bench.md; return the latter."""
     from minislam.data.files import write_text
@@ -137,8 +131,8 @@ def _write_tables(output: Path, ours: dict[str, str]) -> str:
         csv.writer(file, lineterminator="\n").writerows([[dataset], *rows])
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         rows.insert(1, ["-" * width for width in widths])
-        lines = [" | ".join(map(str.ljust, row, widths)) for row in rows]
-        text += "\n".join([f"{dataset}:\n", *(f"| {line} |" for line in lines), "\n"])
+        lines = [f"| {' | '.join(map(str.ljust, row, widths))} |" for row in rows]
+        text += "\n".join([f"{dataset}:\n", *lines, "\n"])
     write_text(output / "bench.csv", file.getvalue())
     write_text(output / "bench.md", text + LEGEND + "\n")
     return text + LEGEND

@@ -23,10 +23,16 @@ def add_notebooks_parser(subparsers: argparse._SubParsersAction) -> None:
 
 
 def run_notebooks(args: argparse.Namespace) -> int:
-    """Copy all notebooks; return the exit code. What is there already is never replaced."""
+    """Copy all notebooks, never over a file that is there; return the exit code."""
     from minislam.data.files import read_text, write_text  # needs torch
 
-    folder, paths = Path(args.folder).expanduser(), notebook_paths()
+    # A wheel holds the notebooks inside the package, the repository beside it.
+    folder, package = Path(args.folder).expanduser(), Path(minislam.__file__).parent
+    paths = sorted(package.glob("notebooks/*.ipynb")) or sorted(
+        package.glob("../notebooks/*.ipynb")
+    )
+    if not paths:
+        raise InputError(f"expected notebooks in {package} or beside it, found none; install again")
     there = [path.name for path in paths if (folder / path.name).exists()]
     if there:
         raise InputError(
@@ -41,19 +47,6 @@ def run_notebooks(args: argparse.Namespace) -> int:
         write_text(folder / path.name, text)
     print(f"{len(paths)} notebooks in {folder}; open them with: jupyter lab {folder}")
     return 0
-
-
-def notebook_paths() -> list[Path]:
-    """Return the notebooks: those built into the package, or those of the repository around it."""
-    package = Path(minislam.__file__).parent
-    for folder in (package / "notebooks", package.parent / "notebooks"):
-        paths = sorted(folder.glob("[0-9][0-9]_*.ipynb"))
-        if paths:
-            return paths
-    raise InputError(
-        f"expected notebooks in {package} or beside it, found none; install minislam again, or "
-        "take them from its repository"
-    )
 
 
 def without_solutions(notebook: dict) -> dict:

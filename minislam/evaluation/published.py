@@ -26,23 +26,19 @@ def compare(ours: dict[str, str]) -> dict[str, list[list[str]]]:
     """
     rows, tables = published_errors(), {}
     known = {_plain(row["folder"]): row for row in rows}
-    place = {name: known.get(_plain(name), {"dataset": OTHER, "sequence": name}) for name in ours}
-    for dataset in dict.fromkeys(found["dataset"] for found in place.values()):
-        mine = {
-            at["sequence"]: ours[name] for name, at in place.items() if at["dataset"] == dataset
-        }
+    datasets: dict[str, dict[str, str]] = {}  # dataset: {sequence: ours}
+    for name, ate_cm in ours.items():
+        row = known.get(_plain(name), {"dataset": OTHER, "sequence": name})
+        datasets.setdefault(row["dataset"], {})[row["sequence"]] = ate_cm
+    for dataset, mine in datasets.items():
         systems: dict[tuple[str, str], dict[str, str]] = {}
         for row in rows:
-            if (
-                row["dataset"] == dataset
-                and mine.keys() & {row["sequence"]}
-                and row["ate_cm"] != "-"
-            ):
+            if row["dataset"] == dataset and row["sequence"] in mine and row["ate_cm"] != "-":
                 key = row["system"], row["input"]
                 systems.setdefault(key, dict.fromkeys(mine, "-"))[row["sequence"]] = row["ate_cm"]
         systems["minislam", "Monocular"] = mine
         lines = [
-            [*key, *errors.values(), _mean([*errors.values()])] for key, errors in systems.items()
+            [*key, *found.values(), _mean(list(found.values()))] for key, found in systems.items()
         ]
         tables[dataset] = [["ATE [cm]", "input", *mine, "mean"], *lines]
     return tables
