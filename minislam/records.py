@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -109,7 +110,9 @@ class Sequence(Protocol):
     checksums: dict[int, int]  # of the images read so far, by frame index
     ground_truth: GroundTruth | None
     depth_scale: float  # units of a stored depth image per metre
+    files: list[Path]  # that hold the images
     opened_as: dict[str, Any]  # "sequence" and "input", the part of config.json that opens it
+    preparation: dict[str, Any]  # how raw images became working images, see `ImagePreparation`
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -119,6 +122,9 @@ class Sequence(Protocol):
 
     def frame(self, frame_index: int) -> Frame:
         """Return one frame again."""
+
+    def source_name(self, frame_index: int) -> str:
+        """Return the name of a frame's image file, or of its video with the number in it."""
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return (H, W) bool, True where something moves; None if no masks are given."""

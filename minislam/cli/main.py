@@ -1,4 +1,4 @@
-"""The command line, `minislam demo | run | bench | notebooks | ...`; `main` first."""
+"""The command line, `minislam demo | run | render | bench | ...`; `main` first."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import difflib
 import os
 import signal
 import sys
-import time
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -32,6 +31,7 @@ from minislam.cli.options import (
 )
 from minislam.cli.priors import add_priors_parser
 from minislam.cli.progress import ProgressLine, ending_signals, say
+from minislam.cli.render import add_render_parser
 from minislam.cli.weights import add_weights_parser
 from minislam.errors import InputError, MinislamError
 
@@ -179,14 +179,14 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     add_bench_parser(commands)
     add_notebooks_parser(commands)
     add_eval_parser(commands)
+    add_render_parser(commands)
     add_doctor_parser(commands)
     return parser
 
 
 def _run(args: argparse.Namespace) -> int:
-    from minislam.data import RunFolder, open_sequence
-    from minislam.data.run_folder import locked
-    from minislam.runs.run import choose_priors, run_sequence
+    from minislam.data import open_sequence
+    from minislam.runs.run import default_depth, default_output, run_in_folder
 
     if args.resume and args.output is None:
         raise InputError(
@@ -196,28 +196,25 @@ def _run(args: argparse.Namespace) -> int:
     source = source_of(args)
     progress = ProgressLine()
     sequence = open_sequence(source, input_options(args), partial(progress.show, "making frames"))
-    choice = prior_choice(args, "simulated" if source.startswith("synth:") else "none")
-    output = args.output or f"output/{sequence.name}_{time.strftime('%Y%m%d-%H%M%S')}"
+    choice = prior_choice(args, default_depth(source))
+    output = args.output or default_output(sequence)
     say(sequence.description)
     for warning in sequence.warnings:
         say(f"WARNING: {warning}", "stderr")
-    # Everything that may be wrong is checked before the files of an earlier run are removed.
-    for index in range(len(sequence)):
-        sequence.given_mask(index)
-    priors, lpips = choose_priors(choice, sequence, config), lpips_of(args, sequence.camera)
-    with locked(output), ending_signals(progress.interrupt):
-        images, resume = sequence.files, args.resume
-        folder = RunFolder(output) if resume else RunFolder.create(output, args.overwrite, images)
-        outcome = run_sequence(sequence, config, choice, priors, folder, progress, lpips, resume)
+    lpips = lpips_of(args, sequence.camera)
+    with ending_signals(progress.interrupt):
+        outcome = run_in_folder(
+            sequence, config, choice, output, progress, lpips, args.overwrite, args.resume
+        )
     say(f"{outcome.state}:\n  focal length           {outcome.focal_length}")
     for name, value in outcome.metrics.items():
         say(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
     for warning in outcome.warnings:
         if warning not in sequence.warnings:
             say(f"WARNING: {warning}", "stderr")
-    say(f"results in {folder.path}; open {folder.path}/report.html")
+    say(f"results in {output}; open {output}/report.html")
     if outcome.state == "interrupted":
-        say(f"to go on: minislam run --resume -o {folder.path}")
+        say(f"to go on: minislam run --resume -o {output}")
     return outcome.exit_code
 
 

@@ -34,7 +34,7 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         shown = "" if option.default is None else f"; {option.default}"
         group.add_argument(
             f"--{option.name.replace('_', '-')}",
-            type=_size if types[option.name] is tuple else types[option.name],
+            type=size_of if types[option.name] is tuple else types[option.name],
             metavar="WIDTHxHEIGHT" if option.name == "size" else "VALUE",
             help=option.metadata["meaning"] + shown,
         )
@@ -97,7 +97,8 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         group.add_argument(f"--{name}", dest=f"set:{name}", metavar="VALUE", help=meaning)
 
 
-def _size(text: str) -> tuple[int, int]:
+def size_of(text: str) -> tuple[int, int]:
+    """Return width and height of a text like 320x240."""
     width, _, height = text.lower().partition("x")
     if not (width.isdigit() and height.isdigit()):
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT like 320x240, found {text!r}")

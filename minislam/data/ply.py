@@ -57,7 +57,7 @@ def encode_ply(gaussians: GaussianArrays) -> bytes:
         gaussians.means,
         np.zeros_like(gaussians.means),  # normals, which no viewer reads
         # Viewers clamp colours outside [0, 1] in different ways, so it is done here.
-        (np.clip(gaussians.colors, 0, 1) - 0.5) / _SH_C0,
+        (gaussians.colors - 0.5) / _SH_C0,
         gaussians.opacity_logits[:, None],
         gaussians.log_scales,
         _normalised(gaussians.quats_wxyz),

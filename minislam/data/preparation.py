@@ -1,5 +1,7 @@
 """From the raw image to the working image: undistort, cut unseen borders, resize, crop."""
 
+from dataclasses import asdict
+
 import cv2
 import numpy as np
 
@@ -25,6 +27,7 @@ class ImagePreparation:
         size: tuple[int, int] | None,  # (width, height) px of the working image, None: choose
         pixels: int,  # about width * height of the working image when it is chosen
     ) -> None:
+        self.raw_camera, self.distortion = raw_camera, distortion
         self.raw_size = (raw_camera.width, raw_camera.height)
         if min(self.raw_size) < MINIMUM_SIDE:
             raise InputError(
@@ -48,6 +51,16 @@ class ImagePreparation:
         self.camera = (
             raw_camera.cropped(*self._window).resized(*self._resized).cropped(*self._crop, *size)
         )
+
+    def steps(self) -> dict[str, object]:
+        """Return how raw images become working images, in order, in pixels."""
+        return {
+            "raw_camera": asdict(self.raw_camera),
+            "distortion": asdict(self.distortion),
+            "window": self._window,  # left, top, width, height of the undistorted image
+            "resized": self._resized,  # width, height
+            "crop": self._crop,  # left, top
+        }
 
     def color(
         self,

@@ -13,21 +13,29 @@ import torch
 from torch import Tensor
 
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
-from minislam.data.files import atomic_write, read_json, write_json, write_text
+from minislam.data.files import (
+    atomic_write,
+    read_bytes,
+    read_json,
+    read_text,
+    write_json,
+    write_text,
+)
 from minislam.data.images import encode_png
-from minislam.data.ply import GaussianArrays, write_ply
+from minislam.data.ply import GaussianArrays, read_ply, write_ply
 from minislam.data.trajectory import read_trajectory, write_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
 
-CONFIG, RUN, METRICS = "config.json", "run.json", "metrics.json"
+CONFIG, RUN, METRICS, CAMERA = "config.json", "run.json", "metrics.json", "camera.json"
 TRAJECTORY, KEYFRAME_TRAJECTORY = "trajectory.txt", "keyframe_trajectory.txt"
 LOST_FRAMES, MAP, MLP, REPORT = "lost_frames.txt", "map.ply", "uncertainty_mlp.pt", "report.html"
-CHECKPOINT = "checkpoint.npz"
+CHECKPOINT, VIEWER, CLIP, LOG = "checkpoint.npz", "viewer.html", "clip.webp", "log.txt"
 KEYFRAME_KINDS = ("input", "render", "depth", "beta")
 
 _FILES = (
-    CONFIG, RUN, METRICS, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MLP, REPORT, CHECKPOINT
+    CONFIG, RUN, METRICS, CAMERA, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MLP, REPORT,
+    CHECKPOINT, VIEWER, CLIP, LOG,
 )  # fmt: skip
 KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
 PLOT_NAMES = ("ate_over_time", "trajectory", "losses", "gaussians", "health", "overview")
@@ -106,6 +114,10 @@ class RunFolder:
         """Write the errors against the ground truth."""
         write_json(self.path / METRICS, metrics)
 
+    def write_camera(self, scene: dict[str, Any]) -> None:
+        """Write camera, unit, background and frames: what `minislam.load` stands on."""
+        write_json(self.path / CAMERA, scene)
+
     def write_trajectory(self, trajectory: Trajectory) -> None:
         """Write the poses of all tracked frames."""
         write_trajectory(self.path / TRAJECTORY, trajectory)
@@ -140,6 +152,14 @@ class RunFolder:
         assert name in PLOT_NAMES, name
         atomic_write(self.path / PLOTS / f"{name}.png", png)
 
+    def write_clip(self, webp: bytes) -> None:
+        """Write the animation of the whole clip: input, beta and static map side by side."""
+        atomic_write(self.path / CLIP, webp)
+
+    def write_viewer(self, html: str) -> None:
+        """Write the page in which the map can be turned."""
+        write_text(self.path / VIEWER, html)
+
     def write_report(self, html: str) -> None:
         """Write the report to open in a browser."""
         write_text(self.path / REPORT, html)
@@ -168,6 +188,14 @@ class RunFolder:
         """Return sequence, input, priors and settings."""
         return read_json(self.path / CONFIG)
 
+    def has_camera(self) -> bool:
+        """Tell whether a run came as far as a map here."""
+        return (self.path / CAMERA).is_file()
+
+    def read_camera(self) -> dict[str, Any]:
+        """Return camera, unit, background and frames."""
+        return read_json(self.path / CAMERA)
+
     def read_run(self) -> dict[str, Any]:
         """Return version, seed, command, timings and exit state."""
         return read_json(self.path / RUN)
@@ -176,9 +204,29 @@ class RunFolder:
         """Return the errors against the ground truth."""
         return read_json(self.path / METRICS)
 
+    def read_plot(self, name: str) -> bytes:
+        """Return the PNG bytes of plots/NAME.png."""
+        return read_bytes(self.path / PLOTS / f"{name}.png")
+
+    def read_viewer(self) -> str:
+        """Return the page in which the map can be turned."""
+        return read_text(self.path / VIEWER)
+
     def read_trajectory(self) -> Trajectory:
         """Return the poses of all tracked frames."""
         return read_trajectory(self.path / TRAJECTORY)
+
+    def read_keyframe_trajectory(self) -> Trajectory:
+        """Return the poses of the keyframes."""
+        return read_trajectory(self.path / KEYFRAME_TRAJECTORY)
+
+    def read_map(self) -> GaussianArrays:
+        """Return the Gaussian map."""
+        return read_ply(self.path / MAP)
+
+    def read_mlp(self) -> dict[str, Tensor]:
+        """Return the weights of the uncertainty MLP."""
+        return torch.load(io.BytesIO(read_bytes(self.path / MLP)), weights_only=True)
 
 
 def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:

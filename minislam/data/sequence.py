@@ -50,6 +50,8 @@ class RecordedSequence:
     def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
         self._recording = recording
         self.depth_scale = options.depth_scale
+        if not source.startswith("synth:"):  # so that it is found again from any folder
+            source = str(Path(source).expanduser().absolute())
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
         self._chosen = chosen[: options.max_frames]
@@ -78,6 +80,7 @@ class RecordedSequence:
         )
         self.name = recording.name
         self.camera = self._prepare.camera
+        self.preparation = self._prepare.steps()
         self.warnings = list(recording.warnings)
         self.refines_focal = options.focal == "refine"
         if options.focal == "auto":
@@ -122,6 +125,10 @@ class RecordedSequence:
         if not 0 <= frame_index < len(self):
             raise IndexError(f"frame {frame_index} of a sequence of {len(self)}")
         return self._chosen[frame_index]
+
+    def source_name(self, frame_index: int) -> str:
+        """Return the name of a frame's image file, or of its video with the number in it."""
+        return self._recording.images.name(self.source_index(frame_index))
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""

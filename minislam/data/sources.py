@@ -30,6 +30,9 @@ class ImageSource(Protocol):
     def label(self, index: int) -> str:
         """Return how to call this image in a message."""
 
+    def name(self, index: int) -> str:
+        """Return a short name of this image, without its folder."""
+
 
 @dataclass
 class FileImages:
@@ -47,6 +50,10 @@ class FileImages:
     def label(self, index: int) -> str:
         """Return the path of an image."""
         return str(self.paths[index])
+
+    def name(self, index: int) -> str:
+        """Return the name of the file."""
+        return self.paths[index].name
 
 
 class VideoImages:
@@ -91,6 +98,10 @@ class VideoImages:
     def label(self, index: int) -> str:
         """Return how to call this frame in a message."""
         return f"frame {index} of {self.path}"
+
+    def name(self, index: int) -> str:
+        """Return the name of the video with the number of the frame."""
+        return f"{self.path.stem}_{index:06d}"
 
     def lost(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing: gaps of a constant rate, or calls that failed."""

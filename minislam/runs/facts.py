@@ -1,9 +1,13 @@
 """What a run reports: run.json with its warnings, and metrics.json."""
 
+import platform
 import sys
 from dataclasses import asdict
 from typing import Any
 
+import cv2
+import numpy as np
+import scipy
 import torch
 from torch import Tensor
 
@@ -28,6 +32,11 @@ def run_facts(
     return {
         "version": minislam.__version__,
         "command": sys.argv,
+        "versions": {
+            "python": platform.python_version(),
+            **{library.__name__: library.__version__ for library in (torch, np, scipy, cv2)},
+        },
+        "platform": platform.platform(),
         "sequence": slam.sequence.description,
         "priors": asdict(choice),
         "seed": slam.config.seed,

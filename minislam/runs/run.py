@@ -1,5 +1,6 @@
 """One run from a name to a folder: read the sequence, do SLAM, measure it, write everything."""
 
+import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from operator import itemgetter
@@ -9,6 +10,8 @@ import torch
 
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
+from minislam.data.animation import encode_animation
+from minislam.data.run_folder import locked
 from minislam.errors import InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
@@ -18,6 +21,8 @@ from minislam.priors.networks.published import find_weights
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms
 from minislam.runs.facts import failed_adjustments, focal_length_note, measure, run_facts
+from minislam.runs.flythrough import clip
+from minislam.runs.loaded import Run, scene_of
 from minislam.runs.pictures import write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
@@ -58,6 +63,45 @@ def load_lpips(trunk: Path | str, heads: Path | str) -> Lpips:
     return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in found))
 
 
+def default_depth(source: str) -> str:
+    """Return the depth prior of a source that is given without one."""
+    return "simulated" if source.startswith("synth:") else "none"
+
+
+def default_output(sequence: Sequence) -> str:
+    """Return a run folder for a run that is given without one."""
+    return f"output/{sequence.name}_{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def run_in_folder(
+    sequence: Sequence,
+    config: SlamConfig,
+    choice: PriorChoice,
+    output: Path | str,
+    observer: Observer | None = None,
+    lpips: Lpips | None = None,
+    overwrite: bool = False,  # replace an earlier run
+    resume: bool = False,  # go on with an interrupted one
+) -> RunOutcome:
+    """Check everything that may be wrong, then run SLAM into a folder of its own.
+
+    Nothing of an earlier run is removed before the checks. The threads of torch are afterwards as
+    they were.
+    """
+    for index in range(len(sequence)):
+        sequence.given_mask(index)
+    priors = choose_priors(choice, sequence, config)
+    threads = torch.get_num_threads()
+    with locked(output):
+        folder = (
+            RunFolder(output) if resume else RunFolder.create(output, overwrite, sequence.files)
+        )
+        try:
+            return run_sequence(sequence, config, choice, priors, folder, observer, lpips, resume)
+        finally:
+            torch.set_num_threads(threads)
+
+
 def run_sequence(
     sequence: Sequence,
     config: SlamConfig,
@@ -95,6 +139,8 @@ def run_sequence(
         _write_estimates(folder, slam)
         metrics = measure(slam, facts["seconds"]["total"], lpips)
         folder.write_metrics(metrics)
+        with suppress(InputError):  # an OpenCV that writes no WebP
+            folder.write_clip(encode_animation(*clip(Run(folder.path)), ".webp"))
         write_pictures(folder, slam, metrics, facts["warnings"])
         folder.write_run(facts)
     except (Exception, KeyboardInterrupt) as error:
@@ -139,3 +185,4 @@ def _write_estimates(folder: RunFolder, slam: Slam) -> None:
     arrays.pop("anchor_keyframe")
     folder.write_map(GaussianArrays(**arrays))
     folder.write_mlp(slam.mapper.mlp.state_dict())
+    folder.write_camera(scene_of(slam))

@@ -1,6 +1,7 @@
 """Figures (matplotlib, no window needed) and the HTML report of a run."""
 
 from minislam.viz.figures import (
+    Figure,
     ate_over_time,
     keyframe_health,
     keyframe_strip,
@@ -10,8 +11,10 @@ from minislam.viz.figures import (
     overview,
     trajectory_plot,
 )
+from minislam.viz.notebook import Page, summary_html
 from minislam.viz.report import build_report
 from minislam.viz.style import (
+    beta_limits,
     beta_to_rgb,
     depth_to_rgb,
     figure_png,
@@ -22,7 +25,10 @@ from minislam.viz.style import (
 from minislam.viz.viewer import build_viewer
 
 __all__ = [
+    "Figure",
+    "Page",
     "ate_over_time",
+    "beta_limits",
     "beta_to_rgb",
     "build_report",
     "build_viewer",
@@ -37,5 +43,6 @@ __all__ = [
     "overview",
     "show_figure",
     "show_image",
+    "summary_html",
     "trajectory_plot",
 ]

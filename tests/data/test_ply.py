@@ -56,8 +56,8 @@ end_header
 
 
 def test_one_gaussian_byte_by_byte():
-    # Colours 0.5, 0.5 + C0 / 4 and 2 (clamped to 1) give f_dc 0, 0.25 and 0.5 / C0; the
-    # quaternion (0, 0, 3, 4) is stored as (0, 0, 0.6, 0.8).
+    # Colours 0.5, 0.5 + C0 / 4 and 2 give f_dc 0, 0.25 and 1.5 / C0: as a colour above 1 renders,
+    # so it is kept. The quaternion (0, 0, 3, 4) is stored as (0, 0, 0.6, 0.8).
     c0 = 0.28209479177387814
     one = GaussianArrays(
         means=np.array([[1.0, 2, 3]]),
@@ -66,7 +66,7 @@ def test_one_gaussian_byte_by_byte():
         opacity_logits=np.array([-4.5]),
         colors=np.array([[0.5, 0.5 + c0 / 4, 2.0]]),
     )
-    values = [1, 2, 3, 0, 0, 0, 0, 0.25, 0.5 / c0, -4.5, -1, -2, -3, 0, 0, 0.6, 0.8]
+    values = [1, 2, 3, 0, 0, 0, 0, 0.25, 1.5 / c0, -4.5, -1, -2, -3, 0, 0, 0.6, 0.8]
     content = encode_ply(one)
     assert content[: len(HEADER_DEGREE_0)] == HEADER_DEGREE_0
     body = content[len(HEADER_DEGREE_0) :]

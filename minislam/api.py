@@ -1,0 +1,66 @@
+"""The door for Python: `run`, `load`, `open_sequence`, as in `import minislam; minislam.run(...)`.
+
+Stable from version to version: the names in `minislam.__all__`, the public attributes of `Run`,
+and the files of a run folder. Everything else may move.
+"""
+
+import threading
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import fields
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from minislam.cli.progress import ProgressLine, ending_signals
+from minislam.config import preset as preset_of
+from minislam.config import with_settings
+from minislam.data import InputOptions, open_sequence
+from minislam.errors import InputError
+from minislam.priors.choice import PriorChoice
+from minislam.runs.loaded import Run
+from minislam.runs.run import default_depth, default_output, run_in_folder
+
+_INPUTS = {field.name for field in fields(InputOptions)}
+_PRIORS = {field.name for field in fields(PriorChoice)}
+
+
+def run(
+    source: str | Path,  # video, image folder, TUM folder, or synth:NAME[:SEED]
+    output: str | Path | None = None,  # run folder; output/NAME_TIME
+    *,
+    preset: str = "laptop",
+    settings: Mapping[str, Any] | None = None,  # by their names with dots: minislam settings
+    overwrite: bool = False,  # replace an earlier run in `output`
+    quiet: bool = False,  # no progress on stderr
+    **options: Any,  # as on the command line: stride, max_frames, fx, depth, device, ...
+) -> Run:
+    """Run SLAM on a sequence, write its folder and return the run, as `minislam run` does.
+
+    The process is left as it was. Raises `MinislamError` where the command would end with a
+    sentence; an interrupt (Ctrl-C, the square of a notebook) ends after the present step, and
+    what is known by then is returned.
+    """
+    inputs = {name: value for name, value in options.items() if name in _INPUTS}
+    priors = {name: value for name, value in options.items() if name in _PRIORS}
+    for name in options.keys() - _INPUTS - _PRIORS:
+        near = get_close_matches(name, _INPUTS | _PRIORS, n=1, cutoff=0)[0]
+        raise InputError(f"expected a known option, found {name}; the nearest is {near}")
+    config = with_settings(preset_of(preset), dict(settings or {}))
+    choice = PriorChoice(**{"depth": default_depth(str(source))} | priors)
+    sequence = open_sequence(str(source), InputOptions(**inputs))
+    output = output or default_output(sequence)
+    progress = ProgressLine()
+    is_main = threading.current_thread() is threading.main_thread()
+    with ending_signals(progress.interrupt) if is_main else nullcontext():
+        observer = None if quiet else progress
+        run_in_folder(sequence, config, choice, Path(output), observer, overwrite=overwrite)
+    return Run(output)
+
+
+def load(folder: str | Path) -> Run:
+    """Return a run that was written earlier, with all that is needed to render its map."""
+    return Run(folder)
+
+
+__all__ = ["InputOptions", "Run", "load", "open_sequence", "run"]

@@ -1,0 +1,93 @@
+"""Images of a finished run in motion: along its trajectory, in a circle, or beside the input."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.runs.loaded import Run
+from minislam.viz import beta_limits, beta_to_rgb
+
+ORBIT_IMAGES, ORBIT_RATE = 90, 20.0  # images per turn; images per second
+ORBIT_RADIUS = 0.1  # of the distance of the point that stays in the centre
+LABELS = ("input", "uncertainty", "static map")
+CLIP_IMAGES, CLIP_WIDTH = 60, 240  # most images of a clip; px, most of each of its three panels
+_RATES = 5.0, 30.0  # images per second, least and most
+_SHOWN_BETAS = 8  # frames from whose beta one range of colours is chosen
+
+
+def frame_rate(run: Run) -> float:
+    """Return how many frames per second the run's source has, between 5 and 30."""
+    steps = [b.timestamp - a.timestamp for a, b in pairwise(run.frames)]
+    return float(np.clip(1 / np.median(steps), *_RATES)) if steps else _RATES[0]
+
+
+def fly_along(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
+    """Yield the static map from the pose of each frame."""
+    for pose in run.poses.values():
+        yield run.render(pose, camera)
+
+
+def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
+    """Yield the static map from a circle around the middle keyframe, which looks at one point.
+
+    The circle is small, since the map holds only what the camera saw.
+    """
+    start = run.poses[_middle(run)]
+    depth = run.render_depth(start)
+    if not (depth > 0).any():
+        raise InputError("expected a map in front of the middle keyframe, found none to fly around")
+    distance = float(np.median(depth[depth > 0]))
+    for angle in np.linspace(0, 2 * np.pi, ORBIT_IMAGES, endpoint=False):
+        aside = ORBIT_RADIUS * np.array([np.sin(angle), np.cos(angle), 0])  # per distance
+        turn = Rotation.from_rotvec([np.arctan(aside[1]), -np.arctan(aside[0]), 0])
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = turn.as_matrix(), distance * aside
+        yield run.render(start @ step, camera)
+
+
+def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarray]:  # (H, 3 W, 3)
+    """Yield input, beta and static map of every n-th frame that has a pose; all betas in one scale.
+
+    Only as much of the source is read as is shown.
+    """
+    shown = list(run.poses)[::every]
+    sampled = shown[:: max(1, len(shown) // _SHOWN_BETAS)]
+    limits = beta_limits(np.stack([run.beta(index) for index in sampled]))
+    size = camera.width, camera.height
+    for index in shown:
+        image = run.sequence.frame(index).image.numpy()
+        beta = beta_to_rgb(run.beta(index), limits)
+        panels = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (image, beta)]
+        row = np.concatenate([*panels, run.render(run.poses[index], camera)], 1)
+        yield _labelled(row, camera.width)
+
+
+def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:
+    """Return the images of a short clip beside the input, and how many per second."""
+    every = -(-len(run.poses) // CLIP_IMAGES)
+    return side_by_side(run, shrunk(run.camera, CLIP_WIDTH), every), frame_rate(run) / every
+
+
+def shrunk(camera: Camera, width: int) -> Camera:
+    """Return the camera for images of at most this width [px]."""
+    scale = min(1.0, width / camera.width)
+    return camera.resized(round(scale * camera.width), round(scale * camera.height))
+
+
+def _labelled(row: np.ndarray, width: int) -> np.ndarray:
+    row = np.round(255 * row).astype(np.uint8)  # the type that OpenCV writes text on
+    for number, label in enumerate(LABELS):
+        place = number * width + 6, 16
+        for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            font = cv2.FONT_HERSHEY_SIMPLEX
+            cv2.putText(row, label, place, font, 0.45, color, thickness, cv2.LINE_AA)
+    return row / 255
+
+
+def _middle(run: Run) -> int:
+    return run.keyframes[len(run.keyframes) // 2]

@@ -1,0 +1,202 @@
+"""A run read back from its folder: camera, poses, map and beta, to render, plot and export."""
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from minislam.config import SlamConfig, from_json
+from minislam.data import GaussianArrays, InputOptions, RecordedSequence, RunFolder, open_sequence
+from minislam.errors import InputError
+from minislam.geometry import Camera, se3_inverse
+from minislam.images import resample
+from minislam.priors.choice import PriorChoice, choose_features
+from minislam.priors.high_resolution import HighResolutionFeatures
+from minislam.priors.interfaces import FeatureExtractor
+from minislam.records import Trajectory
+from minislam.runs.facts import surface_depth
+from minislam.slam import Slam
+from minislam.splatting import GaussianMap, Rendering, render
+from minislam.uncertainty import UncertaintyMLP, beta_of_mask
+from minislam.viz import Figure, Page, overview, summary_html
+
+METRIC, ARBITRARY = "m", "world units"
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """Where a frame of a run comes from."""
+
+    index: int  # position in the run: 0, 1, 2, ...
+    timestamp: float  # second
+    source: str  # name of its image file, or of its video with the number in it
+    keyframe: bool
+
+
+def scene_of(slam: Slam) -> dict[str, Any]:
+    """Return the content of camera.json: what it takes to render the map as the run did."""
+    sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
+    frames = [
+        SourceFrame(index, frame.timestamp, sequence.source_name(index), index in keyframes)
+        for index, frame in enumerate(slam.tracker.tracked)
+    ]
+    return {
+        "sequence": {"name": sequence.name, "description": sequence.description},
+        "camera": asdict(slam.tracker.grid.camera),
+        "unit": METRIC if slam.tracker.keyframes.has_prior else ARBITRARY,
+        "background": slam.mapper.background.tolist(),
+        "preparation": sequence.preparation,
+        "frames": [asdict(frame) for frame in frames],
+    }
+
+
+class Run:
+    """A run on disk: poses are T_world_camera (4, 4), images are RGB in [0, 1].
+
+    The camera's axes: x right, y down, z forward; the centre of the first pixel is (0, 0).
+    What is not in the folder, the input images, is read from the source again.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        """Read the folder of a run that has a map."""
+        self.folder = RunFolder(folder)
+        if not self.folder.has_camera():
+            raise InputError(
+                f"expected a run with a map in {folder}, found no camera.json; give the --output "
+                f"of a finished run, or repeat it: minislam run --config {folder}/config.json"
+            )
+        scene = self.folder.read_camera()
+        try:
+            self.name: str = scene["sequence"]["name"]
+            self.camera = Camera(**scene["camera"])
+            self.unit: str = scene["unit"]
+            self.background = np.array(scene["background"], np.float32).reshape(3)
+            self.frames = [SourceFrame(**frame) for frame in scene["frames"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"expected camera.json of a run in {self.folder.path}, found {error!r}; repeat the "
+                "run, or restore the file"
+            ) from error
+        self.trajectory: Trajectory = self.folder.read_trajectory()
+        self.gaussians: GaussianArrays = self.folder.read_map()
+
+    @cached_property
+    def config(self) -> SlamConfig:
+        """Return the settings of the run."""
+        return from_json(self.folder.read_config())
+
+    @cached_property
+    def poses(self) -> dict[int, np.ndarray]:
+        """Return T_world_camera (4, 4) of every frame that has a pose, by frame index."""
+        rows = zip(self.trajectory.timestamps, self.trajectory.T_world_camera, strict=True)
+        found = {round(stamp, 6): pose for stamp, pose in rows}
+        stamps = {frame.index: round(frame.timestamp, 6) for frame in self.frames}
+        return {index: found[stamp] for index, stamp in stamps.items() if stamp in found}
+
+    @property
+    def keyframes(self) -> list[int]:
+        """Return the frame indices of the keyframes."""
+        return [frame.index for frame in self.frames if frame.keyframe]
+
+    def render(
+        self, T_world_camera: np.ndarray, camera: Camera | None = None
+    ) -> np.ndarray:  # (H, W, 3)
+        """Return the colours of the map, seen from a pose; by default with the run's camera."""
+        return self._rendering(T_world_camera, camera).color.clamp(0, 1).numpy()
+
+    def render_depth(
+        self, T_world_camera: np.ndarray, camera: Camera | None = None
+    ) -> np.ndarray:  # (H, W)
+        """Return the z-depth of the visible surface [unit], 0 where the map is transparent."""
+        return surface_depth(self._rendering(T_world_camera, camera)).numpy()
+
+    def beta(self, frame_index: int) -> np.ndarray:  # (H, W)
+        """Return the uncertainty of any frame by the final MLP; without uncertainty it is 1."""
+        height, width = self.camera.height, self.camera.width
+        settings, sequence = self.config.uncertainty, self.sequence
+        if not settings.enabled:
+            return np.ones((height, width), np.float32)
+        mask = sequence.given_mask(frame_index) if settings.given_masks else None
+        if mask is not None:
+            return beta_of_mask(torch.from_numpy(mask)).numpy()
+        with torch.no_grad():
+            beta = self._mlp(self._features(sequence.frame(frame_index)))
+        return resample(beta, height, width).numpy()
+
+    def plot(self, frame_index: int | None = None) -> Figure:
+        """Return one picture of the run: a frame (by default the middle keyframe) and the path."""
+        index = self.keyframes[len(self.keyframes) // 2] if frame_index is None else frame_index
+        if index not in self.poses:
+            raise InputError(f"expected a frame with a pose, found {index}; see lost_frames.txt")
+        image = self.sequence.frame(index).image.numpy()
+        color = self.render(self.poses[index])
+        return overview(image, self.beta(index), color, self.trajectory, unit=self.unit)
+
+    def view(self, height: int = 620) -> Page:  # px
+        """Return the map to turn with the mouse, as the output of a notebook's cell."""
+        return Page(self.folder.read_viewer(), height)
+
+    def __repr__(self) -> str:
+        """Return the facts of the run in a line."""
+        return f"Run of {self.name}: {', '.join(self._facts().values())}; {self.folder.path}"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of the run: facts, warnings, one picture."""
+        facts = {"run": str(self.folder.path)} | self._facts()
+        warnings = self.folder.read_run()["warnings"]
+        return summary_html(self.name, facts, warnings, self.folder.read_plot("overview"))
+
+    def _facts(self) -> dict[str, str]:
+        return {
+            "frames with a pose": f"{len(self.poses)} of {len(self.frames)} frames",
+            "keyframes": f"{len(self.keyframes)} keyframes",
+            "map": f"{len(self.gaussians)} Gaussians",
+            "unit of length": self.unit,
+        }
+
+    @cached_property
+    def sequence(self) -> RecordedSequence:
+        """Return the source of the run, opened again."""
+        source = self.folder.read_config()["sequence"]
+        sequence = open_sequence(source, self.sequence_options())
+        if len(sequence) < len(self.frames):
+            raise InputError(
+                f"expected the {len(self.frames)} frames of the run in {source}, found "
+                f"{len(sequence)}; restore the source"
+            )
+        return sequence
+
+    def sequence_options(self) -> InputOptions:
+        """Return the options with which the source was opened."""
+        options: dict[str, Any] = dict(self.folder.read_config()["input"])
+        return InputOptions(**options | {"size": options["size"] and tuple(options["size"])})
+
+    @cached_property
+    def _features(self) -> FeatureExtractor:
+        choice = PriorChoice(**self.folder.read_config()["priors"] | {"device": "cpu"})
+        config, factor = self.config, self.config.uncertainty.grid_factor
+        features = choose_features(choice, self.sequence.camera, config.features, config.networks)
+        return HighResolutionFeatures(features, factor) if factor > 1 else features
+
+    @cached_property
+    def _mlp(self) -> UncertaintyMLP:
+        settings = self.config.uncertainty
+        generator = torch.Generator()  # of weights that are replaced at once
+        mlp = UncertaintyMLP(self._features.dimension, generator, settings.hidden_units)
+        mlp.load_state_dict(self.folder.read_mlp())
+        return mlp
+
+    @cached_property
+    def _map(self) -> GaussianMap:
+        rows = {name: torch.from_numpy(values) for name, values in vars(self.gaussians).items()}
+        anchors = torch.zeros(len(self.gaussians), dtype=torch.int64)
+        return GaussianMap(**rows, anchor_keyframe=anchors)
+
+    def _rendering(self, T_world_camera: np.ndarray, camera: Camera | None) -> Rendering:
+        T_camera_world = se3_inverse(torch.from_numpy(np.asarray(T_world_camera, np.float64)))
+        background = torch.from_numpy(self.background)
+        with torch.no_grad():
+            return render(self._map, camera or self.camera, T_camera_world.float(), background)

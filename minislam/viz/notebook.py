@@ -1,0 +1,36 @@
+"""What a notebook shows of a run: HTML that a cell displays, without any library."""
+
+import base64
+from collections.abc import Mapping
+from collections.abc import Sequence as Series
+from html import escape
+
+
+class Page:
+    """A whole HTML page, shown inside a notebook's cell."""
+
+    def __init__(self, html: str, height: int) -> None:
+        self.html = html
+        self.height = height  # px
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame of its own, so that its styles stay inside."""
+        return (
+            f'<iframe srcdoc="{escape(self.html)}" width="100%" height="{self.height}" '
+            'style="border: 0"></iframe>'
+        )
+
+
+def summary_html(
+    title: str, facts: Mapping[str, str], warnings: Series[str], png: bytes | None
+) -> str:
+    """Return the HTML of a small summary: title, facts, warnings, one picture."""
+    rows = "".join(
+        f"<tr><th style='text-align: left'>{escape(name)}</th>"
+        f"<td style='text-align: left'>{escape(value)}</td></tr>"
+        for name, value in facts.items()
+    )
+    notes = "".join(f"<p><b>Warning:</b> {escape(warning)}</p>" for warning in warnings)
+    data = base64.b64encode(png or b"").decode("ascii")
+    picture = f'<img src="data:image/png;base64,{data}" alt="overview">' if png else ""
+    return f"<h4>{escape(title)}</h4><table>{rows}</table>{notes}{picture}"

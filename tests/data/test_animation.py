@@ -1,0 +1,45 @@
+"""Animations are read back by OpenCV: as many images, their size, order and colours."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from minislam.data.animation import encode_animation, write_animation
+from minislam.errors import InputError
+
+REDS = np.linspace(0.1, 0.9, 8)
+
+
+def images():
+    for red in REDS:
+        image = np.full((32, 48, 3), 0.5)
+        image[:, :24, 0] = red
+        yield image
+
+
+def test_webp_holds_the_images_in_order(tmp_path: Path):
+    write_animation(tmp_path / "a.webp", images(), 10.0)
+    _, animation = cv2.imreadanimation(str(tmp_path / "a.webp"))
+    found = [frame[16, 12, 2] / 255 for frame in animation.frames]  # BGR
+    np.testing.assert_allclose(found, REDS, atol=0.05)
+    assert list(animation.durations) == [100] * len(REDS)
+
+
+def test_webm_holds_the_images_in_order(tmp_path: Path):
+    write_animation(tmp_path / "a.webm", images(), 10.0)
+    assert (tmp_path / "a.webm").read_bytes()[:4] == b"\x1a\x45\xdf\xa3"  # EBML, as browsers expect
+    capture = cv2.VideoCapture(str(tmp_path / "a.webm"))
+    found = [capture.read()[1][16, 12, 2] / 255 for _ in REDS]
+    np.testing.assert_allclose(found, REDS, atol=0.05)
+    assert not capture.read()[0]
+
+
+def test_another_kind_and_nothing_to_show_are_said(tmp_path: Path):
+    with pytest.raises(InputError, match=r"ends in \.webm or \.webp, found \.mp4"):
+        write_animation(tmp_path / "a.mp4", images(), 10.0)
+    for kind in (".webm", ".webp"):
+        with pytest.raises(InputError, match="expected this OpenCV"):
+            encode_animation([], 10.0, kind)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,79 @@
+"""Where the camera flies, and that input, beta and map stand beside each other."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from minislam.errors import InputError
+from minislam.geometry import Camera
+from minislam.runs import flythrough
+from minislam.runs.loaded import SourceFrame
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+
+
+class FakeRun:
+    """A run whose renderings are grey by the frame's number and whose poses are recorded."""
+
+    def __init__(self, count: int = 7, depth: float = 2.0) -> None:
+        self.camera = CAMERA
+        self.frames = [SourceFrame(i, i / 12, f"{i}.png", i % 3 == 0) for i in range(count)]
+        self.keyframes = [frame.index for frame in self.frames if frame.keyframe]
+        self.poses = {i: np.eye(4) for i in range(count)}
+        for index, pose in self.poses.items():
+            pose[0, 3] = index
+        self.seen: list[np.ndarray] = []
+        self.depth = depth
+        self.sequence = SimpleNamespace(
+            frame=lambda i: SimpleNamespace(image=torch.full((48, 64, 3), i / 10))
+        )
+
+    def render(self, pose: np.ndarray, camera: Camera) -> np.ndarray:
+        self.seen.append(pose)
+        return np.full((camera.height, camera.width, 3), 0.25, np.float32)
+
+    def render_depth(self, pose: np.ndarray) -> np.ndarray:
+        return np.full((48, 64), self.depth)
+
+    def beta(self, index: int) -> np.ndarray:
+        return np.full((48, 64), 0.1 if index < 3 else 5.0, np.float32)
+
+
+def test_along_the_trajectory_every_pose_is_visited_in_order():
+    run = FakeRun()
+    assert len(list(flythrough.fly_along(run, CAMERA))) == 7
+    np.testing.assert_array_equal([pose[0, 3] for pose in run.seen], range(7))
+    assert flythrough.frame_rate(run) == pytest.approx(12)
+
+
+def test_the_circle_looks_at_one_point_from_one_distance():
+    run = FakeRun()
+    assert len(list(flythrough.fly_around(run, CAMERA))) == flythrough.ORBIT_IMAGES
+    target = run.poses[run.keyframes[1]] @ [0, 0, 2.0, 1]
+    for pose in run.seen:
+        seen = np.linalg.inv(pose) @ target
+        assert np.abs(seen[:2] / seen[2]).max() < 2e-3  # close to the principal point
+        radius = np.linalg.norm(pose[:3, 3] - run.poses[3][:3, 3])
+        assert radius == pytest.approx(0.2)
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+    with pytest.raises(InputError, match="expected a map in front"):
+        next(flythrough.fly_around(FakeRun(depth=0.0), CAMERA))
+
+
+def test_panels_beside_each_other_in_one_scale_of_beta():
+    run = FakeRun()
+    rows = list(flythrough.side_by_side(run, CAMERA))
+    assert rows[4].shape == (48, 3 * 64, 3)
+    assert rows[4][40, 30] == pytest.approx([0.4] * 3, abs=0.01)
+    assert rows[4][40, 160] == pytest.approx([0.25] * 3, abs=0.01)
+    assert rows[0][40, 96].sum() < 0.1 < 2 < rows[6][40, 96].sum()
+
+
+def test_a_clip_of_a_long_run_keeps_its_duration():
+    run = FakeRun(count=130)
+    images, rate = flythrough.clip(run)
+    assert rate == pytest.approx(4)  # 12 per second, every third
+    assert next(images).shape == (48, 3 * 64, 3)  # never enlarged
+    assert flythrough.shrunk(CAMERA.resized(640, 480), 240).height == 180

@@ -1,0 +1,111 @@
+"""A finished run from its folder alone: the same renderings, poses, beta and frames."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import minislam
+from minislam import api
+from minislam.data import RunFolder, open_sequence
+from minislam.errors import InputError
+from minislam.geometry import Camera
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def run(root: Path) -> minislam.Run:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        done = minislam.run(
+            "synth:person", root / "run", preset="test", stride=3, max_frames=10, size=(96, 72),
+            settings={"seed": 3}, quiet=True,
+        )  # fmt: skip
+        assert torch.get_num_threads() == 2  # of the caller
+    finally:
+        torch.set_num_threads(threads)
+    return done
+
+
+def test_every_keyframe_is_rendered_again_within_one_grey_level(run: minislam.Run):
+    again = minislam.load(run.folder.path)
+    assert len(again.keyframes) >= 4
+    for index in again.keyframes:
+        file = run.folder.path / f"keyframes/{index:06d}_render.png"
+        stored = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+        rendered = np.round(255 * again.render(again.poses[index]))
+        assert np.abs(rendered - stored).max() <= 1
+
+
+def test_depth_is_that_of_the_surface_and_a_camera_can_be_given(run: minislam.Run):
+    pose = run.poses[run.keyframes[0]]
+    depth = run.render_depth(pose)
+    assert 1 < np.median(depth[depth > 0]) < 10  # metres in a room
+    small = run.camera.resized(48, 36)
+    assert run.render(pose, small).shape == (36, 48, 3)
+    assert isinstance(small, Camera)
+
+
+def test_frames_know_their_source(run: minislam.Run):
+    assert [frame.index for frame in run.frames] == list(range(10))
+    assert run.frames[1].source == "0.100000.png" and run.frames[1].timestamp == 0.1
+    assert set(run.poses) == {frame.index for frame in run.frames}
+    assert run.unit == "m"
+    np.testing.assert_array_equal(
+        run.sequence.frame(4).image,
+        open_sequence("synth:person", run.sequence_options()).frame(4).image,
+    )
+
+
+def test_beta_is_larger_on_the_person_than_elsewhere(run: minislam.Run):
+    truth = run.sequence.ground_truth
+    assert truth is not None
+    index = run.keyframes[-1]
+    moving, beta = truth.moving_mask(index), run.beta(index)
+    assert moving is not None and beta.shape == moving.shape
+    assert np.median(beta[moving]) > np.median(beta[~moving])
+
+
+def test_what_a_notebook_shows(run: minislam.Run):
+    shown = run._repr_html_()
+    assert "person-0" in shown and "data:image/png;base64," in shown
+    assert "10 of 10 frames" in repr(run)
+    assert len(run.plot(run.keyframes[0]).axes) == 4
+    with pytest.raises(InputError, match="expected a frame with a pose, found 77"):
+        run.plot(77)
+
+
+def test_a_damaged_or_missing_camera_is_said(run: minislam.Run, tmp_path: Path):
+    with pytest.raises(InputError, match="expected a run with a map"):
+        minislam.load(tmp_path)
+    RunFolder(tmp_path).write_camera({"camera": 3})
+    with pytest.raises(InputError, match=r"expected camera\.json of a run"):
+        minislam.load(tmp_path)
+
+
+def test_a_source_with_fewer_frames_is_said(run: minislam.Run, root: Path, tmp_path: Path):
+    for name in ("camera.json", "config.json", "trajectory.txt", "map.ply"):
+        (tmp_path / name).write_bytes((run.folder.path / name).read_bytes())
+    config = json.loads((tmp_path / "config.json").read_text())
+    config["input"]["max_frames"] = 8
+    RunFolder(tmp_path).write_config(config)
+    with pytest.raises(InputError, match="expected the 10 frames of the run"):
+        _ = minislam.load(tmp_path).sequence
+
+
+def test_unknown_options_and_outputs_in_use_are_refused(run: minislam.Run):
+    with pytest.raises(InputError, match="found strid; the nearest is stride"):
+        minislam.run("synth:person", strid=3)
+    with pytest.raises(InputError, match="expected a new or empty output folder"):
+        minislam.run("synth:person", run.folder.path, max_frames=4, size=(96, 72), preset="test")
+
+
+def test_the_door_shows_what_is_stable():
+    assert set(minislam.__all__) - {"__version__"} == set(api.__all__) and dir(minislam)
+    with pytest.raises(AttributeError):
+        minislam.Slam  # noqa: B018
