@@ -10,7 +10,6 @@ MODULES = sorted(p for p in (ROOT / "minislam").glob("*/**/*.py") if p.stem != "
 
 # Modules that hold no logic of their own, or whose every line runs in the tests of another one.
 TESTED_ELSEWHERE: dict[str, str] = {
-    "runs/pictures": "test_slam.py",
     "splatting/constants": "splatting/test_projection.py",
     "splatting/tile_loop": "splatting/test_renderer.py",
     "tracking/config": "test_config.py",

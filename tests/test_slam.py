@@ -32,6 +32,7 @@ METRICS = [
     "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
     "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
+    "psnr_static_db", "path_length", "reprojection_px", "parallax_px",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0
@@ -184,7 +185,10 @@ def test_pictures_and_report_are_there(finished: RunFolder):
     assert len(pictures) == 4 * keyframes
     assert cv2.imread(str(pictures[0])).shape == (72, 96, 3)
     report = (finished.path / "report.html").read_text()
-    assert "ate_all_cm" in report and report.count("<img") == len(plots) - 1 + min(6, keyframes)
+    # One page of keyframes and, where there is one, the clip beside the plots.
+    assert "position error" in report and report.count("<img") == len(plots) + 4 + 1
+    viewer = (finished.path / "viewer.html").read_text()
+    assert viewer.count("data:image/jpeg") == 3 * keyframes
     assert not list(finished.path.rglob("*.tmp"))
 
 

@@ -187,6 +187,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
 def _run(args: argparse.Namespace) -> int:
     from minislam.data import open_sequence
     from minislam.runs.run import default_depth, default_output, run_in_folder
+    from minislam.runs.summary import as_text
 
     if args.resume and args.output is None:
         raise InputError(
@@ -206,9 +207,7 @@ def _run(args: argparse.Namespace) -> int:
         outcome = run_in_folder(
             sequence, config, choice, output, progress, lpips, args.overwrite, args.resume
         )
-    say(f"{outcome.state}:\n  focal length           {outcome.focal_length}")
-    for name, value in outcome.metrics.items():
-        say(f"  {name:22s} {'unknown' if value is None else f'{value:.3f}'}")
+    say("\n".join([f"{outcome.state}:", *as_text(outcome.summary)]))
     for warning in outcome.warnings:
         if warning not in sequence.warnings:
             say(f"WARNING: {warning}", "stderr")

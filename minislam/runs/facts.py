@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 import minislam
+from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MappedView, ate_cm, measure_run
 from minislam.geometry import se3_inverse
@@ -20,6 +21,10 @@ from minislam.records import Trajectory
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Slam
 from minislam.splatting import Rendering
+from minislam.tracking.bundle_adjustment import residuals
+from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.reprojection import lengths
+from minislam.tracking.safeguards.diagnostics import weighted_median
 
 _OPAQUE = 0.5  # a less opaque pixel shows a gap rather than a surface
 
@@ -51,9 +56,11 @@ def run_facts(
         "adjustments": adjustments,
         "failed_adjustments": failed,
         "gaussians": len(slam.mapper.gaussians),
+        "unit": "m" if slam.tracker.keyframes.has_prior else "world units",
         "camera": asdict(slam.tracker.grid.camera),
         "focal_length": {"used": focal_length_note(slam)}
-        | (asdict(slam.focal_length) if slam.focal_length else {}),
+        | (asdict(slam.focal_length) if slam.focal_length else {})
+        | ({"is_doubtful": slam.focal_length.is_doubtful} if slam.focal_length else {}),
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
         "segments": slam.tracker.watch.segments,
         "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],
@@ -79,15 +86,19 @@ def focal_length_note(slam: Slam) -> str:
 
 def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     """Return the content of metrics.json."""
-    views = [
-        MappedView(
+    views, likeness = [], []
+    for index, keyframe in enumerate(slam.mapper.keyframes):
+        rendering = slam.mapper.render(keyframe.T_camera_world)
+        view = MappedView(
             keyframe.frame_index,
             se3_inverse(keyframe.T_camera_world).numpy(),
             slam.beta_image(index) if slam.config.uncertainty.is_learnt else None,
-            surface_depth(slam.mapper.render(keyframe.T_camera_world)).numpy(),
+            surface_depth(rendering).numpy(),
         )
-        for index, keyframe in enumerate(slam.mapper.keyframes)
-    ]
+        views.append(view)
+        static = slam.mapper.static_weight(slam.mapper.beta_of(keyframe), slam.mapper.camera) > 0
+        if static.any():
+            likeness.append(psnr(rendering.color.clamp(0, 1), keyframe.image, static))
     metrics: dict[str, Any] = measure_run(
         slam.sequence.ground_truth,
         slam.trajectory(),
@@ -101,7 +112,24 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     metrics["seconds_total"] = seconds
     metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds
     metrics["peak_memory_mb"] = peak_memory_mb()
-    return metrics
+    metrics["psnr_static_db"] = float(np.mean(likeness)) if likeness else None
+    return metrics | _ties(slam)
+
+
+def _ties(slam: Slam) -> dict[str, float | None]:
+    """Return how long the path is and how well poses, depths and flow agree, without any truth."""
+    graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
+    parallaxes = [keyframe.parallax for keyframe in slam.tracker.watch.diagnostics]
+    links, error = range(len(graph.links.edges())), None
+    if links:
+        problem = bundle_problem(graph, links, 0, 0.0)
+        distances = lengths(residuals(problem, graph.state)[0])
+        error = weighted_median(distances, problem.weights[:, 0])
+    return {
+        "path_length": float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
+        "reprojection_px": error,
+        "parallax_px": float(np.median(parallaxes)) if parallaxes else None,
+    }
 
 
 def _segment_errors(slam: Slam) -> dict[str, float | None]:

@@ -1,62 +1,181 @@
-"""The pictures of a run folder: keyframe images, plots and the report."""
+"""The pictures of a run folder: keyframe images, plots, the viewer and the report."""
+
+import shlex
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
+from minislam.config import PRESETS, SlamConfig, preset, settings_of
 from minislam.data import RunFolder
+from minislam.data.images import encode_jpeg
+from minislam.errors import InputError
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
-from minislam.runs.facts import focal_length_note
+from minislam.runs.facts import surface_depth
+from minislam.runs.summary import summarise
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
 from minislam.viz import (
+    Report,
     ate_over_time,
+    beta_limits,
     beta_to_rgb,
     build_report,
+    build_viewer,
+    depth_limits,
     depth_to_rgb,
     figure_png,
     keyframe_health,
-    keyframe_strip,
     loss_curves,
     map_growth,
     overview,
+    picture_url,
     trajectory_plot,
 )
 
-MAX_STRIPS = 6  # keyframes shown in the report
+MAX_SHOWN = 150  # keyframes in report and viewer, evenly spread: 40 kB each
+LONGEST_SIDE = 320  # px of their pictures there
+COLOUR_SAMPLES = 6  # keyframes from which the colours of all are chosen
+PREVIEW_FRACTION = 0.01  # of a run's time that writing reports before its end may take [-]
+
+
+class Preview:
+    """Keeps a report in the folder from the first map on, while the run goes on."""
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self._last, self._cost = 0.0, 0.0  # second: when the last one was written, how long it took
+
+    def refresh(self, slam: Slam, facts: Callable[[], dict[str, Any]]) -> None:
+        """Write the report if there is a map and a new report is due."""
+        begun = time.perf_counter()
+        if slam.mapper.keyframes and begun - self._last >= self._cost / PREVIEW_FRACTION:
+            self.write(slam, facts())
+            self._last = time.perf_counter()
+            self._cost = self._last - begun
+
+    def write(self, slam: Slam, facts: dict[str, Any]) -> None:
+        """Write the report of what is known so far. A full disk does not end the run."""
+        newest = len(slam.mapper.keyframes) - 1
+        keyframe = slam.mapper.keyframes[newest]
+        color = slam.mapper.render(keyframe.T_camera_world).color.numpy()
+        strip = [keyframe.image.numpy(), beta_to_rgb(slam.beta_image(newest)), color]
+        jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
+        with suppress(InputError):
+            self._folder.write_report(_report(self._folder, slam, {}, facts, picture_url(jpeg)))
 
 
 def write_pictures(
-    folder: RunFolder, slam: Slam, metrics: dict[str, float | None], warnings: list[str]
+    folder: RunFolder, slam: Slam, metrics: dict[str, float | None], facts: dict[str, Any]
 ) -> None:
-    """Write keyframe images, plots and the report."""
-    estimate, true_path, unit = slam.trajectory(), None, "world units"
+    """Write keyframe images, plots, viewer and report."""
+    estimate, true_path, unit = slam.trajectory(), None, facts["unit"]
     plots: dict[str, tuple[str, bytes]] = {}  # caption and PNG, by name
+    plots["health"] = "How much of the flow poses and depths explain, by keyframe", _health(slam)
     truth = slam.sequence.ground_truth
     if metrics["ate_all_cm"] is not None and truth is not None and truth.trajectory is not None:
         error = absolute_trajectory_error(estimate, truth.trajectory, max_difference=MAX_DIFFERENCE)
         estimate, true_path, unit = error.estimate, error.truth, "m"
         over_time = figure_png(ate_over_time(estimate.timestamps, error.errors, unit))
-        plots["ate_over_time"] = "Error over time", over_time
-    plots["trajectory"] = "Trajectory", figure_png(trajectory_plot(estimate, true_path, unit))
+        plots["ate_over_time"] = "Error of the camera's position over time", over_time
+    path = figure_png(trajectory_plot(estimate, true_path, unit))
+    plots["trajectory"] = "Path of the camera, from above and from behind", path
     history = slam.mapper.history
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
-    plots["losses"] = "Losses", figure_png(loss_curves(curves))
+    plots["losses"] = "Losses while the map was optimised", figure_png(loss_curves(curves))
     plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
-    plots["health"] = "Do motion and depth explain the flow?", _health(slam)
-    for name, (_, png) in plots.items():
-        folder.write_plot(name, png)
 
-    strips = _write_keyframes(folder, slam)
+    limits = _colour_limits(slam)
+    jpegs = _write_keyframes(folder, slam, *limits)
     middle = len(slam.mapper.keyframes) // 2
     keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
     color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).numpy()
     picture = overview(keyframe.image.numpy(), beta, color, estimate, true_path, unit)
-    folder.write_plot("overview", figure_png(picture))
-    summary = {"focal_length": focal_length_note(slam)}
-    summary |= {name: _shown(value) for name, value in metrics.items()}
-    figures = [plots.pop("trajectory"), *strips, *plots.values()]
-    title = f"minislam: {slam.sequence.name}"
-    folder.write_report(build_report(title, summary, warnings, figures))
+    png = figure_png(picture)
+    folder.write_plot("overview", png)
+    for name, (_, plot) in plots.items():
+        folder.write_plot(name, plot)
+    folder.write_viewer(_viewer(slam, jpegs))
+    folder.write_report(
+        _report(folder, slam, metrics, facts, picture_url(png), jpegs, limits, plots)
+    )
+
+
+def _report(
+    folder: RunFolder,
+    slam: Slam,
+    metrics: dict[str, float | None],
+    facts: dict[str, Any],
+    picture: str,  # address of the overview
+    jpegs: dict[int, list[bytes]] | None = None,
+    limits: tuple[tuple[float, float], tuple[float, float]] = ((0, 1), (0.1, 1)),
+    plots: dict[str, tuple[str, bytes]] | None = None,
+) -> str:
+    nearest, changed = changed_settings(slam.config)
+    return build_report(
+        Report(
+            title=f"minislam: {slam.sequence.name}",
+            state=facts["state"],
+            description=slam.sequence.description,
+            warnings=facts["warnings"],
+            overview=picture,
+            summary=[
+                (line.what, line.value, line.verdict, line.detail or line.meaning)
+                for line in summarise(metrics, facts)
+            ],
+            keyframes=jpegs or {},
+            depth_limits=limits[0],
+            beta_limits=limits[1],
+            unit=facts["unit"],
+            figures=list((plots or {}).values()),
+            command=shlex.join(["minislam", *facts["command"][1:]]),
+            preset=nearest,
+            settings=changed,
+            next_commands=_next_commands(shlex.quote(str(folder.path)), facts),
+        )
+    )
+
+
+def _next_commands(folder: str, facts: dict[str, Any]) -> list[tuple[str, str]]:
+    if facts["state"].startswith("running"):
+        return []
+    if facts["exit_code"] in (1, 130):  # failed, interrupted
+        return [(f"minislam run --resume -o {folder}", "Go on with this run:")]
+    return [
+        (f"minislam render {folder} --path orbit -o fly.webp", "Fly around the map:"),
+        (f"minislam export {folder} --nerfstudio DIR", "Train a larger model from it:"),
+        (f"minislam run --config {folder}/config.json -o NEW_FOLDER", "Repeat it, changed:"),
+    ]
+
+
+def changed_settings(config: SlamConfig) -> tuple[str, dict[str, tuple[str, str]]]:
+    """Return the nearest preset and the settings that differ from it: the value, the preset's."""
+    found: dict[str, dict[str, tuple[str, str]]] = {}
+    for name in PRESETS:
+        usual, now = settings_of(preset(name)), settings_of(config)
+        found[name] = {
+            key: (str(now[key]), str(usual[key])) for key in now if now[key] != usual[key]
+        }
+    nearest = min(found, key=lambda name: len(found[name]))
+    return nearest, found[nearest]
+
+
+def _viewer(slam: Slam, jpegs: dict[int, list[bytes]]) -> str:
+    trajectory = slam.trajectory()
+    frame_at = {tracked.timestamp: tracked.frame_index for tracked in slam.tracker.tracked}
+    frames = [frame_at[stamp] for stamp in trajectory.timestamps.tolist()]
+    return build_viewer(
+        f"minislam: {slam.sequence.name}",
+        slam.mapper.gaussians.to_arrays(),
+        slam.mapper.camera,
+        slam.mapper.background.numpy(),
+        dict(zip(frames, trajectory.T_world_camera, strict=True)),
+        len(slam.tracker.tracked),
+        {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()},
+    )
 
 
 def _health(slam: Slam) -> bytes:
@@ -71,25 +190,41 @@ def _health(slam: Slam) -> bytes:
     return figure_png(figure)
 
 
-def _write_keyframes(folder: RunFolder, slam: Slam) -> list[tuple[str, bytes]]:
-    """Write the pictures of all keyframes; return some of them as strips with captions."""
-    strips: list[tuple[str, bytes]] = []
-    count = len(slam.mapper.keyframes)
-    shown = set(np.linspace(0, count - 1, min(MAX_STRIPS, count)).round().astype(int).tolist())
+def _spread(count: int, most: int) -> list[int]:
+    """Return at most `most` of `count` positions, the first and the last among them."""
+    return sorted(set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()))
+
+
+def _colour_limits(slam: Slam) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the depths and the betas between which all keyframes are coloured."""
+    depths, betas = [], []
+    for index in _spread(len(slam.mapper.keyframes), COLOUR_SAMPLES):
+        rendering = slam.mapper.render(slam.mapper.keyframes[index].T_camera_world)
+        depths.append(surface_depth(rendering).numpy())
+        betas.append(slam.beta_image(index))
+    return depth_limits(np.array(depths)), beta_limits(np.array(betas))
+
+
+def _write_keyframes(
+    folder: RunFolder,
+    slam: Slam,
+    of_depth: tuple[float, float],  # world units, limits of the colours
+    of_beta: tuple[float, float],
+) -> dict[int, list[bytes]]:  # frame_index: JPEG of input, depth, beta, render
+    """Write the pictures of all keyframes; return small ones for report and viewer."""
+    jpegs: dict[int, list[bytes]] = {}
+    shown = set(_spread(len(slam.mapper.keyframes), MAX_SHOWN))
     for index, keyframe in enumerate(slam.mapper.keyframes):
         rendering = slam.mapper.render(keyframe.T_camera_world)
-        image, beta = keyframe.image.numpy(), slam.beta_image(index)
-        color, depth = rendering.color.clamp(0, 1).numpy(), rendering.depth.numpy()
-        number = keyframe.frame_index
-        folder.write_keyframe_image(number, "input", image)
-        folder.write_keyframe_image(number, "render", color)
-        folder.write_keyframe_image(number, "depth", depth_to_rgb(depth))
-        folder.write_keyframe_image(number, "beta", beta_to_rgb(beta))
+        pictures = {
+            "input": keyframe.image.numpy(),
+            "depth": depth_to_rgb(surface_depth(rendering).numpy(), of_depth),
+            "beta": beta_to_rgb(slam.beta_image(index), of_beta),
+            "render": rendering.color.clamp(0, 1).numpy(),
+        }
+        for kind, picture in pictures.items():
+            folder.write_keyframe_image(keyframe.frame_index, kind, picture)
         if index in shown:
-            strip = figure_png(keyframe_strip(image, depth, beta, color, f"frame {number}"))
-            strips.append((f"Keyframe {index}, frame {number}", strip))
-    return strips
-
-
-def _shown(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.3f}"
+            small = [encode_jpeg(picture, LONGEST_SIDE) for picture in pictures.values()]
+            jpegs[keyframe.frame_index] = small
+    return jpegs

@@ -20,11 +20,12 @@ from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.priors.networks.published import find_weights
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms
-from minislam.runs.facts import failed_adjustments, focal_length_note, measure, run_facts
+from minislam.runs.facts import failed_adjustments, measure, run_facts
 from minislam.runs.flythrough import clip
 from minislam.runs.loaded import Run, scene_of
-from minislam.runs.pictures import write_pictures
+from minislam.runs.pictures import Preview, write_pictures
 from minislam.runs.resume import Checkpoints
+from minislam.runs.summary import Line, summarise
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer, SilentObserver
 
@@ -36,7 +37,7 @@ class RunOutcome:
     """The result of a finished or interrupted run, for the command line to print."""
 
     metrics: dict[str, float | None]
-    focal_length: str  # which one was used, and where it comes from
+    summary: list[Line]  # what is known, in words
     warnings: list[str]
     exit_code: int
     state: str  # "finished", "interrupted", ... as in run.json
@@ -115,11 +116,12 @@ def run_sequence(
     """Run SLAM, or with `resume` the rest of it, and write the folder, however the run ends."""
     torch.set_num_threads(config.threads)
     checkpoints = Checkpoints(folder, sequence, config, choice)
-    alarms = Alarms(observer or SilentObserver())
+    alarms, preview = Alarms(observer or SilentObserver()), Preview(folder)
 
     def between_steps(force: bool) -> None:
         alarms.check(slam)
         checkpoints.save(slam, force)
+        preview.refresh(slam, lambda: run_facts(slam, choice, checkpoints, "running", None))
 
     slam = Slam(sequence, config, priors, observer, between_steps)
     if resume:
@@ -141,19 +143,21 @@ def run_sequence(
         folder.write_metrics(metrics)
         with suppress(InputError):  # an OpenCV that writes no WebP
             folder.write_clip(encode_animation(*clip(Run(folder.path)), ".webp"))
-        write_pictures(folder, slam, metrics, facts["warnings"])
+        write_pictures(folder, slam, metrics, facts)
         folder.write_run(facts)
     except (Exception, KeyboardInterrupt) as error:
         state, exit_code = f"failed: {str(error) or repr(error)}", FAILED_EXIT
         if isinstance(error, KeyboardInterrupt):
             state, exit_code = "interrupted", INTERRUPTED_EXIT
         with suppress(Exception):  # a full disk: the first error is the one to hear of
-            folder.write_run(run_facts(slam, choice, checkpoints, state, exit_code))
+            facts = run_facts(slam, choice, checkpoints, state, exit_code)
+            folder.write_run(facts)
             _write_trajectories(folder, slam)
+            preview.write(slam, facts)
         raise
     if not interrupted:
         folder.remove_checkpoint()
-    return RunOutcome(metrics, focal_length_note(slam), facts["warnings"], exit_code, state)
+    return RunOutcome(metrics, summarise(metrics, facts), facts["warnings"], exit_code, state)
 
 
 def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:

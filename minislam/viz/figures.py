@@ -126,7 +126,7 @@ def keyframe_health(
     lost: Series[int],  # frame_index
 ) -> Figure:
     """Draw how well poses and depths explain the flow, and where the run is broken or lost."""
-    figure = new_figure(WIDE)
+    figure = new_figure((WIDE[0], 2.2))
     axes = figure.subplots()
     axes.plot(frames, [np.nan if e is None else e for e in explained], marker=".", **ESTIMATE_STYLE)
     axes.axhline(least, color="gray", linestyle=":", label="least of a healthy keyframe")
@@ -135,6 +135,7 @@ def keyframe_health(
         axes.axvspan(first - 0.5, last + 0.5, color="tab:red", alpha=0.25, label=label)
     axes.plot(lost, np.zeros(len(lost)), "|", color="black", label="lost" if len(lost) else None)
     axes.set(xlabel="frame", ylabel="explained flow", ylim=(-0.05, 1.05))
+    axes.set_xlim(-0.5, max([1, *frames, *lost]) + 0.5)
     axes.legend(loc="lower left")
     axes.grid(alpha=0.3)
     return figure

@@ -1,60 +1,145 @@
-"""The report of a run: one HTML file that needs no other file, no network and no script."""
+"""The report of a run: one HTML page with its pictures inside; report.html is its frame."""
 
-import base64
+import json
 from collections.abc import Mapping
 from collections.abc import Sequence as Series
+from dataclasses import dataclass, field
 from html import escape
+from importlib.resources import files
+from string import Template
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em;
-       color: #222; background: #fff; }
-table { border-collapse: collapse; }
-td, th { padding: 0.2em 1em 0.2em 0; text-align: left; vertical-align: top; }
-tr + tr { border-top: 1px solid #ddd; }
-.warning { border-left: 4px solid #e08000; background: #fff6e8; padding: 0.4em 0.8em; }
-figure { margin: 1.5em 0; } img { max-width: 100%; } figcaption { color: #555; }
-""".strip()
+import numpy as np
+
+from minislam.viz.style import beta_to_rgb, depth_to_rgb
+from minislam.viz.viewer import picture_url
+
+_STOPS = 9  # colours of a colour bar
+_VIEWER = """<section class="waiting"><iframe id="viewer" src="viewer.html" title="the map, to be
+turned by hand"></iframe><p class="dim">Drag to turn, wheel or pinch to come nearer.</p></section>
+<section><h2>The clip</h2><figure><img src="clip.webp" alt="input, uncertainty, static map"
+onerror="this.closest('section').remove()"><figcaption>Input, uncertainty and static map of every
+frame.</figcaption></figure></section>"""
+_BUTTONS = """<div class="buttons"><a href="viewer.html">Turn the map</a>
+<a href="map.ply">map.ply</a><a href="trajectory.txt">trajectory.txt</a></div>"""
+
+_SO_FAR = """<p class="dim">Input, uncertainty and map so far, of the newest keyframe. This page
+renews itself until the run is finished.</p>"""
 
 
-def build_report(
-    title: str,
-    summary: Mapping[str, str],  # what -> value, in the order of the table
-    warnings: Series[str],
-    figures: Series[tuple[str, bytes]],  # (caption, PNG)
-) -> str:
-    """Return the HTML of a report: summary table, warnings, then the figures in order."""
-    rows = "\n".join(
-        f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>"
-        for name, value in summary.items()
+@dataclass(frozen=True)
+class Report:
+    """What a report shows. A part that is left out is not shown."""
+
+    title: str
+    state: str  # "finished", "interrupted", "running", ...
+    description: str = ""  # of the sequence, one line
+    warnings: Series[str] = ()
+    overview: str = ""  # address of a picture
+    summary: Series[tuple[str, str, str, str]] = ()  # what, value with unit, verdict, meaning
+    keyframes: Mapping[int, Series[bytes]] = field(default_factory=dict)
+    # frame_index: JPEG of input, depth, beta, render
+    depth_limits: tuple[float, float] = (0.0, 1.0)  # of the colours [unit]
+    beta_limits: tuple[float, float] = (0.1, 1.0)
+    unit: str = "world units"
+    figures: Series[tuple[str, bytes]] = ()  # caption, PNG
+    command: str = ""
+    preset: str = ""
+    settings: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # name: value, preset's
+    next_commands: Series[tuple[str, str]] = ()  # command, what it does
+
+
+def build_report(report: Report) -> str:
+    """Return the HTML of a report."""
+    is_running = report.state.startswith("running")
+    template = files("minislam.viz").joinpath("report.html").read_text(encoding="utf-8")
+    return Template(template).substitute(
+        title=escape(report.title),
+        state=escape(report.state),
+        state_class="running" if is_running else report.state.split(",")[0].split(":")[0],
+        description=escape(report.description),
+        warnings="\n".join(f'<p class="warning">{escape(text)}</p>' for text in report.warnings),
+        overview=_overview(report, is_running),
+        results="" if is_running else _VIEWER,
+        summary="\n".join(_row(*line) for line in report.summary),
+        keyframes=_keyframes(report) if report.keyframes else "",
+        figures="\n".join(_figure(caption, png) for caption, png in report.figures),
+        command=escape(report.command),
+        settings=_settings(report),
+        next=_next(report.next_commands),
     )
-    notes = "\n".join(f'<p class="warning">{escape(warning)}</p>' for warning in warnings)
-    pictures = "\n".join(_figure(caption, png) for caption, png in figures)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>
-{_STYLE}
-</style>
-</head>
-<body>
-<h1>{escape(title)}</h1>
-{notes}
-<table>
-{rows}
-</table>
-{pictures}
-</body>
-</html>
-"""
+
+
+def _overview(report: Report, is_running: bool) -> str:
+    if not report.overview:
+        return ""
+    alternative = "input, uncertainty, static map and path of one keyframe"
+    image = f'<div class="wide"><img src="{report.overview}" alt="{alternative}"></div>'
+    return image + (_SO_FAR if is_running else _BUTTONS)
+
+
+def _row(what: str, value: str, verdict: str, meaning: str) -> str:
+    return (
+        f'<tr><th>{escape(what)}</th><td class="value">{escape(value)}</td>'
+        f'<td class="verdict"><span class="{verdict}">{verdict}</span></td>'
+        f'<td class="meaning dim">{escape(meaning)}</td></tr>'
+    )
+
+
+def _keyframes(report: Report) -> str:
+    """Return the slider over the keyframes, with the scales of the colours."""
+    pages = [(frame, list(map(picture_url, jpegs))) for frame, jpegs in report.keyframes.items()]
+    low, high = report.beta_limits
+    depths, betas = np.linspace(*report.depth_limits, _STOPS), np.geomspace(low, high, _STOPS)
+    scales = {
+        "input": "",
+        "depth of the map": _scale(
+            depth_to_rgb(depths[None], report.depth_limits), depths, report.unit
+        ),
+        "uncertainty \u03b2": _scale(beta_to_rgb(betas[None], report.beta_limits), betas, ""),
+        "static map": "",
+    }
+    pictures = "".join(
+        f'<figure><img src="{url}" alt="{name}"><figcaption>{name}</figcaption>{scale}</figure>'
+        for url, (name, scale) in zip(pages[0][1], scales.items(), strict=True)
+    )
+    return (
+        f'<h2>Keyframes</h2><div class="four">{pictures}</div>'
+        f'<input type="range" id="keyframe" min="0" max="{len(pages) - 1}" value="0" '
+        f'aria-label="keyframe"><small>{len(pages)} keyframes; this one is frame '
+        f'<span id="frame">{pages[0][0]}</span>. Grey depth: the map shows nothing. Bright \u03b2: '
+        "something moves; from 1.4 on the map leaves it out.</small>"
+        f'<script type="application/json" id="pictures">{json.dumps(pages)}</script>'
+    )
+
+
+def _scale(colors: np.ndarray, values: np.ndarray, unit: str) -> str:
+    """Return a colour bar (1, N, 3) with its smallest, middle and largest number."""
+    stops = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * colors[0])
+    numbers = [f"<span>{values[place]:.2g}</span>" for place in (0, _STOPS // 2)]
+    numbers.append(f"<span>{values[-1]:.2g} {unit}</span>")
+    return (
+        f'<div class="bar" style="background:linear-gradient(to right, {stops})"></div>'
+        f'<div class="numbers">{"".join(numbers)}</div>'
+    )
+
+
+def _settings(report: Report) -> str:
+    rows = "".join(
+        f"<tr><th><code>{escape(name)}</code></th><td>{escape(value)}</td>"
+        f'<td class="dim">instead of {escape(usual)}</td></tr>'
+        for name, (value, usual) in report.settings.items()
+    )
+    if not rows:
+        return f"<p>All settings are those of the preset {report.preset}.</p>"
+    return f"<p>Settings that differ from the preset {report.preset}:</p><table>{rows}</table>"
+
+
+def _next(commands: Series[tuple[str, str]]) -> str:
+    rows = "".join(f"<p>{escape(does)}</p><pre>{escape(text)}</pre>" for text, does in commands)
+    return f"<section><h2>What to do next</h2>{rows}</section>" if rows else ""
 
 
 def _figure(caption: str, png: bytes) -> str:
-    data = base64.b64encode(png).decode("ascii")
-    alternative = escape(caption, quote=True)
-    return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{alternative}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
+    text = escape(caption, quote=True)
+    image = f'<img src="{picture_url(png)}" alt="{text}">'
+    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"

@@ -79,10 +79,17 @@ def depth_to_rgb(
     """Colour a depth map: viridis from near to far, grey where unknown."""
     depth = np.asarray(depth, dtype=np.float64)
     known = np.isfinite(depth) & (depth > 0)
-    low, high = limits or (np.quantile(depth[known], _QUANTILES) if known.any() else (0.0, 1.0))
+    low, high = limits or depth_limits(depth)
     colored = _mapped(np.where(known, depth, low), low, high, _DEPTH_COLORMAP)
     colored[~known] = _UNKNOWN_RGB
     return colored
+
+
+def depth_limits(depth: np.ndarray) -> tuple[float, float]:
+    """Return the nearest and the farthest depth of the colours, for maps of any shape."""
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    low, high = np.quantile(known, _QUANTILES) if len(known) else (0.0, 1.0)
+    return float(low), float(high)
 
 
 def beta_to_rgb(

@@ -49,7 +49,7 @@ def build_viewer(
             [index, np.round(pose[:3].astype(float), 6).ravel().tolist()]
             for index, pose in sorted(poses.items())
         ],
-        "keyframes": {index: list(map(jpeg_url, jpegs)) for index, jpegs in keyframes.items()},
+        "keyframes": {index: list(map(picture_url, jpegs)) for index, jpegs in keyframes.items()},
     }
     # "<" could end the script element that holds the data.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
@@ -57,9 +57,10 @@ def build_viewer(
     return template.replace(_PLACE_OF_THE_DATA, text)
 
 
-def jpeg_url(jpeg: bytes) -> str:
-    """Return a picture as the address that a page uses for it, the picture itself inside."""
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
+def picture_url(picture: bytes) -> str:
+    """Return a PNG or JPEG as the address that a page uses for it, the picture itself inside."""
+    kind = "png" if picture.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64," + base64.b64encode(picture).decode("ascii")
 
 
 def _base64(values: np.ndarray) -> str:

@@ -8,6 +8,7 @@ from minislam import slam
 from minislam.cli.main import main
 from minislam.data import RunFolder
 from minislam.errors import InputError
+from minislam.runs import pictures
 from minislam.tracking import bundle_adjustment
 
 pytestmark = pytest.mark.slow
@@ -19,13 +20,20 @@ COMMAND = [
 SAME = ("trajectory.txt", "keyframe_trajectory.txt", "map.ply", "config.json")
 
 
-def test_config_json_alone_gives_the_same_bytes_again(root: Path):
+def test_config_json_alone_gives_the_same_bytes_again(root: Path, monkeypatch):
     assert main([*COMMAND, "-o", str(root / "first")]) == 0
     config = str(root / "first/config.json")
+    reports: list[str] = []
+    # The second run writes a report after every step: not a byte of its results may change.
+    monkeypatch.setattr(pictures, "PREVIEW_FRACTION", float("inf"))
+    monkeypatch.setattr(pictures.RunFolder, "write_report", lambda _, html: reports.append(html))
     assert main(["run", "--config", config, "-o", str(root / "again")]) == 0
     for name in SAME:
         first, again = (root / run / name for run in ("first", "again"))
         assert first.read_bytes() == again.read_bytes(), name
+    running = [html for html in reports if "state running" in html]
+    assert len(running) > 20 and len(reports) == len(running) + 1
+    assert "data:image/jpeg" in running[0] and "location.reload" in running[0]
     facts = RunFolder(root / "again").read_run()
     assert facts["failed_adjustments"] == 0 < facts["adjustments"]
 

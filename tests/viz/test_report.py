@@ -1,16 +1,81 @@
-"""The report: one HTML file, escaped, the same bytes for the same run."""
+"""The report: one HTML page, escaped, its pictures inside, the same bytes for the same run."""
 
-from minislam.viz import build_report, figure_png, new_figure
+import json
+import re
+
+import numpy as np
+
+from minislam.viz import Report, build_report, depth_to_rgb, figure_png, new_figure
+
+PNG = figure_png(new_figure((2, 2)), dpi=20)
+JPEGS = {0: [b"input", b"depth", b"beta", b"map"], 7: [b"i", b"d", b"b", b"m"]}
 
 
-def test_a_report_needs_no_other_file():
-    png = figure_png(new_figure((2, 2)), dpi=20)
-    html = build_report("run <1>", {"ATE": "1 & 2"}, ["focal length guessed"], [("a < b", png)])
-    assert html.startswith("<!DOCTYPE html>")
-    assert "run &lt;1&gt;" in html and "1 &amp; 2" in html and "a &lt; b" in html
-    assert '<p class="warning">focal length guessed</p>' in html
-    assert html.count("data:image/png;base64,") == 1
-    assert "<script" not in html and "http" not in html
-    assert html == build_report(
-        "run <1>", {"ATE": "1 & 2"}, ["focal length guessed"], [("a < b", png)]
+def report(**parts: object) -> str:
+    return build_report(Report("run <1>", parts.pop("state", "finished"), **parts))
+
+
+def test_a_report_shows_its_pictures_without_the_rest_of_the_folder():
+    html = report(
+        summary=[("ATE", "1 & 2 cm", "good", "a < b")],
+        warnings=["focal length <guessed>"],
+        figures=[("a < b", PNG)],
+        keyframes=JPEGS,
     )
+    assert html.startswith("<!DOCTYPE html>") and "http" not in html
+    assert "run &lt;1&gt;" in html and "1 &amp; 2 cm" in html and html.count("a &lt; b") == 3
+    assert '<span class="good">good</span>' in html
+    assert '<p class="warning">focal length &lt;guessed&gt;</p>' in html
+    assert html.count("data:image/png;base64,") == 1
+    # Only the viewer and the clip are files of their own; without them their places vanish.
+    beside = re.findall(r'src="(?!data:)([^"]*)"', html)
+    assert beside == ["viewer.html", "clip.webp"]
+    assert "onerror" in html and 'class="waiting"' in html
+    assert html == report(
+        summary=[("ATE", "1 & 2 cm", "good", "a < b")],
+        warnings=["focal length <guessed>"],
+        figures=[("a < b", PNG)],
+        keyframes=JPEGS,
+    )
+
+
+def test_a_part_that_is_not_known_is_not_shown():
+    html = report()
+    assert "Keyframes" not in html and "What to do next" not in html
+    assert '<section id="figures"></section>' in html  # the style hides an empty one
+
+
+def test_the_slider_reaches_every_keyframe():
+    html = report(keyframes=JPEGS)
+    pages = json.loads(re.search(r'id="pictures">(.*?)</script>', html)[1])
+    assert [frame for frame, _ in pages] == [0, 7] and all(len(urls) == 4 for _, urls in pages)
+    assert 'min="0" max="1"' in html
+    assert html.count(pages[0][1][0]) == 2  # the first is shown before the slider moves
+
+
+def test_the_scales_say_their_numbers_in_the_colours_of_the_pictures():
+    html = report(keyframes=JPEGS, depth_limits=(1.0, 5.0), beta_limits=(0.1, 10.0), unit="m")
+    numbers = re.findall(r"<span>([^<]*)</span>", html)
+    assert numbers == ["1", "3", "5 m", "0.1", "1", "10 "]  # beta is coloured by its logarithm
+    red, green, blue = 255 * depth_to_rgb(np.array([[5.0]]), (1.0, 5.0))[0, 0]
+    assert f"rgb({red:.0f} {green:.0f} {blue:.0f})" in html
+
+
+def test_settings_and_commands_are_said():
+    html = report(
+        command="minislam run a.mp4",
+        preset="laptop",
+        settings={"tracking.window": ("9", "7")},
+        next_commands=[("minislam render X", "Fly:")],
+    )
+    assert "differ from the preset laptop" in html and "<code>tracking.window</code>" in html
+    assert "<pre>minislam run a.mp4</pre>" in html and "<pre>minislam render X</pre>" in html
+    assert "All settings are those of the preset test" in report(preset="test")
+
+
+def test_a_running_report_renews_itself_and_promises_no_viewer():
+    html = report(state="running", overview="data:,")
+    assert 'class="state running"' in html and "viewer.html</a></th>" in html
+    assert "<iframe" not in html and 'class="buttons"' not in html
+    for state, kind in {"finished, broken": "finished", "failed: disk full": "failed"}.items():
+        assert f'class="state {kind}">{state}<' in report(state=state)

@@ -1,0 +1,56 @@
+"""What a report says of settings and next steps, and when one is written before the end."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from minislam.config import preset
+from minislam.runs import pictures
+from minislam.runs.pictures import MAX_SHOWN, Preview, changed_settings
+
+
+def test_settings_are_compared_with_the_nearest_preset():
+    assert changed_settings(preset("test")) == ("test", {})
+    assert changed_settings(preset("paper-fast"))[0] == "paper-fast"
+    config = replace(preset("laptop"), seed=4)
+    assert changed_settings(config) == ("laptop", {"seed": ("4", "0")})
+
+
+@pytest.mark.parametrize(
+    ("state", "code", "words"),
+    [("running", None, []), ("interrupted", 130, ["--resume"]), ("failed: x", 1, ["--resume"]),
+     ("finished", 0, ["render", "export", "--config"])],
+)  # fmt: skip
+def test_the_next_command_fits_the_end(state: str, code: int | None, words: list[str]):
+    found = pictures._next_commands("out/my", {"state": state, "exit_code": code})
+    assert len(found) == len(words)
+    for (command, _), word in zip(found, words, strict=True):
+        assert command.startswith("minislam ") and word in command and "out/my" in command
+
+
+def test_of_many_keyframes_some_are_shown_the_first_and_the_last_among_them():
+    assert pictures._spread(3, MAX_SHOWN) == [0, 1, 2] and pictures._spread(0, MAX_SHOWN) == []
+    many = pictures._spread(1000, MAX_SHOWN)
+    assert len(many) == MAX_SHOWN and (many[0], many[-1]) == (0, 999)
+
+
+def test_a_preview_waits_for_a_map_and_then_keeps_its_share_of_the_time(monkeypatch):
+    now, written = [100.0], []
+    monkeypatch.setattr(pictures.time, "perf_counter", lambda: now[0])
+    preview = Preview(None)
+
+    def write(slam: object, facts: dict) -> None:
+        written.append(now[0])
+        now[0] += 0.5  # second that it takes
+
+    monkeypatch.setattr(preview, "write", write)
+    slam = SimpleNamespace(mapper=SimpleNamespace(keyframes=[]))
+    preview.refresh(slam, dict)
+    assert written == []  # no map yet
+    slam.mapper.keyframes.append(object())
+    for _ in range(200):
+        preview.refresh(slam, dict)
+        now[0] += 1.0
+    assert written[0] == 100.0 and len(written) == 4
+    assert 0.5 / (written[1] - written[0]) <= pictures.PREVIEW_FRACTION
