@@ -12,14 +12,15 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from minislam.cli.progress import ProgressLine, ending_signals
+from minislam.cli.progress import ProgressLine, ending_signals, plan_of
 from minislam.config import preset as preset_of
 from minislam.config import with_settings
 from minislam.data import InputOptions, open_sequence
+from minislam.data.options import default_depth
 from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run
-from minislam.runs.run import default_depth, default_output, run_in_folder
+from minislam.runs.run import default_output, run_in_folder
 
 _INPUTS = {field.name for field in fields(InputOptions)}
 _PRIORS = {field.name for field in fields(PriorChoice)}
@@ -51,6 +52,7 @@ def run(
     sequence = open_sequence(str(source), InputOptions(**inputs))
     output = output or default_output(sequence)
     progress = ProgressLine()
+    progress.plan = plan_of(config, choice, sequence)
     is_main = threading.current_thread() is threading.main_thread()
     with ending_signals(progress.interrupt) if is_main else nullcontext():
         observer = None if quiet else progress

@@ -106,15 +106,15 @@ def preset(name: str) -> SlamConfig:
     return with_settings(SlamConfig(), PRESETS[name])
 
 
-def meanings_of(config: Any) -> dict[str, str]:
-    """Return the meaning of each value of a configuration, by its name with dots."""
-    return {name: metadata["meaning"] for name, _, metadata in _leaves(config)}
+def metadata_of(config: Any) -> dict[str, Mapping[str, Any]]:
+    """Return meaning, least and most of each value of a configuration, by its name with dots."""
+    return {name: metadata for name, _, metadata in _leaves(config)}
 
 
 def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
     """Return the configuration with values replaced; they are given by their names with dots."""
     known = settings_of(config)
-    metadata = {name: metadata for name, _, metadata in _leaves(config)}
+    metadata = metadata_of(config)
     for name, value in settings.items():
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)

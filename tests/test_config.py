@@ -11,7 +11,7 @@ from minislam.config import (
     as_json,
     flattened,
     from_json,
-    meanings_of,
+    metadata_of,
     preset,
     settings_of,
     with_settings,
@@ -61,7 +61,7 @@ def test_settings_of_deeper_parts_are_named_with_more_dots():
 
 
 def test_every_setting_says_what_it_means():
-    meanings = meanings_of(SlamConfig())
+    meanings = {name: data["meaning"] for name, data in metadata_of(SlamConfig()).items()}
     assert set(meanings) == set(settings_of(SlamConfig()))
     assert [name for name, meaning in meanings.items() if len(meaning) < 8] == []
 

@@ -24,8 +24,9 @@ def add_eval_parser(subparsers: argparse._SubParsersAction) -> argparse.Argument
         "pose error (RPE); both files in TUM format. Without -a, -s and --no_align a Sim(3) is "
         "fitted first, since a monocular estimate has no scale of its own.",
     )
+    parser.add_argument("format", nargs="?", choices=["tum"], help="as evo asks for, or nothing")
     parser.add_argument("reference", help="ground truth, TUM format")
-    parser.add_argument("estimate", help="estimated trajectory, TUM format")
+    parser.add_argument("estimate", help="estimated trajectory, TUM format, or a run folder")
     parser.add_argument("-a", "--align", action="store_true", help="fit rotation and translation")
     parser.add_argument("-s", "--correct_scale", action="store_true", help="fit the scale")
     parser.add_argument("--no_align", action="store_true", help="fit nothing")
@@ -55,9 +56,12 @@ def add_eval_parser(subparsers: argparse._SubParsersAction) -> argparse.Argument
 
 def run_eval(args: argparse.Namespace) -> int:
     """Compare two trajectory files; return the exit code."""
+    from minislam.data.run_folder import TRAJECTORY
     from minislam.data.trajectory import read_trajectory
     from minislam.evaluation.trajectory import absolute_trajectory_error
 
+    if Path(args.estimate).is_dir():
+        args.estimate = str(Path(args.estimate) / TRAJECTORY)
     estimate, truth = read_trajectory(args.estimate), read_trajectory(args.reference)
     alignment = _alignment(args)
     result = absolute_trajectory_error(

@@ -9,18 +9,20 @@ import argparse
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
+from minislam.cli.help import UsageError, unknown_option
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
     from minislam.config import SlamConfig
     from minislam.data import InputOptions
     from minislam.evaluation.lpips import Lpips
-    from minislam.geometry import Camera
-    from minislam.priors.choice import PriorChoice
+    from minislam.priors.names import PriorChoice
+
+PRESETS = ("laptop", "paper", "paper-fast", "test")  # of minislam.config, which needs torch
 
 
 def add_input(parser: argparse.ArgumentParser) -> None:
-    """Add the sequence, and a flag for every field of InputOptions. This needs torch."""
+    """Add the sequence, and a flag for every field of InputOptions."""
     from minislam.data import InputOptions
 
     parser.add_argument(
@@ -40,12 +42,14 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         )
 
 
-def add_priors(parser: argparse.ArgumentParser, default_depth: str) -> None:
-    """Add the options that choose features and depth. Their names are checked with the weights."""
+def add_priors(
+    parser: argparse.ArgumentParser, default_depth: str, with_flow: bool = False
+) -> None:
+    """Add the options that choose features and depth, and the flow, which only a run needs."""
     group = parser.add_argument_group(
         "priors",
-        "networks need their official checkpoints: minislam weights list; FILE is a path, or one "
-        "of those names, and without it the one that is called like the network is taken",
+        "networks need their official checkpoints: minislam weights list\n"
+        "FILE: a path, or a name of that list; without it the file called like the network",
     )
     group.add_argument(
         "--features",
@@ -61,13 +65,18 @@ def add_priors(parser: argparse.ArgumentParser, default_depth: str) -> None:
         "--depth-weights", metavar="FILE", help="checkpoint of metric3d or depth-anything"
     )
     group.add_argument("--device", help="where networks run: cpu or cuda; cpu")
+    if with_flow:
+        group.add_argument("--flow", help="classical, droid or python:MODULE:FUNCTION; classical")
+        group.add_argument("--flow-weights", metavar="FILE", help="checkpoint of droid")
 
 
-def add_flow(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the flow, which only a run needs."""
-    group = parser.add_argument_group("flow")
-    group.add_argument("--flow", help="classical, droid or python:MODULE:FUNCTION; classical")
-    group.add_argument("--flow-weights", metavar="FILE", help="checkpoint of droid")
+def add_talk(parser: argparse.ArgumentParser) -> None:
+    """Add how much is said."""
+    how_much = parser.add_mutually_exclusive_group()
+    how_much.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
+    how_much.add_argument(
+        "-v", "--verbose", action="store_true", help="every step, and the settings that differ"
+    )
 
 
 def add_lpips(parser: argparse.ArgumentParser) -> None:
@@ -78,23 +87,36 @@ def add_lpips(parser: argparse.ArgumentParser) -> None:
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add the presets and a flag for every setting. This needs torch."""
-    from minislam.config import PRESETS, SlamConfig, meanings_of, settings_of
-
+    """Add the presets and what stands over them. `take_settings` finds names with a dot."""
+    parser.set_defaults(takes_settings=True)
     parser.add_argument("--preset", help=f"{', '.join(PRESETS)}; laptop")
     parser.add_argument("--config", help="JSON file of settings; config.json of a run repeats it")
     parser.add_argument("--seed", type=int, help="seed of every random draw, 0")
+    parser.add_argument("--threads", help="threads of torch, 1")
+    parser.add_argument("--checkpoint_fraction", help="see minislam settings checkpoint; 0.01")
     parser.add_argument(
         "--no-uncertainty", action="store_true", help="give every pixel the same weight (ablation)"
     )
-    group = parser.add_argument_group("settings", "every setting by its name, with its default")
-    meanings = meanings_of(SlamConfig())
-    for name, value in settings_of(SlamConfig()).items():
-        if name == "seed":
+
+
+def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
+    """Return what is no setting, and the values of settings like --tracking.window 8 by name.
+
+    Names with a dot are settings. Which of them there are is known only with torch.
+    """
+    rest: list[str] = []
+    given: dict[str, str] = {}
+    todo = iter(arguments)
+    for argument in todo:
+        name, equals, value = argument.partition("=")
+        if not (name.startswith("--") and "." in name):
+            rest.append(argument)
             continue
-        shown = ",".join(map(str, value)) if isinstance(value, tuple) else value
-        meaning = f"{meanings[name]}; {shown}".replace("%", "%%")
-        group.add_argument(f"--{name}", dest=f"set:{name}", metavar="VALUE", help=meaning)
+        found = value if equals else next(todo, None)
+        if found is None:
+            raise UsageError(f"expected a value after {name}, found none; give one")
+        given[name.removeprefix("--")] = found
+    return rest, given
 
 
 def size_of(text: str) -> tuple[int, int]:
@@ -107,12 +129,13 @@ def size_of(text: str) -> tuple[int, int]:
 
 def config_file(args: argparse.Namespace) -> dict[str, Any]:
     """Return the file given with --config, or config.json of the run that --resume goes on with."""
-    from minislam.data import RunFolder
     from minislam.data.files import read_json
 
     if args.config:
         tree = read_json(args.config)
     elif getattr(args, "resume", False):
+        from minislam.data import RunFolder
+
         tree = RunFolder(args.output).read_config()
     else:
         return {}
@@ -141,7 +164,7 @@ def input_options(args: argparse.Namespace) -> InputOptions:
 
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
     """Return the priors: those of the file of --config, replaced by what is given."""
-    from minislam.priors.choice import PriorChoice
+    from minislam.priors.names import PriorChoice
 
     return PriorChoice(**{"depth": default_depth, **_section(args, "priors", PriorChoice)})
 
@@ -180,10 +203,8 @@ def _converted(value: Any, kind: type) -> Any:
     return kind(value)
 
 
-def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
-    """Return the measure whose files were given, if it can be taken at this size of images."""
-    from minislam.runs.run import load_lpips
-
+def lpips_of(args: argparse.Namespace) -> Lpips | None:
+    """Return the measure whose files were given."""
     trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
     if trunk is None and heads is None:
         return None
@@ -192,9 +213,9 @@ def lpips_of(args: argparse.Namespace, camera: Camera) -> Lpips | None:
         raise InputError(
             f"expected --lpips-{missing} FILE with --lpips-{given}, found none; give both or none"
         )
-    lpips = load_lpips(trunk, heads)
-    lpips.require_size(camera.width, camera.height)
-    return lpips
+    from minislam.runs.run import load_lpips
+
+    return load_lpips(trunk, heads)
 
 
 def settings(args: argparse.Namespace) -> SlamConfig:
@@ -220,19 +241,27 @@ def resumed_settings(args: argparse.Namespace) -> SlamConfig:
     return then
 
 
+def changed_settings(config: SlamConfig) -> dict[str, Any]:
+    """Return the settings that differ from the defaults."""
+    from minislam.config import SlamConfig, settings_of
+
+    default = settings_of(SlamConfig())
+    return {name: v for name, v in settings_of(config).items() if v != default[name]}
+
+
 def _with_given(args: argparse.Namespace, base: SlamConfig) -> SlamConfig:
-    from minislam.config import settings_in, with_settings
+    from minislam.config import settings_in, settings_of, with_settings
     from minislam.data.files import read_json
 
     if args.config:
         base = with_settings(base, settings_in(read_json(args.config)))
-    given = {
-        name.removeprefix("set:"): value
-        for name, value in vars(args).items()
-        if name.startswith("set:") and value is not None
-    }
-    if args.seed is not None:
-        given["seed"] = args.seed
+    known, given = settings_of(base), dict(args.settings)
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise unknown_option(f"--{unknown[0]}", args.parser)
+    for name in ("seed", "threads", "checkpoint_fraction"):
+        if getattr(args, name) is not None:
+            given[name] = getattr(args, name)
     if args.no_uncertainty:
         given["uncertainty.enabled"] = False
     if getattr(args, "masks", None):

@@ -13,9 +13,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minislam.cli.options import input_options, prior_choice, settings, source_of
+from minislam.cli.help import add_help
+from minislam.cli.options import (
+    add_input,
+    add_priors,
+    add_settings,
+    input_options,
+    prior_choice,
+    settings,
+    source_of,
+)
 from minislam.cli.progress import ProgressLine
+from minislam.data.options import require_source
 from minislam.errors import InputError
+from minislam.priors.names import require_priors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,31 +45,37 @@ def add_priors_parser(subparsers: argparse._SubParsersAction) -> argparse.Argume
         "priors",
         help="write features and depth of every frame to files, to run SLAM on elsewhere",
         usage="minislam priors SEQUENCE --out DIR [--features NAME] [--depth NAME] [options]",
+        add_help=False,
         allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    add_help(parser)
     parser.add_argument(
         "--out", required=True, metavar="DIR", help="gets the folders features and depth"
     )
+    add_settings(parser)
+    add_input(parser)
+    add_priors(parser, default_depth="none")
     parser.set_defaults(run=run_priors)
     return parser
 
 
 def run_priors(args: argparse.Namespace) -> int:
     """Write the priors that are asked for; return the exit code."""
-    import torch
-
-    from minislam.data import open_sequence
-
-    config, choice = settings(args), prior_choice(args, default_depth="none")
+    source, inputs, choice = source_of(args), input_options(args), prior_choice(args, "none")
+    require_source(source)
+    require_priors(choice)
     if args.features is None and choice.depth == "none":
         raise InputError(
             "expected --features or --depth, found neither; name at least one to write"
         )
+    import torch
+
+    from minislam.data import open_sequence
+
+    config, progress = settings(args), ProgressLine()
     torch.set_num_threads(config.threads)
-    progress = ProgressLine()
-    sequence = open_sequence(
-        source_of(args), input_options(args), partial(progress.show, "making frames")
-    )
+    sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
     print(sequence.description)
     out = Path(args.out).expanduser()
     kinds = _kinds(choice, args.features is not None, sequence, config)

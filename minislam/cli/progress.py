@@ -9,9 +9,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from minislam.config import SlamConfig
+    from minislam.priors.names import PriorChoice
+    from minislam.records import Sequence
 
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
-
+REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
+TRUST = 0.1  # fraction of the plan by which it resists the first measurements
 
 # What asks a program to end: Ctrl-C, a scheduler or `docker stop`, a closed terminal (not Windows).
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
@@ -39,17 +46,51 @@ def ending_signals(handler: Callable[[int, FrameType | None], object]) -> Iterat
             signal.signal(number, earlier)
 
 
-class ProgressLine:
-    """One line per stage with rate and time left; off a terminal, a plain line every 10 %.
+def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list[dict[str, float]]:
+    """Return the stages of a run: what each shows, and about its seconds on one idle core.
 
-    The first signal that comes to `interrupt` is deferred to the end of the current step, when
-    the state is consistent. A second one ends the program at once.
+    The figures come from runs of the demo, synth:crowd:61 and synth:table2:61, where about every
+    fifth frame was a keyframe. What the results take at the end is never shown, hence "".
+    """
+    mapping, has_prior, frames = config.mapping, choice.depth != "none", len(sequence)
+    scale = sequence.camera.width * sequence.camera.height / REFERENCE_PIXELS
+    per_frame, iteration = frames * scale, 0.24 * mapping.image_scale * scale
+    first_map = {"first map": iteration * mapping.init_iterations}
+    late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
+    online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
+    posing = {"posing all frames": 0.12 * per_frame}
+    again = {**posing, "coarse depth": 0.05 * per_frame, "second adjustment": 0.1 * per_frame}
+    stages = [
+        {"tracking and mapping": 0.25 * per_frame + online} | (first_map if has_prior else {}),
+        {"final adjustment": 0.05 * per_frame},
+        again if config.uncertainty.enabled else {},
+        posing,
+        {} if has_prior else {"dense depth": 0.25 * per_frame} | first_map,
+        {"refining the map": iteration * mapping.refine_iterations},
+        {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
+    ]
+    stages[-1 if stages[-1] else -2][""] = 0.1 * per_frame
+    return [stage for stage in stages if stage]
+
+
+class ProgressLine:
+    """One line per stage with its rate, and the time of the whole run if there is a plan.
+
+    Off a terminal it is a plain line every 10 %. The first signal that comes to `interrupt` is
+    deferred to the end of the current step, when the state is consistent. A second one ends the
+    program at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, is_quiet: bool = False, is_verbose: bool = False) -> None:
+        self.plan: list[dict[str, float]] = []  # see `plan_of`; without it, no time of the whole
         self._begun: dict[str, tuple[float, int]] = {}  # stage: time [s] and steps when first shown
         self._shown: dict[str, float] = {}  # stage: fraction done in the last plain line
-        self._terminal = sys.stderr.isatty()
+        self._stage = 0  # of the plan
+        self._fractions: dict[tuple[int, str], float] = {}  # done of each part of a stage
+        self._start: tuple[float, float] | None = None  # time [s] and planned seconds done then
+        self._stream = "stdout" if is_quiet else "stderr"  # a quiet stdout still reaches log.txt
+        self._terminal = sys.stderr.isatty() and not (is_quiet or is_verbose)
+        self._plain_step = 0.0 if is_verbose else PLAIN_STEP
         self._should_stop = False
 
     def show(self, stage: str, done: int, total: int) -> None:
@@ -57,15 +98,45 @@ class ProgressLine:
         now = time.perf_counter()
         start, done_at_start = self._begun.setdefault(stage, (now, done))
         seconds, steps = now - start, done - done_at_start
-        text = f"{stage}: {done}/{total}"
+        fraction = done / max(total, 1)
+        number, in_all = self._whole(stage, fraction, now)
+        text = f"{number}{stage}: {done}/{total}"
         if done >= total:
             text += f" ({seconds:.0f} s)"
+            del self._begun[stage]  # it may come again
         elif steps and seconds:
             rate = steps / seconds
-            text += f" ({rate:.1f}/s, {(total - done) / rate:.0f} s left)"
+            left = "" if in_all else f", {(total - done) / rate:.0f} s left"
+            text += f" ({rate:.1f}/s{left})"
+        text += in_all
         if self._should_stop:
             text += ", stopping after this step; Ctrl-C again stops at once"
-        self._print(stage, text, done / max(total, 1))
+        self._print(stage, text, fraction)
+
+    def _whole(self, name: str, fraction: float, now: float) -> tuple[str, str]:
+        """Return which stage of the plan this is, and how long the run takes in all.
+
+        What is left of the plan takes as many times longer than planned as what is done has
+        taken. At first little is done, so TRUST of the whole plan counts as done as planned: the
+        estimate begins with the plan and moves from there slowly.
+        """
+        if not self.plan:
+            return "", ""
+        for index in range(self._stage, len(self.plan)):
+            if self._fractions.get((index, name), 0.0) < 1 and name in self.plan[index]:
+                self._stage = index
+                self._fractions[index, name] = fraction
+                break
+        planned = [sum(stage.values()) for stage in self.plan]
+        present = self.plan[self._stage].items()
+        done = sum(planned[: self._stage])
+        done += sum(cost * self._fractions.get((self._stage, part), 0.0) for part, cost in present)
+        self._start = self._start or (now, done)
+        taken, trusted = now - self._start[0], TRUST * sum(planned)
+        slowness = (taken + trusted) / (done - self._start[1] + trusted)
+        in_all = taken + (sum(planned) - done) * slowness
+        number = f"stage {self._stage + 1} of {len(self.plan)}, "
+        return number, f", about {_duration(in_all)} in all"
 
     def warn(self, text: str) -> None:
         """Print a warning on a line of its own."""
@@ -80,12 +151,19 @@ class ProgressLine:
         if self._terminal:
             end = "\n" if fraction >= 1 else ""
             say(f"\r\033[K{text}", "stderr", end)
-        elif fraction >= 1 or fraction >= self._shown.get(stage, 0.0) + PLAIN_STEP:
-            self._shown[stage] = fraction
-            say(text, "stderr")
+        elif fraction >= 1 or fraction >= self._shown.get(stage, 0.0) + self._plain_step:
+            self._shown[stage] = fraction % 1  # 0 when it is done, since it may come again
+            say(text, self._stream)
 
     def interrupt(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal."""
         if self._should_stop:
             raise KeyboardInterrupt
         self._should_stop = True
+
+
+def _duration(seconds: float) -> str:
+    """Return a rough duration for people, rounded so that it does not flicker."""
+    if seconds < 100:
+        return f"{5 * max(1, round(seconds / 5))} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -47,6 +47,18 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
         ) from error
 
 
+def require_free(folder: Path | str, overwrite: bool, also: str = "") -> None:
+    """Refuse an output folder that holds files, unless it may be overwritten."""
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"expected an output folder, but {folder} is a file; choose another name")
+    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
+        raise InputError(
+            f"expected a new or empty output folder, but {folder} holds files; choose another name "
+            f"or add --overwrite{also}"
+        )
+
+
 def write_text(path: Path | str, text: str) -> None:
     """Write a UTF-8 text file atomically, with Unix line ends on every system.
 

@@ -70,3 +70,8 @@ def require_source(source: str) -> None:
             f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
             f"{source} does not exist; check the path"
         )
+
+
+def default_depth(source: str) -> str:
+    """Return the depth prior of a source that is given without one."""
+    return "simulated" if source.startswith(SYNTHETIC) else "none"

@@ -50,21 +50,42 @@ def read_ply(path: Path | str) -> GaussianArrays:
     return decode_ply(read_bytes(path), str(path))
 
 
-def encode_ply(gaussians: GaussianArrays) -> bytes:
-    """Return the bytes of a PLY file of a Gaussian map."""
+def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
+    """Return the bytes of a PLY file of a Gaussian map.
+
+    Some viewers insist on spherical harmonics of degree 3. Ours are of degree 0, so the
+    coefficients above are zeros.
+    """
     _validate(gaussians, "the map")
+    zeros = np.zeros((len(gaussians), 3 * ((sh_degree + 1) ** 2 - 1)))
+    before, after = PROPERTIES[:9], PROPERTIES[9:]
+    names = [*before, *(f"f_rest_{index}" for index in range(zeros.shape[1])), *after]
     columns = [
         gaussians.means,
         np.zeros_like(gaussians.means),  # normals, which no viewer reads
         # Viewers clamp colours outside [0, 1] in different ways, so it is done here.
         (gaussians.colors - 0.5) / _SH_C0,
+        zeros,
         gaussians.opacity_logits[:, None],
         gaussians.log_scales,
         _normalised(gaussians.quats_wxyz),
     ]
     table = np.concatenate([column.astype("<f4") for column in columns], axis=1)
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
-    lines += [f"property float {name}" for name in PROPERTIES] + ["end_header"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    return ("\n".join(lines) + "\n").encode("ascii") + table.tobytes()
+
+
+def encode_points(
+    points: np.ndarray,  # (N, 3) world units
+    colors: np.ndarray,  # (N, 3) uint8 RGB
+) -> bytes:
+    """Return the bytes of a PLY file of a plain coloured point cloud."""
+    table = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    table["xyz"], table["rgb"] = points, colors
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    lines += [f"property float {name}" for name in "xyz"]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")] + ["end_header"]
     return ("\n".join(lines) + "\n").encode("ascii") + table.tobytes()
 
 

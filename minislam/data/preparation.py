@@ -74,6 +74,16 @@ class ImagePreparation:
             image = cv2.resize(image, self._resized, interpolation=cv2.INTER_AREA)
         return self._cropped(image).astype(np.float32) / np.float32(255)
 
+    def full_color(self, raw: np.ndarray, label: str = "an image") -> np.ndarray:  # (H, W, 3) uint8
+        """Undistort a colour image and cut unseen borders, at the size of the source."""
+        self._require_size(raw, label)
+        return np.ascontiguousarray(self._undistorted(raw, cv2.INTER_LINEAR))
+
+    def full_camera(self, camera: Camera) -> Camera:
+        """Return the camera of such an image from that of the working image: the steps back."""
+        left, top = self._crop
+        return camera.cropped(-left, -top, *self._resized).resized(*self._window[2:])
+
     def nearest(
         self,
         raw: np.ndarray,  # (H, W)

@@ -18,6 +18,7 @@ from minislam.data.files import (
     read_bytes,
     read_json,
     read_text,
+    require_free,
     write_json,
     write_text,
 )
@@ -87,15 +88,7 @@ class RunFolder:
     ) -> "RunFolder":
         """Make a new run folder; with `overwrite`, remove what an earlier run wrote, only that."""
         path = Path(path)
-        if path.exists() and not path.is_dir():
-            raise InputError(
-                f"expected an output folder, but {path} is a file; choose another name"
-            )
-        if path.is_dir() and any(path.iterdir()) and not overwrite:
-            raise InputError(
-                f"expected a new or empty output folder, but {path} holds files; choose another "
-                "name or add --overwrite (or --resume, to go on with an interrupted run)"
-            )
+        require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if path.is_dir() else ():
             file.unlink()
         for folder in (KEYFRAMES, PLOTS):

@@ -16,6 +16,7 @@ from minislam.data.preparation import ImagePreparation
 from minislam.data.recording import RecordedTruth, Recording, mask_files, path_of
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
+from minislam.geometry import Camera
 from minislam.records import Frame, GroundTruth
 
 _SYNTHETIC_SIZE = (320, 240)  # px
@@ -119,6 +120,16 @@ class RecordedSequence:
         image = self._prepare.color(raw, self._recording.images.label(index))
         timestamp = float(self._recording.timestamps[index])
         return Frame(frame_index, timestamp, torch.from_numpy(image))
+
+    def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
+        """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""
+        index = self.source_index(frame_index)
+        images = self._recording.images
+        return self._prepare.full_color(images.read(index), images.label(index))
+
+    def full_camera(self, camera: Camera) -> Camera:
+        """Return the camera of `full_image` from that of the working images."""
+        return self._prepare.full_camera(camera)
 
     def source_index(self, frame_index: int) -> int:
         """Return the position of a frame in the source, before start and stride."""

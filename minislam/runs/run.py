@@ -64,11 +64,6 @@ def load_lpips(trunk: Path | str, heads: Path | str) -> Lpips:
     return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in found))
 
 
-def default_depth(source: str) -> str:
-    """Return the depth prior of a source that is given without one."""
-    return "simulated" if source.startswith("synth:") else "none"
-
-
 def default_output(sequence: Sequence) -> str:
     """Return a run folder for a run that is given without one."""
     return f"output/{sequence.name}_{time.strftime('%Y%m%d-%H%M%S')}"

@@ -127,6 +127,16 @@ def test_relative_errors_are_those_of_evo(files, tmp_path: Path):
         assert statistics["rmse"] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse))
 
 
+def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path: Path, capsys):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/trajectory.txt").write_text(Path(files[1]).read_text())
+    said = []
+    for names in (files, ("tum", *files), (files[0], str(tmp_path / "run"))):
+        assert run_eval(parse(*names, "-as")) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] == said[2]
+
+
 # Errors
 
 

@@ -19,7 +19,9 @@ pytestmark = pytest.mark.slow
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (20, 27, 3)).astype(np.uint8)
 # What a failed run may leave.
-RUN_FILES = {"checkpoint.npz", "config.json", "keyframes", "plots", "run.json"}
+RUN_FILES = {
+    "camera.json", "checkpoint.npz", "config.json", "keyframes", "log.txt", "plots", "run.json"
+}  # fmt: skip
 
 
 def texture(shift: int) -> np.ndarray:
@@ -48,35 +50,7 @@ def the_sentence(capsys: pytest.CaptureFixture[str]) -> str:
     return said[0]
 
 
-# Help and doctor
-
-
-@pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["eval"], ["doctor"], ["weights"]])
-def test_every_command_has_help(command: list[str], capsys):
-    with pytest.raises(SystemExit) as ended:
-        main([*command, "--help"])
-    assert ended.value.code == 0
-    text = capsys.readouterr().out
-    assert "usage: minislam" in text and "--help" in text
-
-
-def test_help_names_every_setting_with_its_meaning_and_default(capsys):
-    with pytest.raises(SystemExit):
-        main(["run", "--help"])
-    text = " ".join(capsys.readouterr().out.split())
-    assert "--tracking.window VALUE newest keyframes that the local BA moves; 10" in text
-    assert "--features.windows VALUE" in text and "1,3,5" in text
-
-
-@pytest.mark.parametrize("command", [[], ["eval"], ["doctor"], ["weights"]])
-def test_help_answers_without_torch(command: list[str]):
-    program = (
-        "import sys\nfrom minislam.cli.main import main\n"
-        f"try: main({[*command, '--help']!r})\n"
-        "except SystemExit: print('torch' in sys.modules, 'numpy' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == "False False", done.stderr
+# Doctor and evaluation
 
 
 def test_the_module_is_the_command():
@@ -258,20 +232,24 @@ def test_an_unknown_setting_in_a_file_names_the_nearest(tree: dict, tmp_path: Pa
     assert "the nearest is tracking.window" in the_sentence(capsys)
 
 
-def test_an_unknown_option_names_the_nearest_setting_and_is_wrong_usage(capsys):
-    assert run("synth:crowd", "--tracking.windw", 3) == 2
-    assert "found --tracking.windw; the nearest setting is --tracking.window" in the_sentence(
-        capsys
+def test_settings_may_stand_before_the_sequence(tmp_path: Path, capsys):
+    assert main(["run", "--tracking.window", "0", str(images(tmp_path / "in", [texture(0)]))]) == 1
+    assert "tracking.window of at least 1" in the_sentence(capsys)
+
+
+def test_quiet_prints_warnings_only_and_the_log_has_everything(tmp_path: Path, capsys):
+    source, out = images(tmp_path / "in", [texture(0), texture(3)]), tmp_path / "out"
+    assert run(source, "-o", out, "--mapping.refine_iterations", "2", "-q") == 0
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.count("\n") == printed.err.count("WARNING: ") > 0
+    rows = (out / "log.txt").read_text().splitlines()
+    assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", row) for row in rows)
+    assert "image folder: 2 of 2 images" in rows[0] and "results in" in "".join(rows)
+    assert any(re.search(r"stage \d of \d, refining the map: 2/2", row) for row in rows)
+    again = run(source, "-o", out, "--mapping.refine_iterations", "2", "--overwrite", "-v")
+    assert again == 0
+    printed = capsys.readouterr()
+    assert "  tracking.warmup_keyframes 6" in printed.out.splitlines()
+    assert len((out / "log.txt").read_text().splitlines()) == len(
+        (printed.out + printed.err).splitlines()
     )
-    assert run("synth:crowd", "--tracking.windo=3") == 2  # no abbreviations
-    assert "the nearest setting is --tracking.window" in the_sentence(capsys)
-    assert main(["doctor", "--everything"]) == 2
-    assert "see minislam COMMAND --help" in the_sentence(capsys)
-
-
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["run", "a", "--size", "big"]])
-def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 2
-    assert len(capsys.readouterr().err) < 500

@@ -6,17 +6,20 @@ from pathlib import Path
 
 import pytest
 
+import minislam.config
 from minislam.cli.options import (
-    add_flow,
+    PRESETS,
     add_input,
     add_priors,
     add_settings,
+    changed_settings,
     input_options,
     prior_choice,
     settings,
     source_of,
+    take_settings,
 )
-from minislam.config import SlamConfig, as_json, with_settings
+from minislam.config import SlamConfig, as_json, settings_of, with_settings
 from minislam.data import InputOptions
 from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
@@ -33,10 +36,10 @@ FILE = {
 def parse(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     add_input(parser)
-    add_priors(parser, default_depth="none")
-    add_flow(parser)
+    add_priors(parser, default_depth="none", with_flow=True)
     add_settings(parser)
-    return parser.parse_args(arguments)
+    rest, given = take_settings(list(arguments))
+    return argparse.Namespace(**vars(parser.parse_args(rest)), settings=given, parser=parser)
 
 
 @pytest.fixture
@@ -50,6 +53,22 @@ def test_without_flags_all_is_default():
     args = parse("a.mp4")
     assert source_of(args) == "a.mp4" and input_options(args) == InputOptions()
     assert prior_choice(args, "none") == PriorChoice() and settings(args) == SlamConfig()
+
+
+def test_the_presets_are_those_of_the_configuration():
+    assert PRESETS == tuple(minislam.config.PRESETS)
+
+
+def test_names_with_a_dot_are_settings_wherever_they_stand():
+    rest, given = take_settings(["--a.b", "-3", "x.mp4", "-o", "y.z", "--c.d=e=f", "--g"])
+    assert rest == ["x.mp4", "-o", "y.z", "--g"] and given == {"a.b": "-3", "c.d": "e=f"}
+
+
+def test_settings_without_a_dot_are_options():
+    changed = {"seed": 3, "threads": 2, "checkpoint_fraction": 0.5}
+    given = parse("--seed", "3", "--threads", "2", "--checkpoint_fraction", "0.5")
+    assert changed_settings(settings(given)) == changed
+    assert {name for name in settings_of(SlamConfig()) if "." not in name} == set(changed)
 
 
 def test_a_file_says_sequence_input_priors_and_settings(file: str):

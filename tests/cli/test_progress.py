@@ -4,10 +4,15 @@ import io
 import re
 import signal
 import sys
+from itertools import pairwise
+from unittest.mock import MagicMock
 
 import pytest
 
-from minislam.cli.progress import ENDING, ProgressLine, ending_signals, say
+from minislam.cli.progress import ENDING, ProgressLine, ending_signals, plan_of, say
+from minislam.config import PRESETS, preset
+from minislam.geometry import Camera
+from minislam.priors.names import PriorChoice
 
 
 def test_off_a_terminal_a_stage_prints_a_line_every_tenth(capsys):
@@ -62,3 +67,54 @@ def test_nobody_who_listens_ends_no_run(monkeypatch):
         ProgressLine().show("walking", 1, 1)
         assert sys.stderr is not full
         say("more", "stderr")
+
+
+# The time of the whole run
+
+
+def seconds_said(seconds_per_planned: float, monkeypatch, capsys) -> list[float]:
+    """Return what is said of the whole run, by a clock that is slower than the plan."""
+    clock = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    progress = ProgressLine(is_verbose=True)
+    progress.plan = [{"walking": 20.0, "resting": 10.0}, {"resting": 10.0, "": 10.0}]
+    for name, seconds in [("walking", 20.0), ("resting", 10.0), ("resting", 10.0)]:
+        for done in range(21):
+            progress.show(name, done, 20)
+            clock[0] += seconds / 20 * seconds_per_planned
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("stage 1 of 2, walking: 0/20")
+    assert lines[-1].startswith("stage 2 of 2, resting: 20/20")
+    return [float(re.search(r"about (\d+) s in all", line)[1]) for line in lines]
+
+
+@pytest.mark.parametrize("slowness", [0.5, 1.0, 1.7])
+def test_the_whole_is_estimated_from_the_plan_and_then_from_what_was_measured(
+    slowness: float, monkeypatch, capsys
+):
+    said = seconds_said(slowness, monkeypatch, capsys)
+    assert said[0] == 50 and said[-1] == pytest.approx(50 * slowness, abs=6)
+    steps = [abs(b - a) for a, b in pairwise(said)]
+    assert max(steps) <= 5  # it does not jump
+    assert abs(said[20] - 50 * slowness) < 0.35 * 50 * abs(slowness - 1) + 6
+
+
+def test_a_part_that_is_not_planned_is_shown_in_the_present_stage(capsys):
+    progress = ProgressLine()
+    progress.plan = [{"walking": 20.0}, {"resting": 10.0}]
+    for name in ("walking", "looking", "resting"):
+        progress.show(name, 1, 1)
+    starts = [line.partition(":")[0] for line in capsys.readouterr().err.splitlines()]
+    assert starts == ["stage 1 of 2, walking", "stage 1 of 2, looking", "stage 2 of 2, resting"]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("has_prior", [True, False])
+def test_every_run_has_a_plan(name: str, has_prior: bool):
+    sequence = MagicMock(camera=Camera(300, 300, 160, 120, 320, 240))
+    sequence.__len__.return_value = 60
+    plan = plan_of(preset(name), PriorChoice(depth="sensor" if has_prior else "none"), sequence)
+    shown = [part for stage in plan for part in stage if part]
+    assert shown[0] == "tracking and mapping" and ("dense depth" in shown) != has_prior
+    assert min(seconds for stage in plan for seconds in stage.values()) >= 0
+    assert shown.count("first map") == 1 and len(plan) == 8 - has_prior - (name == "paper-fast") - 1

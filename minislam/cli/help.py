@@ -1,0 +1,114 @@
+"""What `-h` and `--help` show, and the hint after an option that does not exist."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from minislam.errors import InputError
+
+# What most people need; `--help` shows the rest, too.
+ESSENTIAL = (
+    "--help --output --overwrite --resume --quiet --verbose --preset --config --no-uncertainty "
+    "--stride --max-frames --size --fx --calibration --features --depth --flow --out"
+).split()
+SHORT_EPILOG = """\
+every option, files of a run folder, exit codes:  minislam run --help
+constants, each of them an option:                minislam settings [PATTERN]
+"""
+RUN_EPILOG = """\
+files of a run folder:
+  report.html, plots/, keyframes/          pictures; open report.html first
+  map.ply                                  Gaussians for any 3DGS viewer; y points down
+  trajectory.txt, keyframe_trajectory.txt  poses in TUM format, timestamps of the source
+  lost_frames.txt                          frames without a pose, and why
+  uncertainty_mlp.pt                       weights of the uncertainty MLP
+  metrics.json                             accuracy, null where unknown
+  run.json, log.txt                        timings, warnings, how the run ended; what was printed
+  config.json, camera.json                 sequence, input, priors and settings; camera and frames
+  checkpoint.npz                           until the run is finished: arrays, no pickle
+
+minislam run --config FOLDER/config.json -o NEW_FOLDER
+  repeats a run, on the same CPU to the same bytes. Other flags replace values of the file.
+
+minislam run --resume -o FOLDER
+  continues after Ctrl-C, a power cut, a full disk or a damaged image from the last checkpoint
+  to the same bytes. Other settings are refused. Checkpoints are written before each of the
+  last stages, on Ctrl-C, and between steps in --checkpoint_fraction of the time (1 %).
+
+exit codes: 0 finished, 1 known error in one sentence, 2 wrong usage, 3 finished but not to be
+  trusted as a whole: frames were lost, the trajectory is broken (motion and depth contradict the
+  images; run.json lists the breaks and the segments between them) or most bundle adjustments
+  failed, 130 interrupted with everything so far written
+
+settings: every constant is an option, like --tracking.window 8; minislam settings lists them.
+  Ablations of the paper:
+  --no-uncertainty                       the same weight for every pixel
+  --uncertainty.lambda_depth 0           no depth term in L_uncer, Eq. (4)
+  --uncertainty.given_masks on           the sequence's own masks instead of the learnt beta
+  --tracking.lambda_disparity_prior 0    no disparity prior in Eq. (5)
+  --tracking.prior_mask off              no mask M
+  --tracking.final_prior on              disparity prior also in the final adjustment
+  --mapping.pose_refinement.enabled off  no photometric refinement of the other frames
+  --mapping.keyframe_stride 5            map optimised every 5 keyframes (fast mode)
+"""
+
+
+class UsageError(InputError):
+    """A command or an option that does not exist: exit code 2."""
+
+
+class Help(argparse.Action):
+    """`-h` shows what most people need, `--help` everything."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Print the help and end the program."""
+        if option_string == "-h":
+            parser.epilog = SHORT_EPILOG
+            for action in parser._actions:
+                if action.option_strings and not set(action.option_strings) & set(ESSENTIAL):
+                    action.help = argparse.SUPPRESS
+            for group in parser._action_groups:
+                group.description = None
+        parser.print_help()
+        parser.exit()
+
+
+def add_help(parser: argparse.ArgumentParser) -> None:
+    """Add a short help as -h and a long one as --help."""
+    parser.add_argument(
+        "-h", "--help", action=Help, nargs=0, help="the most needed options, or all of them"
+    )
+
+
+def unknown_option(found: str, parser: argparse.ArgumentParser) -> UsageError:
+    """Return what to say about an option that a command does not have, with the nearest one."""
+    if not found.startswith("-"):
+        return UsageError(
+            f"expected only the names that {parser.prog} takes, found also {found!r}; put a name "
+            "with spaces in quotes"
+        )
+    name = found.partition("=")[0]
+    near = nearest(name, parser._option_string_actions)
+    if near is None and parser.get_default("takes_settings"):
+        from minislam.config import SlamConfig, settings_of
+
+        # A name without dots may be the end of a setting's; the first setting with it comes last.
+        known = [f"--{setting}" for setting in reversed(settings_of(SlamConfig()))]
+        by_end = {k if "." in name else f"--{k.rpartition('.')[2]}": k for k in known}
+        near = by_end.get(nearest(name, by_end) or "")
+    hint = f"the nearest is {near}" if near else f"see {parser.prog} --help"
+    return UsageError(f"expected a known option, found {name}; {hint}")
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the most similar of the known names, None if none is similar."""
+    return next(iter(difflib.get_close_matches(name, known, n=1)), None)

@@ -1,0 +1,75 @@
+"""log.txt of a run folder: what a command printed, and when."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TextIO
+
+RUN, LOG = "run.json", "log.txt"  # of a run folder; run.json is written when the run begins
+
+
+class Log:
+    """Keeps what is printed, with the time of each line, until it has a file to write to."""
+
+    def __init__(self) -> None:
+        self.is_begun = False  # something is in the file
+        self._folder: Path | None = None
+        self._lines: list[str] = []  # not written yet
+        self._begun = ""  # a line whose end is not printed yet
+
+    def write_to(self, folder: Path) -> None:
+        """Append to log.txt of a run as soon as it has begun, beginning with what was printed."""
+        self._folder = folder
+
+    def add(self, text: str) -> None:
+        """Take what is printed. Of a progress line on a terminal, the last state is kept."""
+        *lines, self._begun = (self._begun + text).split("\n")
+        now = time.strftime("%Y-%m-%d %H:%M:%S")
+        states = (line.rpartition("\r")[2].replace("\033[K", "") for line in lines)
+        self._lines += [f"{now}  {state}\n" for state in states]
+        if self._folder is not None and self._lines and (self._folder / RUN).exists():
+            with contextlib.suppress(OSError):  # a full disk ends no run
+                with open(self._folder / LOG, "a", encoding="utf-8", errors="replace") as file:
+                    file.writelines(self._lines)
+                self._lines, self.is_begun = [], True
+
+
+class _Recorded(io.TextIOBase):
+    """A stream that gives what is printed to a log, too, and prints nothing if it is silent."""
+
+    def __init__(self, stream: TextIO, log: Log, is_silent: bool) -> None:
+        self._stream, self._log, self._is_silent = stream, log, is_silent
+
+    def write(self, text: str) -> int:
+        """Print and record. A reader that has ended, or a full disk, ends only the printing."""
+        self._log.add(text)
+        try:
+            if not self._is_silent:
+                self._stream.write(text)
+                self._stream.flush()
+        except (OSError, ValueError):  # ValueError: a closed file
+            self._is_silent = True
+        return len(text)
+
+    def isatty(self) -> bool:
+        """Tell whether a person reads this."""
+        return self._stream.isatty()
+
+
+@contextlib.contextmanager
+def recorded(is_quiet: bool) -> Iterator[Log]:
+    """Give what is printed to a log; if it shall be quiet, print only what goes to stderr."""
+    log = Log()
+    out, err = _Recorded(sys.stdout, log, is_quiet), _Recorded(sys.stderr, log, False)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            yield log
+        except BaseException as error:
+            if log.is_begun:  # a run that is refused leaves the folder as it is
+                log.add(f"minislam: {str(error) or type(error).__name__}\n")
+            raise

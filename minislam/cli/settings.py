@@ -1,0 +1,58 @@
+"""The sub-command `minislam settings`: every constant, with its default, bounds and meaning."""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import shutil
+import textwrap
+
+from minislam.cli.help import nearest
+from minislam.errors import InputError
+
+MAX_WIDTH = 100  # characters of a line
+
+
+def add_settings_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Add `settings` to the sub-commands of a parser."""
+    parser = subparsers.add_parser(
+        "settings",
+        help="list the constants, each of which is an option of run",
+        description="Every constant with its default, its bounds, its meaning and [its unit]. "
+        "Change one with minislam run ... --NAME VALUE, or in a file for --config.",
+    )
+    parser.add_argument(
+        "pattern", nargs="?", default="", help="part of a name, or a pattern like tracking.*round*"
+    )
+    parser.set_defaults(run=run_settings)
+
+
+def run_settings(args: argparse.Namespace) -> int:
+    """Print the settings whose names fit the pattern; return the exit code."""
+    from minislam.config import PRESETS, SlamConfig, metadata_of, settings_of
+    from minislam.parameters import MOST
+
+    values, metadata = settings_of(SlamConfig()), metadata_of(SlamConfig())
+    pattern: str = args.pattern
+    found = fnmatch.filter(values, f"*{pattern}*")
+    if not found:
+        near = nearest(pattern, values)
+        raise InputError(
+            f"expected part of a setting's name, found {pattern!r} in none; "
+            + (f"the nearest is {near}" if near else "minislam settings lists all of them")
+        )
+    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    for name in found:
+        least, most = metadata[name]["least"], metadata[name]["most"]
+        bounds = f"at least {least:g}" if most == MOST else f"{least:g} to {most:g}"
+        notes = ["on or off" if isinstance(values[name], bool) else bounds]
+        notes += [f"{key} {_shown(PRESETS[key][name])}" for key in PRESETS if name in PRESETS[key]]
+        print(f"--{name} {_shown(values[name])}  ({'; '.join(notes)})")
+        print(textwrap.indent(textwrap.fill(metadata[name]["meaning"], width - 4), "    "))
+    return 0
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
