@@ -78,11 +78,16 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
         inside = [folder, *sorted(folder.glob("*")), *sorted(folder.glob("*/*"))]
         paths = [path for path in inside if path.is_dir() and is_tum_folder(path)]
         names = [path.resolve().name for path in paths]
-        if not paths or len({*names, *found}) < len(names) + len(found):
+        if not paths:
             raise InputError(
                 f"expected sequences (folders with rgb.txt, or rgb/ with times as names) in "
-                f"{folder}, each of another name, found {', '.join(names) or 'none'}; check the "
-                "path, and bench sequences of the same name in two commands"
+                f"{folder}, found none; check the path"
+            )
+        twice = next((name for name in names if names.count(name) > 1 or name in found), None)
+        if twice:
+            raise InputError(
+                f"expected sequences of different names, found two called {twice}; bench them in "
+                "two commands, each with its own -o"
             )
         found |= dict(zip(names, paths, strict=True))
     return found
