@@ -18,6 +18,7 @@ from minislam.priors.high_resolution import HighResolutionFeatures
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
 from minislam.runs.facts import surface_depth
+from minislam.runs.summary import Line, summarise
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.uncertainty import UncertaintyMLP, beta_of_mask
@@ -139,23 +140,21 @@ class Run:
         """Return the map to turn with the mouse, as the output of a notebook's cell."""
         return Page(self.folder.read_viewer(), height)
 
+    def summary(self) -> list[Line]:
+        """Return what is known of the run in words, with units and verdicts."""
+        return summarise(self.folder.read_metrics(), self.folder.read_run())
+
     def __repr__(self) -> str:
         """Return the facts of the run in a line."""
-        return f"Run of {self.name}: {', '.join(self._facts().values())}; {self.folder.path}"
+        poses = f"{len(self.poses)} of {len(self.frames)} frames with a pose"
+        size = f"{len(self.keyframes)} keyframes, {len(self.gaussians)} Gaussians"
+        return f"Run of {self.name}: {poses}, {size}; {self.folder.path}"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows of the run: facts, warnings, one picture."""
-        facts = {"run": str(self.folder.path)} | self._facts()
+        """Return what a notebook shows of the run: summary, warnings, one picture."""
+        lines = {line.what: (line.value, line.verdict) for line in self.summary()}
         warnings = self.folder.read_run()["warnings"]
-        return summary_html(self.name, facts, warnings, self.folder.read_plot("overview"))
-
-    def _facts(self) -> dict[str, str]:
-        return {
-            "frames with a pose": f"{len(self.poses)} of {len(self.frames)} frames",
-            "keyframes": f"{len(self.keyframes)} keyframes",
-            "map": f"{len(self.gaussians)} Gaussians",
-            "unit of length": self.unit,
-        }
+        return summary_html(self.name, lines, warnings, self.folder.read_plot("overview"))
 
     @cached_property
     def sequence(self) -> RecordedSequence:

@@ -22,15 +22,19 @@ class Page:
 
 
 def summary_html(
-    title: str, facts: Mapping[str, str], warnings: Series[str], png: bytes | None
+    title: str,
+    lines: Mapping[str, tuple[str, str]],  # what -> its value, and whether that is good
+    warnings: Series[str],
+    png: bytes,
 ) -> str:
-    """Return the HTML of a small summary: title, facts, warnings, one picture."""
+    """Return the HTML of a small summary: title, lines, warnings, one picture."""
+    left = 'style="text-align: left"'
     rows = "".join(
-        f"<tr><th style='text-align: left'>{escape(name)}</th>"
-        f"<td style='text-align: left'>{escape(value)}</td></tr>"
-        for name, value in facts.items()
+        f"<tr><th {left}>{escape(what)}</th><td {left}>{escape(value)}</td>"
+        f"<td {left}>{escape(verdict)}</td></tr>"
+        for what, (value, verdict) in lines.items()
     )
     notes = "".join(f"<p><b>Warning:</b> {escape(warning)}</p>" for warning in warnings)
-    data = base64.b64encode(png or b"").decode("ascii")
-    picture = f'<img src="data:image/png;base64,{data}" alt="overview">' if png else ""
+    data = base64.b64encode(png).decode("ascii")
+    picture = f'<img src="data:image/png;base64,{data}" alt="input, uncertainty, map, path">'
     return f"<h4>{escape(title)}</h4><table>{rows}</table>{notes}{picture}"

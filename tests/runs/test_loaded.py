@@ -74,7 +74,8 @@ def test_beta_is_larger_on_the_person_than_elsewhere(run: minislam.Run):
 def test_what_a_notebook_shows(run: minislam.Run):
     shown = run._repr_html_()
     assert "person-0" in shown and "data:image/png;base64," in shown
-    assert "10 of 10 frames" in repr(run)
+    assert "10 of 10 frames with a pose" in repr(run)
+    assert "frames followed" in shown and run.summary()[0].verdict == "good"
     assert len(run.plot(run.keyframes[0]).axes) == 4
     with pytest.raises(InputError, match="expected a frame with a pose, found 77"):
         run.plot(77)

@@ -13,8 +13,7 @@ def test_a_page_survives_its_frame():
     assert 'height="300"' in shown
 
 
-def test_a_summary_escapes_names_and_may_lack_its_picture():
-    shown = summary_html("a<b", {"frames": "3 & 4"}, ["x > y"], None)
-    assert "a&lt;b" in shown and "3 &amp; 4" in shown and "x &gt; y" in shown
-    assert "<img" not in shown
-    assert "iVBOR" in summary_html("", {}, [], b"\x89PNG\r\n")
+def test_a_summary_escapes_whatever_it_is_given():
+    shown = summary_html("a<b", {"frames": ("3 & 4", "good")}, ["x > y"], b"\x89PNG\r\n")
+    assert "a&lt;b" in shown and "3 &amp; 4" in shown and "x &gt; y" in shown and "good" in shown
+    assert "iVBOR" in shown
