@@ -16,6 +16,7 @@ import minislam
 from minislam.cli.bench import add_bench_parser
 from minislam.cli.doctor import add_doctor_parser
 from minislam.cli.evaluate import add_eval_parser
+from minislam.cli.export import add_export_parser
 from minislam.cli.help import (
     RUN_EPILOG,
     SHORT_EPILOG,
@@ -134,6 +135,7 @@ def _parser() -> argparse.ArgumentParser:
         add_notebooks_parser,
         add_eval_parser,
         add_render_parser,
+        add_export_parser,
         add_doctor_parser,
     ):
         add(commands)

@@ -166,4 +166,6 @@ def _duration(seconds: float) -> str:
     """Return a rough duration for people, rounded so that it does not flicker."""
     if seconds < 100:
         return f"{5 * max(1, round(seconds / 5))} s"
+    if seconds < 600:
+        return f"{round(seconds / 30) / 2:g} min"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 # Help
 
-COMMANDS = "demo run settings priors weights bench notebooks eval doctor".split()
+COMMANDS = "demo run settings priors weights bench notebooks eval render export doctor".split()
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])

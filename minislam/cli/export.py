@@ -1,0 +1,82 @@
+"""The sub-command `minislam export`: a finished run for COLMAP, nerfstudio and other programs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from minislam.cli.progress import ProgressLine, say
+from minislam.data.files import atomic_write, require_free
+from minislam.errors import InputError
+
+SH_MAP = "map_sh{}.ply"  # in the run folder
+EPILOG = """\
+poses are T_world_camera with y down, as everywhere; the unit of length is printed. Images and
+masks are at the size of the source, masks 255 where static and 0 where something moves.
+
+  minislam export output/my --nerfstudio my_ns       then: ns-train splatfacto --data my_ns
+  minislam export output/my --colmap my_colmap       then: any trainer that reads COLMAP folders
+  minislam export output/my --depth d --keyframes    z-depth as .npy, float32, for fusion
+"""
+
+
+def add_export_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Add `export` to the sub-commands of a parser."""
+    parser = subparsers.add_parser(
+        "export",
+        help="write a run for COLMAP, nerfstudio and other programs",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=EPILOG,
+    )
+    parser.add_argument("folder", metavar="RUN", help="folder of a finished run")
+    parser.add_argument("--colmap", metavar="DIR", help="images, masks, COLMAP's sparse model")
+    parser.add_argument("--nerfstudio", metavar="DIR", help="images, masks, transforms.json")
+    parser.add_argument("--points", metavar="FILE.ply", help="the map as a plain point cloud")
+    parser.add_argument("--depth", metavar="DIR", help="rendered z-depth, .npy at the working size")
+    parser.add_argument("--masks", metavar="DIR", help="255 where static, 0 where it moves")
+    parser.add_argument(
+        "--sh-degree", type=int, choices=(1, 2, 3), help="map with zeros up to this degree, in RUN"
+    )
+    parser.add_argument("--keyframes", action="store_true", help="only keyframes, not all frames")
+    parser.add_argument("--overwrite", action="store_true", help="replace files of these names")
+    parser.set_defaults(run=run_export)
+
+
+def run_export(args: argparse.Namespace) -> int:
+    """Write what is asked for; return the exit code."""
+    folders = [args.colmap, args.nerfstudio, args.depth, args.masks]
+    if not any([*folders, args.points, args.sh_degree]):
+        raise InputError(
+            "expected at least one of --colmap, --nerfstudio, --points, --depth, --masks and "
+            "--sh-degree, found none; say what to write"
+        )
+    for folder in filter(None, folders):
+        require_free(folder, args.overwrite)
+    padded = Path(args.folder) / SH_MAP.format(args.sh_degree)
+    files = [Path(args.points)] if args.points else []
+    files += [padded] if args.sh_degree else []
+    for file in files:
+        if file.exists() and not args.overwrite:
+            raise InputError(
+                f"expected a new file, but {file} exists; choose another name or add --overwrite"
+            )
+    import minislam
+    from minislam.data.ply import encode_ply
+    from minislam.runs import export
+
+    run, show = minislam.load(args.folder), ProgressLine().show
+    frames = sorted(run.keyframes if args.keyframes else run.poses)
+    writers = [export.export_colmap, export.export_nerfstudio, export.export_depth]
+    for folder, write in zip(folders, [*writers, export.export_masks], strict=True):
+        if folder:
+            write(run, Path(folder), frames, show)
+            say(f"{folder}: {len(frames)} frames, lengths in {run.unit}")
+    if args.points:
+        export.export_points(run, Path(args.points))
+        say(f"{args.points}: {len(export.points_of(run)[0])} points, lengths in {run.unit}")
+    if args.sh_degree:
+        atomic_write(padded, encode_ply(run.gaussians, args.sh_degree))
+        say(f"{padded}: the map with zeros up to degree {args.sh_degree}")
+    if args.nerfstudio:
+        say(f"to go on: ns-train splatfacto --data {args.nerfstudio}")
+    return 0

@@ -1,0 +1,68 @@
+"""`minislam export` on the folder of a small run, and what it refuses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from minislam.cli.main import main
+from minislam.data import read_ply
+from tests.cli.test_main import images, run, texture
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run on two images."""
+    root = tmp_path_factory.mktemp("export")
+    source = images(root / "in", [texture(0), texture(3)])
+    assert run(source, "-o", root / "run", "--mapping.refine_iterations", "2") == 0
+    return root / "run"
+
+
+def export(folder: Path, *arguments: object) -> int:
+    return main(["export", str(folder), *map(str, arguments)])
+
+
+def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
+    names = ["colmap", "nerfstudio", "depth", "masks"]
+    targets = [word for name in names for word in (f"--{name}", tmp_path / name)]
+    assert export(folder, *targets, "--points", tmp_path / "p.ply", "--sh-degree", 3) == 0
+    assert "to go on: ns-train splatfacto --data" in capsys.readouterr().out
+    made = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    pictures = {f"{kind}/{n:06d}.png" for kind in ("images", "masks") for n in range(2)}
+    both = {f"{name}/{picture}" for name in names[:2] for picture in pictures}
+    model = {f"colmap/sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")}
+    assert made == both | model | {
+        "nerfstudio/transforms.json", "nerfstudio/points.ply", "p.ply", "depth/camera.json",
+        "depth/000000.npy", "depth/000001.npy", "masks/000000.png", "masks/000001.png",
+    }  # fmt: skip
+    assert np.load(tmp_path / "depth/000001.npy").shape == (72, 96)
+    assert len(read_ply(folder / "map_sh3.ply")) == len(read_ply(folder / "map.ply"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "expected at least one of --colmap"),
+        (["--points", "mine.ply"], "expected a new file, but mine.ply exists"),
+        (["--depth", "mine"], "expected a new or empty output folder, but mine holds files"),
+        (["--masks", "mine.ply", "--overwrite"], "but mine.ply is a file"),
+    ],
+)
+def test_files_of_the_user_stay(arguments, words, folder: Path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    for name in ("mine.ply", "mine/a.txt"):
+        (tmp_path / name).write_text("mine")
+    assert export(folder, *arguments) == 1
+    assert words in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.txt", "mine", "mine.ply"]
+    assert (tmp_path / "mine.ply").read_text() == "mine"
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path: Path, capsys):
+    assert export(tmp_path / "nowhere", "--points", tmp_path / "a.ply") == 1
+    assert "expected a run folder" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
