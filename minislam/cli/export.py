@@ -9,7 +9,7 @@ from minislam.cli.progress import ProgressLine, say
 from minislam.data.files import atomic_write, require_free
 from minislam.errors import InputError
 
-SH_MAP = "map_sh{}.ply"  # in the run folder
+SH_MAP = "map_sh.ply"  # in the run folder
 EPILOG = """\
 poses are T_world_camera with y down, as everywhere; the unit of length is printed. Images and
 masks are at the size of the source, masks 255 where static and 0 where something moves.
@@ -52,7 +52,7 @@ def run_export(args: argparse.Namespace) -> int:
         )
     for folder in filter(None, folders):
         require_free(folder, args.overwrite)
-    padded = Path(args.folder) / SH_MAP.format(args.sh_degree)
+    padded = Path(args.folder) / SH_MAP
     files = [Path(args.points)] if args.points else []
     files += [padded] if args.sh_degree else []
     for file in files:

@@ -36,12 +36,12 @@ KEYFRAME_KINDS = ("input", "render", "depth", "beta")
 
 _FILES = (
     CONFIG, RUN, METRICS, CAMERA, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MLP, REPORT,
-    CHECKPOINT, VIEWER, CLIP, LOG,
+    CHECKPOINT, VIEWER, CLIP, LOG, "map_sh.ply",
 )  # fmt: skip
 KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
 PLOT_NAMES = ("ate_over_time", "trajectory", "losses", "gaussians", "health", "overview")
 _OURS = re.compile(  # every path that a run writes, inside its folder, also half-written
-    rf"({'|'.join(map(re.escape, _FILES))}|map_sh[123]\.ply|{KEYFRAMES}/\d{{6,}}_({'|'.join(KEYFRAME_KINDS)})\.png|"
+    rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_({'|'.join(KEYFRAME_KINDS)})\.png|"
     rf"{PLOTS}/({'|'.join(PLOT_NAMES)})\.png)(\.[0-9a-f]{{8}}\.tmp)?"
 )
 _CONFIG_PARTS = {"sequence", "input", "priors", "tracking", "mapping"}  # of every config.json

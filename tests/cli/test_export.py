@@ -39,7 +39,7 @@ def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
         "depth/000000.npy", "depth/000001.npy", "masks/000000.png", "masks/000001.png",
     }  # fmt: skip
     assert np.load(tmp_path / "depth/000001.npy").shape == (72, 96)
-    assert len(read_ply(folder / "map_sh3.ply")) == len(read_ply(folder / "map.ply"))
+    assert len(read_ply(folder / "map_sh.ply")) == len(read_ply(folder / "map.ply"))
 
 
 @pytest.mark.parametrize(
