@@ -68,7 +68,7 @@ def test_the_source_archive_has_every_file_of_the_repository():
         for name in listed.stdout.splitlines()
         if not any(fnmatch.fnmatch(name, pattern.replace("**/", "*")) for pattern in patterns)
     ]
-    assert missing == [".gitignore"]
+    assert missing == [".gitattributes", ".gitignore"]
 
 
 def test_it_works_without_the_modules_that_windows_lacks():
