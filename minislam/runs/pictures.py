@@ -4,6 +4,8 @@ import shlex
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from minislam.errors import InputError
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.runs.facts import surface_depth
+from minislam.runs.loaded import Run
 from minislam.runs.summary import summarise
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
@@ -32,7 +35,6 @@ from minislam.viz import (
     loss_curves,
     map_growth,
     overview,
-    picture_url,
     trajectory_plot,
 )
 
@@ -65,7 +67,8 @@ class Preview:
         strip = [keyframe.image.numpy(), beta_to_rgb(slam.beta_image(newest)), color]
         jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
         with suppress(InputError):
-            self._folder.write_report(_report(self._folder, slam, {}, facts, picture_url(jpeg)))
+            page = replace(_known(self._folder, slam, {}, facts), overview=jpeg)
+            self._folder.write_report(build_report(page))
 
 
 def write_pictures(
@@ -88,67 +91,52 @@ def write_pictures(
     plots["losses"] = "Losses while the map was optimised", figure_png(loss_curves(curves))
     plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
 
-    limits = _colour_limits(slam)
-    jpegs = _write_keyframes(folder, slam, *limits)
+    of_depth, of_beta = _colour_limits(slam)
+    jpegs = _write_keyframes(folder, slam, of_depth, of_beta)
     middle = len(slam.mapper.keyframes) // 2
     keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
     color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).numpy()
     picture = overview(keyframe.image.numpy(), beta, color, estimate, true_path, unit)
-    png = figure_png(picture)
-    folder.write_plot("overview", png)
+    folder.write_plot("overview", png := figure_png(picture))
     for name, (_, plot) in plots.items():
         folder.write_plot(name, plot)
-    folder.write_viewer(_viewer(slam, jpegs))
-    folder.write_report(
-        _report(folder, slam, metrics, facts, picture_url(png), jpegs, limits, plots)
+    run = Run(folder.path)
+    small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
+    scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
+    folder.write_viewer(build_viewer(f"minislam: {run.name}", *scene))
+    page = replace(
+        _known(folder, slam, metrics, facts),
+        overview=png,
+        keyframes=jpegs,
+        depth_limits=of_depth,
+        beta_limits=of_beta,
+        unit=facts["unit"],
+        figures=list(plots.values()),
     )
+    folder.write_report(build_report(page))
 
 
-def _report(
-    folder: RunFolder,
-    slam: Slam,
-    metrics: dict[str, float | None],
-    facts: dict[str, Any],
-    picture: str,  # address of the overview
-    jpegs: dict[int, list[bytes]] | None = None,
-    limits: tuple[tuple[float, float], tuple[float, float]] = ((0, 1), (0.1, 1)),
-    plots: dict[str, tuple[str, bytes]] | None = None,
-) -> str:
+def _known(
+    folder: RunFolder, slam: Slam, metrics: dict[str, float | None], facts: dict[str, Any]
+) -> Report:
+    """Return a report without pictures."""
     nearest, changed = changed_settings(slam.config)
-    return build_report(
-        Report(
-            title=f"minislam: {slam.sequence.name}",
-            state=facts["state"],
-            description=slam.sequence.description,
-            warnings=facts["warnings"],
-            overview=picture,
-            summary=[
-                (line.what, line.value, line.verdict, line.detail or line.meaning)
-                for line in summarise(metrics, facts)
-            ],
-            keyframes=jpegs or {},
-            depth_limits=limits[0],
-            beta_limits=limits[1],
-            unit=facts["unit"],
-            figures=list((plots or {}).values()),
-            command=shlex.join(["minislam", *facts["command"][1:]]),
-            preset=nearest,
-            settings=changed,
-            next_commands=_next_commands(shlex.quote(str(folder.path)), facts),
-        )
+    program, *arguments = facts["command"]
+    by_hand = Path(program).stem in ("minislam", "__main__")  # or else by a program of the user
+    return Report(
+        title=f"minislam: {slam.sequence.name}",
+        folder=shlex.quote(str(folder.path)),
+        state=facts["state"],
+        description=slam.sequence.description,
+        warnings=facts["warnings"],
+        summary=[
+            (line.what, line.value, line.verdict, line.detail or line.meaning)
+            for line in summarise(metrics, facts)
+        ],
+        command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
+        preset=nearest,
+        settings=changed,
     )
-
-
-def _next_commands(folder: str, facts: dict[str, Any]) -> list[tuple[str, str]]:
-    if facts["state"].startswith("running"):
-        return []
-    if facts["exit_code"] in (1, 130):  # failed, interrupted
-        return [(f"minislam run --resume -o {folder}", "Go on with this run:")]
-    return [
-        (f"minislam render {folder} --path orbit -o fly.webp", "Fly around the map:"),
-        (f"minislam export {folder} --nerfstudio DIR", "Train a larger model from it:"),
-        (f"minislam run --config {folder}/config.json -o NEW_FOLDER", "Repeat it, changed:"),
-    ]
 
 
 def changed_settings(config: SlamConfig) -> tuple[str, dict[str, tuple[str, str]]]:
@@ -161,21 +149,6 @@ def changed_settings(config: SlamConfig) -> tuple[str, dict[str, tuple[str, str]
         }
     nearest = min(found, key=lambda name: len(found[name]))
     return nearest, found[nearest]
-
-
-def _viewer(slam: Slam, jpegs: dict[int, list[bytes]]) -> str:
-    trajectory = slam.trajectory()
-    frame_at = {tracked.timestamp: tracked.frame_index for tracked in slam.tracker.tracked}
-    frames = [frame_at[stamp] for stamp in trajectory.timestamps.tolist()]
-    return build_viewer(
-        f"minislam: {slam.sequence.name}",
-        slam.mapper.gaussians.to_arrays(),
-        slam.mapper.camera,
-        slam.mapper.background.numpy(),
-        dict(zip(frames, trajectory.T_world_camera, strict=True)),
-        len(slam.tracker.tracked),
-        {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()},
-    )
 
 
 def _health(slam: Slam) -> bytes:

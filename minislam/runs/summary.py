@@ -1,53 +1,14 @@
-"""The summary of a run in words: what is known, in which unit, and whether it is good."""
+"""The summary of a run in words: what is known, in which unit, and whether it is good.
 
+measures.csv beside this file names the numbers of metrics.json and says when they are healthy. Its
+bounds are from tests/benchmarks/RESULTS.md: good is what all clips reach with beta, and what is
+not even fair is what they reach without it, or where a run is broken.
+"""
+
+import csv
 from collections.abc import Iterator, Mapping
+from importlib.resources import files
 from typing import Any, NamedTuple
-
-
-class Measure(NamedTuple):
-    """One number of metrics.json, and when it is healthy."""
-
-    key: str
-    words: str
-    unit: str
-    digits: int
-    good: float | None  # the value from which it is good; smaller than `fair` if less is better
-    fair: float | None  # the value from which the run is of use; None: there is nothing to judge
-    meaning: str
-
-
-# The bounds are what tests/benchmarks/RESULTS.md reports: good is what runs with beta reach on all
-# clips, at least fair is better than what the same runs reach without beta, or broken ones.
-MEASURES = (
-    Measure("path_length", "path of the camera", "", 2, None, None,
-            "from the first followed frame to the last"),
-    Measure("reprojection_px", "reprojection error, median", "px", 2, 0.5, 1.0,
-            "between the measured flow and that of the poses and depths"),
-    Measure("parallax_px", "parallax of the keyframes, median", "px", 1, 5.0, 2.0,
-            "flow by the camera's movement alone; without it there is no depth"),
-    Measure("psnr_static_db", "map against input, static pixels", "dB", 1, 22.0, 18.0,
-            "PSNR in the keyframes where beta says that nothing moves"),
-    Measure("ate_all_cm", "position error of all frames (ATE)", "cm", 2, 3.0, 10.0,
-            "root mean square against the true path, after alignment"),
-    Measure("ate_keyframes_cm", "position error of the keyframes", "cm", 2, 3.0, 10.0, ""),
-    Measure("ate_straight_line_cm", "error of a straight walk", "cm", 1, None, None,
-            "what an answer without looking would have, for comparison"),
-    Measure("psnr_novel_db", "map against unseen views", "dB", 1, 20.0, 17.0,
-            "PSNR of views that the run has not seen, aligned by the camera centres"),
-    Measure("ssim_novel", "the same, SSIM", "", 2, 0.6, 0.5, "structural similarity, at most 1"),
-    Measure("psnr_novel_oriented_db", "the same, aligned by orientation", "dB", 1, 22.0, 18.0,
-            "PSNR that measures the map rather than the alignment"),
-    Measure("psnr_input_db", "map against the empty room", "dB", 1, 22.0, 18.0,
-            "PSNR of the keyframes against the scene without dynamic objects"),
-    Measure("psnr_masked_db", "the same behind dynamic objects", "dB", 1, 18.0, 15.0,
-            "a ghost would show here"),
-    Measure("lpips_novel", "map against unseen views, LPIPS", "", 3, None, None, "0 is equal"),
-    Measure("lpips_input", "map against the empty room, LPIPS", "", 3, None, None, "0 is equal"),
-    Measure("beta_auroc", "beta finds what moves (AUROC)", "", 3, 0.95, 0.85,
-            "1 tells all moving pixels from static ones, 0.5 is chance"),
-    Measure("depth_l1_cm", "depth error of the map", "cm", 1, 10.0, 30.0,
-            "mean difference from the true depth, where the scene is static"),
-)  # fmt: skip
 
 
 class Line(NamedTuple):
@@ -96,13 +57,14 @@ def _counted(facts: Mapping[str, Any]) -> Iterator[Line]:
 
 
 def _measured(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[Line]:
-    for measure in MEASURES:
-        value = metrics.get(measure.key)
+    table = files("minislam.runs").joinpath("measures.csv").read_text(encoding="utf-8")
+    for row in csv.DictReader(table.splitlines()):
+        value = metrics.get(row["key"])
         if value is not None:
-            unit = facts["unit"] if measure.key == "path_length" else measure.unit
-            verdict = judge(value, measure.good, measure.fair)
-            text = f"{value:.{measure.digits}f} {unit}".rstrip()
-            yield Line(measure.words, text, verdict, measure.meaning)
+            good, fair = (float(row[name]) if row[name] else None for name in ("good", "fair"))
+            unit = row["unit"].replace("of the map", facts["unit"])
+            text = f"{value:.{row['digits']}f} {unit}".rstrip()
+            yield Line(row["words"], text, judge(value, good, fair), row["meaning"])
 
 
 def _spent(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[Line]:

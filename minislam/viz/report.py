@@ -14,16 +14,6 @@ from minislam.viz.style import beta_to_rgb, depth_to_rgb
 from minislam.viz.viewer import picture_url
 
 _STOPS = 9  # colours of a colour bar
-_VIEWER = """<section class="waiting"><iframe id="viewer" src="viewer.html" title="the map, to be
-turned by hand"></iframe><p class="dim">Drag to turn, wheel or pinch to come nearer.</p></section>
-<section><h2>The clip</h2><figure><img src="clip.webp" alt="input, uncertainty, static map"
-onerror="this.closest('section').remove()"><figcaption>Input, uncertainty and static map of every
-frame.</figcaption></figure></section>"""
-_BUTTONS = """<div class="buttons"><a href="viewer.html">Turn the map</a>
-<a href="map.ply">map.ply</a><a href="trajectory.txt">trajectory.txt</a></div>"""
-
-_SO_FAR = """<p class="dim">Input, uncertainty and map so far, of the newest keyframe. This page
-renews itself until the run is finished.</p>"""
 
 
 @dataclass(frozen=True)
@@ -31,10 +21,11 @@ class Report:
     """What a report shows. A part that is left out is not shown."""
 
     title: str
-    state: str  # "finished", "interrupted", "running", ...
+    folder: str  # of the run, for the commands to type next
+    state: str  # "running", "interrupted", "failed: ...", "finished", "finished, ..."
     description: str = ""  # of the sequence, one line
     warnings: Series[str] = ()
-    overview: str = ""  # address of a picture
+    overview: bytes = b""  # PNG or JPEG
     summary: Series[tuple[str, str, str, str]] = ()  # what, value with unit, verdict, meaning
     keyframes: Mapping[int, Series[bytes]] = field(default_factory=dict)
     # frame_index: JPEG of input, depth, beta, render
@@ -45,36 +36,25 @@ class Report:
     command: str = ""
     preset: str = ""
     settings: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # name: value, preset's
-    next_commands: Series[tuple[str, str]] = ()  # command, what it does
 
 
 def build_report(report: Report) -> str:
     """Return the HTML of a report."""
-    is_running = report.state.startswith("running")
     template = files("minislam.viz").joinpath("report.html").read_text(encoding="utf-8")
     return Template(template).substitute(
         title=escape(report.title),
+        folder=escape(report.folder),
         state=escape(report.state),
-        state_class="running" if is_running else report.state.split(",")[0].split(":")[0],
+        kind=report.state.replace(":", ",").partition(",")[0],
         description=escape(report.description),
         warnings="\n".join(f'<p class="warning">{escape(text)}</p>' for text in report.warnings),
-        overview=_overview(report, is_running),
-        results="" if is_running else _VIEWER,
+        overview=picture_url(report.overview),
         summary="\n".join(_row(*line) for line in report.summary),
         keyframes=_keyframes(report) if report.keyframes else "",
         figures="\n".join(_figure(caption, png) for caption, png in report.figures),
         command=escape(report.command),
         settings=_settings(report),
-        next=_next(report.next_commands),
     )
-
-
-def _overview(report: Report, is_running: bool) -> str:
-    if not report.overview:
-        return ""
-    alternative = "input, uncertainty, static map and path of one keyframe"
-    image = f'<div class="wide"><img src="{report.overview}" alt="{alternative}"></div>'
-    return image + (_SO_FAR if is_running else _BUTTONS)
 
 
 def _row(what: str, value: str, verdict: str, meaning: str) -> str:
@@ -132,11 +112,6 @@ def _settings(report: Report) -> str:
     if not rows:
         return f"<p>All settings are those of the preset {report.preset}.</p>"
     return f"<p>Settings that differ from the preset {report.preset}:</p><table>{rows}</table>"
-
-
-def _next(commands: Series[tuple[str, str]]) -> str:
-    rows = "".join(f"<p>{escape(does)}</p><pre>{escape(text)}</pre>" for text, does in commands)
-    return f"<section><h2>What to do next</h2>{rows}</section>" if rows else ""
 
 
 def _figure(caption: str, png: bytes) -> str:

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import pytest
-
 from minislam.config import preset
 from minislam.runs import pictures
 from minislam.runs.pictures import MAX_SHOWN, Preview, changed_settings
@@ -15,18 +13,6 @@ def test_settings_are_compared_with_the_nearest_preset():
     assert changed_settings(preset("paper-fast"))[0] == "paper-fast"
     config = replace(preset("laptop"), seed=4)
     assert changed_settings(config) == ("laptop", {"seed": ("4", "0")})
-
-
-@pytest.mark.parametrize(
-    ("state", "code", "words"),
-    [("running", None, []), ("interrupted", 130, ["--resume"]), ("failed: x", 1, ["--resume"]),
-     ("finished", 0, ["render", "export", "--config"])],
-)  # fmt: skip
-def test_the_next_command_fits_the_end(state: str, code: int | None, words: list[str]):
-    found = pictures._next_commands("out/my", {"state": state, "exit_code": code})
-    assert len(found) == len(words)
-    for (command, _), word in zip(found, words, strict=True):
-        assert command.startswith("minislam ") and word in command and "out/my" in command
 
 
 def test_of_many_keyframes_some_are_shown_the_first_and_the_last_among_them():

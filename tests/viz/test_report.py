@@ -12,7 +12,7 @@ JPEGS = {0: [b"input", b"depth", b"beta", b"map"], 7: [b"i", b"d", b"b", b"m"]}
 
 
 def report(**parts: object) -> str:
-    return build_report(Report("run <1>", parts.pop("state", "finished"), **parts))
+    return build_report(Report("run <1>", "out/my", parts.pop("state", "finished"), **parts))
 
 
 def test_a_report_shows_its_pictures_without_the_rest_of_the_folder():
@@ -27,10 +27,9 @@ def test_a_report_shows_its_pictures_without_the_rest_of_the_folder():
     assert '<span class="good">good</span>' in html
     assert '<p class="warning">focal length &lt;guessed&gt;</p>' in html
     assert html.count("data:image/png;base64,") == 1
-    # Only the viewer and the clip are files of their own; without them their places vanish.
-    beside = re.findall(r'src="(?!data:)([^"]*)"', html)
-    assert beside == ["viewer.html", "clip.webp"]
-    assert "onerror" in html and 'class="waiting"' in html
+    # Viewer and clip are files of their own, asked for by the script and shown when they are there.
+    assert re.findall(r'src="(?!data:)([^"]*)"', html) == []
+    assert html.count('class="waiting ended"') == 2 and 'viewer.src = "viewer.html"' in html
     assert html == report(
         summary=[("ATE", "1 & 2 cm", "good", "a < b")],
         warnings=["focal length <guessed>"],
@@ -41,8 +40,8 @@ def test_a_report_shows_its_pictures_without_the_rest_of_the_folder():
 
 def test_a_part_that_is_not_known_is_not_shown():
     html = report()
-    assert "Keyframes" not in html and "What to do next" not in html
-    assert '<section id="figures"></section>' in html  # the style hides an empty one
+    assert "Keyframes</h2>" not in html
+    assert '<section id="figures" class="ended"></section>' in html  # hidden by the style
 
 
 def test_the_slider_reaches_every_keyframe():
@@ -66,16 +65,22 @@ def test_settings_and_commands_are_said():
         command="minislam run a.mp4",
         preset="laptop",
         settings={"tracking.window": ("9", "7")},
-        next_commands=[("minislam render X", "Fly:")],
     )
     assert "differ from the preset laptop" in html and "<code>tracking.window</code>" in html
-    assert "<pre>minislam run a.mp4</pre>" in html and "<pre>minislam render X</pre>" in html
+    assert "<pre>minislam run a.mp4</pre>" in html and "minislam render out/my --path" in html
+    assert "minislam run --resume -o out/my" in html  # the style shows it where it fits
     assert "All settings are those of the preset test" in report(preset="test")
 
 
-def test_a_running_report_renews_itself_and_promises_no_viewer():
-    html = report(state="running", overview="data:,")
-    assert 'class="state running"' in html and "viewer.html</a></th>" in html
-    assert "<iframe" not in html and 'class="buttons"' not in html
-    for state, kind in {"finished, broken": "finished", "failed: disk full": "failed"}.items():
-        assert f'class="state {kind}">{state}<' in report(state=state)
+def test_the_end_of_the_run_decides_what_is_shown():
+    states = {
+        "running": "running",
+        "finished": "finished",
+        "finished, broken": "finished",
+        "interrupted": "interrupted",
+        "failed: disk full, again": "failed",
+    }
+    for state, kind in states.items():
+        html = report(state=state)
+        assert f'<main class="{kind}">' in html and f'<span class="state">{state}</span>' in html
+    assert ".running .ended, .failed .ended" in html and ".failed .resume" in html
