@@ -13,13 +13,13 @@ import numpy as np
 from minislam.config import PRESETS, SlamConfig, preset, settings_of
 from minislam.data import RunFolder
 from minislam.data.images import encode_jpeg
-from minislam.errors import InputError
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.runs.facts import surface_depth
 from minislam.runs.loaded import Run
 from minislam.runs.summary import summarise
 from minislam.slam import Slam
+from minislam.state.steps import Observer
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
 from minislam.viz import (
     Report,
@@ -45,28 +45,39 @@ PREVIEW_FRACTION = 0.01  # of a run's time that writing reports before its end m
 
 
 class Preview:
-    """Keeps a report in the folder from the first map on, while the run goes on."""
+    """Keeps a report in the folder while the run goes on, from the first iteration of the map on.
 
-    def __init__(self, folder: RunFolder) -> None:
-        self._folder = folder
+    It stands between the run and its observer, because it is told of progress as often as that.
+    """
+
+    def __init__(self, folder: RunFolder, observer: Observer) -> None:
+        self._folder, self._observer = folder, observer
+        self._slam: Slam | None = None
         self._last, self._cost = 0.0, 0.0  # second: when the last one was written, how long it took
+        self.warn, self.should_stop = observer.warn, observer.should_stop
 
-    def refresh(self, slam: Slam, facts: Callable[[], dict[str, Any]]) -> None:
-        """Write the report if there is a map and a new report is due."""
+    def watch(self, slam: Slam, facts: Callable[[], dict[str, Any]]) -> None:
+        """Take up a run; `facts` returns the present content of run.json."""
+        self._slam, self._facts = slam, facts
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Pass progress on. If there is a map and a new report is due, write it."""
+        self._observer.show(stage, done, total)
         begun = time.perf_counter()
-        if slam.mapper.keyframes and begun - self._last >= self._cost / PREVIEW_FRACTION:
-            self.write(slam, facts())
-            self._last = time.perf_counter()
-            self._cost = self._last - begun
+        if self._slam is not None and begun - self._last >= self._cost / PREVIEW_FRACTION:
+            if self._slam.mapper.keyframes:
+                self.write(self._slam, self._facts())
+                self._last = time.perf_counter()
+                self._cost = self._last - begun
 
     def write(self, slam: Slam, facts: dict[str, Any]) -> None:
-        """Write the report of what is known so far. A full disk does not end the run."""
-        newest = len(slam.mapper.keyframes) - 1
-        keyframe = slam.mapper.keyframes[newest]
-        color = slam.mapper.render(keyframe.T_camera_world).color.numpy()
-        strip = [keyframe.image.numpy(), beta_to_rgb(slam.beta_image(newest)), color]
-        jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
-        with suppress(InputError):
+        """Write the report of what is known so far, if it can be written: no run ends of it."""
+        with suppress(Exception):
+            newest = len(slam.mapper.keyframes) - 1
+            keyframe = slam.mapper.keyframes[newest]
+            color = slam.mapper.render(keyframe.T_camera_world).color.numpy()
+            strip = [keyframe.image.numpy(), beta_to_rgb(slam.beta_image(newest)), color]
+            jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
             page = replace(_known(self._folder, slam, {}, facts), overview=jpeg)
             self._folder.write_report(build_report(page))
 

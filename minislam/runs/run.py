@@ -111,14 +111,15 @@ def run_sequence(
     """Run SLAM, or with `resume` the rest of it, and write the folder, however the run ends."""
     torch.set_num_threads(config.threads)
     checkpoints = Checkpoints(folder, sequence, config, choice)
-    alarms, preview = Alarms(observer or SilentObserver()), Preview(folder)
+    observer = observer or SilentObserver()
+    alarms, preview = Alarms(observer), Preview(folder, observer)
 
     def between_steps(force: bool) -> None:
         alarms.check(slam)
         checkpoints.save(slam, force)
-        preview.refresh(slam, lambda: run_facts(slam, choice, checkpoints, "running", None))
 
-    slam = Slam(sequence, config, priors, observer, between_steps)
+    slam = Slam(sequence, config, priors, preview, between_steps)
+    preview.watch(slam, lambda: run_facts(slam, choice, checkpoints, "running", None))
     if resume:
         checkpoints.restore(slam)
     folder.write_config({**sequence.opened_as, "priors": asdict(choice), **as_json(config)})
