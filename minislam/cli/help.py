@@ -82,11 +82,23 @@ class Help(argparse.Action):
         parser.exit()
 
 
-def add_help(parser: argparse.ArgumentParser) -> None:
-    """Add a short help as -h and a long one as --help."""
+def add_command(
+    subparsers: argparse._SubParsersAction, name: str, what: str, usage: str, epilog: str | None
+) -> argparse.ArgumentParser:
+    """Add a command with many options, hence with a short help as -h and a long one as --help."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        name,
+        help=what,
+        usage=f"minislam {name} {usage} [options]",
+        add_help=False,
+        allow_abbrev=False,  # half a setting's name might be another setting tomorrow
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=epilog,
+    )
     parser.add_argument(
         "-h", "--help", action=Help, nargs=0, help="the most needed options, or all of them"
     )
+    return parser
 
 
 def unknown_option(found: str, parser: argparse.ArgumentParser) -> UsageError:

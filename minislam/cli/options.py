@@ -9,7 +9,7 @@ import argparse
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
-from minislam.cli.help import UsageError, unknown_option
+from minislam.cli.help import unknown_option
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,9 +74,7 @@ def add_talk(parser: argparse.ArgumentParser) -> None:
     """Add how much is said."""
     how_much = parser.add_mutually_exclusive_group()
     how_much.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
-    how_much.add_argument(
-        "-v", "--verbose", action="store_true", help="every step, and the settings that differ"
-    )
+    how_much.add_argument("-v", "--verbose", action="store_true", help="a line for every step")
 
 
 def add_lpips(parser: argparse.ArgumentParser) -> None:
@@ -99,23 +97,20 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
+def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str | None]]:
     """Return what is no setting, and the values of settings like --tracking.window 8 by name.
 
     Names with a dot are settings. Which of them there are is known only with torch.
     """
     rest: list[str] = []
-    given: dict[str, str] = {}
+    given: dict[str, str | None] = {}
     todo = iter(arguments)
     for argument in todo:
         name, equals, value = argument.partition("=")
-        if not (name.startswith("--") and "." in name):
+        if name.startswith("--") and "." in name:
+            given[name.removeprefix("--")] = value if equals else next(todo, None)
+        else:
             rest.append(argument)
-            continue
-        found = value if equals else next(todo, None)
-        if found is None:
-            raise UsageError(f"expected a value after {name}, found none; give one")
-        given[name.removeprefix("--")] = found
     return rest, given
 
 
@@ -239,14 +234,6 @@ def resumed_settings(args: argparse.Namespace) -> SlamConfig:
                 f"{now[name]}; leave the settings out, or start anew in another folder"
             )
     return then
-
-
-def changed_settings(config: SlamConfig) -> dict[str, Any]:
-    """Return the settings that differ from the defaults."""
-    from minislam.config import SlamConfig, settings_of
-
-    default = settings_of(SlamConfig())
-    return {name: v for name, v in settings_of(config).items() if v != default[name]}
 
 
 def _with_given(args: argparse.Namespace, base: SlamConfig) -> SlamConfig:

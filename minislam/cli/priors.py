@@ -13,16 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minislam.cli.help import add_help
-from minislam.cli.options import (
-    add_input,
-    add_priors,
-    add_settings,
-    input_options,
-    prior_choice,
-    settings,
-    source_of,
-)
+from minislam.cli import options
+from minislam.cli.help import add_command
 from minislam.cli.progress import ProgressLine
 from minislam.data.options import require_source
 from minislam.errors import InputError
@@ -41,28 +33,26 @@ FRAME_DIGITS = 5  # of the file names, as WildGS-SLAM names its own
 
 def add_priors_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
     """Add `priors` to the sub-commands of a parser."""
-    parser = subparsers.add_parser(
-        "priors",
-        help="write features and depth of every frame to files, to run SLAM on elsewhere",
-        usage="minislam priors SEQUENCE --out DIR [--features NAME] [--depth NAME] [options]",
-        add_help=False,
-        allow_abbrev=False,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_help(parser)
+    what = "write features and depth of every frame to files, to run SLAM on elsewhere"
+    usage = "SEQUENCE --out DIR [--features NAME] [--depth NAME]"
+    parser = add_command(subparsers, "priors", what, usage, epilog=None)
     parser.add_argument(
         "--out", required=True, metavar="DIR", help="gets the folders features and depth"
     )
-    add_settings(parser)
-    add_input(parser)
-    add_priors(parser, default_depth="none")
+    options.add_settings(parser)
+    options.add_input(parser)
+    options.add_priors(parser, default_depth="none")
     parser.set_defaults(run=run_priors)
     return parser
 
 
 def run_priors(args: argparse.Namespace) -> int:
     """Write the priors that are asked for; return the exit code."""
-    source, inputs, choice = source_of(args), input_options(args), prior_choice(args, "none")
+    source, inputs, choice = (
+        options.source_of(args),
+        options.input_options(args),
+        options.prior_choice(args, "none"),
+    )
     require_source(source)
     require_priors(choice)
     if args.features is None and choice.depth == "none":
@@ -73,7 +63,7 @@ def run_priors(args: argparse.Namespace) -> int:
 
     from minislam.data import open_sequence
 
-    config, progress = settings(args), ProgressLine()
+    config, progress = options.settings(args), ProgressLine()
     torch.set_num_threads(config.threads)
     sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
     print(sequence.description)

@@ -164,7 +164,7 @@ class ProgressLine:
 
 def _duration(seconds: float) -> str:
     """Return a rough duration for people, rounded so that it does not flicker."""
-    if seconds < 100:
+    if seconds < 117:
         return f"{5 * max(1, round(seconds / 5))} s"
     if seconds < 600:
         return f"{round(seconds / 30) / 2:g} min"

@@ -84,7 +84,6 @@ def test_what_is_wrong_is_said_before_torch_is_loaded(arguments: list[str], word
         (["run", "a", "--quite"], "the nearest is --quiet"),
         (["run", "a", "--zoom", "2"], "found --zoom; see minislam run --help"),
         (["run", "a", "b"], "expected only the names that minislam run takes, found also 'b'"),
-        (["run", "a", "--tracking.window"], "a value after --tracking.window, found none"),
         (["run", "synth:crowd", "--window", "3"], "the nearest is --tracking.window"),
         (["run", "synth:crowd", "--tracking.windw", "3"], "the nearest is --tracking.window"),
         (["run", "synth:crowd", "--tracking.windo=3"], "the nearest is --tracking.window"),

@@ -12,7 +12,6 @@ from minislam.cli.options import (
     add_input,
     add_priors,
     add_settings,
-    changed_settings,
     input_options,
     prior_choice,
     settings,
@@ -67,7 +66,7 @@ def test_names_with_a_dot_are_settings_wherever_they_stand():
 def test_settings_without_a_dot_are_options():
     changed = {"seed": 3, "threads": 2, "checkpoint_fraction": 0.5}
     given = parse("--seed", "3", "--threads", "2", "--checkpoint_fraction", "0.5")
-    assert changed_settings(settings(given)) == changed
+    assert settings(given) == with_settings(SlamConfig(), changed)
     assert {name for name in settings_of(SlamConfig()) if "." not in name} == set(changed)
 
 

@@ -58,7 +58,7 @@ def test_priors_without_weights_are_found_by_their_names():
     ("choose", "flags", "sentence"),
     [
         (flow, {"flow": "raft"}, "expected --flow classical, droid or python:M"),
-        (features, {"features": "x"}, "classical, files:FOLDER, fit3d, dinov2 or python:"),
+        (features, {"features": "x"}, "classical, files:FOLDER, dinov2, fit3d or python:"),
         (depth, {"depth": "x"}, "none, simulated, sensor, files:FOLDER, metric3d, depth-a"),
         (flow, {"flow": "droid"}, "expected --flow-weights FILE with --flow droid, found none"),
         (depth, {"depth_weights": "a.pth"}, "expected --depth metric3d or depth-anything with"),

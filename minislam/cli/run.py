@@ -1,0 +1,96 @@
+"""The sub-commands `minislam demo` and `minislam run`."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from functools import partial
+from pathlib import Path
+
+from minislam.cli import options
+from minislam.cli.help import RUN_EPILOG, SHORT_EPILOG, add_command
+from minislam.cli.log import Log, recorded
+from minislam.cli.progress import ProgressLine, ending_signals, plan_of, say
+from minislam.data.files import require_free
+from minislam.data.options import default_depth, require_source
+from minislam.errors import InputError
+from minislam.priors.names import require_priors
+
+DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
+
+
+def add_demo_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Add `demo` to the sub-commands of a parser."""
+    what = "make a synthetic clip with moving people and run everything on it"
+    demo = add_command(subparsers, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
+    demo.add_argument("-o", "--output", metavar="DIR", help="run folder, output/demo")
+    options.add_talk(demo)
+    options.add_settings(demo)
+    demo.set_defaults(run=_run, overwrite=True, resume=False, **DEMO)
+
+
+def add_run_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Add `run` to the sub-commands of a parser."""
+    what = "run SLAM on a video, an image folder or a benchmark"
+    run = add_command(subparsers, "run", what, "SEQUENCE [-o OUTPUT]", RUN_EPILOG)
+    run.add_argument("-o", "--output", metavar="DIR", help="run folder, default output/NAME_TIME")
+    earlier = run.add_mutually_exclusive_group()
+    earlier.add_argument("--overwrite", action="store_true", help="replace an earlier run")
+    earlier.add_argument(
+        "--resume", action="store_true", help="go on with the interrupted run in OUTPUT"
+    )
+    options.add_talk(run)
+    options.add_settings(run)
+    options.add_input(run)
+    options.add_priors(run, default_depth="simulated for synth:, else none", with_flow=True)
+    options.add_lpips(run)
+    run.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    with recorded(args.quiet) as log:
+        return _run_recorded(args, log)
+
+
+def _run_recorded(args: argparse.Namespace, log: Log) -> int:
+    if args.resume and args.output is None:
+        raise InputError(
+            "expected --output FOLDER with --resume, found none; give that of the interrupted run"
+        )
+    # What may be wrong is looked for in the order of the time that it takes.
+    source, inputs = options.source_of(args), options.input_options(args)
+    require_source(source)
+    if args.output and not args.resume:
+        also = " (or --resume, to go on with an interrupted run)"
+        require_free(args.output, args.overwrite, also)
+    choice = options.prior_choice(args, default_depth(source))
+    require_priors(choice)
+    from minislam.data import open_sequence
+    from minislam.runs.run import default_output, run_in_folder
+    from minislam.runs.summary import as_text
+
+    config = options.resumed_settings(args) if args.resume else options.settings(args)
+    lpips, progress = options.lpips_of(args), ProgressLine(args.quiet, args.verbose)
+    sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
+    if lpips is not None:
+        lpips.require_size(sequence.camera.width, sequence.camera.height)
+    output = args.output or default_output(sequence)
+    say(sequence.description)
+    for warning in sequence.warnings:
+        say(f"WARNING: {warning}", "stderr")
+    progress.plan = plan_of(config, choice, sequence)
+    log.write_to(Path(output))
+    with ending_signals(progress.interrupt):
+        outcome = run_in_folder(
+            sequence, config, choice, output, progress, lpips, args.overwrite, args.resume
+        )
+    say("\n".join([f"{outcome.state}:", *as_text(outcome.summary)]))
+    for warning in outcome.warnings:
+        if warning not in sequence.warnings:
+            say(f"WARNING: {warning}", "stderr")
+    say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
+    if outcome.state == "interrupted":
+        say(f"to go on: minislam run --resume -o {shlex.quote(output)}")
+    else:
+        say(f"next: minislam render {shlex.quote(output)} -o fly.webm, or minislam export -h")
+    return outcome.exit_code

@@ -1,0 +1,39 @@
+"""`minislam run` and `minislam demo`: what is said, and where it is kept."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from minislam.cli.main import main
+from minislam.cli.run import DEMO
+from minislam.data.options import require_source
+from tests.cli.test_main import images, run, texture, the_sentence
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_demo_is_a_sequence_that_exists():
+    require_source(str(DEMO["sequence"]))
+
+
+def test_settings_may_stand_before_the_sequence(tmp_path: Path, capsys):
+    assert main(["run", "--tracking.window", "0", str(images(tmp_path / "in", [texture(0)]))]) == 1
+    assert "tracking.window of at least 1" in the_sentence(capsys)
+
+
+def test_quiet_prints_warnings_only_and_the_log_has_everything(tmp_path: Path, capsys):
+    source, out = images(tmp_path / "in", [texture(0), texture(3)]), tmp_path / "out"
+    assert run(source, "-o", out, "--mapping.refine_iterations", "2", "-q") == 0
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.count("\n") == printed.err.count("WARNING: ") > 0
+    rows = (out / "log.txt").read_text().splitlines()
+    assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", row) for row in rows)
+    assert "image folder: 2 of 2 images" in rows[0] and "results in" in "".join(rows)
+    assert any(re.search(r"stage \d of \d, refining the map: 2/2", row) for row in rows)
+    again = run(source, "-o", out, "--mapping.refine_iterations", "2", "--overwrite", "-v")
+    assert again == 0
+    printed = capsys.readouterr()
+    assert len((out / "log.txt").read_text().splitlines()) == len(
+        (printed.out + printed.err).splitlines()
+    )
