@@ -64,11 +64,11 @@ class Preview:
         """Pass progress on. If there is a map and a new report is due, write it."""
         self._observer.show(stage, done, total)
         begun = time.perf_counter()
-        if self._slam is not None and begun - self._last >= self._cost / PREVIEW_FRACTION:
-            if self._slam.mapper.keyframes:
-                self.write(self._slam, self._facts())
-                self._last = time.perf_counter()
-                self._cost = self._last - begun
+        is_due = begun - self._last >= self._cost / PREVIEW_FRACTION
+        if is_due and self._slam is not None and self._slam.mapper.keyframes:
+            self.write(self._slam, self._facts())
+            self._last = time.perf_counter()
+            self._cost = self._last - begun
 
     def write(self, slam: Slam, facts: dict[str, Any]) -> None:
         """Write the report of what is known so far, if it can be written: no run ends of it."""
@@ -152,14 +152,11 @@ def _known(
 
 def changed_settings(config: SlamConfig) -> tuple[str, dict[str, tuple[str, str]]]:
     """Return the nearest preset and the settings that differ from it: the value, the preset's."""
-    found: dict[str, dict[str, tuple[str, str]]] = {}
+    now, changed = settings_of(config), {}
     for name in PRESETS:
-        usual, now = settings_of(preset(name)), settings_of(config)
-        found[name] = {
-            key: (str(now[key]), str(usual[key])) for key in now if now[key] != usual[key]
-        }
-    nearest = min(found, key=lambda name: len(found[name]))
-    return nearest, found[nearest]
+        usual = settings_of(preset(name))
+        changed[name] = {k: (str(v), str(usual[k])) for k, v in now.items() if v != usual[k]}
+    return min(changed.items(), key=lambda found: len(found[1]))
 
 
 def _health(slam: Slam) -> bytes:

@@ -48,7 +48,7 @@ def _counted(facts: Mapping[str, Any]) -> Iterator[Line]:
     frames, lost = facts["frames"], facts["lost_frames"]
     followed = f"{frames - lost:,} of {frames:,}"
     verdict = judge(lost / max(frames, 1), 0.0, 0.1)
-    yield Line("frames followed", followed, verdict, "the others have no pose")
+    yield Line("frames followed", followed, verdict, "frames with a pose; the others are lost")
     if facts["breaks"]:
         where = ", ".join(f"{b['first_frame']} to {b['last_frame']}" for b in facts["breaks"])
         yield Line("broken at frames", where, "poor", "before and after do not belong together")
@@ -77,7 +77,7 @@ def _spent(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[Lin
     seconds = dict(facts["seconds"])
     total = seconds.pop("total")
     stages = sorted(seconds.items(), key=lambda stage: -stage[1])
-    parts = ", ".join(f"{stage} {spent:.0f}" for stage, spent in stages if spent >= 0.5)
+    parts = ", ".join(f"{stage} {spent:.0f} s" for stage, spent in stages if spent >= 0.5)
     yield Line("time", f"{total:.0f} s", detail=parts)
     if metrics.get("peak_memory_mb"):
         yield Line("memory at most", f"{metrics['peak_memory_mb']:.0f} MB")

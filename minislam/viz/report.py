@@ -109,9 +109,10 @@ def _settings(report: Report) -> str:
         f'<td class="dim">instead of {escape(usual)}</td></tr>'
         for name, (value, usual) in report.settings.items()
     )
-    if not rows:
-        return f"<p>All settings are those of the preset {report.preset}.</p>"
-    return f"<p>Settings that differ from the preset {report.preset}:</p><table>{rows}</table>"
+    which = "Other settings than those" if rows else "All settings are those"
+    return (
+        f"<p>{which} of the preset {report.preset}{':' if rows else '.'}</p><table>{rows}</table>"
+    )
 
 
 def _figure(caption: str, png: bytes) -> str:

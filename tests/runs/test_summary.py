@@ -34,7 +34,7 @@ def test_numbers_have_units_words_and_verdicts():
     assert found["path of the camera"] == ("2.77 m", "", "")
     assert found["reprojection error, median"] == ("0.10 px", "good", "")
     assert found["map against input, static pixels"] == ("17.0 dB", "poor", "")
-    assert found["time"] == ("94 s", "", "mapping 20, tracking 8")
+    assert found["time"] == ("94 s", "", "mapping 20 s, tracking 8 s")
     assert lines({"path_length": 1.0}, unit="world units")["path of the camera"][0] == (
         "1.00 world units"
     )
@@ -75,6 +75,6 @@ def test_the_terminal_gets_columns_without_explanations():
     assert text[0] == "  frames followed                    57 of 60       fair"
     assert (
         text[-1]
-        == "  time                               94 s                 mapping 20, tracking 8"
+        == "  time                               94 s                 mapping 20 s, tracking 8 s"
     )
     assert max(map(len, text)) < 100
