@@ -15,7 +15,7 @@ from minislam.checks.grading import NOT_YET, PASSED
 from minislam.cli.notebooks import as_text, without_solutions
 from tests.notebook_files import NOTEBOOKS, ROOT, cleaned, is_exercise, load, prose, source
 
-LARGEST = 500_000  # bytes
+LARGEST = 800_000  # bytes
 MOST_CELLS = 40
 LONGEST_CELL = 600  # characters of code
 LONGEST_SETUP = 900  # characters of imports, of a scene ("# Setup: ...") or of an exercise

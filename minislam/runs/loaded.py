@@ -148,7 +148,7 @@ class Run:
         """Return the facts of the run in a line."""
         poses = f"{len(self.poses)} of {len(self.frames)} frames with a pose"
         size = f"{len(self.keyframes)} keyframes, {len(self.gaussians)} Gaussians"
-        return f"Run of {self.name}: {poses}, {size}; {self.folder.path}"
+        return f"Run of {self.name}: {poses}, {size}; {self.folder.path.name}"
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of the run: summary, warnings, one picture."""
