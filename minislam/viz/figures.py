@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from collections.abc import Sequence as Series
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -133,7 +134,8 @@ def keyframe_health(
     for position, (first, last) in enumerate(broken):
         label = "broken" if position == 0 else None
         axes.axvspan(first - 0.5, last + 0.5, color="tab:red", alpha=0.25, label=label)
-    axes.plot(lost, np.zeros(len(lost)), "|", color="black", label="lost" if len(lost) else None)
+    mark: dict[str, Any] = {"color": "tab:red", "markersize": 14, "markeredgewidth": 3}
+    axes.plot(lost, np.zeros(len(lost)), "|", label="lost" if len(lost) else None, **mark)
     axes.set(xlabel="frame", ylabel="explained flow", ylim=(-0.05, 1.05))
     axes.set_xlim(-0.5, max([1, *frames, *lost]) + 0.5)
     axes.legend(loc="lower left")

@@ -45,7 +45,7 @@ def build_report(report: Report) -> str:
         title=escape(report.title),
         folder=escape(report.folder),
         state=escape(report.state),
-        kind=report.state.replace(":", ",").partition(",")[0],
+        kind=report.state.partition(":")[0].replace(",", ""),
         description=escape(report.description),
         warnings="\n".join(f'<p class="warning">{escape(text)}</p>' for text in report.warnings),
         overview=picture_url(report.overview),

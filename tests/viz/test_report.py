@@ -79,7 +79,7 @@ def test_the_end_of_the_run_decides_what_is_shown():
     states = {
         "running": "running",
         "finished": "finished",
-        "finished, broken": "finished",
+        "finished, broken": "finished broken",
         "interrupted": "interrupted",
         "failed: disk full, again": "failed",
     }
