@@ -11,8 +11,8 @@ from minislam.errors import InputError
 
 SH_MAP = "map_sh.ply"  # in the run folder
 EPILOG = """\
-poses are T_world_camera with y down, as everywhere; the unit of length is printed. Images and
-masks are at the size of the source, masks 255 where static and 0 where something moves.
+The world has the axes of the first camera, so y points down; the unit of length is printed.
+Images and masks have the size of the source; masks are 255 where static, 0 where it moves.
 
   minislam export output/my --nerfstudio my_ns       then: ns-train splatfacto --data my_ns
   minislam export output/my --colmap my_colmap       then: any trainer that reads COLMAP folders
@@ -65,7 +65,8 @@ def run_export(args: argparse.Namespace) -> int:
     from minislam.runs import export
 
     run, show = minislam.load(args.folder), ProgressLine().show
-    frames = sorted(run.keyframes if args.keyframes else run.poses)
+    wanted = run.keyframes if args.keyframes else run.poses
+    frames = [frame for frame in sorted(run.poses) if frame in wanted]
     writers = [export.export_colmap, export.export_nerfstudio, export.export_depth]
     for folder, write in zip(folders, [*writers, export.export_masks], strict=True):
         if folder:

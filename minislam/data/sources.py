@@ -86,8 +86,11 @@ class VideoImages:
         return len(self._calls)
 
     def read(self, index: int) -> np.ndarray:
-        """Return a raw image (H, W, 3) uint8 RGB; walking forward decodes every frame once."""
-        if self._calls[index] <= self._grabbed:
+        """Return a raw image (H, W, 3) uint8 RGB; walking forward decodes every frame once.
+
+        The same frame may be read again at once: an export needs it in two sizes.
+        """
+        if self._calls[index] < self._grabbed:
             self._rewind()
         while self._grabbed < self._calls[index]:
             self._capture.grab()

@@ -29,6 +29,14 @@ def test_any_frame_can_be_read_in_any_order(tmp_path: Path):
         assert abs(int(images.read(index)[50, 80, 0]) - 20 * index) <= 4, index
 
 
+def test_the_same_frame_again_is_not_looked_for_from_the_start(tmp_path: Path, monkeypatch):
+    images = VideoImages(video(tmp_path / "v.mp4"))
+    first = images.read(5)
+    monkeypatch.setattr(images, "_rewind", lambda: pytest.fail("read from the start"))
+    np.testing.assert_array_equal(images.read(5), first)
+    assert abs(int(images.read(6)[50, 80, 0]) - 120) <= 4
+
+
 def test_colours_are_rgb(tmp_path: Path):
     corner = VideoImages(video(tmp_path / "v.mp4")).read(0)[5, 5]
     assert corner[0] > 180 and corner[2] < 60
