@@ -90,6 +90,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mapping.refine_iterations": 60,
         "mapping.image_scale": 1.0,
         "tracking.learned.warmup_rounds": 2,
+        "tracking.learned.warmup_rounds_with_beta": 2,
+        "tracking.learned.final_rounds": 4,
         "tracking.learned.rounds": 1,
         "tracking.learned.pose_rounds": 1,
         "networks.droid.chain_updates": 1,
@@ -114,6 +116,9 @@ def metadata_of(config: Any) -> dict[str, Mapping[str, Any]]:
 def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
     """Return the configuration with values replaced; they are given by their names with dots."""
     known = settings_of(config)
+    # With a learned flow tracking.learned.X replaces tracking.X. Whoever gives only one means both.
+    also = {n.replace("tracking.", "tracking.learned.", 1): v for n, v in settings.items()}
+    settings = settings | {n: v for n, v in also.items() if n in known and n not in settings}
     metadata = metadata_of(config)
     for name, value in settings.items():
         if name not in known:

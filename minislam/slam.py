@@ -10,7 +10,7 @@ beta into the weight of each cell. `_move_map` deforms the map when an adjustmen
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -63,8 +63,9 @@ class Slam(Stateful):
         priors: Priors,
         observer: Observer | None = None,
         save_checkpoint: Callable[[bool], None] = lambda force: None,
+        device: str = "cpu",  # of all tensors; the networks are where the priors put them
     ) -> None:
-        self.sequence = sequence
+        self.sequence, self.device = sequence, device
         self.config = config
         self.steps = Steps(observer or SilentObserver(), save_checkpoint)
         self._features = priors.features
@@ -77,6 +78,7 @@ class Slam(Stateful):
             self._features,
             priors.depth,
             self._static_weight,
+            device,
         )
         self.tracker.graph.seeks_focal = sequence.refines_focal
         self.mapper = self._new_mapper()
@@ -110,13 +112,19 @@ class Slam(Stateful):
     def _new_mapper(self) -> Mapper:
         config, dimension = self.config, self._features.dimension
         camera = self.tracker.grid.camera
-        return Mapper(camera, config.mapping, config.uncertainty, dimension, config.seed)
+        parts = config.mapping, config.uncertainty
+        return Mapper(camera, *parts, dimension, config.seed, self.device)
+
+    def frame(self, frame_index: int) -> Frame:
+        """Read a frame; its image moves to the device of the run."""
+        frame = self.sequence.frame(frame_index)
+        return replace(frame, image=frame.image.to(self.device))
 
     def _frames_left(self) -> Iterator[Frame]:
         """Yield the frames to come. If one cannot be read, the state before it is saved."""
         for index in range(self.steps.done("tracking and mapping"), len(self.sequence)):
             try:
-                frame = self.sequence.frame(index)
+                frame = self.frame(index)
             except MinislamError:
                 self.steps.save_checkpoint(True)
                 raise
@@ -185,7 +193,7 @@ class Slam(Stateful):
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
         others = [index for index in self._poses if index not in keyframes]
         for done in range(self.steps.done(stage), len(others)):
-            frame = self.sequence.frame(others[done])
+            frame = self.frame(others[done])
             pose = self._poses[frame.frame_index]
             beta = self._beta(frame, None)
             self._poses[frame.frame_index] = self.mapper.refine_pose(pose, frame.image, beta)
@@ -202,7 +210,7 @@ class Slam(Stateful):
         uncertainty = self.config.uncertainty
         is_known = uncertainty.given_masks or bool(self.mapper.keyframes)
         if not (uncertainty.enabled and is_known):
-            return torch.ones(self.tracker.grid.shape)
+            return torch.ones(self.tracker.grid.shape, device=self.device)
         beta = self._beta(keyframes.frames[index], keyframes.features[index])
         return tracking_weight(beta, self.sequence.camera, self._stride)
 
@@ -223,12 +231,13 @@ class Slam(Stateful):
                 f"expected a mask of movers for every frame of {self.sequence.name}, found none for"
                 f" {frame_index}; give --masks files:FOLDER, or set uncertainty.given_masks to off"
             )
-        return torch.from_numpy(mask)
+        return torch.from_numpy(mask).to(self.device)
 
     def _keyframes(self, first: int = 0) -> list[Keyframe]:
         """Return the tracker's keyframes from `first` on in the form that the mapper takes."""
         store = self.tracker.keyframes
-        unknown = torch.zeros(self.sequence.camera.height, self.sequence.camera.width)
+        size = self.sequence.camera.height, self.sequence.camera.width
+        unknown = torch.zeros(size, device=self.device)
         result = []
         for index in range(first, len(store)):
             frame, depth = store.frames[index], store.metric_depths[index]
@@ -263,7 +272,7 @@ class Slam(Stateful):
     def render(self, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the colours (H, W, 3) in [0, 1] of the map, seen from a pose (4, 4)."""
         pose = se3_inverse(torch.from_numpy(T_world_camera))
-        return self.mapper.render(pose).color.clamp(0, 1).numpy()
+        return self.mapper.render(pose).color.clamp(0, 1).cpu().numpy()
 
     def beta_image(self, keyframe_index: int) -> np.ndarray:
         """Return beta (H, W) of a keyframe; without uncertainty it is 1 everywhere."""
@@ -271,7 +280,7 @@ class Slam(Stateful):
         if not self.config.uncertainty.enabled:
             return np.ones((camera.height, camera.width), np.float32)
         beta = self.mapper.beta_of(self.mapper.keyframes[keyframe_index])
-        return resample(beta, camera.height, camera.width).numpy()
+        return resample(beta, camera.height, camera.width).cpu().numpy()
 
     def lost_frames(self) -> list[tuple[int, float, str]]:
         """Return frame index, timestamp and reason of every frame without a pose."""
@@ -285,5 +294,5 @@ class Slam(Stateful):
 def _trajectory(timestamps: list[float], T_camera_world: list[Tensor]) -> Trajectory:
     if not T_camera_world:
         raise TrackingLost("expected at least one frame with a pose, found none")
-    T_world_camera = se3_inverse(torch.stack(T_camera_world)).numpy()
+    T_world_camera = se3_inverse(torch.stack(T_camera_world)).cpu().numpy()
     return Trajectory(np.array(timestamps), T_world_camera)

@@ -64,7 +64,8 @@ def add_priors(
     group.add_argument(
         "--depth-weights", metavar="FILE", help="checkpoint of metric3d or depth-anything"
     )
-    group.add_argument("--device", help="where networks run: cpu or cuda; cpu")
+    group.add_argument("--device", help="where everything runs: cpu or cuda; cpu")
+    group.add_argument("--precision", help="of the networks: fp32, bf16 or fp16 (cuda); fp32")
     if with_flow:
         group.add_argument("--flow", help="classical, droid or python:MODULE:FUNCTION; classical")
         group.add_argument("--flow-weights", metavar="FILE", help="checkpoint of droid")

@@ -131,7 +131,7 @@ class RunFolder:
     def write_mlp(self, state: dict[str, Tensor]) -> None:
         """Write the weights of the uncertainty MLP."""
         buffer = io.BytesIO()
-        torch.save(state, buffer)
+        torch.save({name: values.cpu() for name, values in state.items()}, buffer)
         atomic_write(self.path / MLP, buffer.getvalue())
 
     def write_keyframe_image(self, frame_index: int, kind: str, image: np.ndarray) -> None:

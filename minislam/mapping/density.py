@@ -27,9 +27,9 @@ class ScreenGradients(Stateful):
     total: Tensor  # (N,) sum of the lengths
     views: Tensor  # (N,) number of views
 
-    def __init__(self, count: int) -> None:
-        self.total = torch.zeros(count)
-        self.views = torch.zeros(count)
+    def __init__(self, like: Tensor) -> None:
+        """Start at zero, for as many Gaussians as a tensor (N,) has, and on its device."""
+        self.total, self.views = torch.zeros_like(like), torch.zeros_like(like)
 
     def add(
         self,
@@ -38,8 +38,6 @@ class ScreenGradients(Stateful):
         camera: Camera,
     ) -> None:
         """Add the gradients of one view."""
-        self.total = self.total.to(v_screen)
-        self.views = self.views.to(v_screen)
         half_image = v_screen.new_tensor([camera.width / 2, camera.height / 2])
         seen = radii > 0
         self.total += torch.where(seen, (v_screen * half_image).norm(dim=-1), 0)
@@ -88,7 +86,7 @@ def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
     normal = torch.randn(doubled.means.shape, generator=generator).to(doubled.means)
     rotations = rotation_from_quaternion(doubled.quats_wxyz)
     offsets = (rotations @ (doubled.scales * normal)[..., None]).squeeze(-1)
-    log_scales = doubled.log_scales - torch.tensor(SPLIT_SHRINK).log().to(doubled.means)
+    log_scales = doubled.log_scales - doubled.means.new_tensor(SPLIT_SHRINK).log()
     return replace(doubled, means=doubled.means + offsets, log_scales=log_scales)
 
 

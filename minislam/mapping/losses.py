@@ -40,10 +40,10 @@ class MappingHistory:
 
     def add(self, loss: RenderLoss, uncertainty: float, gaussians: int) -> None:
         """Append one iteration."""
-        self.render.append(float(loss.total.detach()))
-        self.color.append(float(loss.color.detach()))
-        self.depth.append(float(loss.depth.detach()))
-        self.isotropic.append(float(loss.isotropic.detach()))
+        parts = torch.stack([loss.total, loss.color, loss.depth, loss.isotropic]).tolist()
+        columns = self.render, self.color, self.depth, self.isotropic
+        for column, part in zip(columns, parts, strict=True):
+            column.append(part)
         self.uncertainty.append(uncertainty)
         self.gaussians.append(gaussians)
 

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.mapping.deformation import deform_rigidly
-from minislam.mapping.density import ScreenGradients
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation, Progress
 from minislam.mapping.pose_refinement import refine_pose
@@ -35,7 +34,7 @@ class Mapper(JointOptimisation):
             self._insert(self.keyframes[-1])
         count = len(self.keyframes)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
-        uniform = torch.full((count,), 1 / count, dtype=torch.float64)
+        uniform = torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
         self._optimise([self._online_camera] * self.config.init_iterations, uniform, progress)
         self._replace_dynamic_gaussians()
 
@@ -84,7 +83,7 @@ class Mapper(JointOptimisation):
         if done == 0:
             self._replace_dynamic_gaussians()
         count = len(self.keyframes)
-        uniform = torch.full((count,), 1 / count, dtype=torch.float64)
+        uniform = torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
         self._optimise(cameras, uniform, progress, self.config.refine_rate_end, done)
@@ -122,7 +121,7 @@ class Mapper(JointOptimisation):
             self._generator,
         )
         self._optimizer.append(new)
-        self._gradients = ScreenGradients(len(self.gaussians))
+        self._reset_gradients()
 
     def _remove_dynamic_gaussians(self) -> None:
         """Remove Gaussians that were inserted on an object before the MLP knew that it moves."""
@@ -135,7 +134,7 @@ class Mapper(JointOptimisation):
                 gaussians.means[anchored], self._online_camera, keyframe.T_camera_world, weight
             )
         self._optimizer.prune(keep)
-        self._gradients = ScreenGradients(len(self.gaussians))
+        self._reset_gradients()
 
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""

@@ -51,18 +51,19 @@ class JointOptimisation(Stateful):
         uncertainty: UncertaintyConfig,
         feature_dimension: int,  # C
         seed: int,
+        device: str = "cpu",  # of all tensors; keyframes must be there, too
     ) -> None:
         self.camera = camera
         self.config = config
         self.uncertainty = uncertainty
         self.keyframes = []
         self.window = []
-        self.background = torch.zeros(3)
+        self.background = torch.zeros(3, device=device)
         self.history = MappingHistory()
-        self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed)
+        self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed, device)
         self._generator = torch.Generator().manual_seed(seed + 1)
-        self._optimizer = MapOptimizer(GaussianMap.empty(), LearningRates())
-        self._gradients = ScreenGradients(0)
+        self._optimizer = MapOptimizer(GaussianMap.empty(device=device), LearningRates())
+        self._reset_gradients()
 
     @property
     def gaussians(self) -> GaussianMap:
@@ -157,10 +158,13 @@ class JointOptimisation(Stateful):
         )
         return self._trainer.step(keyframe.features, error, cells)
 
+    def _reset_gradients(self) -> None:
+        self._gradients = ScreenGradients(self.gaussians.opacity_logits)
+
     def _change_density(self) -> None:
         """Clone, split and prune, then let the map settle before the MLP learns again."""
         config = self.config.density
         densify(self._optimizer, self._gradients.mean, self.median_depth, config, self._generator)
         self._optimizer.prune(useful_rows(self.gaussians, self.median_depth))
-        self._gradients = ScreenGradients(len(self.gaussians))
+        self._reset_gradients()
         self._frozen_until = self._iteration + self.config.freeze_iterations

@@ -66,8 +66,8 @@ def sampling_probabilities(
     window is still drawn at least that often. This includes a window of all keyframes.
     """
     if len(window) > window_probability * count:
-        return torch.full((count,), 1 / count, dtype=torch.float64)
+        return torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
     others = (1 - window_probability) / (count - len(window))
-    probabilities = torch.full((count,), others, dtype=torch.float64)
+    probabilities = torch.full((count,), others, dtype=torch.float64, device="cpu")
     probabilities[window] = window_probability / len(window)
     return probabilities

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.depth import (
@@ -18,7 +20,7 @@ from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.priors.names import FILES, FOLDER, PriorChoice, require_prior
+from minislam.priors.names import FILES, FOLDER, PRECISIONS, PriorChoice, require_prior
 from minislam.priors.networks.table import NetworksConfig, find_network, load_network
 from minislam.priors.plugins import load_plugin
 from minislam.records import Sequence
@@ -73,7 +75,8 @@ def _choose(
     weights = require_prior(kind, name, getattr(choice, f"{kind}_weights"))
     network = find_network(kind, name)
     if network is not None:
-        return load_network(network, Path(str(weights)).expanduser(), choice.device, networks)
+        path, precision = Path(str(weights)).expanduser(), PRECISIONS[choice.precision]
+        return load_network(network, path, choice.device, networks, getattr(torch, precision))
     maker = makers.get(FOLDER if name.startswith(FILES) else name)
     if maker is not None and weights is None:
         return maker()

@@ -12,7 +12,7 @@ from torch import Tensor
 
 def grayscale(image: Tensor) -> np.ndarray:
     """Return the 8-bit luminance (H, W) of an image (H, W, 3) in [0, 1]."""
-    rgb = (image.numpy() * 255 + 0.5).astype(np.uint8)
+    rgb = (image.cpu().numpy() * 255 + 0.5).astype(np.uint8)
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
 
 

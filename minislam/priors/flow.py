@@ -9,7 +9,6 @@ from functools import cache
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
 from minislam.priors.dense_flow import composed_flow, dense_from_grid, grayscale, reverse_flow
@@ -84,7 +83,7 @@ class ClassicalFlow(Stateful):
     ) -> FlowMatches:
         """Match every grid cell of each source in its target; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
-        starts = dict(zip(edges, predicted_targets.numpy().astype(np.float32), strict=True))
+        starts = dict(zip(edges, predicted_targets.cpu().numpy().astype(np.float32), strict=True))
         moved = {edge for edge, start in starts.items() if self._has_moved(edge, start)}
         # Each direction checks the other, so both are measured anew, or none.
         self._measure({(i, j): starts[i, j] for i, j in edges if {(i, j), (j, i)} & moved})
@@ -93,7 +92,7 @@ class ClassicalFlow(Stateful):
             [edge.targets for edge in measured],
             [edge.confidence for edge in measured],
             [self._textures[source] for source in edges_source],
-            predicted_targets.dtype,
+            predicted_targets,
         )
 
     def disparity_damping(self, keyframes: int) -> None:
@@ -184,7 +183,7 @@ class FlowChain(Stateful):
         measured = _threads(self._config.workers).map(follow, starts)
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
-        return chain, as_matches([targets], [confidence], [texture], torch.float32)
+        return chain, as_matches([targets], [confidence], [texture], image)
 
     def restart(self) -> "FlowChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""

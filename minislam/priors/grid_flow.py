@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from minislam.parameters import parameter
 from minislam.priors.dense_flow import pixel_maps, sample, warp
@@ -168,11 +169,12 @@ def as_matches(
     targets: list[np.ndarray],  # per edge (h, w, 2) px
     confidences: list[np.ndarray],  # per edge (h, w)
     textures: list[np.ndarray],  # per edge (h, w), the most its confidence could be
-    dtype: torch.dtype,
+    like: Tensor,  # of the dtype and on the device wanted
 ) -> FlowMatches:
     """Stack the measurements of E edges; compute the matched ratio of each edge."""
-    matched = torch.from_numpy(np.stack(targets)).to(dtype).flatten(1, 2).mT.contiguous()
-    confidence = torch.from_numpy(np.stack(confidences)).to(dtype)
-    possible = torch.from_numpy(np.stack(textures)).to(dtype).sum((1, 2))
+    matched, confidence, texture = (
+        torch.from_numpy(np.stack(grids)).to(like) for grids in (targets, confidences, textures)
+    )
+    matched, possible = matched.flatten(1, 2).mT.contiguous(), texture.sum((1, 2))
     ratios = confidence.sum((1, 2)) / possible.clamp_min(1e-6)
     return FlowMatches(matched, confidence.flatten(1)[:, None].repeat(1, 2, 1), ratios)

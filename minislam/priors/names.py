@@ -10,6 +10,7 @@ from minislam.priors.networks.published import find_weights, published_files
 FILES = "files:"  # before the name of a folder of results made elsewhere
 PYTHON = "python:"  # before MODULE:FACTORY
 FOLDER = f"{FILES}FOLDER"
+PRECISIONS = {"fp32": "float32", "bf16": "bfloat16", "fp16": "float16"}  # names of torch
 BUILT_IN = {
     "flow": ("classical",),
     "features": ("classical", FOLDER),
@@ -27,16 +28,23 @@ class PriorChoice:
     features_weights: str | None = None
     depth: str = "none"
     depth_weights: str | None = None
-    device: str = "cpu"  # where networks run, cpu or cuda; everything else stays on the CPU
+    device: str = "cpu"  # of the whole run, cpu or cuda; what OpenCV does stays on the CPU
+    precision: str = "fp32"  # of DROID and of the vision transformers: fp32, bf16 or fp16
 
     def __post_init__(self) -> None:
-        """Refuse a device that is not there."""
+        """Refuse a device that is not there, and a precision that it has not."""
         if self.device not in ("cpu", "cuda"):
             raise InputError(f"expected --device cpu or cuda, found {self.device!r}; choose one")
         if self.device == "cuda" and not _has_gpu():
             raise InputError(
                 "expected a GPU that this torch can use for --device cuda, found none; say "
                 "--device cpu, or make the priors elsewhere with minislam priors"
+            )
+        usable = [name for name in PRECISIONS if (self.device, name) != ("cpu", "fp16")]
+        if self.precision not in usable:
+            raise InputError(
+                f"expected --precision {' or '.join(usable)} with --device {self.device}, found "
+                f"{self.precision!r}; choose one"
             )
 
 

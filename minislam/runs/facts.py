@@ -91,9 +91,9 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         rendering = slam.mapper.render(keyframe.T_camera_world)
         view = MappedView(
             keyframe.frame_index,
-            se3_inverse(keyframe.T_camera_world).numpy(),
+            se3_inverse(keyframe.T_camera_world).cpu().numpy(),
             slam.beta_image(index) if slam.config.uncertainty.is_learnt else None,
-            surface_depth(rendering).numpy(),
+            surface_depth(rendering).cpu().numpy(),
         )
         views.append(view)
         static = slam.mapper.static_weight(slam.mapper.beta_of(keyframe), slam.mapper.camera) > 0

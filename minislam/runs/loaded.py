@@ -175,7 +175,8 @@ class Run:
 
     @cached_property
     def _features(self) -> FeatureExtractor:
-        choice = PriorChoice(**self.folder.read_config()["priors"] | {"device": "cpu"})
+        on_cpu = {"device": "cpu", "precision": "fp32"}
+        choice = PriorChoice(**self.folder.read_config()["priors"] | on_cpu)
         config, factor = self.config, self.config.uncertainty.grid_factor
         features = choose_features(choice, self.sequence.camera, config.features, config.networks)
         return HighResolutionFeatures(features, factor) if factor > 1 else features

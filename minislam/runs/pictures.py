@@ -75,8 +75,8 @@ class Preview:
         with suppress(Exception):
             newest = len(slam.mapper.keyframes) - 1
             keyframe = slam.mapper.keyframes[newest]
-            color = slam.mapper.render(keyframe.T_camera_world).color.numpy()
-            strip = [keyframe.image.numpy(), beta_to_rgb(slam.beta_image(newest)), color]
+            color = slam.mapper.render(keyframe.T_camera_world).color.cpu().numpy()
+            strip = [keyframe.image.cpu().numpy(), beta_to_rgb(slam.beta_image(newest)), color]
             jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
             page = replace(_known(self._folder, slam, {}, facts), overview=jpeg)
             self._folder.write_report(build_report(page))
@@ -106,8 +106,8 @@ def write_pictures(
     jpegs = _write_keyframes(folder, slam, of_depth, of_beta)
     middle = len(slam.mapper.keyframes) // 2
     keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
-    color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).numpy()
-    picture = overview(keyframe.image.numpy(), beta, color, estimate, true_path, unit)
+    color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).cpu().numpy()
+    picture = overview(keyframe.image.cpu().numpy(), beta, color, estimate, true_path, unit)
     folder.write_plot("overview", png := figure_png(picture))
     for name, (_, plot) in plots.items():
         folder.write_plot(name, plot)
@@ -181,7 +181,7 @@ def _colour_limits(slam: Slam) -> tuple[tuple[float, float], tuple[float, float]
     depths, betas = [], []
     for index in _spread(len(slam.mapper.keyframes), COLOUR_SAMPLES):
         rendering = slam.mapper.render(slam.mapper.keyframes[index].T_camera_world)
-        depths.append(surface_depth(rendering).numpy())
+        depths.append(surface_depth(rendering).cpu().numpy())
         betas.append(slam.beta_image(index))
     return depth_limits(np.array(depths)), beta_limits(np.array(betas))
 
@@ -198,10 +198,10 @@ def _write_keyframes(
     for index, keyframe in enumerate(slam.mapper.keyframes):
         rendering = slam.mapper.render(keyframe.T_camera_world)
         pictures = {
-            "input": keyframe.image.numpy(),
-            "depth": depth_to_rgb(surface_depth(rendering).numpy(), of_depth),
+            "input": keyframe.image.cpu().numpy(),
+            "depth": depth_to_rgb(surface_depth(rendering).cpu().numpy(), of_depth),
             "beta": beta_to_rgb(slam.beta_image(index), of_beta),
-            "render": rendering.color.clamp(0, 1).numpy(),
+            "render": rendering.color.clamp(0, 1).cpu().numpy(),
         }
         for kind, picture in pictures.items():
             folder.write_keyframe_image(keyframe.frame_index, kind, picture)

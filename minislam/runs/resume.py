@@ -14,6 +14,8 @@ from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
 from minislam.slam import Slam
 
+_OF_THE_GPU = ("device", "precision")  # of the choice of priors; may change where there is none
+
 
 class Checkpoints:
     """Saves the state of a run in its folder; saving takes a small fraction of the time."""
@@ -70,8 +72,8 @@ class Checkpoints:
         found = self._folder.read_checkpoint(device)
         try:
             then = flattened({name: found.get(name) for name in self._origin})
-            if device == "cpu":
-                then["priors.device"] = "cpu"
+            if device == "cpu" and then.get("priors.device") != "cpu":
+                then |= {f"priors.{name}": self._origin["priors"][name] for name in _OF_THE_GPU}
             for name, now in flattened(self._origin).items():
                 if then.get(name) != now:
                     raise InputError(
@@ -86,7 +88,7 @@ class Checkpoints:
                         f"expected frame {index} as the interrupted run in {where} read it, found "
                         "another image; restore it, or start anew in another folder"
                     )
-            slam.restore_state(found["slam"], functools.cache(slam.sequence.frame))
+            slam.restore_state(found["slam"], functools.cache(slam.frame))
             self._start -= float(found["run_seconds"])
             self.seconds = float(found["checkpoint_seconds"])
             steps, frames = slam.steps.saved_state()["_done"], len(slam.tracker.tracked)

@@ -118,7 +118,7 @@ def run_sequence(
         alarms.check(slam)
         checkpoints.save(slam, force)
 
-    slam = Slam(sequence, config, priors, preview, between_steps)
+    slam = Slam(sequence, config, priors, preview, between_steps, choice.device)
     preview.watch(slam, lambda: run_facts(slam, choice, checkpoints, "running", None))
     if resume:
         checkpoints.restore(slam)

@@ -178,6 +178,6 @@ def conics_from_factors2d_vjp(
 def _limited_tangents(points_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return (x/z, y/z) (2, N), kept near the view, and where (2, N) they needed no limit."""
     tangents = points_camera[:2] / points_camera[2]
-    lower, upper = (torch.tensor(limit).to(tangents)[:, None] for limit in tangent_limits(camera))
+    lower, upper = (tangents.new_tensor(limit)[:, None] for limit in tangent_limits(camera))
     inside = (tangents >= lower) & (tangents <= upper)
     return torch.clamp(tangents, lower, upper), inside

@@ -113,11 +113,11 @@ def project_covariances(
     """
     z = points_camera[:, 2:]
     tangents = points_camera[:, :2] / z
-    lower, upper = (torch.tensor(limit).to(tangents) for limit in tangent_limits(camera))
+    lower, upper = (tangents.new_tensor(limit) for limit in tangent_limits(camera))
     limited = torch.cat([torch.minimum(torch.maximum(tangents, lower), upper) * z, z], -1)
     to_pixels = camera.project_jacobian(limited) @ T_camera_world[:3, :3]  # J W, (N, 2, 3)
     projected = to_pixels @ covariances_world @ to_pixels.transpose(-1, -2)
-    return projected + LOW_PASS_VARIANCE * torch.eye(2).to(projected)
+    return projected + LOW_PASS_VARIANCE * torch.eye(2, dtype=z.dtype, device=z.device)
 
 
 def gaussian_alphas(

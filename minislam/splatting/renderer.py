@@ -157,7 +157,7 @@ def _denormals_flushed() -> Iterator[None]:
     Behind twenty nearly opaque Gaussians T is denormal, and each product takes a hundred cycles.
     """
     smallest_normal = torch.finfo(torch.float32).tiny
-    already = float(torch.full((1,), smallest_normal) * 0.5) == 0
+    already = float(torch.full((1,), smallest_normal, device="cpu") * 0.5) == 0
     torch.set_flush_denormal(True)
     try:
         yield

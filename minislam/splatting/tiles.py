@@ -49,8 +49,10 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
 def tile_centres(camera: Camera, like: Tensor) -> Tensor:  # (2, tiles) px
     """Return the centre of every tile."""
     rows, columns = tile_grid(camera)
-    u = torch.arange(columns).to(like) * TILE + (TILE - 1) / 2
-    v = torch.arange(rows).to(like) * TILE + (TILE - 1) / 2
+    u, v = (
+        torch.arange(count, dtype=like.dtype, device=like.device) * TILE + (TILE - 1) / 2
+        for count in (columns, rows)
+    )
     return torch.stack([u.repeat(rows), v.repeat_interleave(columns)])
 
 

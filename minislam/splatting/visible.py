@@ -151,7 +151,7 @@ def _nearest_first(depths: Tensor) -> Tensor:  # (V,) positive -> (V,) int64
         return depths.argsort(stable=True)
     # Positive floats are in the order of their bits. With the row in the lower half of each key
     # any sort is stable, and numpy's sort of integers is ten times faster than a stable one.
-    keys = depths.view(torch.int32).long() << 32 | torch.arange(len(depths))
+    keys = depths.view(torch.int32).long() << 32 | torch.arange(len(depths), device=depths.device)
     return torch.from_numpy(np.sort(keys.numpy())) & 0xFFFFFFFF
 
 

@@ -95,7 +95,7 @@ class Sweeper:
         width = min(width, camera.width)
         self.camera = camera.resized(width, max(1, round(width * camera.height / camera.width)))
         self._sequence = sequence
-        self._poses = {index: pose.double().numpy() for index, pose in poses.items()}
+        self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
 
     def _read_image(self, frame_index: int) -> PosedImage:

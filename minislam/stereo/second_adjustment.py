@@ -53,8 +53,10 @@ def sweep_keyframes(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of the tracker's keyframes."""
     frames = [frame.frame_index for frame in graph.keyframes.frames]
-    known = [agreed_disparities(graph, index).numpy() for index in range(len(frames))]
-    return dense_depths(sequence, graph.grid.camera, poses, frames, known, progress, width)
+    known = [agreed_disparities(graph, index).cpu().numpy() for index in range(len(frames))]
+    swept = dense_depths(sequence, graph.grid.camera, poses, frames, known, progress, width)
+    device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
+    return [(depth.to(device), confirmation.to(device)) for depth, confirmation in swept]
 
 
 def adjust_confirmed(

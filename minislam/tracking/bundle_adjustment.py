@@ -222,13 +222,13 @@ def _assemble_poses(
     target = slots[problem.edges_target] % width
     common, border, A = A[:, 6:, 6:].sum(0), A[:, :6, 6:], A[:, :6, :6]
     A_source = -adjoint.mT @ A  # rows of the source, columns of the target
-    H = torch.zeros(width**2, 6, 6, dtype=torch.float64)
+    H = A.new_zeros(width**2, 6, 6)
     H.index_add_(0, target * width + target, A)
     H.index_add_(0, source * width + target, A_source)
     H.index_add_(0, target * width + source, A_source.mT)
     H.index_add_(0, source * width + source, -A_source @ adjoint)
     right = torch.cat([border, b[:, :6, None]], 2)  # the border and g are summed alike
-    B = torch.zeros(width, 6, right.shape[2], dtype=torch.float64)
+    B = right.new_zeros(width, 6, right.shape[2])
     B.index_add_(0, target, right)
     B.index_add_(0, source, -adjoint.mT @ right)
     H = H.reshape(width, width, 6, 6)[:count, :count].permute(0, 2, 1, 3).flatten(2).flatten(0, 1)
@@ -245,18 +245,20 @@ def _source_blocks(
     The rows of E_k belong to frame k itself (summed over its edges), to its targets and to the
     common columns, so the Schur complement is one small matrix product per source frame.
     """
-    slots, offsets = _pose_slots(problem), torch.arange(6)
-    common = 6 * int(problem.free_poses.sum()) + torch.arange(E_target.shape[1] - 6)
-    blocks = []
-    for source in torch.unique(problem.edges_source).tolist():
-        if not problem.free_disparities[source]:
-            continue
-        members = torch.nonzero(problem.edges_source == source).squeeze(1)
-        ends = torch.cat([slots[source : source + 1], slots[problem.edges_target[members]]])
-        parts = torch.cat([E_source[members].sum(0)[None], E_target[members, :6]])
-        rows = torch.cat([(ends[ends >= 0, None] * 6 + offsets).flatten(), common])
-        E = torch.cat([parts[ends >= 0].flatten(0, 1), E_target[members, 6:].sum(0)])
-        blocks.append((source, rows, E))
+    slots, targets = _pose_slots(problem).tolist(), problem.edges_target.tolist()
+    edges_of: dict[int, list[int]] = {}
+    for edge, source in enumerate(problem.edges_source.tolist()):
+        edges_of.setdefault(source, []).append(edge)
+    common = [6 * (max(slots) + 1) + column for column in range(E_target.shape[1] - 6)]
+    blocks, is_free = [], problem.free_disparities.tolist()
+    for source in sorted(source for source in edges_of if is_free[source]):
+        edges = edges_of[source]
+        ends = [slots[source], *(slots[targets[edge]] for edge in edges)]
+        free = [position for position, end in enumerate(ends) if end >= 0]
+        parts = torch.cat([E_source[edges].sum(0)[None], E_target[edges, :6]])
+        rows = [6 * ends[position] + row for position in free for row in range(6)] + common
+        E = torch.cat([parts[free].flatten(0, 1), E_target[edges, 6:].sum(0)])
+        blocks.append((source, torch.tensor(rows, dtype=torch.long, device=E.device), E))
     return blocks
 
 
@@ -284,7 +286,7 @@ def _damped_step(
     S.diagonal().mul_(1 + damping).add_(absolute_damping)
     factor, failure = torch.linalg.cholesky_ex(S)
     xi = torch.cholesky_solve(b[:, None], factor).squeeze(1)
-    if failure or not torch.isfinite(xi).all():
+    if failure | ~torch.isfinite(xi).all():
         return None
 
     poses = state.T_camera_world.clone()

@@ -7,9 +7,10 @@ from minislam.parameters import parameter
 
 @dataclass(frozen=True)
 class LearnedFlowConfig:
-    """What replaces the settings of the same names where the confidence of the flow is learned.
+    """The defaults that differ where the confidence of the flow is learned.
 
-    Flow and geometry take turns: one update of the flow, two Gauss-Newton steps, and again.
+    Flow and geometry take turns: one update of the flow, two Gauss-Newton steps, and again. Whoever
+    sets tracking.X sets tracking.learned.X as well, unless both are given (`with_settings`).
     """
 
     keyframe_flow: float = parameter(10.0, "as tracking.keyframe_flow [px]")

@@ -88,7 +88,7 @@ def depth_consistency(
     stride = grid.stride
     depth = view.metric_depth[::stride, ::stride].reshape(-1)
     cell_features = sample_features(view.features, grid.pixels, grid.camera)
-    corresponding = torch.zeros(len(depth), dtype=torch.int64)
+    corresponding = torch.zeros_like(depth, dtype=torch.int64)
     consistent = torch.zeros_like(corresponding)
     for other in others:
         T_view_other = view.T_camera_world @ se3_inverse(other.T_camera_world)
@@ -113,8 +113,8 @@ def warp_depth(
     hidden surface would count as a contradiction.
     """
     camera, stride = grid.camera, grid.stride
-    pixels = camera.pixel_grid(dtype=other.metric_depth.dtype).reshape(-1, 2)
     depth = other.metric_depth.reshape(-1)
+    pixels = camera.pixel_grid(dtype=depth.dtype, device=depth.device).reshape(-1, 2)
     points = camera.backproject(pixels, depth)
     points = transform_points(T_view_other.to(points.dtype), points)
     warped = points[:, 2]

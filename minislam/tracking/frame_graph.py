@@ -148,10 +148,10 @@ def flow_distances(
     both directions. Rotation counts less than translation, because it brings no parallax.
     """
     count = len(T_camera_world)
-    distances = torch.full((count, count), FAR, dtype=disparities.dtype)
-    all_keyframes = torch.arange(count)
+    distances = disparities.new_full((count, count), FAR)
+    all_keyframes = torch.arange(count, device=disparities.device)
     for row in range(count) if rows is None else rows:
-        this = torch.full((count,), row)
+        this = torch.full_like(all_keyframes, row)
         both = []
         for source, target in ((this, all_keyframes), (all_keyframes, this)):
             motion = relative_transforms(T_camera_world, source, target).to(disparities.dtype)
@@ -169,8 +169,8 @@ def _directed_distances(
     camera: Camera,
     rotation_weight: float,
 ) -> Tensor:  # (E,) px, FAR where too little of the source stays in view
-    without_rotation = torch.eye(4, dtype=T_target_source.dtype).repeat(len(T_target_source), 1, 1)
-    without_rotation[:, :3, 3] = T_target_source[:, :3, 3]
+    without_rotation = T_target_source.clone()
+    without_rotation[:, :3, :3] = torch.eye(3, device=T_target_source.device)
     total, visible = disparities.new_zeros(2, len(T_target_source))
     motions = (T_target_source, rotation_weight), (without_rotation, 1 - rotation_weight)
     for motion, weight in motions:

@@ -21,9 +21,9 @@ class Grid(Stateful):
     rays: Tensor  # (N, 3), z = 1
 
     @classmethod
-    def of(cls, camera: Camera, stride: int) -> "Grid":
+    def of(cls, camera: Camera, stride: int, device: str = "cpu") -> "Grid":
         """Return the grid of a camera."""
-        pixels = camera.pixel_grid(stride)
+        pixels = camera.pixel_grid(stride, device=device)
         height, width = pixels.shape[:2]
         flat = pixels.reshape(-1, 2)
         return cls(camera, stride, (height, width), flat, camera.rays(flat))

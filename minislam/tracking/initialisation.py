@@ -46,7 +46,7 @@ def first_disparity_hypotheses(
     if bool(known.any()):
         return [torch.where(known, prior_disparities, prior_disparities[known].median())]
     triangulated = [essential_disparities(grid, *measured) for measured in from_first]
-    return [torch.ones(len(grid.rays)), *(d for d in triangulated if d is not None)]
+    return [torch.ones_like(prior_disparities), *(d for d in triangulated if d is not None)]
 
 
 def chain_state(
@@ -59,7 +59,7 @@ def chain_state(
     prior_strength: float,  # lambda_4 fx^2
 ) -> tuple[BundleState, Tensor]:  # and the motion weights (K, N)
     """Return poses and disparities of K keyframes, each from its predecessor."""
-    poses = [torch.eye(4, dtype=torch.float64)]
+    poses = [torch.eye(4, dtype=torch.float64, device=first_disparities.device)]
     disparities = [first_disparities]
     weights = [torch.ones_like(first_disparities)]
     for index, matches in enumerate(flow_to_next):

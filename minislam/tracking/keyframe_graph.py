@@ -63,11 +63,13 @@ class KeyframeGraph(Stateful):
     seeks_focal: bool = False  # the focal length is only a first guess
     focal_is_free: bool = False  # the motion has told it; adjustments of all keyframes refine it
 
-    def __init__(self, camera: Camera, config: TrackingConfig, flow: FlowEstimator) -> None:
+    def __init__(
+        self, camera: Camera, config: TrackingConfig, flow: FlowEstimator, device: str = "cpu"
+    ) -> None:
         self.is_learned = flow.learned_confidence  # then flow and geometry take turns
         self.config = config.for_learned_flow() if self.is_learned else config
-        self.grid = Grid.of(camera, flow.stride)
-        self.keyframes = KeyframeStore(len(self.grid.rays))
+        self.grid = Grid.of(camera, flow.stride, device)
+        self.keyframes = KeyframeStore(self.grid.rays[:, 0])
         self.flow_to_next = []
         self.links = FrameGraph()
         self.flow = flow
@@ -149,8 +151,9 @@ class KeyframeGraph(Stateful):
         keyframes, grid, newest, count = self.keyframes, self.grid, len(self.keyframes), len(around)
         known, weights = keyframes.T_camera_world[around], keyframes.cell_weights[around]
         robust = self.robust and self.robust.widened(ROBUST_NARROWING)
-        ends = torch.arange(count), torch.full((count,), count)
-        unused = torch.zeros(1, len(grid.rays))  # disparities of the image itself
+        numbers = torch.arange(count + 1, device=known.device)
+        ends = numbers[:-1], numbers[-1:].expand(count)
+        unused = grid.rays.new_zeros(1, len(grid.rays))  # disparities of the image itself
         disparities = torch.cat([keyframes.disparities[around], unused])
         state = BundleState(torch.cat([known, start[None]]), disparities)
         self.flow.add_frame(newest, image)
@@ -159,7 +162,7 @@ class KeyframeGraph(Stateful):
             predicted, _ = reproject(transforms, disparities[:-1], grid.rays, grid.camera)
             matches = self.flow.match(around, [newest] * count, predicted)
             measured = *ends, matches.targets, matches.confidences * weights[:, None]
-            problem = motion_only_problem(grid, *measured, torch.arange(count + 1) == count, robust)
+            problem = motion_only_problem(grid, *measured, numbers == count, robust)
             if count == 1 and not self.is_learned:  # then it may follow a dynamic object
                 poses = known[0], list(state.T_camera_world[1:])
                 pose = start_pose(grid, matches, disparities[0], weights[0], *poses, self.robust)
@@ -213,7 +216,7 @@ class KeyframeGraph(Stateful):
 
     def _flow_from_geometry(self, edges: list[Edge]) -> FlowMatches:
         """Return the flow of these edges, started from what the present geometry predicts."""
-        sources, targets = torch.tensor(edges).unbind(1)
+        sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         predicted, _ = reproject(
             transforms, self.keyframes.disparities[sources], self.grid.rays, self.grid.camera
@@ -221,7 +224,7 @@ class KeyframeGraph(Stateful):
         # Points near the camera plane project to anywhere; a flow started there finds nothing.
         size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
         predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
-        return self.flow.match(sources.tolist(), targets.tolist(), predicted)
+        return self.flow.match(sources, targets, predicted)
 
     # Which keyframes to link --------------------------------------------------------------------
 
@@ -284,10 +287,11 @@ class KeyframeGraph(Stateful):
         self, poses: Tensor, disparities: Tensor, rows: range | None = None
     ) -> Tensor:
         view = self.grid.rays, self.grid.pixels, self.grid.camera
-        return flow_distances(poses, disparities, *view, ROTATION_WEIGHT, rows)
+        # On the CPU, because pairs are chosen by one number after the other.
+        return flow_distances(poses, disparities, *view, ROTATION_WEIGHT, rows).cpu()
 
-    def parallaxes(self, sources: Tensor, targets: Tensor) -> Tensor:  # (E,), (E,) -> (E,) px
-        """Return the mean parallax of edges, from the present poses and disparities."""
+    def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
+        """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         disparities = self.keyframes.disparities[sources]
         return mean_parallax(transforms, disparities, self.grid.rays, self.grid.camera)

@@ -20,16 +20,15 @@ class KeyframeStore(Stateful):
     static_weights: Tensor  # (K, N) in [0, 1], from beta
     motion_weights: Tensor  # (K, N) in [0, 1], how well a cell's flow has fitted the camera motion
 
-    def __init__(self, cells: int) -> None:
+    def __init__(self, like: Tensor) -> None:
+        """Start empty, for as many cells as a tensor (N,) has, and on its device."""
         self.frames = []
         self.features = []
         self.metric_depths = []
-        self.T_camera_world = torch.zeros(0, 4, 4, dtype=torch.float64)
-        self.disparities = torch.zeros(0, cells)
-        self.prior_disparities = torch.zeros(0, cells)
-        self.prior_masks = torch.zeros(0, cells, dtype=torch.bool)
-        self.static_weights = torch.zeros(0, cells)
-        self.motion_weights = torch.zeros(0, cells)
+        self.T_camera_world = like.new_zeros(0, 4, 4, dtype=torch.float64)
+        self.disparities = self.prior_disparities = like.new_zeros(0, len(like))
+        self.static_weights = self.motion_weights = like.new_zeros(0, len(like))
+        self.prior_masks = self.disparities.bool()
 
     def __len__(self) -> int:
         return len(self.frames)

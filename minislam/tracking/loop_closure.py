@@ -28,7 +28,7 @@ def loop_pairs(
     suppression: int,  # keyframes around a pair that would repeat it
 ) -> list[tuple[int, int]]:
     """Return pairs (newest, old) that close a loop."""
-    index = torch.arange(len(distances))
+    index = torch.arange(len(distances), device=distances.device)
     near_in_time = (index[:, None] - index).abs() < min_gap
     candidates = distances.masked_fill(near_in_time, FAR)
     far_edges = [edge for edge in edges if abs(edge[0] - edge[1]) >= min_gap]

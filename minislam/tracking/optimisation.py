@@ -102,8 +102,8 @@ def bundle_problem(
 ) -> BundleProblem:
     """Collect links of the graph into the bundle problem of Eq. (5)."""
     keyframes, links, grid = graph.keyframes, graph.links, graph.grid
-    sources = torch.tensor([links.edges_source[p] for p in positions])
-    edges_target = torch.tensor([links.edges_target[p] for p in positions])
+    ends = [(links.edges_source[p], links.edges_target[p]) for p in positions]
+    sources, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
     targets = torch.stack([links.targets[p] for p in positions])
     confidences = torch.stack([links.confidences[p] for p in positions])
     # Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a
@@ -116,7 +116,7 @@ def bundle_problem(
     if lambda_prior is None:
         lambda_prior = graph.config.lambda_disparity_prior
     strength = lambda_prior * grid.camera.fx**2
-    free = torch.arange(len(keyframes)) >= first_free
+    free = torch.arange(len(keyframes), device=prior.device) >= first_free
     free_poses = free.clone()
     free_poses[0] = False  # the first camera is the world
     return BundleProblem(
@@ -137,7 +137,7 @@ def bundle_problem(
 
 def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool
     """Tell which keyframes have a link with enough parallax, so that it measures depth."""
-    most = torch.zeros(len(graph.keyframes))
+    most = graph.grid.rays.new_zeros(len(graph.keyframes))
     seen = graph.parallaxes(problem.edges_source, problem.edges_target)
     most.scatter_reduce_(0, problem.edges_source, seen, "amax")
     return most >= graph.config.min_parallax * graph.pixel_scale

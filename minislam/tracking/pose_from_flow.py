@@ -41,7 +41,7 @@ def motion_only_problem(
 ) -> BundleProblem:
     """Return a bundle problem in which only poses move: disparities held, no prior."""
     count = len(free_poses)
-    no_prior = torch.zeros(count, len(grid.rays))
+    no_prior = grid.rays.new_zeros(count, len(grid.rays))
     return BundleProblem(
         camera=grid.camera,
         rays=grid.rays,
@@ -52,7 +52,7 @@ def motion_only_problem(
         prior_disparities=no_prior,
         prior_weights=no_prior,
         free_poses=free_poses,
-        free_disparities=torch.zeros(count, dtype=torch.bool),
+        free_disparities=torch.zeros_like(free_poses),
         robust=robust,
     )
 
@@ -77,11 +77,12 @@ def start_pose(
     for widening in ROBUST_WIDENING if robust else (1.0,):
         candidates += starts
         count = len(candidates)
-        ends = torch.zeros(count, dtype=torch.long), torch.arange(1, count + 1)
+        numbers = torch.arange(count + 1, device=disparities.device)
         weights = (matches.confidences * cell_weights).expand(count, -1, -1)
+        ends = torch.zeros_like(numbers[1:]), numbers[1:]
         measured = *ends, matches.targets.expand(count, -1, -1), weights
         kernel = robust and robust.widened(widening)
-        problem = motion_only_problem(grid, *measured, torch.arange(count + 1) > 0, kernel)
+        problem = motion_only_problem(grid, *measured, numbers > 0, kernel)
         poses = torch.stack([T_source_world, *candidates])
         state = BundleState(poses, disparities.expand(count + 1, -1))
         state, _ = motion_only_adjust(problem, state, POSE_ITERATIONS)
@@ -100,8 +101,14 @@ def warp_disparities(
     warped = splat_disparities(
         T_target_source, disparities, grid.rays, grid.camera, grid.shape, grid.stride
     ).reshape(grid.shape)
-    empty = warped.numpy() == 0
-    if empty.all():
+    if not warped.any():
         return disparities[disparities > 0].median().expand(len(disparities)).clone()
-    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return warped[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])].reshape(-1)
+    return filled_from_nearest(warped, warped == 0)
+
+
+def filled_from_nearest(values: Tensor, empty: Tensor) -> Tensor:  # (h, w), (h, w) bool -> (N,)
+    """Return values in which each empty cell has that of the nearest other one (scipy, CPU)."""
+    cells = empty.cpu().numpy()
+    nearest = ndimage.distance_transform_edt(cells, return_distances=False, return_indices=True)
+    row, column = torch.from_numpy(nearest).to(values.device)
+    return values[row, column].reshape(-1)

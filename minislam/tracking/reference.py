@@ -45,7 +45,7 @@ def predicted_positions(problem: BundleProblem, state: BundleState) -> tuple[Ten
 def moved(problem: BundleProblem, state: BundleState, step: Tensor) -> BundleState:
     """Return the state after a step (6 P + D,): exp(xi) T for poses, d + step for disparities."""
     pose_unknowns = 6 * int(problem.free_poses.sum())
-    xi = torch.zeros(len(problem.free_poses), 6, dtype=step.dtype)
+    xi = step.new_zeros(len(problem.free_poses), 6)
     xi = xi.index_put((problem.free_poses,), step[:pose_unknowns].reshape(-1, 6))
     added = torch.zeros_like(state.disparities)
     free = problem.free_disparities
@@ -60,7 +60,7 @@ def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseN
     """
     poses = int(problem.free_poses.sum())
     frames = int(problem.free_disparities.sum())
-    no_step = torch.zeros(6 * poses + frames * len(problem.rays), dtype=torch.float64)
+    no_step = problem.rays.new_zeros(6 * poses + frames * len(problem.rays), dtype=torch.float64)
 
     def predicted(step: Tensor) -> Tensor:
         return predicted_positions(problem, moved(problem, state, step))[0].reshape(-1)

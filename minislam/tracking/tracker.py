@@ -75,6 +75,7 @@ class Tracker(Stateful):
         features: FeatureExtractor,
         depth_prior: DepthPrior,
         predict_static_weight: Callable[[int], Tensor],  # keyframe index -> (h, w) in [0, 1]
+        device: str = "cpu",  # of all tensors; frames must be there, too
     ) -> None:
         """Start without any frame.
 
@@ -82,7 +83,7 @@ class Tracker(Stateful):
         the warm-up and in the final adjustment. So online, a keyframe keeps the beta it had when
         it came, although the MLP learns on.
         """
-        self.graph = KeyframeGraph(camera, config, flow)
+        self.graph = KeyframeGraph(camera, config, flow, device)
         self.config = config = self.graph.config  # for this kind of flow
         self.keyframes = self.graph.keyframes
         self.grid = self.graph.grid
@@ -137,8 +138,9 @@ class Tracker(Stateful):
         """Make the first frame the first keyframe; its camera frame is the world frame."""
         self.mode = Mode.WARMING_UP
         self._chain = self.graph.flow.start_chain(frame.image)
-        world = torch.eye(4, dtype=torch.float64)
-        self._add_keyframe(frame, self._features(frame), world, torch.ones(len(self.grid.rays)))
+        ones = torch.ones_like(self.grid.rays[:, 0])
+        world = torch.eye(4, dtype=torch.float64, device=ones.device)
+        self._add_keyframe(frame, self._features(frame), world, ones)
         self._log_followed(frame, 1.0)
 
     def _follow(self, frame: Frame) -> None:

@@ -28,7 +28,7 @@ def pose_all_frames(
     others = {t.frame_index: t for t in followed if t.frame_index not in fits}
 
     def fit_from(index: int, start: Tensor) -> PoseFit:
-        image = sequence.frame(index).image
+        image = sequence.frame(index).image.to(poses.device)
         return PoseFit(*graph.fit_pose(image, _around(graph, others[index]), start))
 
     for done, (index, tracked) in enumerate(others.items()):

@@ -73,12 +73,12 @@ class UncertaintyTrainer(Stateful):
         feature_dimension: int,  # C
         config: UncertaintyConfig,
         seed: int,
+        device: str = "cpu",  # of the MLP; its random numbers are drawn on the CPU
     ) -> None:
         self.config = config
         self.generator = torch.Generator().manual_seed(seed)
-        self.mlp = UncertaintyMLP(
-            feature_dimension, self.generator, config.hidden_units, config.dropout
-        )
+        mlp = UncertaintyMLP(feature_dimension, self.generator, config.hidden_units, config.dropout)
+        self.mlp = mlp.to(device)
         self.optimizer = torch.optim.Adam(
             self.mlp.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )

@@ -28,7 +28,7 @@ def map_of(scales: list[float], opacity_logit: float = 2.0) -> GaussianMap:
 
 
 def test_screen_gradient_is_in_half_images_and_counts_only_views_that_see():
-    gradients = ScreenGradients(2)
+    gradients = ScreenGradients(torch.zeros(2))
     camera = Camera(10.0, 10.0, 4.0, 2.0, 20, 10)
     gradients.add(torch.tensor([[0.3, 0.0], [1.0, 1.0]]), torch.tensor([2.0, 0.0]), camera)
     gradients.add(torch.tensor([[0.0, 0.2], [1.0, 1.0]]), torch.tensor([2.0, 0.0]), camera)

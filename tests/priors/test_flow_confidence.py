@@ -76,9 +76,8 @@ def test_matched_ratio_is_relative_to_what_texture_allows():
     texture = np.array([[0.5, 0.9], [0.0, 0.6]])
     confidence = 0.5 * texture
     targets = np.zeros((2, 2, 2))
-    matches = as_matches(
-        [targets, targets], [confidence, texture], [texture, texture], torch.float64
-    )
+    like = torch.zeros(0, dtype=torch.float64)
+    matches = as_matches([targets, targets], [confidence, texture], [texture, texture], like)
     torch.testing.assert_close(matches.matched_ratios, torch.tensor([0.5, 1.0]).double())
     assert torch.equal(matches.confidences[:, 0], matches.confidences[:, 1])
 

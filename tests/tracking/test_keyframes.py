@@ -11,7 +11,7 @@ CELLS = 12
 
 
 def filled(count: int) -> KeyframeStore:
-    store = KeyframeStore(CELLS)
+    store = KeyframeStore(torch.zeros(CELLS))
     poses = poses_on_an_arc(count, 0)
     for index in range(count):
         frame = Frame(3 * index, 0.1 * index, torch.zeros(6, 8, 3))
@@ -23,7 +23,7 @@ def filled(count: int) -> KeyframeStore:
 
 
 def test_an_empty_store_has_no_rows():
-    store = KeyframeStore(CELLS)
+    store = KeyframeStore(torch.zeros(CELLS))
     assert len(store) == 0 and store.T_camera_world.shape == (0, 4, 4)
     assert store.disparities.shape == (0, CELLS)
 

@@ -8,6 +8,7 @@ tensor that was never read is unexpected.
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ class Weights:
     def __init__(self, tensors: dict[str, Tensor], file: str, prefix: str = "") -> None:
         self.file = file  # for messages
         self.prefix = prefix
+        self.precision = torch.float32  # in which the layers of large networks compute
         self._tensors = tensors
         self._used: set[str] = set()
 
@@ -58,7 +60,7 @@ class Weights:
     def below(self, prefix: str) -> "Weights":
         """Return the weights whose names start with `prefix`, under their names without it."""
         part = Weights(self._tensors, self.file, self.prefix + prefix)
-        part._used = self._used
+        part._used, part.precision = self._used, self.precision
         return part
 
     def count(self, pattern: str) -> int:
@@ -76,6 +78,11 @@ class Weights:
     def device(self) -> torch.device:
         """Return where the tensors are, and where networks built on them run."""
         return next(iter(self._tensors.values())).device
+
+    def autocast(self) -> AbstractContextManager[Any]:
+        """Return the context in which layers compute in the precision of these weights."""
+        is_mixed = self.precision is not torch.float32
+        return torch.autocast(self.device.type, self.precision) if is_mixed else nullcontext()
 
     def linear(self, name: str, x: Tensor, bias: bool = True) -> Tensor:
         """Apply a linear layer."""

@@ -61,12 +61,14 @@ class EncodedFrame:
     def __init__(self, weights: Weights, image: Tensor) -> None:
         self.image = image  # (H, W, 3)
         self._weights, self._normalised = weights, normalise(image, weights.device)
-        self.features = encode_features(weights, self._normalised)  # (1, 128, h, w)
+        with weights.autocast():
+            self.features = encode_features(weights, self._normalised)  # (1, 128, h, w)
 
     @cached_property
     def context(self) -> tuple[Tensor, Tensor]:  # (1, 128, h, w) twice
         """Return the first hidden state and the context of all updates."""
-        return encode_context(self._weights, self._normalised)
+        with self._weights.autocast():
+            return encode_context(self._weights, self._normalised)
 
 
 class DroidFlow(Stateful):
@@ -191,13 +193,15 @@ class DroidFlow(Stateful):
         last_target: Tensor,  # (E, h, w, 2) cells
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Update edges once; return hidden states, targets [cells] and confidences."""
-        correlation = look_up(correlation_pyramid(source, target), expected)
-        answer = update(self.weights, hidden, context, correlation, expected, last_target)
-        return answer.hidden, expected + answer.revision, answer.confidence
+        with self.weights.autocast():
+            correlation = look_up(correlation_pyramid(source, target), expected)
+            answer = update(self.weights, hidden, context, correlation, expected, last_target)
+        return answer.hidden.float(), expected + answer.revision, answer.confidence.float()
 
     def damping(self, hidden: Tensor) -> Tensor:  # (E, 128, h, w) of one source -> (h, w)
         """Return how much the network would damp the disparities of a source."""
-        return damping(self.weights, hidden)
+        with self.weights.autocast():
+            return damping(self.weights, hidden).float()
 
 
 class DroidChain(Stateful):

@@ -116,9 +116,11 @@ def load_network(
     path: Path | str,
     device: torch.device | str = "cpu",
     config: NetworksConfig = NetworksConfig(),
+    precision: torch.dtype = torch.float32,
 ) -> Any:  # a FlowEstimator, FeatureExtractor or DepthPrior
     """Return a network from its checkpoint file, which is checked."""
     weights = load_checkpoint(path, device)
+    weights.precision = precision
     if recognise(weights) is not network:
         raise InputError(
             f"expected a {network.title} checkpoint, found {weights.file}, which looks like "

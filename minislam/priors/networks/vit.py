@@ -88,7 +88,10 @@ class VisionTransformer:
         taps: tuple[int, ...] | None = None,  # blocks to read, counted from 0
     ) -> list[Tokens]:
         """Return the normed tokens after the given blocks, or after the last one."""
-        taps = (self.depth - 1,) if taps is None else taps
+        with self.weights.autocast():
+            return self._tokens(image, (self.depth - 1,) if taps is None else taps)
+
+    def _tokens(self, image: Tensor, taps: tuple[int, ...]) -> list[Tokens]:
         patches = self.weights.conv("patch_embed.proj", image, stride=PATCH, padding=0)
         rows, cols = patches.shape[-2:]
         patches = patches + self._resized_positions(rows, cols)
@@ -102,7 +105,7 @@ class VisionTransformer:
         return [readings[index] for index in taps]
 
     def _read(self, tokens: Tensor, rows: int, cols: int) -> Tokens:
-        normed = self.weights.layer_norm("norm", tokens, _EPSILON)
+        normed = self.weights.layer_norm("norm", tokens, _EPSILON).float()
         count = self._leading.shape[1]
         patches = normed[:, count:].mT.unflatten(2, (rows, cols))
         return Tokens(normed[:, :count], patches)

@@ -99,7 +99,7 @@ def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
     explained, depth_error = tie_to_predecessors(graph, keyframe)
     if not positions:
         return KeyframeDiagnostics(frame_index, 0.0, 0.0, explained, depth_error)
-    sources, targets = torch.tensor([edges[p] for p in positions]).unbind(1)
+    sources, targets = ([edges[p][end] for p in positions] for end in (0, 1))
     ratio = max(graph.links.matched_ratios[p] for p in positions)
     parallax = float(graph.parallaxes(sources, targets).max())
     return KeyframeDiagnostics(frame_index, ratio, parallax, explained, depth_error)

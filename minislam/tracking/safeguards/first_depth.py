@@ -27,8 +27,8 @@ def triangulate(
     With the matched ray (a, b, 1), (R rho + d t) must be parallel to it: two equations that are
     linear in d, solved by least squares.
     """
-    rotated = grid.rays @ T_target_source[:3, :3].T.to(grid.rays.dtype)
-    t = T_target_source[:3, 3].to(grid.rays.dtype)
+    T_target_source = T_target_source.to(grid.rays)
+    rotated, t = grid.rays @ T_target_source[:3, :3].T, T_target_source[:3, 3]
     seen = grid.camera.rays(targets)[:, :2]
     factor = t[:2] - seen * t[2]
     value = seen * rotated[:, 2:] - rotated[:, :2]
@@ -51,8 +51,7 @@ def essential_disparities(
     confident = confidences[:, 0] > 0.5
     if int(confident.sum()) < MIN_CELLS_FOR_ESSENTIAL:
         return None
-    source = grid.pixels[confident].double().numpy()
-    target = targets[confident].double().numpy()
+    source, target = (pixels[confident].double().cpu().numpy() for pixels in (grid.pixels, targets))
     matrix = camera_matrix(grid.camera)
     cv2.setRNGSeed(0)
     essential, inliers = cv2.findEssentialMat(

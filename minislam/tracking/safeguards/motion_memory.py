@@ -8,13 +8,13 @@ it flows to inherits that weight.
 """
 
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from minislam.geometry import se3_inverse
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.pose_from_flow import filled_from_nearest
 from minislam.tracking.reprojection import reproject
 
 MIN_CONFIDENCE = 0.1  # of a match that counts [-]
@@ -99,9 +99,7 @@ def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> T
     index = cells[arrives, 1] * width + cells[arrives, 0]
     unknown = torch.full_like(weight, torch.inf)
     inherited = unknown.scatter_reduce(0, index, weight[arrives], "amin").reshape(grid.shape)
-    empty = inherited.isinf().numpy()
-    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return inherited[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])].reshape(-1)
+    return filled_from_nearest(inherited, inherited.isinf())
 
 
 def _is_matched(matches: FlowMatches) -> Tensor:  # (N,) bool

@@ -58,9 +58,9 @@ def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
     Its matched ratio is the part of its weight that the pose explains beyond chance. How high a
     learned confidence is says nothing, because the network learned only to weigh cells by it.
     """
-    pose = graph.start_pose(matches, torch.ones(len(graph.grid.rays)))
+    pose = graph.start_pose(matches, torch.ones_like(graph.grid.rays[:, 0]))
     ends = torch.stack([graph.keyframes.T_camera_world[-1], pose])
-    motion = relative_transforms(ends, torch.tensor([0]), torch.tensor([1])).float()
+    motion = relative_transforms(ends, [0], [1]).float()
     disparities = graph.keyframes.disparities[-1:]
     predicted, _ = reproject(motion, disparities, graph.grid.rays, graph.grid.camera)
     way = lengths(matches.targets - graph.grid.pixels.T)

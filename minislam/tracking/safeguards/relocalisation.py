@@ -65,20 +65,22 @@ class Relocaliser:
         pixels, matched = _keypoint_matches(self._keypoints[index], seen)
         if len(pixels) < MIN_INLIERS:
             return None
-        positions = torch.from_numpy(pixels)[None]
-        structure = torch.stack(
-            [self._keyframes.disparities[index], self._keyframes.cell_weights[index]], -1
-        )
-        disparities, cell_weights = self._grid.sample(structure[None], positions)[0].unbind(-1)
+        keyframes, grid = self._keyframes, self._grid
+        structure = torch.stack([keyframes.disparities[index], keyframes.cell_weights[index]], -1)
+        positions = torch.from_numpy(pixels)
+        # From here on on the CPU, where OpenCV finds the pose.
+        sampled = grid.sample(structure[None].cpu(), positions[None])
+        disparities, cell_weights = sampled[0].unbind(-1)
         usable = (disparities > 0) & (cell_weights > MIN_STATIC_WEIGHT)
         if int(usable.sum()) < MIN_INLIERS:
             return None
-        points = self._grid.camera.rays(positions[0]) / disparities[:, None]
+        points = grid.camera.rays(positions) / disparities[:, None]
         pose = self._pose(points[usable].double().numpy(), matched[usable.numpy()])
         if pose is None:
             return None
         T_frame_keyframe, inliers = pose
-        return Place(index, T_frame_keyframe @ self._keyframes.T_camera_world[index], inliers)
+        T_keyframe_world = keyframes.T_camera_world[index]
+        return Place(index, T_frame_keyframe.to(T_keyframe_world) @ T_keyframe_world, inliers)
 
     def _pose(self, points: np.ndarray, pixels: np.ndarray) -> tuple[Tensor, int] | None:
         """Return T_frame_keyframe and its inliers from points (P, 3) and pixels (P, 2)."""

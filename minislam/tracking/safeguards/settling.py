@@ -37,7 +37,7 @@ class Settling(Stateful):
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._graph = graph
-        self.handed_on = torch.zeros(len(graph.grid.rays))
+        self.handed_on = torch.zeros_like(graph.grid.rays[:, 0])
 
     def information(self) -> Tensor:  # (N,) px^2
         """Return the information of the newest keyframe's disparities; a prior settles all."""

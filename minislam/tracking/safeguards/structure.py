@@ -23,15 +23,15 @@ def agreeing_views(graph: KeyframeGraph, keyframe_index: int) -> Tensor:  # (N,)
     low, high = max(0, keyframe_index - NEIGHBOURS), min(count, keyframe_index + NEIGHBOURS + 1)
     others = [k for k in range(low, high) if k != keyframe_index]
     if not others:
-        return torch.zeros(len(grid.rays), dtype=torch.int64)
-    sources, targets = torch.full((len(others),), keyframe_index), torch.tensor(others)
+        return torch.zeros_like(grid.rays[:, 0], dtype=torch.int64)
+    sources = [keyframe_index] * len(others)
     disparities = keyframes.disparities[sources]
-    transforms = relative_transforms(keyframes.T_camera_world, sources, targets).float()
+    transforms = relative_transforms(keyframes.T_camera_world, sources, others).float()
     depth_ratio = scaled_points(transforms, disparities, grid.rays)[:, 2]
     positions, valid = reproject(transforms, disparities, grid.rays, grid.camera)
     expected = disparities / depth_ratio.clamp_min(1e-6)
     positions = positions.mT
-    seen = grid.sample(keyframes.disparities[targets][..., None], positions)[..., 0]
+    seen = grid.sample(keyframes.disparities[others][..., None], positions)[..., 0]
     visible = valid & grid.camera.contains(positions)
     error = (seen - expected).abs() / expected
     return (visible & (error < MAX_DISPARITY_ERROR)).sum(0)

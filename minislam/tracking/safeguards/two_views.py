@@ -31,15 +31,13 @@ def pose_with_depth(
     robust: RobustKernel | None,
 ) -> Tensor:  # (4, 4)
     """Return T_target_world, adjusted together with the disparities of the source."""
-    source, target = torch.tensor([0]), torch.tensor([1])
-    weights = matches.confidences * cell_weights
-    problem = motion_only_problem(
-        grid, source, target, matches.targets, weights, torch.tensor([False, True]), robust
-    )
+    numbers = torch.arange(2, device=cell_weights.device)
+    measured = matches.targets, matches.confidences * cell_weights
+    problem = motion_only_problem(grid, numbers[:1], numbers[1:], *measured, numbers == 1, robust)
     prior = torch.stack([prior_disparities, torch.zeros_like(prior_disparities)])
     problem = replace(
         problem,
-        free_disparities=torch.tensor([True, False]),
+        free_disparities=numbers == 0,
         prior_disparities=prior,
         prior_weights=prior_strength * (prior > 0),
     )
