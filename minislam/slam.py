@@ -71,15 +71,8 @@ class Slam(Stateful):
         self._features = priors.features
         if config.uncertainty.grid_factor > 1:
             self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
-        self.tracker = Tracker(
-            sequence.camera,
-            config.tracking,
-            priors.flow,
-            self._features,
-            priors.depth,
-            self._static_weight,
-            device,
-        )
+        parts = priors.flow, self._features, priors.depth, self._static_weight
+        self.tracker = Tracker(sequence.camera, config.tracking, *parts, device)
         self.tracker.graph.seeks_focal = sequence.refines_focal
         self.mapper = self._new_mapper()
         self._stride = priors.flow.stride

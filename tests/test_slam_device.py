@@ -95,7 +95,7 @@ def short_stages(root: Path) -> Iterator[None]:
 
 def new_slam(kind: str, device: str, save: Callable[[bool], None] = lambda force: None) -> Slam:
     """Return a system: with simulated depth, without any, or with networks."""
-    frames = FRAMES if kind != "networks" else 4
+    frames = {"depth": FRAMES, "no depth": 8, "networks": 4}[kind]
     size = (64, 48) if kind != "networks" else (72, 64)
     options = InputOptions(stride=3, max_frames=frames, size=size)
     sequence = open_sequence("synth:person", options)

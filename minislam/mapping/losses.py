@@ -163,15 +163,9 @@ def render_loss(
     """
     unit = metre(median_depth)
     color = (weight * color_loss(rendering.color, image, config.lambda_ssim)).mean()
-    depth = weighted_depth_loss(
-        rendering.depth,
-        rendering.opacity,
-        reference_depth,
-        weight,
-        FAR_FACTOR * median_depth,
-        FLOATER_MARGIN * median_depth,
-    )
-    depth = depth.mean() / unit
+    depths = rendering.depth, rendering.opacity, reference_depth
+    limits = FAR_FACTOR * median_depth, FLOATER_MARGIN * median_depth
+    depth = weighted_depth_loss(*depths, weight, *limits).mean() / unit
     isotropic = isotropic_loss(gaussians.scales) / unit
     total = config.color_weight * color + (1 - config.color_weight) * depth
     return RenderLoss(total + config.lambda_isotropic * isotropic, color, depth, isotropic)

@@ -45,20 +45,9 @@ def render(
     channels_behind = like.new_zeros(4)  # of the background: at depth 0, which adds nothing
     if background is not None:
         channels_behind[:3] = background.detach()
-    return Rendering(
-        *_Render.apply(
-            like,
-            gaussians.quats_wxyz,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.colors,
-            twist,
-            screen_offsets,
-            T_camera_world.detach().to(like),
-            channels_behind,
-            camera,
-        )
-    )
+    rows = like, gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors
+    view = T_camera_world.detach().to(like), channels_behind, camera
+    return Rendering(*_Render.apply(*rows, twist, screen_offsets, *view))
 
 
 class _Render(torch.autograd.Function):

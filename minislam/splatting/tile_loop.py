@@ -79,11 +79,8 @@ def composite_image(
         canvas[tiles] = out.channels
         opacities[tiles] = 1 - out.transmittance
         weight_sums.index_add_(0, gaussians, out.weight_sums.view(-1))
-        groups.append(
-            CompositedGroup(
-                tiles, gaussians, offsets, coefficients, group_channels, out.checkpoints
-            )
-        )
+        kept = tiles, gaussians, offsets, coefficients, group_channels, out.checkpoints
+        groups.append(CompositedGroup(*kept))
     opacity = from_tiles(opacities, camera)[0].clone()
     image = from_tiles(canvas, camera)
     return CompositedImage(image, opacity, weight_sums[:-1], groups, workspace)

@@ -100,8 +100,7 @@ def bundle_adjust(
     current = _linearised(problem, state)
     cost_before = current.cost
     equations = None
-    accepted = 0
-    level = damping
+    accepted, level = 0, damping
     converged, reason = True, "all iterations used"
     while accepted < iterations:
         if equations is None:
@@ -203,8 +202,7 @@ def _normal_equations(
 
 def _pose_slots(problem: BundleProblem) -> Tensor:
     """Return the position of every keyframe among the free poses, -1 for a fixed one."""
-    slots = torch.cumsum(problem.free_poses.long(), 0) - 1
-    return torch.where(problem.free_poses, slots, torch.full_like(slots, -1))
+    return torch.where(problem.free_poses, torch.cumsum(problem.free_poses.long(), 0) - 1, -1)
 
 
 def _assemble_poses(

@@ -44,15 +44,9 @@ def close_loops(graph: KeyframeGraph) -> bool:
     config, newest = graph.config, len(graph.keyframes) - 1
     if newest < config.loop_min_gap:
         return False
-    pairs = loop_pairs(
-        graph.distances(rows=range(newest, newest + 1)),
-        graph.links.edges(),
-        newest,
-        config.loop_distance * graph.pixel_scale,
-        config.loop_min_gap,
-        config.loop_edges,
-        LOOP_SUPPRESSION,
-    )
+    distances = graph.distances(rows=range(newest, newest + 1))
+    limits = config.loop_distance * graph.pixel_scale, config.loop_min_gap, config.loop_edges
+    pairs = loop_pairs(distances, graph.links.edges(), newest, *limits, LOOP_SUPPRESSION)
     edges = graph.filter_confirmed(both_directions(pairs))
     if not edges:
         return False

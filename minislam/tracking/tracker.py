@@ -79,16 +79,14 @@ class Tracker(Stateful):
     ) -> None:
         """Start without any frame.
 
-        `predict_static_weight` is called for a new keyframe, and for all keyframes at the end of
-        the warm-up and in the final adjustment. So online, a keyframe keeps the beta it had when
-        it came, although the MLP learns on.
+        `predict_static_weight` is called for a new keyframe, and for all of them at the end of the
+        warm-up and in the final adjustment. So online a keyframe keeps the beta that it came with.
         """
         self.graph = KeyframeGraph(camera, config, flow, device)
         self.config = config = self.graph.config  # for this kind of flow
         self.keyframes = self.graph.keyframes
         self.grid = self.graph.grid
-        self.tracked = []
-        self.watch = Watch(self.graph)
+        self.tracked, self.watch = [], Watch(self.graph)
         self._features = features
         self._depth_prior = lambda frame: depth_prior(frame, camera)  # as given: one unit of length
         self._predict_static_weight = predict_static_weight
@@ -139,7 +137,7 @@ class Tracker(Stateful):
         self.mode = Mode.WARMING_UP
         self._chain = self.graph.flow.start_chain(frame.image)
         ones = torch.ones_like(self.grid.rays[:, 0])
-        world = torch.eye(4, dtype=torch.float64, device=ones.device)
+        world = torch.eye(4, device=ones.device)
         self._add_keyframe(frame, self._features(frame), world, ones)
         self._log_followed(frame, 1.0)
 
