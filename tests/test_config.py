@@ -117,6 +117,15 @@ def test_all_parts_are_frozen():
         assert type(part).__dataclass_params__.frozen
 
 
+def test_a_given_setting_of_the_tracker_holds_for_a_learned_flow_too():
+    changed = with_settings(preset("paper"), {"tracking.window": "4"})
+    assert changed.tracking.for_learned_flow().window == changed.tracking.window == 4
+    both = with_settings(SlamConfig(), {"tracking.learned.window": 6, "tracking.window": 4})
+    assert both.tracking.for_learned_flow().window == 6 and both.tracking.window == 4
+    one = with_settings(SlamConfig(), {"tracking.learned.window": 6})
+    assert one.tracking.window == SlamConfig().tracking.window
+
+
 # Errors
 
 

@@ -16,14 +16,19 @@ import pytest
 import torch
 
 from minislam.config import SlamConfig, with_settings
-from minislam.data import InputOptions, open_sequence
+from minislam.data import InputOptions, RunFolder, open_sequence
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
+from minislam.priors.choice import PriorChoice
 from minislam.priors.depth import NoDepth, SimulatedDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.dinov2 import DinoFeatures
 from minislam.priors.networks.droid import DroidFlow
+from minislam.runs import run
+from minislam.runs.facts import measure, run_facts
+from minislam.runs.pictures import write_pictures
+from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
 from minislam.state.stateful import Tree
 from minislam.tracking import initialisation, pose_from_flow
@@ -146,12 +151,31 @@ def both(request: pytest.FixtureRequest, root: Path) -> Iterator[tuple[Run, Run]
 
 
 def test_a_run_on_the_gpu_gives_what_the_cpu_gives(both: tuple[Run, Run]):
-    expected, found = (run.results for run in both)
+    expected, found = (each.results for each in both)
     if isinstance(both[0].slam.tracker.graph.flow, DroidFlow):
         # There torch chooses other kernels, whose last digits differ; they change what is pruned.
         np.testing.assert_allclose(found[0], expected[0], atol=1e-4)
     else:
         assert all(np.array_equal(*pair) for pair in zip(expected, found, strict=True))
+
+
+@pytest.mark.parametrize("both", ["depth"], indirect=True)
+def test_everything_that_a_run_writes_is_the_same(both: tuple[Run, Run], root: Path):
+    expected, found = (written(each.slam, root / f"out{k}") for k, each in enumerate(both))
+    assert found == expected
+
+
+def written(slam: Slam, out: Path) -> dict[str, object]:
+    """Write the results and pictures of a run; return the metrics, and the bytes of some files."""
+    folder, choice = RunFolder.create(out, False, []), PriorChoice(depth="simulated")
+    checkpoints = Checkpoints(folder, slam.sequence, slam.config, choice)
+    facts = run_facts(slam, choice, checkpoints, "finished", 0)
+    metrics = measure(slam, 1.0, None)
+    run._write_estimates(folder, slam)
+    write_pictures(folder, slam, metrics, facts)
+    del metrics["peak_memory_mb"]
+    names = ("trajectory.txt", "map.ply", "camera.json", "plots/overview.png")
+    return metrics | {name: (out / name).read_bytes() for name in names}
 
 
 def test_the_whole_state_of_a_run_is_on_the_gpu(both: tuple[Run, Run]):

@@ -1,7 +1,7 @@
 """The interfaces of flow, features and depth.
 
 Each has an implementation that needs no weights. A pretrained network can replace it, and nothing
-else changes.
+else changes. Images are on the device of the run, and answers come back on it.
 """
 
 from dataclasses import dataclass

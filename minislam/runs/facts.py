@@ -98,7 +98,8 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         views.append(view)
         static = slam.mapper.static_weight(slam.mapper.beta_of(keyframe), slam.mapper.camera) > 0
         if static.any():
-            likeness.append(psnr(rendering.color.clamp(0, 1), keyframe.image, static))
+            pictures = rendering.color.clamp(0, 1), keyframe.image, static
+            likeness.append(psnr(*(picture.cpu() for picture in pictures)))
     metrics: dict[str, Any] = measure_run(
         slam.sequence.ground_truth,
         slam.trajectory(),

@@ -65,6 +65,8 @@ def test_priors_without_weights_are_found_by_their_names():
         (features, {"features": "fit3d", "features_weights": "none.pth"}, "found nothing at none"),
         (depth, {"depth": "simulated"}, "true depth for --depth simulated, found none in desk"),
         (flow, {"device": "tpu"}, "expected --device cpu or cuda, found 'tpu'"),
+        (flow, {"precision": "fp16"}, "--precision fp32 or bf16 with --device cpu, found 'fp16'"),
+        (flow, {"precision": "half"}, "--precision fp32 or bf16 with --device cpu, found 'half'"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_together_is_refused(choose, flags: dict[str, str], sentence: str):

@@ -159,18 +159,20 @@ def test_what_a_gpu_began_goes_on_without_one(
 ):
     out = shutil.copytree(interrupted, tmp_path / "out")
     tree = read_checkpoint(out / "checkpoint.npz")
-    tree["priors"]["device"] = "cuda"
+    tree["priors"] |= {"device": "cuda", "precision": "fp16"}
     write_checkpoint(out / "checkpoint.npz", tree)
     with np.load(out / "checkpoint.npz") as file:
         arrays = dict(file)
     text = arrays["tree.json"].tobytes().replace(b'"cpu"]', b'"cuda:0"]')
     np.savez(out / "checkpoint.npz", **arrays | {"tree.json": np.frombuffer(text, np.uint8)})
     config = (out / "config.json").read_text().replace('"device": "cpu"', '"device": "cuda"')
-    (out / "config.json").write_text(config)
+    (out / "config.json").write_text(config.replace('"fp32"', '"fp16"'))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(["run", "-o", str(out), "--resume"]) == 1
     assert_one_sentence("expected a GPU .* found none; say --device cpu", capsys)
-    again = ("--resume", "--device", "cpu")
+    assert main(["run", "-o", str(out), "--resume", "--device", "cpu"]) == 1
+    assert_one_sentence("--precision fp32 or bf16 with --device cpu, found 'fp16'", capsys)
+    again = ("--resume", "--device", "cpu", "--precision", "fp32")
     assert run_until(ctrl_c, TRACKING, 4, "synth:person", out, *again) == 130
     state = RunFolder(out).read_checkpoint()
     assert state["priors"]["device"] == "cpu" and state["slam"]["steps"]["_done"] == {TRACKING: 4}
