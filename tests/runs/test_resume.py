@@ -154,9 +154,7 @@ def test_sequence_input_and_settings_come_from_the_folder(whole: Path, root: Pat
     assert_same_results(whole, out)
 
 
-def test_what_a_gpu_began_goes_on_without_one(
-    interrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-):
+def test_what_a_gpu_began_goes_on_on_a_cpu(interrupted: Path, tmp_path: Path, monkeypatch, capsys):
     out = shutil.copytree(interrupted, tmp_path / "out")
     tree = read_checkpoint(out / "checkpoint.npz")
     tree["priors"] |= {"device": "cuda", "precision": "fp16"}
