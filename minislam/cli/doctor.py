@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import time
-from importlib.metadata import distributions
 
 import minislam
 from minislam.errors import MinislamError
@@ -54,6 +53,8 @@ def run_doctor(args: argparse.Namespace) -> int:
 
 def opencv_warnings() -> list[str]:
     """Say if several OpenCV packages are installed, which overwrite each other's files."""
+    from importlib.metadata import distributions
+
     names = {str(found.metadata["Name"]).lower() for found in distributions()}
     found = sorted(name for name in names if name.startswith("opencv-"))
     if len(found) < 2:

@@ -1,7 +1,6 @@
 """Which priors there are, by the values of --flow, --features and --depth. This needs no torch."""
 
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from minislam.errors import InputError
@@ -50,6 +49,8 @@ class PriorChoice:
 
 def plugin_names(kind: str) -> list[str]:
     """Return the names that installed packages give to priors of a kind."""
+    from importlib.metadata import entry_points
+
     return sorted({entry.name for entry in entry_points(group=f"minislam.{kind}")})
 
 

@@ -37,7 +37,7 @@ class Package:
     ],
 )
 def test_two_packages_of_opencv_are_warned_of(monkeypatch, names: list[str], warned: bool):
-    monkeypatch.setattr(doctor, "distributions", lambda: map(Package, names))
+    monkeypatch.setattr("importlib.metadata.distributions", lambda: map(Package, names))
     found = doctor.opencv_warnings()
     assert bool(found) == warned
     assert not warned or "opencv-python, opencv-python-headless share one folder" in found[0]
