@@ -32,7 +32,7 @@ from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
 from minislam.state.stateful import Tree
 from minislam.tracking import initialisation, pose_from_flow
-from minislam.tracking.safeguards import focal_length
+from minislam.tracking.safeguards import focal_length, relocalisation
 from tests.checkpoint_files import calm_droid, tiny_fit3d
 from tests.pretended_gpu import GPU, PACKAGE, GpuTensor, pretended_gpu
 
@@ -157,6 +157,23 @@ def test_a_run_on_the_gpu_gives_what_the_cpu_gives(both: tuple[Run, Run]):
         np.testing.assert_allclose(found[0], expected[0], atol=1e-4)
     else:
         assert all(np.array_equal(*pair) for pair in zip(expected, found, strict=True))
+
+
+@pytest.mark.parametrize("both", ["depth"], indirect=True)
+def test_a_lost_camera_is_found_on_the_gpu(both: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(relocalisation, "MIN_INLIERS", 5)  # the images are tiny
+    expected, found = (place_of_second_keyframe(each.slam) for each in both)
+    assert found.T_camera_world.device.type == GPU and found.inliers == expected.inliers
+    assert found.T_camera_world.tolist() == expected.T_camera_world.tolist()
+
+
+def place_of_second_keyframe(slam: Slam) -> relocalisation.Place:
+    tracker, keyframes = slam.tracker, slam.tracker.keyframes
+    scale = tracker.graph.pixel_scale
+    finder = relocalisation.Relocaliser(tracker.grid, keyframes, scale)
+    place = finder.find(keyframes.frames[1].image, keyframes.features[1])
+    assert place is not None
+    return place
 
 
 @pytest.mark.parametrize("both", ["depth"], indirect=True)
