@@ -14,17 +14,13 @@ RUN, LOG = "run.json", "log.txt"  # of a run folder; run.json is written when th
 
 
 class Log:
-    """Keeps what is printed, with the time of each line, until it has a file to write to."""
+    """Keeps what is printed, with the time of each line, until the run in `folder` has begun."""
 
     def __init__(self) -> None:
+        self.folder: Path | None = None
         self.is_begun = False  # something is in the file
-        self._folder: Path | None = None
         self._lines: list[str] = []  # not written yet
         self._begun = ""  # a line whose end is not printed yet
-
-    def write_to(self, folder: Path) -> None:
-        """Append to log.txt of a run as soon as it has begun, beginning with what was printed."""
-        self._folder = folder
 
     def add(self, text: str) -> None:
         """Take what is printed. Of a progress line on a terminal, the last state is kept."""
@@ -32,9 +28,9 @@ class Log:
         now = time.strftime("%Y-%m-%d %H:%M:%S")
         states = (line.rpartition("\r")[2].replace("\033[K", "") for line in lines)
         self._lines += [f"{now}  {state}\n" for state in states]
-        if self._folder is not None and self._lines and (self._folder / RUN).exists():
+        if self.folder is not None and self._lines and (self.folder / RUN).exists():
             with contextlib.suppress(OSError):  # a full disk ends no run
-                with open(self._folder / LOG, "a", encoding="utf-8", errors="replace") as file:
+                with open(self.folder / LOG, "a", encoding="utf-8", errors="replace") as file:
                     file.writelines(self._lines)
                 self._lines, self.is_begun = [], True
 

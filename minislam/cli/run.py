@@ -79,7 +79,7 @@ def _run_recorded(args: argparse.Namespace, log: Log) -> int:
     for warning in sequence.warnings:
         say(f"WARNING: {warning}", "stderr")
     progress.plan = plan_of(config, choice, sequence)
-    log.write_to(Path(output))
+    log.folder = Path(output)
     with ending_signals(progress.interrupt):
         outcome = run_in_folder(
             sequence, config, choice, output, progress, lpips, args.overwrite, args.resume

@@ -24,7 +24,7 @@ def folder(tmp_path: Path) -> Path:
 def test_lines_before_and_after_the_run_begins_are_in_it(tmp_path: Path):
     log = Log()
     log.add("one\n")
-    log.write_to(tmp_path)
+    log.folder = tmp_path
     log.add("two\nthr")
     assert not (tmp_path / "log.txt").exists()
     (tmp_path / "run.json").touch()
@@ -34,7 +34,7 @@ def test_lines_before_and_after_the_run_begins_are_in_it(tmp_path: Path):
 
 def test_of_a_line_that_is_written_over_the_last_state_counts(folder: Path):
     log = Log()
-    log.write_to(folder)
+    log.folder = folder
     for text in ("\r\033[Kwalking 1/2", "\r\033[Kwalking 2/2", "\n"):
         log.add(text)
     assert texts(folder / "log.txt") == ["walking 2/2"]
@@ -43,14 +43,14 @@ def test_of_a_line_that_is_written_over_the_last_state_counts(folder: Path):
 def test_a_command_that_is_refused_before_it_says_more_writes_nothing(folder: Path, capsys):
     with pytest.raises(ValueError), recorded(is_quiet=False) as log:
         print("before")
-        log.write_to(folder)
+        log.folder = folder
         raise ValueError("refused")
     assert not (folder / "log.txt").exists()
 
 
 def test_quiet_keeps_standard_output_from_the_terminal_but_not_from_the_log(folder, capsys):
     with pytest.raises(ValueError), recorded(is_quiet=True) as log:
-        log.write_to(folder)
+        log.folder = folder
         print("a result")
         print("a warning", file=sys.stderr)
         raise ValueError("the end")
@@ -63,7 +63,7 @@ def test_a_full_disk_ends_neither_the_run_nor_the_log(folder: Path, monkeypatch)
     with device as full, monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", full)
         with recorded(is_quiet=False) as log:
-            log.write_to(folder)
+            log.folder = folder
             (folder / "log.txt").mkdir()  # where nothing can be written
             print("one")
             (folder / "log.txt").rmdir()

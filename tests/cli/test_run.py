@@ -31,9 +31,3 @@ def test_quiet_prints_warnings_only_and_the_log_has_everything(tmp_path: Path, c
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", row) for row in rows)
     assert "image folder: 2 of 2 images" in rows[0] and "results in" in "".join(rows)
     assert any(re.search(r"stage \d of \d, refining the map: 2/2", row) for row in rows)
-    again = run(source, "-o", out, "--mapping.refine_iterations", "2", "--overwrite", "-v")
-    assert again == 0
-    printed = capsys.readouterr()
-    assert len((out / "log.txt").read_text().splitlines()) == len(
-        (printed.out + printed.err).splitlines()
-    )
