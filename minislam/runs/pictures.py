@@ -131,7 +131,6 @@ def _known(
     folder: RunFolder, slam: Slam, metrics: dict[str, float | None], facts: dict[str, Any]
 ) -> Report:
     """Return a report without pictures."""
-    nearest, changed = changed_settings(slam.config)
     program, *arguments = facts["command"]
     by_hand = Path(program).stem in ("minislam", "__main__")  # or else by a program of the user
     return Report(
@@ -145,18 +144,18 @@ def _known(
             for line in summarise(metrics, facts)
         ],
         command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
-        preset=nearest,
-        settings=changed,
+        settings=named_settings(slam.config),
     )
 
 
-def changed_settings(config: SlamConfig) -> tuple[str, dict[str, tuple[str, str]]]:
-    """Return the nearest preset and the settings that differ from it: the value, the preset's."""
-    now, changed = settings_of(config), {}
+def named_settings(config: SlamConfig) -> str:
+    """Return the settings as the name of the nearest preset and what differs from it."""
+    now, others = settings_of(config), {}
     for name in PRESETS:
         usual = settings_of(preset(name))
-        changed[name] = {k: (str(v), str(usual[k])) for k, v in now.items() if v != usual[k]}
-    return min(changed.items(), key=lambda found: len(found[1]))
+        others[name] = [f"{k} {v} instead of {usual[k]}" for k, v in now.items() if v != usual[k]]
+    nearest = min(others, key=lambda name: len(others[name]))
+    return " with ".join(filter(None, [f"preset {nearest}", ", ".join(others[nearest])]))
 
 
 def _health(slam: Slam) -> bytes:

@@ -34,8 +34,7 @@ class Report:
     unit: str = "world units"
     figures: Series[tuple[str, bytes]] = ()  # caption, PNG
     command: str = ""
-    preset: str = ""
-    settings: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # name: value, preset's
+    settings: str = ""
 
 
 def build_report(report: Report) -> str:
@@ -53,7 +52,7 @@ def build_report(report: Report) -> str:
         keyframes=_keyframes(report) if report.keyframes else "",
         figures="\n".join(_figure(caption, png) for caption, png in report.figures),
         command=escape(report.command),
-        settings=_settings(report),
+        settings=escape(report.settings),
     )
 
 
@@ -95,23 +94,11 @@ def _keyframes(report: Report) -> str:
 def _scale(colors: np.ndarray, values: np.ndarray, unit: str) -> str:
     """Return a colour bar (1, N, 3) with its smallest, middle and largest number."""
     stops = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * colors[0])
-    numbers = [f"<span>{values[place]:.2g}</span>" for place in (0, _STOPS // 2)]
-    numbers.append(f"<span>{values[-1]:.2g} {unit}</span>")
+    shown = f"{values[0]:.2g}", f"{values[len(values) // 2]:.2g}", f"{values[-1]:.2g} {unit}"
+    numbers = "".join(f"<span>{number}</span>" for number in shown)
     return (
         f'<div class="bar" style="background:linear-gradient(to right, {stops})"></div>'
-        f'<div class="numbers">{"".join(numbers)}</div>'
-    )
-
-
-def _settings(report: Report) -> str:
-    rows = "".join(
-        f"<tr><th><code>{escape(name)}</code></th><td>{escape(value)}</td>"
-        f'<td class="dim">instead of {escape(usual)}</td></tr>'
-        for name, (value, usual) in report.settings.items()
-    )
-    which = "Other settings than those" if rows else "All settings are those"
-    return (
-        f"<p>{which} of the preset {report.preset}{':' if rows else '.'}</p><table>{rows}</table>"
+        f'<div class="numbers">{numbers}</div>'
     )
 
 

@@ -5,15 +5,15 @@ from types import SimpleNamespace
 
 from minislam.config import preset
 from minislam.runs import pictures
-from minislam.runs.pictures import MAX_SHOWN, Preview, changed_settings
+from minislam.runs.pictures import MAX_SHOWN, Preview, named_settings
 from minislam.state.steps import SilentObserver
 
 
-def test_settings_are_compared_with_the_nearest_preset():
-    assert changed_settings(preset("test")) == ("test", {})
-    assert changed_settings(preset("paper-fast"))[0] == "paper-fast"
+def test_settings_are_named_by_the_nearest_preset():
+    assert named_settings(preset("test")) == "preset test"
+    assert named_settings(preset("paper-fast")) == "preset paper-fast"
     config = replace(preset("laptop"), seed=4)
-    assert changed_settings(config) == ("laptop", {"seed": ("4", "0")})
+    assert named_settings(config) == "preset laptop with seed 4 instead of 0"
 
 
 def test_of_many_keyframes_some_are_shown_the_first_and_the_last_among_them():
