@@ -63,7 +63,7 @@ def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
     columns = [
         gaussians.means,
         np.zeros_like(gaussians.means),  # normals, which no viewer reads
-        # Viewers clamp colours outside [0, 1] in different ways, so it is done here.
+        # Not clamped to [0, 1], because a map that is read back must render as it did.
         (gaussians.colors - 0.5) / _SH_C0,
         zeros,
         gaussians.opacity_logits[:, None],
