@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from minislam.config import SlamConfig, from_json
 from minislam.data import GaussianArrays, InputOptions, RecordedSequence, RunFolder, open_sequence
@@ -81,6 +82,7 @@ class Run:
                 f"expected camera.json of a run in {self.folder.path}, found {error!r}; repeat the "
                 "run, or restore the file"
             ) from error
+        self._betas: dict[int, Tensor] = {}  # raw beta (h', w') of frames asked for so far
         self.trajectory: Trajectory = self.folder.read_trajectory()
         self.gaussians: GaussianArrays = self.folder.read_map()
 
@@ -123,9 +125,11 @@ class Run:
         mask = sequence.given_mask(frame_index) if settings.given_masks else None
         if mask is not None:
             return beta_of_mask(torch.from_numpy(mask)).numpy()
-        with torch.no_grad():
-            beta = self._mlp(self._features(sequence.frame(frame_index)))
-        return resample(beta, height, width).numpy()
+        if frame_index not in self._betas:  # a network may take seconds for the features
+            with torch.no_grad():
+                features = self._features(sequence.frame(frame_index))
+                self._betas[frame_index] = self._mlp(features)
+        return resample(self._betas[frame_index], height, width).numpy()
 
     def plot(self, frame_index: int | None = None) -> Figure:
         """Return one picture of the run: a frame (by default the middle keyframe) and the path."""
