@@ -1,6 +1,7 @@
 """Settings for every test: one thread (repeatable, not slower on a busy machine), quiet plots."""
 
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -18,6 +19,11 @@ def pytest_configure(config) -> None:
     # Notebook kernels start in notebooks/, so a bare clone needs an absolute path to the package.
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     sys.path.insert(0, str(ROOT))
+    # A job in the background (`nohup`, `&`) ignores what ends a program; its tests must not.
+    for name, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+        number = getattr(signal, name, None)  # no SIGHUP on Windows
+        if number is not None and signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
