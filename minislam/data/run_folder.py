@@ -209,10 +209,6 @@ class RunFolder:
         """Return the poses of all tracked frames."""
         return read_trajectory(self.path / TRAJECTORY)
 
-    def read_keyframe_trajectory(self) -> Trajectory:
-        """Return the poses of the keyframes."""
-        return read_trajectory(self.path / KEYFRAME_TRAJECTORY)
-
     def read_map(self) -> GaussianArrays:
         """Return the Gaussian map."""
         return read_ply(self.path / MAP)
