@@ -47,7 +47,8 @@ def run(
     for name in options.keys() - _INPUTS - _PRIORS:
         near = get_close_matches(name, _INPUTS | _PRIORS, n=1, cutoff=0)[0]
         raise InputError(f"expected a known option, found {name}; the nearest is {near}")
-    config = with_settings(preset_of(preset), dict(settings or {}))
+    from_files = {"uncertainty.given_masks": True} if inputs.get("masks") else {}
+    config = with_settings(preset_of(preset), from_files | dict(settings or {}))
     choice = PriorChoice(**{"depth": default_depth(str(source))} | priors)
     sequence = open_sequence(str(source), InputOptions(**inputs))
     output = output or default_output(sequence)

@@ -56,7 +56,7 @@ def run_facts(
         "adjustments": adjustments,
         "failed_adjustments": failed,
         "gaussians": len(slam.mapper.gaussians),
-        "unit": "m" if slam.tracker.keyframes.has_prior else "world units",
+        "unit": unit_of(slam),
         "camera": asdict(slam.tracker.grid.camera),
         "focal_length": {"used": focal_length_note(slam)}
         | (asdict(slam.focal_length) if slam.focal_length else {})
@@ -65,6 +65,11 @@ def run_facts(
         "segments": slam.tracker.watch.segments,
         "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],
     }
+
+
+def unit_of(slam: Slam) -> str:
+    """Return the unit of length of trajectory and map."""
+    return "m" if slam.tracker.keyframes.has_prior else "world units"
 
 
 def failed_adjustments(slam: Slam) -> tuple[int, int]:

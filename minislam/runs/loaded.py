@@ -18,14 +18,12 @@ from minislam.priors.choice import PriorChoice, choose_features
 from minislam.priors.high_resolution import HighResolutionFeatures
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
-from minislam.runs.facts import surface_depth
+from minislam.runs.facts import surface_depth, unit_of
 from minislam.runs.summary import Line, summarise
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.uncertainty import UncertaintyMLP, beta_of_mask
 from minislam.viz import Figure, Page, overview, summary_html
-
-METRIC, ARBITRARY = "m", "world units"
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ def scene_of(slam: Slam) -> dict[str, Any]:
     return {
         "sequence": {"name": sequence.name, "description": sequence.description},
         "camera": asdict(slam.tracker.grid.camera),
-        "unit": METRIC if slam.tracker.keyframes.has_prior else ARBITRARY,
+        "unit": unit_of(slam),
         "background": slam.mapper.background.tolist(),
         "preparation": sequence.preparation,
         "frames": [asdict(frame) for frame in frames],

@@ -106,6 +106,17 @@ def test_unknown_options_and_outputs_in_use_are_refused(run: minislam.Run):
         minislam.run("synth:person", run.folder.path, max_frames=4, size=(96, 72), preset="test")
 
 
+def test_masks_of_the_user_are_used_as_on_the_command_line(root: Path, tmp_path: Path):
+    for frame in range(30):  # of the source
+        cv2.imwrite(str(tmp_path / f"{frame:05d}.png"), np.full((72, 96), 255 * (frame > 2), "u1"))
+    done = minislam.run(
+        "synth:person", root / "masked", preset="test", stride=3, max_frames=10, size=(96, 72),
+        masks=f"files:{tmp_path}", depth="simulated", quiet=True,
+    )  # fmt: skip
+    assert done.config.uncertainty.given_masks
+    assert done.beta(5).min() > 1 > done.beta(0).max()
+
+
 def test_the_door_shows_what_is_stable():
     assert set(minislam.__all__) - {"__version__"} == set(api.__all__) and dir(minislam)
     with pytest.raises(AttributeError):
