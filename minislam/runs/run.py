@@ -36,7 +36,6 @@ FAILED_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 3, 130  # exit codes of a run that
 class RunOutcome:
     """The result of a finished or interrupted run, for the command line to print."""
 
-    metrics: dict[str, float | None]
     summary: list[Line]  # what is known, in words
     warnings: list[str]
     exit_code: int
@@ -153,7 +152,7 @@ def run_sequence(
         raise
     if not interrupted:
         folder.remove_checkpoint()
-    return RunOutcome(metrics, summarise(metrics, facts), facts["warnings"], exit_code, state)
+    return RunOutcome(summarise(metrics, facts), facts["warnings"], exit_code, state)
 
 
 def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
