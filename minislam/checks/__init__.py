@@ -9,7 +9,15 @@ its interface asks for.
 
 from minislam.checks.bundle_adjustment import check_schur_step, check_target_jacobian
 from minislam.checks.geometry import check_reproject, check_resized_intrinsics
-from minislam.checks.grading import NOT_YET, PASSED, WRONG, Case, Verdict, check_function
+from minislam.checks.grading import (
+    NOT_YET,
+    PASSED,
+    WRONG,
+    Case,
+    Verdict,
+    check_function,
+    is_written,
+)
 from minislam.checks.mapping import check_deformed_means, check_sampling
 from minislam.checks.slam import check_ate, check_separability
 from minislam.checks.splatting import (
@@ -56,4 +64,5 @@ __all__ = [
     "check_suppressed",
     "check_target_jacobian",
     "check_twist_vjp",
+    "is_written",
 ]

@@ -1,5 +1,7 @@
 """Grade an answer against the package, case by case, up to the first wrong number."""
 
+import dis
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -90,3 +92,16 @@ def _hint(answer: Any, case: Case, hints: Hints, tolerance: float) -> str:
         if not _difference(answer, torch.as_tensor(mistake(*case.arguments)), tolerance):
             return f" {hint}"
     return ""
+
+
+def is_written(function: Function) -> bool:
+    """Say whether an exercise's function has a body; where not, print what to do.
+
+    In a notebook, the cell that uses the function begins with `if checks.is_written(NAME):`.
+    """
+    steps = list(dis.get_instructions(function))
+    is_stub = any(step.argval == "NotImplementedError" for step in steps)
+    is_empty = {step.argval for step in steps if step.opname != "RESUME"} <= {None, ""}
+    if is_stub or is_empty:
+        sys.stdout.write(f"Write {function.__name__} first, then run this cell again.\n")
+    return not (is_stub or is_empty)

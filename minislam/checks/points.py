@@ -1,0 +1,55 @@
+"""The exercises of the course and what each is worth: one row an exercise.
+
+`minislam grade` counts with this table. A test compares it with the notebooks, where the heading
+above each exercise says the same: "### Exercise 2: title (★★☆, 10 minutes, 2 points)".
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """One exercise of a notebook."""
+
+    key: str  # "ex03_2": notebook 03, second exercise; also the pytest marker
+    notebook: str  # file name without .ipynb
+    check: str  # name in minislam.checks
+    points: int  # warm-ups have 2, building exercises 8
+    stars: int  # difficulty, 1 to 3
+    minutes: int
+    # For `minislam grade --no-package`: an answer may call all of minislam.geometry, and what is
+    # named here, less what is refused. Names as Python prints them: "Camera.resized".
+    may_call: str = ""
+    may_not_call: str = ""
+
+
+EXERCISES = (
+    Exercise("ex00_1", "00_start_here", "check_mapping_weight", 2, 1, 10),
+    Exercise(
+        "ex01_1", "01_geometry", "check_resized_intrinsics", 2, 1, 5, may_not_call="Camera.resized"
+    ),
+    Exercise("ex01_2", "01_geometry", "check_reproject", 2, 1, 5),
+    Exercise("ex02_1", "02_splatting", "check_projected_covariance", 2, 1, 10),
+    Exercise("ex02_2", "02_splatting", "check_pixel_color", 2, 1, 10),
+    Exercise("ex03_1", "03_splatting_gradients", "check_conic_vjp", 2, 2, 20),
+    Exercise("ex03_2", "03_splatting_gradients", "check_twist_vjp", 2, 2, 15),
+    Exercise("ex04_1", "04_uncertainty", "check_best_beta", 2, 1, 5),
+    Exercise("ex04_2", "04_uncertainty", "check_feature_variance", 2, 2, 15),
+    Exercise("ex05_1", "05_bundle_adjustment", "check_target_jacobian", 2, 2, 20),
+    Exercise("ex05_2", "05_bundle_adjustment", "check_schur_step", 2, 1, 10),
+    Exercise(
+        "ex06_1",
+        "06_tracking",
+        "check_flow_distance",
+        2,
+        2,
+        15,
+        may_call="relative_transforms reproject",
+    ),
+    Exercise("ex06_2", "06_tracking", "check_suppressed", 2, 2, 15),
+    Exercise("ex07_1", "07_mapping", "check_sampling", 2, 1, 10),
+    Exercise("ex07_2", "07_mapping", "check_deformed_means", 2, 2, 15),
+    Exercise("ex07b_1", "07b_dense_structure", "check_plane_homography", 2, 2, 10),
+    Exercise("ex08_1", "08_full_slam", "check_ate", 2, 1, 10),
+    Exercise("ex08_2", "08_full_slam", "check_separability", 2, 1, 10),
+)
