@@ -11,22 +11,27 @@ from minislam.viz.figures import (
     overview,
     trajectory_plot,
 )
+from minislam.viz.flipbook import FlipBook, figure_picture, flipbook
 from minislam.viz.notebook import Page, summary_html
 from minislam.viz.report import Report, build_report
 from minislam.viz.style import (
     beta_limits,
     beta_to_rgb,
+    colour_bar,
     depth_limits,
     depth_to_rgb,
     figure_png,
     new_figure,
+    set_notebook_style,
     show_figure,
     show_image,
+    show_map,
 )
 from minislam.viz.viewer import build_viewer, picture_url
 
 __all__ = [
     "Figure",
+    "FlipBook",
     "Page",
     "Report",
     "ate_over_time",
@@ -34,9 +39,12 @@ __all__ = [
     "beta_to_rgb",
     "build_report",
     "build_viewer",
+    "colour_bar",
     "depth_limits",
     "depth_to_rgb",
+    "figure_picture",
     "figure_png",
+    "flipbook",
     "keyframe_health",
     "keyframe_strip",
     "loss_curves",
@@ -45,8 +53,10 @@ __all__ = [
     "online_uncertainty",
     "overview",
     "picture_url",
+    "set_notebook_style",
     "show_figure",
     "show_image",
+    "show_map",
     "summary_html",
     "trajectory_plot",
 ]

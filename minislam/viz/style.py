@@ -1,12 +1,15 @@
 """One look for all figures: sizes, colours, and bytes that do not change from run to run."""
 
 import io
+from collections.abc import Sequence as Series
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from minislam.errors import InputError
@@ -17,12 +20,17 @@ WIDE, STRIP = (9.0, 3.0), (9.0, 2.0)  # inch
 TRUTH_STYLE: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.2, "zorder": 3}
 ESTIMATE_STYLE: dict[str, Any] = {"color": "tab:blue", "linestyle": "-", "linewidth": 1.4}
 
-_DEPTH_COLORMAP, _BETA_COLORMAP = "viridis", "magma"
-_DPI = 100  # dots per inch
+_COLORMAPS = {"depth": "viridis", "beta": "magma", "weight": "gray", "error": "RdBu_r"}
+_DPI = 110  # dots per inch
 _UNKNOWN_RGB = (0.25, 0.25, 0.25)  # where there is no depth
 _QUANTILES = (0.02, 0.98)  # a few outliers must not take the whole colour range
 # A range at least this wide keeps the noise of a static frame from filling all colours.
 _LEAST_BETA_RATIO = 4.0
+
+
+def set_notebook_style() -> None:
+    """Let the figures of pyplot look like those of `new_figure`, sharp enough to be projected."""
+    rcParams.update({"figure.dpi": _DPI, "figure.constrained_layout.use": True, "font.size": 9})
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
@@ -72,6 +80,50 @@ def show_image(
     axes.set_axis_off()
 
 
+def show_map(
+    axes: Axes,
+    values: np.ndarray,  # (h, w)
+    kind: str,  # as of `colour_bar`
+    title: str,
+    limits: tuple[float, float] | None = None,  # None: from the values
+    size: tuple[int, int] | None = None,  # (H, W) px to stretch a coarse grid to
+    label: str | None = None,
+) -> None:
+    """Draw a map of numbers with the colours of its kind, and their colour bar beside it."""
+    values = np.asarray(values, dtype=np.float64)
+    limits = limits or _limits(values, kind)
+    if kind == "depth":
+        picture = depth_to_rgb(values, limits)
+    elif kind == "beta":
+        picture = beta_to_rgb(values, limits)
+    else:
+        picture = _mapped(values, *limits, _COLORMAPS[kind])
+    show_image(axes, picture, title, size)
+    colour_bar(axes, kind, limits, label)
+
+
+def colour_bar(
+    axes: Axes | Series[Axes],  # beside which it stands
+    kind: str,  # "beta", "depth", "weight", or "error", which has a sign
+    limits: tuple[float, float],
+    label: str | None = None,  # None: the kind
+) -> None:
+    """Add the colour bar of pictures that stand in the colours of a kind."""
+    norm = (LogNorm if kind == "beta" else Normalize)(*limits)
+    every = [axes] if isinstance(axes, Axes) else list(axes)
+    colours = ScalarMappable(norm, _COLORMAPS[kind])
+    figure = every[0].get_figure()
+    assert figure is not None, "expected axes of a figure"
+    figure.colorbar(colours, ax=every, label=kind if label is None else label)
+
+
+def _limits(values: np.ndarray, kind: str) -> tuple[float, float]:
+    if kind in ("beta", "depth"):
+        return (beta_limits if kind == "beta" else depth_limits)(values)
+    largest = float(np.nanmax(np.abs(values), initial=1e-12))
+    return (-largest, largest) if kind == "error" else (0.0, 1.0)
+
+
 def depth_to_rgb(
     depth: np.ndarray,  # (H, W) world units, 0 where unknown
     limits: tuple[float, float] | None = None,  # world units; None: from the values
@@ -80,7 +132,7 @@ def depth_to_rgb(
     depth = np.asarray(depth, dtype=np.float64)
     known = np.isfinite(depth) & (depth > 0)
     low, high = limits or depth_limits(depth)
-    colored = _mapped(np.where(known, depth, low), low, high, _DEPTH_COLORMAP)
+    colored = _mapped(np.where(known, depth, low), low, high, _COLORMAPS["depth"])
     colored[~known] = _UNKNOWN_RGB
     return colored
 
@@ -99,7 +151,7 @@ def beta_to_rgb(
     """Colour an uncertainty map: magma over log beta, dark is certain."""
     beta = np.asarray(beta, dtype=np.float64)
     low, high = limits or beta_limits(beta)
-    return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), _BETA_COLORMAP)
+    return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), _COLORMAPS["beta"])
 
 
 def beta_limits(beta: np.ndarray) -> tuple[float, float]:

@@ -58,8 +58,9 @@ def build_viewer(
 
 
 def picture_url(picture: bytes) -> str:
-    """Return a PNG or JPEG as the address that a page uses for it, the picture itself inside."""
-    kind = "png" if picture.startswith(b"\x89PNG") else "jpeg"
+    """Return a PNG, JPEG or WebP as a page's address of it, the picture itself inside."""
+    kinds = {b"\x89PNG": "png", b"RIFF": "webp"}
+    kind = kinds.get(picture[:4], "jpeg")
     return f"data:image/{kind};base64," + base64.b64encode(picture).decode("ascii")
 
 

@@ -2,16 +2,20 @@
 
 import numpy as np
 import pytest
-from matplotlib import colormaps, pyplot
+from matplotlib import colormaps, pyplot, rc_context
 
 from minislam.errors import InputError
 from minislam.viz import (
     beta_to_rgb,
+    colour_bar,
     depth_to_rgb,
+    figure_picture,
     figure_png,
     new_figure,
+    set_notebook_style,
     show_figure,
     show_image,
+    show_map,
 )
 
 # Known answers
@@ -32,6 +36,39 @@ def test_beta_is_shown_by_its_logarithm():
 def test_the_noise_of_a_still_scene_stays_dark():
     beta = 1 + 0.01 * np.random.default_rng(0).random((6, 8))
     assert beta_to_rgb(beta).mean() < 0.1
+
+
+@pytest.mark.parametrize("kind, limits", [("depth", (1, 3)), ("weight", (0, 1)), ("beta", (1, 9))])
+def test_a_colour_bar_has_the_colours_and_the_limits_of_its_kind(kind, limits):
+    figure = new_figure((3, 2))
+    axes = figure.subplots(1, 2)
+    colour_bar(axes, kind, limits)
+    bar = figure.axes[-1]
+    assert bar.get_ylim() == pytest.approx(limits) and bar.get_ylabel() == kind
+    assert bar.get_yscale() == ("log" if kind == "beta" else "linear")
+
+
+def test_a_map_of_errors_is_white_at_zero_and_red_above():
+    figure = new_figure((2, 2))
+    show_map(axes := figure.subplots(), np.array([[-2.0, 0.0, 2.0]]), "error", "t", label="cm")
+    left, middle, right = np.asarray(axes.images[0].get_array())[0]
+    assert middle.min() > 0.95 and right[0] > right[2] and left[2] > left[0]
+    assert figure.axes[-1].get_ylim() == (-2, 2) and figure.axes[-1].get_ylabel() == "cm"
+
+
+@pytest.mark.parametrize("kind", ["beta", "depth"])
+def test_maps_look_as_without_a_bar(kind: str):
+    values = np.random.default_rng(0).uniform(1, 9, (4, 5))
+    show_map(axes := new_figure((2, 2)).subplots(), values, kind, "t")
+    drawn = np.asarray(axes.images[0].get_array())
+    np.testing.assert_array_equal(drawn, {"beta": beta_to_rgb, "depth": depth_to_rgb}[kind](values))
+
+
+def test_figures_of_pyplot_are_as_sharp_as_ours():
+    with rc_context():
+        set_notebook_style()
+        assert figure_picture(pyplot.figure(figsize=(2, 1))).shape == (110, 220, 3)
+    pyplot.close("all")
 
 
 # Identities

@@ -1,0 +1,111 @@
+"""A flip book: pictures that a notebook plays, in one piece of HTML that needs nothing else.
+
+The player has neither ids nor a script of its own, only what its button and its slider do, so that
+many flip books on one page do not meet. Where a page runs no scripts, the first picture is seen.
+"""
+
+import json
+from collections.abc import Sequence as Series
+from html import escape
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from minislam.errors import InputError
+from minislam.viz.style import figure_png
+from minislam.viz.viewer import picture_url
+
+LARGEST = 400_000  # bytes of a flip book
+_LEAST_WIDTH = 480  # px on the screen
+_QUALITIES = (80, 70, 60, 45, 30)  # of WebP, the first that fits is taken
+_SCALES = (1.0, 0.75, 0.5, 0.35)  # of the size, tried when no quality fits
+
+# What the slider does, and what the button does with it. `this` is the one that was used.
+_TURN = """
+var box = this.closest('[data-book]'), book = box.book || (box.book = JSON.parse(box.dataset.book));
+var now = +this.value, picture = box.querySelector('img'), text = book.captions[now];
+picture.src = book.pictures[now]; picture.alt = text;
+this.setAttribute('aria-valuetext', text); box.querySelector('output').textContent = text;
+"""
+_PLAY = """
+var button = this, slider = button.nextElementSibling;
+function stop() { clearInterval(button.timer); button.timer = 0; button.textContent = 'Play'; }
+if (button.timer) return stop();
+button.textContent = 'Pause';
+button.timer = setInterval(function () { if (!button.isConnected) return stop();
+slider.value = (+slider.value + 1) % (+slider.max + 1); slider.oninput(); }, MILLISECONDS);
+"""
+
+
+class FlipBook:
+    """The HTML of a flip book; a notebook shows it."""
+
+    def __init__(self, html: str) -> None:
+        self.html = html
+
+    def _repr_html_(self) -> str:
+        return self.html
+
+
+def flipbook(
+    pictures: Series[np.ndarray],  # each (H, W, 3) RGB, uint8 or in [0, 1], all of one size
+    captions: Series[str] | None = None,  # one for each picture; None: its number
+    frames_per_second: float = 8.0,
+) -> FlipBook:
+    """Return a player of pictures, below 400 kB: button, slider and caption.
+
+    The pictures lose quality, then size, until they fit. InputError names what cannot be shown.
+    """
+    images = [_bytes_of(picture) for picture in pictures]
+    if not images or any(image.shape != images[0].shape for image in images):
+        raise InputError(f"expected pictures of one size, found {[i.shape for i in images]}")
+    count = len(images)
+    texts = [f"{n + 1} of {count}" for n in range(count)] if captions is None else list(captions)
+    if len(texts) != count:
+        raise InputError(f"expected one caption for each of {count} pictures, found {len(texts)}")
+    for scale in _SCALES:
+        for quality in _QUALITIES:
+            urls: list[str] = []
+            while len(urls) < count and sum(map(len, urls)) < LARGEST:
+                urls.append(_url(images[len(urls)], scale, quality))
+            html = _player(urls, texts, max(images[0].shape[1], _LEAST_WIDTH), frames_per_second)
+            if len(urls) == count and len(html.encode()) < LARGEST:
+                return FlipBook(html)
+    raise InputError(f"expected pictures that fit into 400 kB, found {count}: show fewer of them")
+
+
+def figure_picture(figure: Figure) -> np.ndarray:  # (H, W, 3) uint8
+    """Turn a figure into a picture; one of `new_figure` is shown nowhere else."""
+    png = np.frombuffer(figure_png(figure, figure.dpi), np.uint8)
+    return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR_RGB))
+
+
+def _bytes_of(picture: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
+    picture = np.asarray(picture)
+    if picture.ndim != 3 or picture.shape[2] != 3:
+        raise InputError(f"expected pictures of the shape (H, W, 3), found {picture.shape}")
+    if picture.dtype == np.uint8:
+        return picture
+    return np.round(255 * np.clip(np.nan_to_num(picture), 0, 1)).astype(np.uint8)
+
+
+def _url(image: np.ndarray, scale: float, quality: int) -> str:
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    options = [cv2.IMWRITE_WEBP_QUALITY, quality]
+    return picture_url(cv2.imencode(".webp", small[..., ::-1], options)[1].tobytes())
+
+
+def _player(urls: list[str], captions: list[str], width: int, rate: float) -> str:
+    book = escape(json.dumps({"pictures": urls, "captions": captions}, separators=(",", ":")))
+    play = escape(_PLAY.replace("MILLISECONDS", str(round(1000 / rate))).strip())
+    first, last = escape(captions[0]), len(urls) - 1
+    return (
+        f'<div data-book="{book}" style="width: {width}px; max-width: 100%">'
+        f'<img src="{urls[0]}" alt="{first}" style="width: 100%; display: block">'
+        '<div style="display: flex; gap: 8px; align-items: center">'
+        f'<button type="button" onclick="{play}">Play</button>'
+        f'<input type="range" min="0" max="{last}" value="0" aria-label="Picture" '
+        f'aria-valuetext="{first}" style="flex: 1" oninput="{escape(_TURN.strip())}">'
+        f'<output aria-live="off">{first}</output></div></div>'
+    )
