@@ -96,3 +96,20 @@ def assert_graded(check: Callable, solution: Callable) -> None:
         verdict = check(lambda *a, factor=factor: _scaled(factor, solution(*a)))
         assert verdict.status == WRONG and ", expected " in verdict.sentence
         assert repr(verdict).startswith("Wrong: for ")
+
+
+def assert_variants(
+    check: Callable, right: dict[str, Callable], wrong: dict[str, Callable], named: float = 0.7
+) -> None:
+    """Assert that a check passes all right variants, refuses all wrong ones, and names most.
+
+    `named` is the smallest fraction of the wrong ones that get a hint.
+    """
+    for name, answer in right.items():
+        verdict = check(answer)
+        assert verdict.status == PASSED, f"{name}: {verdict}"
+    verdicts = {name: check(answer) for name, answer in wrong.items()}
+    for name, verdict in verdicts.items():
+        assert verdict.status == WRONG, f"{name}: {verdict}"
+    unnamed = [f"{name}: {v}" for name, v in verdicts.items() if not v.hint]
+    assert len(unnamed) <= (1 - named) * len(wrong), unnamed

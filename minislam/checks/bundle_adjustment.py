@@ -5,7 +5,16 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import CAMERA, Case, Function, Hints, Verdict, check_function, doubles
+from minislam.checks.grading import (
+    CAMERA,
+    Case,
+    Function,
+    Hints,
+    Verdict,
+    check_function,
+    doubles,
+    normals,
+)
 from minislam.geometry import Camera, se3_exp
 from minislam.tracking.reprojection import reproject_with_jacobians, scaled_points
 
@@ -33,9 +42,17 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
     def rotation_first(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
         return reference(points, disparities, camera).roll(3, -1)
 
-    def case(disparities: Tensor, description: str) -> Case:
+    def turned_with_depth(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
+        J = reference(points, disparities, camera)
+        return torch.cat([J[..., :3], disparities[:, None, None] * J[..., 3:]], -1)
+
+    def case(disparities: Tensor, description: str, motion: Tensor = motion) -> Case:
         points = scaled_points(motion, disparities[None], rays)[0].T
         return Case((points, disparities, CAMERA), description)
+
+    def draw(seed: int) -> Case:
+        xi = 0.1 * normals(seed, 1, 6).clamp(-2, 2)
+        return case(normals(seed, 3).abs(), "another motion", se3_exp(xi))
 
     cases = [
         case(doubles(1.0, 1.0, 1.0), "disparities of 1"),
@@ -50,8 +67,11 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
         ),
         (signed(-1, -1, -1, -1, -1, -1), "This is the derivative of the residual p~ - p."),
         (rotation_first, "The order is (rho, phi), translation first."),
+        (turned_with_depth, "A rotation moves X by phi x X, without another d."),
+        (signed(1, 1, 1, 0, 0, 0), "The rotation is missing: columns 3 to 5."),
+        (signed(0, 0, 0, 1, 1, 1), "The translation is missing: columns 0 to 2."),
     ]
-    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints, draw)
 
 
 def check_schur_step(
@@ -63,13 +83,6 @@ def check_schur_step(
         xi = torch.linalg.solve(H - E / C @ E.T, g - E @ (s / C))
         return xi, (s - E.T @ xi) / C
 
-    def joined(function: Function) -> Function:
-        def both(*arguments: Tensor) -> Tensor | None:
-            answer = function(*arguments)
-            return None if answer is None else torch.cat(tuple(answer))
-
-        return both
-
     def poses_alone(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         xi = torch.linalg.solve(H, g)
         return xi, (s - E.T @ xi) / C
@@ -77,23 +90,40 @@ def check_schur_step(
     def not_substituted(*arguments: Tensor) -> tuple[Tensor, Tensor]:
         return solved(*arguments)[0], arguments[4] / arguments[2]
 
+    def added(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        xi = torch.linalg.solve(H + E / C @ E.T, g - E @ (s / C))
+        return xi, (s - E.T @ xi) / C
+
+    def unscaled(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        xi = torch.linalg.solve(H - E @ E.T, g - E @ s)
+        return xi, (s - E.T @ xi) / C
+
+    def undivided(*arguments: Tensor) -> tuple[Tensor, Tensor]:
+        return solved(*arguments)[0], arguments[2] * solved(*arguments)[1]
+
     def old_gradient(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor):
         xi = torch.linalg.solve(H - E / C @ E.T, g)
         return xi, (s - E.T @ xi) / C
 
-    def case(poses: int, cells: int, description: str) -> Case:
-        source = torch.Generator().manual_seed(poses)
-        J = torch.randn(4 * cells, 6 * poses, generator=source, dtype=torch.float64)
-        r = torch.randn(4 * cells, generator=source, dtype=torch.float64)
+    def case(poses: int, cells: int, description: str, seed: int = 1) -> Case:
+        rows = normals(seed, 4 * cells, 6 * poses + 2)
+        J, r = rows[:, 2:], rows[:, 0]
         # Each cell has four residuals, which depend on no other cell.
         mine = torch.eye(cells, dtype=torch.float64).repeat_interleave(4, 0)
-        Jd = mine * torch.randn(4 * cells, 1, generator=source, dtype=torch.float64)
+        Jd = mine * rows[:, 1:2]
         return Case((J.T @ J, J.T @ Jd, Jd.square().sum(0), J.T @ r, Jd.T @ r), description)
 
+    def draw(seed: int) -> Case:
+        return case(2, 8 + seed % 5, f"two poses and {8 + seed % 5} cells", seed)
+
     cases = [case(1, 5, "one pose and 5 cells"), case(3, 20, "three poses and 20 cells")]
-    hints = [
-        (joined(poses_alone), "The disparities do not stand still: subtract E C^-1 E^T from H."),
-        (joined(old_gradient), "The right-hand side changes too: g - E C^-1 s."),
-        (joined(not_substituted), "The disparities must follow the poses: s - E^T xi."),
+    hints: Hints = [
+        (poses_alone, "The disparities do not stand still: subtract E C^-1 E^T from H."),
+        (old_gradient, "The right-hand side changes too: g - E C^-1 s."),
+        (not_substituted, "The disparities must follow the poses: s - E^T xi."),
+        (added, "E C^-1 E^T is subtracted from H, not added."),
+        (unscaled, "C^-1 is missing between E and E^T, and between E and s."),
+        (undivided, "The steps of the disparities are divided by C, one by one."),
+        (lambda *a: solved(*a)[::-1], "The poses come first: xi, then delta."),
     ]
-    return check_function(joined(student), joined(solved), cases, tolerance=1e-9, hints=hints)
+    return check_function(student, solved, cases, 1e-9, hints, draw, ("xi", "delta"))

@@ -2,9 +2,18 @@
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
-from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles
+from minislam.checks.grading import (
+    CAMERA,
+    Case,
+    Function,
+    Verdict,
+    check_function,
+    doubles,
+    normals,
+)
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 
 
@@ -15,17 +24,42 @@ def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> V
         resized = camera.resized(width, height)
         return doubles(resized.fx, resized.fy, resized.cx, resized.cy)
 
-    def only_scaled(camera: Camera, width: int, height: int) -> Tensor:
-        su, sv = width / camera.width, height / camera.height
-        return doubles(camera.fx * su, camera.fy * sv, camera.cx * su, camera.cy * sv)
+    def shifted(before: float, after: float) -> Function:
+        def resized(camera: Camera, width: int, height: int) -> Tensor:
+            su, sv = width / camera.width, height / camera.height
+            cx, cy = (camera.cx + before) * su + after, (camera.cy + before) * sv + after
+            return doubles(camera.fx * su, camera.fy * sv, cx, cy)
+
+        return resized
+
+    def draw(seed: int) -> Case:
+        width, height = 20 + 37 * seed % 300, 30 + 23 * seed % 200
+        return Case((CAMERA, width, height), f"{width} x {height} pixels")
 
     cases = [
         Case((CAMERA, 101, 53), "the same size"),
         Case((CAMERA, 202, 106), "twice the size"),
         Case((CAMERA, 33, 26), "33 x 26 pixels"),
     ]
-    hint = "This is cx * s: the image starts at -0.5, so scale cx + 0.5 and take 0.5 off again."
-    return check_function(student, reference, cases, hints=[(only_scaled, hint)])
+    hints = [
+        (
+            shifted(0, 0),
+            "This is cx * s: the image starts at -0.5, so scale cx + 0.5 and take 0.5 off again.",
+        ),
+        (shifted(-0.5, 0.5), "The image starts at -0.5, not at 0.5: both signs are the other one."),
+        (shifted(0.5, 0), "Take 0.5 off again after scaling: the new image starts at -0.5, too."),
+        (shifted(0, -0.5), "Add 0.5 before scaling, where 0.5 is taken off after it."),
+        (lambda c, w, h: reference(c, w, h)[[0, 2, 1, 3]], "The order is fx, fy, cx, cy."),
+        (
+            lambda c, w, h: reference(c, c.width * h // c.height, h),
+            "Width and height have a scale each.",
+        ),
+        (
+            lambda c, w, h: reference(Camera(c.fx, c.fy, c.cx, c.cy, w, h), c.width, c.height),
+            "The scale is the new size over the old one.",
+        ),
+    ]
+    return check_function(student, reference, cases, 1e-9, hints, draw)
 
 
 def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor]) -> Verdict:
@@ -43,6 +77,17 @@ def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor])
     def disparity_as_depth(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor):
         return reference(pixels, 1 / disparities, camera, pose)
 
+    def turned_only(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
+        return reference(pixels, 1e-12 * disparities, camera, pose)
+
+    def depth_of_one(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
+        return reference(pixels, torch.ones_like(disparities), camera, pose)
+
+    def draw(seed: int) -> Case:
+        pixels = doubles(50, 25) + 15 * normals(seed, 4, 2)
+        disparities = 0.2 + 0.3 * normals(seed, 4).abs()
+        return Case((pixels, disparities, CAMERA, se3_exp(0.1 * normals(seed, 6))), "4 pixels")
+
     motions = {
         "a camera that stands still": doubles(0, 0, 0, 0, 0, 0),
         "a step of 0.2": doubles(0.2, 0, 0, 0, 0, 0),
@@ -52,5 +97,8 @@ def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor])
     hints = [
         (inverted_pose, "This is the inverse motion: T_target_source takes points to the target."),
         (disparity_as_depth, "This takes the disparity for the depth: depth = 1 / disparity."),
+        (depth_of_one, "The disparities are not used: all points are at depth 1."),
+        (turned_only, "The translation is missing."),
+        (lambda *a: reference(*a).flip(-1), "u and v are exchanged: a pixel is (column, row)."),
     ]
-    return check_function(student, reference, cases, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints, draw)

@@ -16,19 +16,25 @@ def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
         aligned = umeyama(estimate, truth, with_scale).transform_points(estimate)
         return np.linalg.norm(aligned - truth, axis=1)
 
-    def rms(lengths: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(lengths**2)))
+    def rms(errors: np.ndarray) -> float:  # (N,) or (N, 3)
+        return float(np.sqrt(np.sum(errors**2) / len(errors)))
+
+    def centred(positions: np.ndarray) -> np.ndarray:
+        return positions - positions.mean(0)
 
     def reference(estimate: np.ndarray, truth: np.ndarray) -> float:
         return rms(distances(estimate, truth))
 
-    def case(scale: float, turned: bool, description: str) -> Case:
-        source = np.random.default_rng(0)
+    def case(scale: float, turned: bool, description: str, seed: int = 0) -> Case:
+        source = np.random.default_rng(seed)
         truth = np.cumsum(source.normal(size=(20, 3)), axis=0)
         estimate = scale * (truth + 0.1 * source.normal(size=(20, 3)))
         if turned:
             estimate = estimate[:, [2, 0, 1]] + np.array([3.0, -1.0, 2.0])  # z to x, x to y, y to z
         return Case((estimate, truth), description)
+
+    def draw(seed: int) -> Case:
+        return case(0.5 + seed % 3, seed % 2 == 0, "another walk", seed)
 
     cases = [
         case(1.0, False, "an estimate in the right frame"),
@@ -36,13 +42,18 @@ def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
         case(0.25, True, "an estimate in another unit and frame"),
     ]
     hints: Hints = [
-        (lambda e, t: rms(np.linalg.norm(e - t, axis=1)), "The estimate is not aligned yet."),
+        (lambda e, t: rms(e - t), "The estimate is not aligned yet."),
         (lambda e, t: rms(distances(e, t, False)), "A monocular estimate has no scale: align it."),
         (lambda e, t: float(distances(e, t).mean()), "ATE is the root of the mean square."),
         (lambda e, t: float(np.median(distances(e, t))), "ATE is the root of the mean square."),
         (lambda e, t: rms(distances(t, e)), "The truth has been mapped to the estimate."),
+        (lambda e, t: reference(e, t) ** 2, "The root is missing."),
+        (lambda e, t: reference(e, t) / 3**0.5, "A mean over cameras, not over their 3 N numbers."),
+        (lambda e, t: reference(e, t) * len(t) ** 0.5, "The mean is missing: divide by N."),
+        (lambda e, t: float(distances(e, t).max()), "ATE is no maximum."),
+        (lambda e, t: rms(centred(e) - centred(t)), "Centred, but neither turned nor scaled yet."),
     ]
-    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints, draw)
 
 
 def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
@@ -62,9 +73,26 @@ def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Ve
             "a beta that does not tell two cells apart",
         ),
     ]
+
+    def draw(seed: int) -> Case:
+        source = np.random.default_rng(seed)
+        moving = np.arange(12) < 3 + seed % 4
+        beta = np.round(source.uniform(0, 1, 12) + 0.3 * moving, 1)
+        return Case((beta, moving), "12 cells, some of them alike")
+
+    def count(beta: np.ndarray, moving: np.ndarray) -> float:
+        return wins(beta, moving, 0.5) * moving.sum() * (~moving).sum()
+
+    def at_the_median(beta: np.ndarray, moving: np.ndarray) -> float:
+        return float(np.mean((beta > np.median(beta)) == moving))
+
     hints: Hints = [
         (lambda b, m: wins(b, ~m, 0.5), "The other way round: what moves has the larger beta."),
         (lambda b, m: wins(b, m, 0.0), "A pair with equal beta is worth one half."),
         (lambda b, m: wins(b, m, 1.0), "A pair with equal beta is worth one half."),
+        (count, "The number of pairs is missing: divide by it."),
+        (lambda b, m: count(b, m) / len(b) ** 2, "Only pairs of a moving and a static cell count."),
+        (lambda b, m: b[m].mean() - b[~m].mean(), "This is a difference of means, no fraction."),
+        (at_the_median, "No threshold is asked for: compare all pairs."),
     ]
-    return check_function(student, auroc, cases, tolerance=1e-9, hints=hints)
+    return check_function(student, auroc, cases, 1e-9, hints, draw)

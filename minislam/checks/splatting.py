@@ -5,7 +5,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import CAMERA, Case, Function, Verdict, check_function, doubles
+from minislam.checks.grading import (
+    CAMERA,
+    Case,
+    Function,
+    Verdict,
+    check_function,
+    doubles,
+    normals,
+)
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.splatting.constants import LOW_PASS_VARIANCE
 from minislam.splatting.projection import (
@@ -20,7 +28,6 @@ def check_projected_covariance(
     student: Callable[[Tensor, Tensor, Tensor, Camera], Tensor],
 ) -> Verdict:
     """Check (covariance_world, mean_world, T_camera_world, camera) -> Sigma' (2, 2) in px^2."""
-    factor = doubles([0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.05])
 
     def reference(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
         point = transform_points(pose, mean[None])
@@ -38,17 +45,31 @@ def check_projected_covariance(
         twice = pose[:3, :3].T @ pose[:3, :3].T
         return reference(twice @ covariance @ twice.T, mean, pose, camera)
 
-    def case(x: float, turn: float, description: str) -> Case:
+    def spread(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
+        return unfiltered(covariance, mean, pose, camera) + LOW_PASS_VARIANCE
+
+    def in_world(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
+        return project_covariances(covariance[None], mean[None], pose, camera)[0]
+
+    def case(x: float, turn: float, description: str, seed: int = 0) -> Case:
+        factor = doubles([0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.05])
+        factor = factor + 0.03 * normals(seed, 3, 3)
         pose = se3_exp(doubles(0.1, -0.1, 0.2, turn, -turn, 0.5 * turn))
         return Case((factor @ factor.T, doubles(x, 0.1, 2.5), pose, CAMERA), description)
+
+    def draw(seed: int) -> Case:
+        x, turn = normals(seed, 2).clamp(-2, 2).tolist()
+        return case(0.3 * x, 0.15 * turn, "any camera", seed)
 
     cases = [case(-0.1, 0.0, "a camera that is not turned"), case(0.6, 0.2, "a turned camera")]
     hints = [
         (unfiltered, "The low-pass filter is missing: add 0.3 I."),
         (not_turned, "Sigma is still in the world frame: turn it by W before J."),
         (turned_back, "This turns Sigma the wrong way: it is W Sigma W^T."),
+        (spread, "0.3 stands on the diagonal alone: 0.3 I."),
+        (in_world, "J is taken at the world point: move the mean into the camera frame first."),
     ]
-    return check_function(student, reference, cases, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints, draw)
 
 
 def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
@@ -73,6 +94,25 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
         light = transmittances(alphas)
         return blend(torch.cat([light[1:], light[-1:]]), alphas, colors, background)
 
+    def unattenuated(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        return without_background(alphas, colors, background) + background
+
+    def opaque(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        light = transmittances(alphas)
+        return light[:-1] @ colors + light[-1] * background
+
+    def additive(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        light = torch.cat([alphas.new_ones(1), 1 - alphas.cumsum(0)])
+        return blend(light, alphas, colors, background)
+
+    def unshaded(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
+        return alphas @ colors + transmittances(alphas)[-1] * background
+
+    def draw(seed: int) -> Case:
+        values = normals(seed, 5, 4).sigmoid()[: 1 + seed % 5]
+        description = f"a list of {len(values)}, on blue"
+        return Case((values[:, 0], values[:, 1:], doubles(0.1, 0.2, 0.9)), description)
+
     colors = doubles([0.9, 0.1, 0.2], [0.3, 0.8, 0.4], [0.2, 0.5, 1.0])
     alphas = doubles(0.3, 0.6, 0.5)
     grey = doubles(0.6, 0.6, 0.6)
@@ -85,8 +125,12 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
         (without_background, "The background is missing: add T_end times its colour."),
         (far_first, "This starts with the farthest: the list is sorted nearest first."),
         (shades_itself, "T_i holds only the Gaussians in front of i, not i itself."),
+        (unattenuated, "The background shines through T_end only: multiply it."),
+        (opaque, "Each colour counts T_i times its own alpha_i."),
+        (additive, "The light that is left is a product of (1 - alpha), not 1 minus a sum."),
+        (unshaded, "T_i is missing: what stands in front takes light away."),
     ]
-    return check_function(student, reference, cases, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints, draw)
 
 
 def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
@@ -96,26 +140,46 @@ def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verd
         scale = all_of_it * doubles([1.0], [off_diagonal], [1.0])
         return lambda V, conics, v: conics_from_factors2d_vjp(V, conics, scale * v)
 
+    def summed(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
+        return conics_from_factors2d_vjp(V, conics, v).sum(-1, keepdim=True).expand_as(V)
+
+    def of_the_first(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
+        return conics_from_factors2d_vjp(V, conics, v)[..., :1].expand_as(V)
+
+    def one_conic(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
+        v_a, v_b, v_c = v[0], v[1] / 2, v[2]
+        G = torch.stack([torch.stack([v_a, v_b]), torch.stack([v_b, v_c])])
+        Q = torch.stack([conics[:2], conics[1:]])
+        return -2 * torch.einsum("ijn,jkn,kln->iln", Q, G, V)
+
+    def case(V: Tensor, v_conics: Tensor, description: str) -> Case:
+        return Case((V, conics_from_factors2d(V)[0], v_conics), description)
+
+    def draw(seed: int) -> Case:
+        count = 1 + seed % 4
+        return case(2 * normals(seed, 2, 3, count), normals(seed, 3, count), f"N = {count}")
+
     V = doubles([[3.0], [1.0], [0.5]], [[-1.0], [2.0], [0.0]])
-    conics, _ = conics_from_factors2d(V)
     cases = [
-        Case((V, conics, doubles([1.0], [0.0], [0.0])), "a gradient of a alone"),
-        Case((V, conics, doubles([0.7], [-1.2], [0.4])), "a gradient of a, b and c"),
+        case(V, doubles([1.0], [0.0], [0.0]), "a gradient of a alone"),
+        case(V, doubles([0.7], [-1.2], [0.4]), "a gradient of a, b and c"),
+        case(normals(7, 2, 3, 3) + V, normals(8, 3, 3), "three Gaussians"),
     ]
     hints = [
         (scaled(1, -1), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
         (scaled(1, 0.5), "A factor 2 is missing: V appears twice in V V^T."),
         (scaled(2, 1), "b is counted twice: it stands twice in Q, so each place gets v_b / 2."),
+        (summed, "Each Gaussian has its own gradient: do not sum over N."),
+        (of_the_first, "This is the first Gaussian's gradient for all of them."),
+        (one_conic, "Q stands on both sides of G: Q G Q."),
     ]
-    # Gradients of conics are small numbers: an error of 1 % must not pass as rounding.
-    return check_function(student, conics_from_factors2d_vjp, cases, 1e-9, hints)
+    return check_function(student, conics_from_factors2d_vjp, cases, 1e-9, hints, draw)
 
 
 def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> Verdict:
     """Check (points, factors, v_points, v_factors) -> v_twist (6,) of (rho, phi)."""
-    source = torch.Generator().manual_seed(0)
-    points, v_points = torch.randn(2, 3, 4, generator=source, dtype=torch.float64)
-    factors, v_factors = torch.randn(2, 3, 3, 4, generator=source, dtype=torch.float64)
+    points, v_points = normals(0, 2, 3, 4)
+    factors, v_factors = normals(1, 2, 3, 3, 4)
 
     def points_only(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
         return to_camera_twist_vjp(x, B, v_x, torch.zeros_like(v_B))
@@ -126,6 +190,19 @@ def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor])
     def rotation_first(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
         return to_camera_twist_vjp(x, B, v_x, v_B).roll(3)
 
+    def factors_only(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
+        return to_camera_twist_vjp(0 * x, B, v_x, v_B)
+
+    def moves_factors(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
+        slide = torch.cat([v_B.sum((1, 2)), v_B.new_zeros(3)])
+        return to_camera_twist_vjp(x, B, v_x, v_B) + slide
+
+    def draw(seed: int) -> Case:
+        count = 3 - seed % 3  # 3: the axis of length 3 is no longer the only one
+        values = normals(seed, 8, 3, count)
+        x, B, v_x, v_B = values[0], values[1:4], values[4], values[5:]
+        return Case((x, B.transpose(0, 1), v_x, v_B.transpose(0, 1)), f"N = {count}")
+
     cases = [
         Case((points, factors, v_points, torch.zeros_like(v_factors)), "means alone"),
         Case((points, factors, v_points, v_factors), "means and factors"),
@@ -134,5 +211,8 @@ def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor])
         (points_only, "The factors turn with the camera as well: add B x v_B, column by column."),
         (swapped, "The cross product is the wrong way round: v_phi = x cross v_x."),
         (rotation_first, "The order is (rho, phi), translation first."),
+        (lambda *a: to_camera_twist_vjp(*a) / a[0].shape[1], "Sum over all Gaussians: no mean."),
+        (factors_only, "The means turn with the camera as well: x cross v_x."),
+        (moves_factors, "A translation moves the means only: the factors have no place."),
     ]
-    return check_function(student, to_camera_twist_vjp, cases, hints=hints)
+    return check_function(student, to_camera_twist_vjp, cases, 1e-9, hints, draw)

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Verdict, check_function
+from minislam.checks.grading import Case, Hints, Verdict, check_function, normals
 from minislam.geometry import Camera
-from minislam.uncertainty.weights import WEIGHT_SCALE, adjusted_beta, mapping_weight
+from minislam.uncertainty.weights import MAPPING_CUT, adjusted_beta, mapping_weight
 
 
 def check_mapping_weight(student: Callable[[Tensor], Tensor]) -> Verdict:
@@ -18,12 +18,28 @@ def check_mapping_weight(student: Callable[[Tensor], Tensor]) -> Verdict:
         return mapping_weight(beta, camera)
 
     def uncut(beta: Tensor) -> Tensor:
-        return WEIGHT_SCALE / adjusted_beta(beta, camera) ** 2
+        return 0.5 / adjusted_beta(beta, camera) ** 2
+
+    def cut(weight: Tensor) -> Tensor:
+        return torch.where(weight < MAPPING_CUT, 0.0, weight)
+
+    def without_floor(beta: Tensor) -> Tensor:
+        return cut(0.5 / (1.6315789 * (beta - 0.099) + 0.1) ** 2)
+
+    def draw(seed: int) -> Case:
+        return Case((1.2 * normals(seed, 2, 3).abs(),), "any beta")
 
     cases = [
         Case((torch.tensor([[0.2, 0.471, 0.6], [0.7, 0.9, 1.2]]),), "small beta"),
         Case((torch.tensor([[0.5, 1.3, 1.5], [2.0, 3.0, 4.0]]),), "large beta"),
         Case((torch.tensor([[0.0, 0.05, 0.1], [0.5, 0.5, 0.5]]),), "beta below the floor"),
     ]
-    hint = "Weights below 0.1 must be 0: over many iterations a little is too much."
-    return check_function(student, reference, cases, tolerance=1e-5, hints=[(uncut, hint)])
+    hints: Hints = [
+        (uncut, "Weights below 0.1 must be 0: over many iterations a little is too much."),
+        (lambda beta: uncut(beta).clamp_min(0.1), "Weights below 0.1 become 0, not 0.1."),
+        (lambda beta: cut(0.5 / beta**2), "This is 0.5 / beta^2: beta is adjusted first."),
+        (lambda beta: cut(0.5 / beta.clamp_min(0.1) ** 2), "beta is cut, but not adjusted yet."),
+        (lambda beta: cut((0.5 * uncut(beta)).sqrt()), "The adjusted beta must be squared."),
+        (without_floor, "Where beta is below 0.1, 0.1 takes its place: max(beta, 0.1)."),
+    ]
+    return check_function(student, reference, cases, 1e-5, hints, draw)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Verdict, check_function
+from minislam.checks.grading import Case, Verdict, check_function, normals
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.stereo.sweep import plane_homographies
 
@@ -25,6 +25,18 @@ def check_plane_homography(student: Callable[[Tensor, Tensor, float], Tensor]) -
     def without_intrinsics(K: Tensor, T: Tensor, q: float) -> Tensor:
         return torch.linalg.solve(K, reference(K, T, q) @ K)
 
+    def other_axis(K: Tensor, T: Tensor, q: float) -> Tensor:
+        motion = T[:3, :3].clone()
+        motion[2] += q * T[:3, 3]
+        return K @ motion @ torch.linalg.inv(K)
+
+    def turned_only(K: Tensor, T: Tensor, q: float) -> Tensor:
+        return reference(K, T, 0.0)
+
+    def draw(seed: int) -> Case:
+        q = round(0.2 + abs(normals(seed, 1).item()), 2)
+        return Case((K, se3_exp(0.2 * normals(seed, 6)), q), f"q = {q}")
+
     K = torch.tensor([[60.0, 0, 33], [0, 66, 19], [0, 0, 1]], dtype=torch.float64)
     T = se3_exp(torch.tensor([0.3, -0.1, 0.2, 0.1, -0.2, 0.05], dtype=torch.float64))
     cases = [
@@ -37,5 +49,9 @@ def check_plane_homography(student: Callable[[Tensor, Tensor, float], Tensor]) -
         (with_depth, "q is an inverse depth: the translation is multiplied by it."),
         (without_intrinsics, "H maps pixels to pixels: it needs K on both sides."),
         (lambda K, T, q: reference(K, T, -q), "The sign of the translation is the other one."),
+        (turned_only, "The translation is missing."),
+        (other_axis, "t stands in the last column, t n^T, not in the last row."),
+        (lambda K, T, q: torch.linalg.inv(reference(K, T, q)), "This maps the other image to us."),
+        (lambda K, T, q: reference(K, T, q) @ K @ K, "The last factor is K^-1, not K."),
     ]
-    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints, draw)

@@ -1,0 +1,113 @@
+"""Numbers in any form, compared with what was expected, in sentences."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+SINGLE = (torch.float32, torch.float16, torch.bfloat16)
+SMALLEST = 1e-3  # an expected number below this counts as this: it may be a rounded zero
+
+
+def is_single(value: Any) -> bool:
+    """Say whether some of the numbers have less than double precision."""
+    if isinstance(value, list | tuple):
+        return any(map(is_single, value))
+    if isinstance(value, np.ndarray | np.generic):
+        return value.dtype in (np.float32, np.float16)
+    return isinstance(value, Tensor) and value.dtype in SINGLE
+
+
+def largest(value: Any) -> float:
+    """Return the largest absolute value of all real tensors, 0 if there are none."""
+    if isinstance(value, list | tuple):
+        return max(map(largest, value), default=0.0)
+    if not isinstance(value, Tensor) or not value.is_floating_point() or not value.numel():
+        return 0.0
+    return float(value.abs().max())
+
+
+def as_numbers(answer: Any) -> Tensor:
+    """Return numbers in any form in float64.
+
+    Raises TypeError or ValueError where they are no numbers, or rows of different lengths.
+    """
+    if isinstance(answer, np.ndarray | np.generic):
+        answer = torch.from_numpy(np.array(answer))  # a copy: also of what runs backwards
+    if isinstance(answer, Tensor) and not answer.is_complex():
+        return answer.detach().cpu().double()
+    if isinstance(answer, list | tuple):
+        parts = [as_numbers(part) for part in answer]
+        if len({part.shape for part in parts}) > 1:
+            raise ValueError("rows of different lengths")
+        return torch.stack(parts) if parts else torch.zeros(0, dtype=torch.float64)
+    if not isinstance(answer, bool | int | float):
+        raise TypeError(f"a {type(answer).__name__}")
+    return torch.tensor(answer, dtype=torch.float64)
+
+
+def difference(
+    answer: Any,
+    expected: Any,
+    tolerance: float,  # relative to the largest expected number, or to `smallest`
+    names: tuple[str, ...] = (),  # of the parts, where a tuple is expected
+    smallest: float = SMALLEST,
+) -> str:
+    """Return "" if the answer is right, else what is wrong with it."""
+    if not isinstance(expected, tuple):
+        return _difference(answer, expected, tolerance, smallest)
+    count = len(answer) if isinstance(answer, list | tuple) else 1
+    if count != len(expected):
+        values = "value" if count == 1 else "values"
+        wanted = f"{len(expected)}: {', '.join(names)}" if names else f"{len(expected)}"
+        return f"it returns {count} {values}, expected {wanted}"
+    for place, (part, right) in enumerate(zip(answer, expected, strict=True)):
+        found = _difference(part, right, tolerance, smallest)
+        if found:
+            return f"in {names[place] if names else f'value {place + 1}'} {found}"
+    return ""
+
+
+def _difference(answer: Any, expected: Any, tolerance: float, smallest: float) -> str:
+    try:
+        numbers = as_numbers(answer)
+    except (TypeError, ValueError) as error:
+        return f"it returns {error}, expected a tensor"
+    right = as_numbers(expected)
+    if numbers.shape != right.shape:
+        if numbers.numel() != 1 or right.numel() != 1:
+            return f"the shape is {tuple(numbers.shape)}, expected {tuple(right.shape)}"
+        numbers = numbers.view(right.shape)  # (1,) for () and the like
+    allowed = tolerance * max(largest(right), smallest)
+    wrong = ~((numbers - right).abs() <= allowed)  # the negation catches NaN
+    if not wrong.any():
+        return ""
+    index = tuple(wrong.nonzero()[0].tolist())
+    where = f"element {list(index)}" if index else "the value"
+    found, wanted = float(numbers[index]), float(right[index])
+    if f"{found:.6g}" == f"{wanted:.6g}":
+        return f"{where} is {abs(found - wanted):.2g} off the expected {wanted:.6g}"
+    return f"{where} is {found:.6g}, expected {wanted:.6g}"
+
+
+def relation(answer: Any, expected: Any, tolerance: float) -> str:
+    """Return a sentence where one simple change makes the answer right, else ""."""
+    try:
+        numbers, right = as_numbers(answer), as_numbers(expected)
+    except (TypeError, ValueError):
+        return ""
+    if not numbers.isfinite().all():
+        return "A number is NaN or infinite: what is divided by zero, or has no root?"
+    if right.ndim > 1 < numbers.ndim and not difference(numbers.mT, right, tolerance):
+        return "This is the transpose."
+    if numbers.shape != right.shape or not right.numel():
+        return ""
+    if right.ndim and not difference(numbers.flip(0), right, tolerance):
+        return "The order is reversed."
+    factor = float((numbers * right).sum() / right.square().sum().clamp_min(1e-300))
+    if abs(factor) < 1e-6 or difference(numbers / factor, right, tolerance):
+        return ""
+    if abs(factor + 1) < 1e-5:
+        return "The sign is the other one."
+    return f"All of it is {factor:.4g} times what it should be."
