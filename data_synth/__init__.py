@@ -8,6 +8,7 @@ a hand-held camera; it shares no code with the package that is tested on it.
 """
 
 from .errors import SynthError
+from .phone import Phone, film, phone_intrinsics, write_video
 from .poses import Intrinsics, default_intrinsics
 from .scenes import SEQUENCES, SUMMARIES, Scene, default_frames, scene
 from .sequence import SyntheticFrame, SyntheticSequence, generate, render_frame, render_view
@@ -17,6 +18,7 @@ __all__ = [
     "SEQUENCES",
     "SUMMARIES",
     "Intrinsics",
+    "Phone",
     "Scene",
     "SynthError",
     "SyntheticFrame",
@@ -24,9 +26,12 @@ __all__ = [
     "cached_sequence",
     "default_frames",
     "default_intrinsics",
+    "film",
     "generate",
+    "phone_intrinsics",
     "render_frame",
     "render_view",
     "scene",
     "write_sequence",
+    "write_video",
 ]

@@ -3,9 +3,11 @@
 import argparse
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from .errors import SynthError
+from .phone import Phone
 from .scenes import SUMMARIES, default_frames
 from .sequence import Progress
 from .writing import write_sequence
@@ -28,7 +30,13 @@ def main(arguments: list[str] | None = None) -> int:
         size = parse_size(options.size)
         frames = default_frames(options.name) if options.frames is None else options.frames
         folder = write_sequence(
-            options.name, options.seed, frames, size, options.out, progress_printer()
+            options.name,
+            options.seed,
+            frames,
+            size,
+            options.out,
+            progress_printer(),
+            phone_of(options),
         )
     except SynthError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -53,8 +61,27 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="another path, other textures")
     parser.add_argument("--frames", type=int, help="at 30 Hz (default 100; loop 400)")
     parser.add_argument("--size", default="320x240", help="width x height [px] (default 320x240)")
+    parser.add_argument(
+        "--phone",
+        action="store_true",
+        help="film as a phone: all that follows, and no calibration; upright with --size 240x320",
+    )
+    parser.add_argument("--readout", type=float, help="s from first to last line (phone: 0.02)")
+    parser.add_argument("--shutter", type=float, help="s that a line is exposed (phone: 0.01)")
+    parser.add_argument("--exposure", type=float, help="stops of its drift (phone: 0.25)")
+    parser.add_argument("--white", type=float, help="drift of the white balance (phone: 0.08)")
     parser.add_argument("--list", action="store_true", help="list the sequences")
     return parser
+
+
+def phone_of(options: argparse.Namespace) -> Phone | None:
+    """Return the phone that is asked for: a whole one, or only the effects that are given."""
+    names = ("readout", "shutter", "exposure", "white")
+    given = {name: value for name in names if (value := getattr(options, name)) is not None}
+    if not options.phone and not given:
+        return None
+    none_of_it = Phone(0.0, 0.0, 0.0, 0.0, calibrated=True)
+    return replace(Phone() if options.phone else none_of_it, **given)
 
 
 def parse_size(text: str) -> tuple[int, int]:

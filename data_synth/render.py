@@ -225,8 +225,17 @@ def enclosing_sphere(parts: Sequence[Part]) -> tuple[Array, float]:
 
 def develop(colours: Array, intrinsics: Intrinsics) -> Array:
     """Average the rays of each pixel and blur like a lens: (h, w, 3) float32 in [0, 1]."""
+    return through_lens(average(colours, intrinsics))
+
+
+def average(colours: Array, intrinsics: Intrinsics) -> Array:
+    """Return the mean of the rays of each pixel: (h, w, 3) float32."""
     size = (intrinsics.width, intrinsics.height)
-    image = cv2.resize(colours, size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(colours, size, interpolation=cv2.INTER_AREA)
+
+
+def through_lens(image: Array) -> Array:
+    """Blur an image as a lens does: (h, w, 3) float32 in [0, 1]."""
     return np.clip(cv2.GaussianBlur(image, (5, 5), BLUR_SIGMA), 0, 1)
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from .errors import SynthError
 from .motion import FRAME_RATE
+from .phone import Phone, film
 from .poses import Array, Intrinsics, default_intrinsics, rigid
 from .render import Exposure, camera_rays, expose, trace
 from .scenes import Scene, scene
@@ -82,13 +83,17 @@ def to_bytes(image: Array) -> Array:
 
 
 def render_frame(
-    view: Scene, intrinsics: Intrinsics, index: int, noise: bool = True
+    view: Scene,
+    intrinsics: Intrinsics,
+    index: int,
+    noise: bool = True,
+    phone: Phone | None = None,  # films the image; all else stays as it is
 ) -> SyntheticFrame:
     """Render frame `index` of a scene; it is the same however many frames are asked for."""
     time = index / FRAME_RATE
     T_world_camera = view.path(time)
     exposure = _expose(view, T_world_camera, intrinsics, time, movers=True)
-    rgb = exposure.rgb
+    rgb = film(view, intrinsics, time, phone) if phone else exposure.rgb
     if noise:
         rng = np.random.default_rng([zlib.crc32(view.name.encode()), view.seed, index])
         rgb = rgb + np.float32(NOISE_SIGMA) * rng.standard_normal(rgb.shape, np.float32)

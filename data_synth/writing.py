@@ -3,7 +3,7 @@
 rgb/<timestamp>.png  depth/<timestamp>.png   8-bit colour; 16-bit depth, 5000 units per metre
 rgb.txt  depth.txt                           timestamp and file name
 groundtruth.txt                              timestamp tx ty tz qx qy qz qw, camera to world
-calibration.txt                              fx fy cx cy width height k1 k2 p1 p2 k3
+calibration.txt                              fx fy cx cy width height k1 k2 p1 p2 k3; no phone's
 masks/<timestamp>.png                        255 where a mover is seen
 static/<timestamp>.png                       the same view without movers and their shadows
 novel/<index>.png  novel/poses.txt           held-out views of the still world
@@ -15,6 +15,8 @@ import os
 import shutil
 import tempfile
 import time
+import zlib
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -22,6 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .errors import SynthError
+from .phone import Phone, phone_intrinsics
 from .poses import Array, Intrinsics, default_intrinsics
 from .scenes import Scene, scene
 from .sequence import (
@@ -49,6 +52,7 @@ def write_sequence(
     size: tuple[int, int],  # width, height
     folder: Path | str,
     progress: Progress | None = None,
+    phone: Phone | None = None,
 ) -> Path:
     """Write a sequence into a folder; a complete one with the same parameters is kept."""
     check_request(name, seed, frames, size)
@@ -60,16 +64,19 @@ def write_sequence(
         "size": list(size),
         "generator_version": GENERATOR_VERSION,
     }
+    if phone:
+        record["phone"] = asdict(phone)
     replaces = _may_replace(folder, record)
     if replaces is None:
         return folder
-    view, intrinsics = scene(name, seed), default_intrinsics(size)
+    view = scene(name, seed)
+    intrinsics = phone_intrinsics(size) if phone else default_intrinsics(size)
     folder.parent.mkdir(parents=True, exist_ok=True)
     # A sibling on the same file system: the final rename is one step, so nobody ever finds a folder
     # that is half written, and two processes that write the same sequence do not meet.
     scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        _write_content(scratch, view, intrinsics, frames, progress)
+        _write_content(scratch, view, intrinsics, frames, progress, phone)
         (scratch / RECORD).write_text(json.dumps(record, indent=2) + "\n")
         scratch.chmod(0o755)
         _put_in_place(scratch, folder, record)
@@ -84,17 +91,19 @@ def cached_sequence(
     frames: int = 100,
     size: tuple[int, int] = (320, 240),
     progress: Progress | None = None,
+    phone: Phone | None = None,
 ) -> Path:
     """Return the folder of a sequence in the cache, generating it on first use.
 
     The cache is $MINISLAM_CACHE, or ~/.cache/minislam.
     """
     root = Path(os.environ.get("MINISLAM_CACHE") or Path.home() / ".cache" / "minislam")
-    folder = root / "synth" / f"{name}-{seed}-{frames}-{size[0]}x{size[1]}"
+    filmed = "" if phone is None else f"-phone-{zlib.crc32(repr(phone).encode()):08x}"
+    folder = root / "synth" / f"{name}-{seed}-{frames}-{size[0]}x{size[1]}{filmed}"
     for scratch in root.glob("synth/.*-*-*-*x*-????????"):  # left by a killed process
         if time.time() - scratch.stat().st_mtime > STALE and not scratch.is_symlink():
             shutil.rmtree(scratch, ignore_errors=True)
-    return write_sequence(name, seed, frames, size, folder, progress)
+    return write_sequence(name, seed, frames, size, folder, progress, phone)
 
 
 def _may_replace(folder: Path, record: dict) -> bool | None:
@@ -137,13 +146,18 @@ def _put_in_place(scratch: Path, folder: Path, record: dict) -> None:
 
 
 def _write_content(
-    folder: Path, view: Scene, intrinsics: Intrinsics, frames: int, progress: Progress | None
+    folder: Path,
+    view: Scene,
+    intrinsics: Intrinsics,
+    frames: int,
+    progress: Progress | None,
+    phone: Phone | None,
 ) -> None:
     for image_folder in IMAGE_FOLDERS:
         (folder / image_folder).mkdir()
 
     def render_and_write(index: int) -> SyntheticFrame:
-        frame = render_frame(view, intrinsics, index)
+        frame = render_frame(view, intrinsics, index, phone=phone)
         _write_images(folder, frame)
         return frame
 
@@ -152,7 +166,9 @@ def _write_content(
         trajectory.append((f"{frame.timestamp:.6f}", frame.T_world_camera))
         if progress:
             progress(len(trajectory), frames)
-    _write_lists(folder, view.name, intrinsics, trajectory)
+    _write_lists(folder, view.name, trajectory)
+    if phone is None or phone.calibrated:
+        _write_calibration(folder, intrinsics)
 
     poses = novel_poses(view, frames)
     images = in_order(lambda index: novel_image(view, intrinsics, poses[index]), len(poses))
@@ -178,15 +194,15 @@ def _write_image(path: Path, image: Array) -> None:
         raise SynthError(f"could not write {path}: is the disk full or the folder read-only?")
 
 
-def _write_lists(
-    folder: Path, name: str, intrinsics: Intrinsics, trajectory: list[tuple[str, Array]]
-) -> None:
+def _write_lists(folder: Path, name: str, trajectory: list[tuple[str, Array]]) -> None:
     for kind, title in (("rgb", "color images"), ("depth", "depth maps")):
         rows = [f"{stamp} {kind}/{stamp}.png\n" for stamp, _ in trajectory]
         header = f"# {title}\n# sequence: synthetic {name}\n# timestamp filename\n"
         (folder / f"{kind}.txt").write_text(header + "".join(rows))
     _write_trajectory(folder / "groundtruth.txt", "timestamp", trajectory)
-    c = intrinsics
+
+
+def _write_calibration(folder: Path, c: Intrinsics) -> None:
     values = f"{c.fx:.9g} {c.fy:.9g} {c.cx:.9g} {c.cy:.9g} {c.width} {c.height} 0 0 0 0 0\n"
     (folder / "calibration.txt").write_text(
         "# fx fy cx cy width height k1 k2 p1 p2 k3\n"

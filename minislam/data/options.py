@@ -8,6 +8,7 @@ from minislam.errors import InputError
 from minislam.parameters import parameter, require_bounds
 
 SYNTHETIC = "synth:"  # before the name of a synthetic sequence
+PHONE = "?phone"  # behind one that a phone films
 MINIMUM_SIDE = 16  # px; smaller images hold no pair of grid cells
 FOCAL_MODES = ("fixed", "refine", "auto")
 
@@ -59,7 +60,7 @@ def require_source(source: str) -> None:
     if source.startswith(SYNTHETIC):
         import data_synth  # only here: real footage needs no scene generator
 
-        name, _, seed = source.removeprefix(SYNTHETIC).partition(":")
+        name, seed, _ = synthetic_parts(source)
         if name not in data_synth.SEQUENCES or not re.fullmatch(r"[0-9]{0,18}", seed):
             raise InputError(
                 f"expected synth:NAME or synth:NAME:SEED with NAME one of "
@@ -70,6 +71,12 @@ def require_source(source: str) -> None:
             f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
             f"{source} does not exist; check the path"
         )
+
+
+def synthetic_parts(source: str) -> tuple[str, str, bool]:
+    """Return the name, the seed and whether a phone films, of synth:NAME[:SEED][?phone]."""
+    name, _, seed = source.removeprefix(SYNTHETIC).removesuffix(PHONE).partition(":")
+    return name, seed, source.endswith(PHONE)
 
 
 def default_depth(source: str) -> str:

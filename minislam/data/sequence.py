@@ -11,7 +11,7 @@ import torch
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.folder import read_image_folder, read_video
 from minislam.data.images import read_depth, read_mask
-from minislam.data.options import SYNTHETIC, InputOptions, require_source
+from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
 from minislam.data.preparation import ImagePreparation
 from minislam.data.recording import RecordedTruth, Recording, mask_files, path_of
 from minislam.data.tum import is_tum_folder, read_tum_folder
@@ -27,7 +27,7 @@ def open_sequence(
     options: InputOptions | None = None,
     progress: Callable[[int, int], None] | None = None,  # (done, of all) while rendering synth:
 ) -> "RecordedSequence":
-    """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED]`.
+    """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED][?phone]`.
 
     A folder is recognised by its content, not by its name.
     """
@@ -185,19 +185,22 @@ def _open_synthetic(
     """Render a synthetic sequence, or take it from the cache, and open it."""
     import data_synth  # only here: real footage needs no scene generator
 
-    name, _, seed = source.removeprefix(SYNTHETIC).partition(":")
+    name, seed, is_filmed = synthetic_parts(source)
+    phone = data_synth.Phone() if is_filmed else None
     frames = data_synth.default_frames(name)
     if options.max_frames is not None:
         frames = options.start + options.stride * options.max_frames
     size = options.size or _SYNTHETIC_SIZE
     try:
-        folder = data_synth.cached_sequence(name, int(seed or 0), frames, size, progress)
+        folder = data_synth.cached_sequence(name, int(seed or 0), frames, size, progress, phone)
     except (data_synth.SynthError, OSError) as error:
         raise InputError(
             f"expected to render {source} into the cache, but: {error}; set MINISLAM_CACHE to a "
             "folder that is writable and has space left"
         ) from error
     recording = replace(
-        read_tum_folder(folder), name=f"{name}-{seed or 0}", kind=f"synthetic sequence {name}"
+        read_tum_folder(folder),
+        name=f"{name}-{seed or 0}{'-phone' if is_filmed else ''}",
+        kind=f"synthetic sequence {name}{', filmed by a phone' if is_filmed else ''}",
     )
     return RecordedSequence(recording, options, source)

@@ -108,6 +108,15 @@ def test_a_synthetic_sequence_is_read_with_its_truth(tmp_path: Path, monkeypatch
     np.testing.assert_allclose(sequence.frame(1).timestamp, 1 / 30, atol=1e-6)
 
 
+def test_a_phone_films_a_synthetic_sequence_without_saying_its_focal_length(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path))
+    options = InputOptions(max_frames=2, size=(24, 32))
+    filmed, plain = (open_sequence(f"synth:static:3{end}", options) for end in ("?phone", ""))
+    assert filmed.name == "static-3-phone" and filmed.refines_focal and not plain.refines_focal
+    assert len(filmed.ground_truth.trajectory) == 2
+    assert (filmed.frame(1).image - plain.frame(1).image).abs().max() > 0.05
+
+
 def test_rendering_reports_its_progress(tmp_path: Path, monkeypatch):
     monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path))
     calls = []
