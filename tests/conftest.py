@@ -1,6 +1,7 @@
 """Settings for every test: one thread (repeatable, not slower on a busy machine), quiet plots."""
 
 import os
+import re
 import signal
 import sys
 import tempfile
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 def pytest_configure(config) -> None:
@@ -19,6 +21,13 @@ def pytest_configure(config) -> None:
     # Notebook kernels start in notebooks/, so a bare clone needs an absolute path to the package.
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     sys.path.insert(0, str(ROOT))
+    from minislam.checks.points import EXERCISES
+
+    for exercise in EXERCISES:  # pytest -m ex03_2, pytest -m nb03
+        config.addinivalue_line("markers", f"{exercise.key}: tests of {exercise.check}")
+    notebooks = [path.stem for path in NOTEBOOKS] + [e.notebook for e in EXERCISES]
+    for number in sorted({stem.split("_")[0] for stem in notebooks}):
+        config.addinivalue_line("markers", f"nb{number}: this notebook and its exercises")
     # A job in the background (`nohup`, `&`) ignores what ends a program; its tests must not.
     for name, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
         number = getattr(signal, name, None)  # no SIGHUP on Windows
@@ -27,10 +36,26 @@ def pytest_configure(config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as fast what is neither slow nor a notebook: `pytest -m fast`."""
+    """Mark what is neither slow nor a notebook, and what belongs to one.
+
+    `pytest -m fast`; `pytest -m nb03`: the notebook, its checks and the tests of its file.
+    """
     for item in items:
+        for number in notebooks_of(item):
+            item.add_marker(f"nb{number}")
         if item.path.suffix == ".py" and item.get_closest_marker("slow") is None:
             item.add_marker(pytest.mark.fast)
+
+
+def notebooks_of(item: pytest.Item) -> set[str]:
+    """Return "03" for what runs notebook 03, or is marked with one of its exercises."""
+    marks = {mark.name for mark in item.iter_markers()}
+    numbers = {mark[2:].split("_")[0] for mark in marks if re.fullmatch(r"ex\d\db?_\d", mark)}
+    parameters = item.callspec.params if hasattr(item, "callspec") else {}
+    for path in (item.path, parameters.get("path")):
+        if isinstance(path, Path) and path.suffix == ".ipynb":
+            numbers.add(path.stem.split("_")[0])
+    return numbers
 
 
 @pytest.fixture(scope="module")

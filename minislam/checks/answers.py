@@ -35,7 +35,9 @@ def as_numbers(answer: Any) -> Tensor:
     """
     if isinstance(answer, np.ndarray | np.generic):
         answer = torch.from_numpy(np.array(answer))  # a copy: also of what runs backwards
-    if isinstance(answer, Tensor) and not answer.is_complex():
+    if isinstance(answer, Tensor):
+        if answer.is_complex():
+            raise TypeError("complex numbers")
         return answer.detach().cpu().double()
     if isinstance(answer, list | tuple):
         parts = [as_numbers(part) for part in answer]

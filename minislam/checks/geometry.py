@@ -50,12 +50,13 @@ def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> V
         (shifted(0.5, 0), "Take 0.5 off again after scaling: the new image starts at -0.5, too."),
         (shifted(0, -0.5), "Add 0.5 before scaling, where 0.5 is taken off after it."),
         (lambda c, w, h: reference(c, w, h)[[0, 2, 1, 3]], "The order is fx, fy, cx, cy."),
+        (lambda c, w, h: reference(c, w, h)[[2, 3, 0, 1]], "The order is fx, fy, cx, cy."),
         (
-            lambda c, w, h: reference(c, c.width * h // c.height, h),
+            lambda c, w, h: shifted(0.5, -0.5)(c, c.width * h / c.height, h),
             "Width and height have a scale each.",
         ),
         (
-            lambda c, w, h: reference(Camera(c.fx, c.fy, c.cx, c.cy, w, h), c.width, c.height),
+            lambda c, w, h: shifted(0.5, -0.5)(c, c.width**2 / w, c.height**2 / h),
             "The scale is the new size over the old one.",
         ),
     ]

@@ -136,21 +136,25 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
 def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
     """Check (factors2d, conics, v_conics) -> v_factors2d (2, 3, N)."""
 
-    def scaled(off_diagonal: float, all_of_it: float) -> Function:
-        scale = all_of_it * doubles([1.0], [off_diagonal], [1.0])
-        return lambda V, conics, v: conics_from_factors2d_vjp(V, conics, scale * v)
+    reference = conics_from_factors2d_vjp
+
+    def product(factors: str, above: float, below: float) -> Function:
+        """Return -2 times a product like QGQ with V, from two parts of v_b."""
+
+        def answer(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
+            G = torch.stack([v[0], above * v[1], below * v[1], v[2]]).view(2, 2, -1)
+            matrices = {"Q": conics[[0, 1, 1, 2]].view(2, 2, -1), "G": G}
+            for name in reversed(factors):
+                V = torch.einsum("ijn,jkn->ikn", matrices[name], V)
+            return -2 * V
+
+        return answer
 
     def summed(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
-        return conics_from_factors2d_vjp(V, conics, v).sum(-1, keepdim=True).expand_as(V)
+        return reference(V, conics, v).sum(-1, keepdim=True).expand_as(V)
 
     def of_the_first(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
-        return conics_from_factors2d_vjp(V, conics, v)[..., :1].expand_as(V)
-
-    def one_conic(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
-        v_a, v_b, v_c = v[0], v[1] / 2, v[2]
-        G = torch.stack([torch.stack([v_a, v_b]), torch.stack([v_b, v_c])])
-        Q = torch.stack([conics[:2], conics[1:]])
-        return -2 * torch.einsum("ijn,jkn,kln->iln", Q, G, V)
+        return reference(V, conics, v)[..., :1].expand_as(V)
 
     def case(V: Tensor, v_conics: Tensor, description: str) -> Case:
         return Case((V, conics_from_factors2d(V)[0], v_conics), description)
@@ -166,14 +170,19 @@ def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verd
         case(normals(7, 2, 3, 3) + V, normals(8, 3, 3), "three Gaussians"),
     ]
     hints = [
-        (scaled(1, -1), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
-        (scaled(1, 0.5), "A factor 2 is missing: V appears twice in V V^T."),
-        (scaled(2, 1), "b is counted twice: it stands twice in Q, so each place gets v_b / 2."),
+        (lambda *a: -reference(*a), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
+        (lambda *a: reference(*a) / 2, "A factor 2 is missing: V appears twice in V V^T."),
+        (
+            product("QGQ", 1, 1),
+            "b is counted twice: it stands twice in Q, so each place gets v_b / 2.",
+        ),
+        (product("QGQ", 1, 0), "G is symmetric: v_b / 2 stands above and below the diagonal."),
+        (product("QG", 0.5, 0.5), "Q stands on both sides of G: Q G Q."),
+        (product("GQ", 0.5, 0.5), "Q stands on both sides of G: Q G Q."),
         (summed, "Each Gaussian has its own gradient: do not sum over N."),
         (of_the_first, "This is the first Gaussian's gradient for all of them."),
-        (one_conic, "Q stands on both sides of G: Q G Q."),
     ]
-    return check_function(student, conics_from_factors2d_vjp, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints, draw)
 
 
 def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> Verdict:
