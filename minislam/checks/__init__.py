@@ -8,7 +8,7 @@ its interface asks for.
 """
 
 from minislam.checks.bundle_adjustment import check_schur_step, check_target_jacobian
-from minislam.checks.geometry import check_reproject, check_resized_intrinsics
+from minislam.checks.geometry import check_reproject, check_resized_intrinsics, check_warped_photo
 from minislam.checks.grading import (
     NOT_YET,
     PASSED,
@@ -21,15 +21,19 @@ from minislam.checks.grading import (
 from minislam.checks.mapping import check_deformed_means, check_sampling
 from minislam.checks.slam import check_ate, check_separability
 from minislam.checks.splatting import (
-    check_conic_vjp,
     check_pixel_color,
     check_projected_covariance,
+    check_rendered_image,
+)
+from minislam.checks.splatting_gradients import (
+    check_conic_vjp,
+    check_picture_gradient,
     check_twist_vjp,
 )
 from minislam.checks.start_here import check_mapping_weight
 from minislam.checks.stereo import check_plane_homography
 from minislam.checks.tracking import check_flow_distance, check_suppressed
-from minislam.checks.uncertainty import check_best_beta, check_feature_variance
+from minislam.checks.uncertainty import check_best_beta, check_feature_variance, check_training
 from minislam.priors.conformance import (
     check_depth_prior,
     check_feature_extractor,
@@ -53,9 +57,11 @@ __all__ = [
     "check_flow_estimator",
     "check_function",
     "check_mapping_weight",
+    "check_picture_gradient",
     "check_pixel_color",
     "check_plane_homography",
     "check_projected_covariance",
+    "check_rendered_image",
     "check_reproject",
     "check_resized_intrinsics",
     "check_sampling",
@@ -63,6 +69,8 @@ __all__ = [
     "check_separability",
     "check_suppressed",
     "check_target_jacobian",
+    "check_training",
     "check_twist_vjp",
+    "check_warped_photo",
     "is_written",
 ]

@@ -1,14 +1,18 @@
 """Exercises of notebook 01."""
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from minislam.checks.grading import (
     CAMERA,
     Case,
     Function,
+    Hints,
     Verdict,
     check_function,
     doubles,
@@ -103,3 +107,46 @@ def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor])
         (lambda *a: reference(*a).flip(-1), "u and v are exchanged: a pixel is (column, row)."),
     ]
     return check_function(student, reference, cases, 1e-9, hints, draw)
+
+
+def check_warped_photo(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor]) -> Verdict:
+    """Check (photo, depth, camera, T_source_target) -> the photo as the target sees it."""
+    camera = Camera(20.0, 24.0, 8.3, 5.8, 17, 13)
+    photo, depth = normals(0, 13, 17, 3).abs(), 1 + normals(1, 13, 17).abs()
+
+    def warped(*view: Any, flaw: str = "") -> Tensor:
+        photo, depth, camera, pose = view
+        pixels = camera.pixel_grid(dtype=depth.dtype)
+        points = camera.backproject(pixels, 1 / depth if flaw == "disparity" else depth)
+        pose = se3_inverse(pose) if flaw == "inverted" else pose
+        points = transform_points(pose, points.flatten(0, 1)).view(points.shape)
+        pixels, last = camera.project(points), doubles(camera.width - 1, camera.height - 1)
+        seen = ((pixels >= 0) & (pixels <= last)).all(-1) | (flaw == "unmasked")
+        seen &= (points[..., 2] > 0) | (flaw in ("behind", "unmasked"))
+        pixels = 2 * pixels.floor() + 1 - pixels if flaw == "turned" else pixels
+        position = (2 * (pixels.round() if flaw == "rounded" else pixels) / last - 1)[None]
+        channels = photo.permute(2, 0, 1)[None]
+        sampled = functional.grid_sample(
+            channels, position.to(photo), padding_mode="border", align_corners=True
+        )
+        return torch.where(seen[..., None], sampled[0].permute(1, 2, 0), 0)
+
+    def draw(seed: int) -> Case:
+        return Case((photo, depth, camera, se3_exp(0.1 * normals(seed, 6))), f"motion {seed}")
+
+    motions = {
+        "a small step": doubles(0.2, -0.07, 0.1, 0, 0, 0),
+        "any motion": doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1),
+        "a source camera that looks back": doubles(0.1, 0, 0, 0, 3.0, 0),
+    }
+    cases = [Case((photo, depth, camera, se3_exp(xi)), name) for name, xi in motions.items()]
+    flaws = {
+        "inverted": "This is the inverse motion: T_source_target takes points to the source.",
+        "disparity": "This takes the depth for a disparity: the point is depth times the ray.",
+        "behind": "Points behind the source camera (z <= 0) are not in its photo.",
+        "unmasked": "Where the source sees nothing the answer is 0: outside the photo, or behind.",
+        "rounded": "This takes the nearest pixel: mix the four around the position.",
+        "turned": "The weights are exchanged: the nearer of two pixels has the larger weight.",
+    }
+    hints: Hints = [(partial(warped, flaw=flaw), hint) for flaw, hint in flaws.items()]
+    return check_function(student, warped, cases, 1e-9, hints, draw)

@@ -1,6 +1,8 @@
-"""Exercises of notebooks 02 and 03."""
+"""Exercises of notebook 02."""
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -8,20 +10,15 @@ from torch import Tensor
 from minislam.checks.grading import (
     CAMERA,
     Case,
-    Function,
+    Hints,
     Verdict,
     check_function,
     doubles,
     normals,
 )
 from minislam.geometry import Camera, se3_exp, transform_points
-from minislam.splatting.constants import LOW_PASS_VARIANCE
-from minislam.splatting.projection import (
-    conics_from_factors2d,
-    conics_from_factors2d_vjp,
-    to_camera_twist_vjp,
-)
-from minislam.splatting.reference import project_covariances
+from minislam.splatting.constants import LOW_PASS_VARIANCE, NEAR_DEPTH
+from minislam.splatting.reference import composite, gaussian_alphas, project_covariances
 
 
 def check_projected_covariance(
@@ -133,95 +130,46 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
     return check_function(student, reference, cases, 1e-9, hints, draw)
 
 
-def check_conic_vjp(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
-    """Check (factors2d, conics, v_conics) -> v_factors2d (2, 3, N)."""
+def check_rendered_image(
+    student: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Camera], Tensor],
+) -> Verdict:
+    """Check (means, covariances, opacities, colors, T_camera_world, camera) -> image (H, W, 3)."""
+    factors, colors = normals(1, 2, 5, 3, 3)
+    means = doubles([0.1, 0, 3], [0, 0.1, 2], [-0.2, -0.1, 4], [0.3, 0, -2], [-0.3, 0.2, 2.5])
+    values = (means, 0.1 * factors @ factors.mT, doubles(0.8, 0.6, 0.9, 0.7, 1), colors[:, 0].abs())
 
-    reference = conics_from_factors2d_vjp
-
-    def product(factors: str, above: float, below: float) -> Function:
-        """Return -2 times a product like QGQ with V, from two parts of v_b."""
-
-        def answer(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
-            G = torch.stack([v[0], above * v[1], below * v[1], v[2]]).view(2, 2, -1)
-            matrices = {"Q": conics[[0, 1, 1, 2]].view(2, 2, -1), "G": G}
-            for name in reversed(factors):
-                V = torch.einsum("ijn,jkn->ikn", matrices[name], V)
-            return -2 * V
-
-        return answer
-
-    def summed(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
-        return reference(V, conics, v).sum(-1, keepdim=True).expand_as(V)
-
-    def of_the_first(V: Tensor, conics: Tensor, v: Tensor) -> Tensor:
-        return reference(V, conics, v)[..., :1].expand_as(V)
-
-    def case(V: Tensor, v_conics: Tensor, description: str) -> Case:
-        return Case((V, conics_from_factors2d(V)[0], v_conics), description)
+    def rendered(*view: Any, flaw: str = "") -> Tensor:
+        means, covariances, opacities, colors, pose, camera = view
+        points = transform_points(pose, means)
+        kept = ((points[:, 2] > NEAR_DEPTH) | (flaw == "behind")).nonzero()[:, 0]
+        if flaw != "unsorted":
+            kept = kept[points[kept, 2].argsort(descending=flaw == "far first")]
+        wide = project_covariances(covariances[kept], points[kept], pose, camera)
+        wide = wide - (flaw == "sharp") * LOW_PASS_VARIANCE * torch.eye(2, dtype=wide.dtype)
+        wide = wide / 2 if flaw == "whole" else wide
+        alphas = gaussian_alphas(camera.project(points[kept]), wide, opacities[kept], camera)
+        if flaw == "added":
+            return torch.einsum("nhw,nc->hwc", alphas, colors[kept])
+        return composite(alphas, colors[kept], torch.zeros_like(colors[0]))[0]
 
     def draw(seed: int) -> Case:
-        count = 1 + seed % 4
-        return case(2 * normals(seed, 2, 3, count), normals(seed, 3, count), f"N = {count}")
+        pose = se3_exp(0.1 * normals(seed, 6))
+        return Case((*values, pose, camera), f"five Gaussians and pose {seed}")
 
-    V = doubles([[3.0], [1.0], [0.5]], [[-1.0], [2.0], [0.0]])
+    camera = Camera(18.0, 22.0, 9.3, 6.8, 21, 13)
+    turned = se3_exp(doubles(0.1, -0.1, 0.2, 0.1, -0.2, 0.3))
     cases = [
-        case(V, doubles([1.0], [0.0], [0.0]), "a gradient of a alone"),
-        case(V, doubles([0.7], [-1.2], [0.4]), "a gradient of a, b and c"),
-        case(normals(7, 2, 3, 3) + V, normals(8, 3, 3), "three Gaussians"),
+        Case((*(x[:1] for x in values), se3_exp(doubles(*[0] * 6)), camera), "one Gaussian"),
+        Case((*(x[:3] for x in values), turned, camera), "three Gaussians in any order"),
+        Case((*values, turned, camera), "five Gaussians, one behind the camera"),
     ]
-    hints = [
-        (lambda *a: -reference(*a), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
-        (lambda *a: reference(*a) / 2, "A factor 2 is missing: V appears twice in V V^T."),
-        (
-            product("QGQ", 1, 1),
-            "b is counted twice: it stands twice in Q, so each place gets v_b / 2.",
-        ),
-        (product("QGQ", 1, 0), "G is symmetric: v_b / 2 stands above and below the diagonal."),
-        (product("QG", 0.5, 0.5), "Q stands on both sides of G: Q G Q."),
-        (product("GQ", 0.5, 0.5), "Q stands on both sides of G: Q G Q."),
-        (summed, "Each Gaussian has its own gradient: do not sum over N."),
-        (of_the_first, "This is the first Gaussian's gradient for all of them."),
-    ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
-
-
-def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]) -> Verdict:
-    """Check (points, factors, v_points, v_factors) -> v_twist (6,) of (rho, phi)."""
-    points, v_points = normals(0, 2, 3, 4)
-    factors, v_factors = normals(1, 2, 3, 3, 4)
-
-    def points_only(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
-        return to_camera_twist_vjp(x, B, v_x, torch.zeros_like(v_B))
-
-    def swapped(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
-        return doubles(1, 1, 1, -1, -1, -1) * to_camera_twist_vjp(x, B, v_x, v_B)
-
-    def rotation_first(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
-        return to_camera_twist_vjp(x, B, v_x, v_B).roll(3)
-
-    def factors_only(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
-        return to_camera_twist_vjp(0 * x, B, v_x, v_B)
-
-    def moves_factors(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
-        slide = torch.cat([v_B.sum((1, 2)), v_B.new_zeros(3)])
-        return to_camera_twist_vjp(x, B, v_x, v_B) + slide
-
-    def draw(seed: int) -> Case:
-        count = 3 - seed % 3  # 3: the axis of length 3 is no longer the only one
-        values = normals(seed, 8, 3, count)
-        x, B, v_x, v_B = values[0], values[1:4], values[4], values[5:]
-        return Case((x, B.transpose(0, 1), v_x, v_B.transpose(0, 1)), f"N = {count}")
-
-    cases = [
-        Case((points, factors, v_points, torch.zeros_like(v_factors)), "means alone"),
-        Case((points, factors, v_points, v_factors), "means and factors"),
-    ]
-    hints = [
-        (points_only, "The factors turn with the camera as well: add B x v_B, column by column."),
-        (swapped, "The cross product is the wrong way round: v_phi = x cross v_x."),
-        (rotation_first, "The order is (rho, phi), translation first."),
-        (lambda *a: to_camera_twist_vjp(*a) / a[0].shape[1], "Sum over all Gaussians: no mean."),
-        (factors_only, "The means turn with the camera as well: x cross v_x."),
-        (moves_factors, "A translation moves the means only: the factors have no place."),
-    ]
-    return check_function(student, to_camera_twist_vjp, cases, 1e-9, hints, draw)
+    flaws = {
+        "unsorted": "Sort by the depth in the camera frame: the list has no order.",
+        "far first": "This is sorted the wrong way: the nearest Gaussian comes first.",
+        "behind": "A Gaussian behind the camera (z < 0.05) is not seen: leave it out.",
+        "sharp": "The low-pass filter is missing: add 0.3 I to Sigma'.",
+        "whole": "The exponent is -1/2 of the squared distance.",
+        "added": "Light is used up on its way: multiply T by 1 - alpha after each Gaussian.",
+    }
+    hints: Hints = [(partial(rendered, flaw=flaw), hint) for flaw, hint in flaws.items()]
+    return check_function(student, rendered, cases, 1e-6, hints, draw)

@@ -1,14 +1,19 @@
 """Exercises of notebook 04."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.checks.grading import Case, Verdict, check_function, doubles, normals
+from minislam.checks.grading import Case, Function, Verdict, check_function, doubles, normals
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import variance_regulariser
+from minislam.uncertainty.mlp import UncertaintyMLP
+from minislam.uncertainty.training import RenderingError, uncertainty_loss
 
 
 def check_best_beta(student: Callable[[Tensor, float], Tensor]) -> Verdict:
@@ -91,3 +96,61 @@ def check_feature_variance(student: Callable[[Tensor, Tensor], Tensor]) -> Verdi
         (lambda b, f: masked(similar(f), b).sum(), "The mean over the cells is asked for."),
     ]
     return check_function(student, reference, cases, 1e-9, hints, draw)
+
+
+def check_training(student: Callable[..., Tensor]) -> Verdict:
+    """Check (mlp, optimizer, features, ssim, depth, opacity, steps) -> losses (steps,), Eq. (4).
+
+    The answer is compared together with what the MLP then predicts.
+    """
+    features, (ssim, depth) = 2 * normals(0, 2, 3, 4, 5), 2 * normals(1, 2, 2, 3, 4).abs()
+    opacity = torch.where(normals(2, 2, 3, 4) > -0.5, 0.95, 0.5).double()
+
+    def trained(*views: Any, flaw: str = "") -> Tensor:
+        off: dict[str, Any] = {flaw: 0.0} if "lambda" in flaw else {}
+        config = replace(UncertaintyConfig(), **off)
+        mlp, optimizer, features, ssim, depth, opacity, steps = views
+        losses = []
+        for step in range(steps):
+            t = 0 if flaw == "first" else step % len(features)
+            beta, sample = mlp(features[t]), features[t].flatten(0, 1)
+            error = RenderingError(ssim[t], depth[t], opacity[t] + (flaw == "holes"))
+            losses.append(uncertainty_loss(beta, error, beta.flatten(), sample, config))
+            if flaw != "gathered":
+                optimizer.zero_grad()
+            losses[-1].backward()
+            if flaw != "still":
+                optimizer.step()
+        return torch.stack(losses).detach()
+
+    def with_mlp(train: Function) -> Function:
+        def outcome(features: Tensor, *errors_and_steps: Any) -> Tensor | None:
+            mlp = UncertaintyMLP(5, torch.Generator().manual_seed(1)).to(features)
+            # Plain descent: Adam would hide a loss that is twice too large.
+            descent = torch.optim.SGD(mlp.parameters(), lr=0.02)
+            losses = train(mlp, descent, features, *errors_and_steps)
+            if losses is None:
+                return None
+            return torch.cat([torch.as_tensor(losses), mlp(features).flatten()]).detach()
+
+        return outcome
+
+    def draw(seed: int) -> Case:
+        return Case((normals(seed, 2, 3, 4, 5), ssim, depth, opacity, 3), f"features {seed}")
+
+    cases = [
+        Case((features, ssim, depth, torch.ones_like(opacity), 1), "one step"),
+        Case((features, ssim, depth, opacity, 1), "one step, with holes in the map"),
+        Case((features, ssim, depth, opacity, 4), "four steps on two views"),
+    ]
+    flaws = {
+        "lambda_depth": "L_depth is missing in the error.",
+        "lambda_variance": "L_reg_V is missing.",
+        "lambda_log": "The price of a large beta is missing: 0.5 log beta.",
+        "holes": "A cell of opacity below 0.9 has no loss.",
+        "first": "The views take turns: step s looks at view s modulo T.",
+        "gathered": "Gradients add up: call zero_grad before backward.",
+        "still": "The MLP did not change: call optimizer.step().",
+    }
+    hints = [(with_mlp(partial(trained, flaw=flaw)), hint) for flaw, hint in flaws.items()]
+    return check_function(with_mlp(student), with_mlp(trained), cases, 1e-6, hints, draw)

@@ -1,5 +1,8 @@
 """The checks of notebooks 02 and 03: right answers pass, known mistakes are named."""
 
+from functools import partial
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -7,10 +10,11 @@ from minislam.checks import (
     check_conic_vjp,
     check_pixel_color,
     check_projected_covariance,
+    check_rendered_image,
     check_twist_vjp,
 )
 from minislam.geometry import Camera
-from tests.helpers import assert_graded
+from tests.helpers import assert_graded, assert_variants
 
 
 def projected(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
@@ -70,3 +74,55 @@ def test_known_mistakes_of_gradients_are_named():
     assert "turn with the camera" in verdict.sentence
     verdict = check_twist_vjp(lambda *a: twist_pulled_back(*a).roll(3))
     assert "translation first" in verdict.sentence
+
+
+def rendered(means, covariances, opacities, colors, pose, camera, flaw: str = "") -> Tensor:
+    points = means @ pose[:3, :3].T + pose[:3, 3]
+    order = {"unsorted": points.argsort(0)[:, 0].sort().values}.get(flaw, points[:, 2].argsort())
+    image = torch.zeros(camera.height, camera.width, 3, dtype=means.dtype)
+    light = torch.ones(camera.height, camera.width, 1, dtype=means.dtype)
+    for n in order.flip(0) if flaw == "far first" else order:
+        if points[n, 2] < 0.05 and flaw != "behind":
+            continue
+        wide = projected(covariances[n], means[n], pose, camera)
+        wide = wide - 0.3 * torch.eye(2, dtype=wide.dtype) if flaw == "sharp" else wide
+        offsets = camera.pixel_grid(dtype=wide.dtype) - camera.project(points[n])
+        offsets = offsets.flip(-1) if flaw == "exchanged" else offsets
+        distances = ((offsets @ wide.inverse()) * offsets).sum(-1, keepdim=True)
+        alpha = opacities[n].clamp_max(1.0 if flaw == "opaque" else 0.99)
+        alpha = alpha * torch.exp(-distances * (1.0 if flaw == "whole" else 0.5))
+        alpha = torch.where(alpha > 1 / 255, alpha, 0)
+        image = image + light * alpha * colors[n]
+        light = light if flaw == "added" else light * (1 - alpha)
+    return image
+
+
+def rendered_by_pixels(means, covariances, opacities, colors, pose, camera) -> np.ndarray:
+    points = (pose[:3, :3] @ means.T).T + pose[:3, 3]
+    seen = [n for n in np.argsort(points[:, 2].numpy()) if points[n, 2] > 0.05]
+    conics = [
+        np.linalg.inv(projected(covariances[n], means[n], pose, camera).numpy()) for n in seen
+    ]
+    centres = [camera.project(points[n]).numpy() for n in seen]
+    image = np.zeros((camera.height, camera.width, 3))
+    for v, u in np.ndindex(image.shape[:2]):
+        for n, Q, centre in reversed(list(zip(seen, conics, centres, strict=True))):
+            d = np.array([u, v]) - centre
+            alpha = min(0.99, float(opacities[n])) * np.exp(-0.5 * d @ Q @ d)
+            if alpha > 1 / 255:
+                image[v, u] = alpha * colors[n].numpy() + (1 - alpha) * image[v, u]
+    return image
+
+
+def test_a_rendered_image_is_told_from_a_wrong_one():
+    wrong = {
+        "the list has no order": partial(rendered, flaw="unsorted"),
+        "the wrong way": partial(rendered, flaw="far first"),
+        "behind the camera": partial(rendered, flaw="behind"),
+        "add 0.3 I": partial(rendered, flaw="sharp"),
+        "exponent is -1/2": partial(rendered, flaw="whole"),
+        "multiply T": partial(rendered, flaw="added"),
+        "no cap": partial(rendered, flaw="opaque"),
+        "u and v": partial(rendered, flaw="exchanged"),
+    }
+    assert_variants(check_rendered_image, {"one": rendered, "other": rendered_by_pixels}, wrong)

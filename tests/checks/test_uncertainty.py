@@ -1,10 +1,12 @@
 """The checks of notebook 04: right answers pass, known mistakes are named."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from minislam.checks import WRONG, check_best_beta, check_feature_variance
-from tests.helpers import assert_graded
+from minislam.checks import WRONG, check_best_beta, check_feature_variance, check_training
+from tests.helpers import assert_graded, assert_variants
 
 
 def best_beta(error: Tensor, lambda_log: float) -> Tensor:
@@ -34,3 +36,60 @@ def test_known_mistakes_of_uncertainty_are_named():
 
     verdict = check_feature_variance(by_dot_product)
     assert verdict.status == WRONG and "for five cells" in verdict.sentence
+
+
+def trained(mlp, optimizer, features, ssim, depth, opacity, steps, flaw: str = "") -> Tensor:
+    losses = []
+    for step in range(steps):
+        t = 0 if flaw == "first" else step % len(features)
+        beta_raw = mlp(features[t])
+        beta = beta_raw.clamp_min(0.1) + 0.001
+        error = ssim[t] + (0 if flaw == "no depth" else 0.2) * depth[t]
+        loss = error / beta ** (1 if flaw == "power" else 2)
+        loss = loss + (0 if flaw == "no log" else 0.5 * beta.log())
+        loss = loss if flaw == "holes" else torch.where(opacity[t] >= 0.9, loss, 0)
+        loss = loss.sum() if flaw == "sum" else loss.mean()
+        if flaw != "no reg_V":
+            loss = loss + feature_variance(beta_raw.flatten(), features[t].flatten(0, 1))
+        if flaw != "gathered":
+            optimizer.zero_grad()
+        loss.backward()
+        if flaw != "still":
+            optimizer.step()
+        losses.append(loss.detach())
+    return torch.stack(losses)
+
+
+def trained_cell_by_cell(mlp, optimizer, features, ssim, depth, opacity, steps) -> list[float]:
+    losses = []
+    for step in range(steps):
+        t = step % len(features)
+        total, betas = 0.0, mlp(features[t])
+        for i, row in enumerate(betas):
+            for j, beta in enumerate(row):
+                if opacity[t, i, j] >= 0.9:
+                    beta = torch.maximum(beta, torch.tensor(0.1)) + 0.001
+                    total = total + (ssim[t, i, j] + 0.2 * depth[t, i, j]) / beta**2
+                    total = total + 0.5 * torch.log(beta)
+        rest = feature_variance(betas.flatten(), features[t].flatten(0, 1))
+        loss = total / betas.numel() + rest
+        mlp.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return losses
+
+
+def test_a_training_is_told_from_a_wrong_one():
+    wrong = {
+        "L_depth is missing": partial(trained, flaw="no depth"),
+        "L_reg_V is missing": partial(trained, flaw="no reg_V"),
+        "price of a large beta": partial(trained, flaw="no log"),
+        "opacity below 0.9": partial(trained, flaw="holes"),
+        "take turns": partial(trained, flaw="first"),
+        "zero_grad": partial(trained, flaw="gathered"),
+        "did not change": partial(trained, flaw="still"),
+        "beta, not its square": partial(trained, flaw="power"),
+        "a sum": partial(trained, flaw="sum"),
+    }
+    assert_variants(check_training, {"one": trained, "other": trained_cell_by_cell}, wrong)
