@@ -14,6 +14,7 @@ from minislam.cli.bench import add_bench_parser
 from minislam.cli.doctor import add_doctor_parser
 from minislam.cli.evaluate import add_eval_parser
 from minislam.cli.export import add_export_parser
+from minislam.cli.grade import add_grade_parser
 from minislam.cli.help import UsageError, nearest, unknown_option
 from minislam.cli.notebooks import add_notebooks_parser
 from minislam.cli.options import take_settings
@@ -28,7 +29,7 @@ from minislam.errors import MinislamError
 ADD_PARSERS: list[Callable[[argparse._SubParsersAction], object]] = [
     add_demo_parser, add_run_parser, add_render_parser, add_export_parser, add_eval_parser,
     add_settings_parser, add_weights_parser, add_priors_parser, add_bench_parser,
-    add_notebooks_parser, add_doctor_parser,
+    add_notebooks_parser, add_grade_parser, add_doctor_parser,
 ]  # fmt: skip
 FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
 

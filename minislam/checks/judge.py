@@ -1,0 +1,138 @@
+"""Judge the parts of a submission with the installed checks, in a process of its own.
+
+`python -m minislam.checks.judge FOLDER` reads FOLDER/job.json and appends one line to
+FOLDER/verdicts.txt before and after each exercise, so that `minislam grade` knows where a student's
+code ended the program. The code shares the process with the checks: replaced functions of the
+package are noticed, but whoever sets out to deceive Python itself will, so read what surprises you.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import minislam
+from minislam import checks
+from minislam.checks.calls import Stopped, call
+from minislam.checks.grading import SECONDS, WRONG
+from minislam.checks.points import EXERCISES, Exercise
+from minislam.checks.submission import SUBMITTED
+
+REFUSED = "refused"
+PACKAGE = str(Path(minislam.__file__).parent)
+BY_KEY = {exercise.key: exercise for exercise in EXERCISES}
+
+
+def judge(
+    files: list[tuple[str, str]],  # (path of a part, key of its exercise or ""), in order
+    wanted: list[str],  # keys to judge; the others are only defined
+    without_package: bool,
+    report: Callable[[dict[str, Any]], object],
+) -> None:
+    """Run the parts in order and report {"key": k} before, and the verdict after each exercise."""
+    namespace: dict[str, Any] = {}
+    installed = _functions()
+    for path, key in files:
+        exercise = BY_KEY[key] if key in wanted else None
+        if exercise is not None:
+            report({"key": key})
+        begin = time.perf_counter()
+        try:
+            namespace = call(lambda p=path, n=namespace: _run(p, n), (), SECONDS)[0]
+            function, failure = namespace.get(SUBMITTED), ""
+        except (Stopped, NotImplementedError) as stop:
+            function, failure = None, f"the cell {stop or 'is not written yet'}."
+        if exercise is None:
+            continue
+        status, sentence, hint = WRONG, failure, ""
+        if not failure:
+            status, sentence, hint = _verdict(exercise, function, without_package)
+        changed = [name for name, i in _functions().items() if installed.get(name, i) != i]
+        if changed:
+            status, sentence = REFUSED, f"the notebook replaces {changed[0]} of the package."
+        row = {"key": key, "status": status, "sentence": sentence, "hint": hint}
+        report({**row, "seconds": round(time.perf_counter() - begin, 2)})
+
+
+def _run(path: str, namespace: dict[str, Any]) -> dict[str, Any]:
+    """Run a file with the names of the parts before it; return all names."""
+    specification = importlib.util.spec_from_file_location(Path(path).stem, path)
+    assert specification is not None and specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    vars(module).update({k: v for k, v in namespace.items() if not k.startswith("__")})
+    specification.loader.exec_module(module)
+    return vars(module)
+
+
+def _verdict(exercise: Exercise, function: Any, without_package: bool) -> tuple[str, str, str]:
+    used: set[str] = set()
+    answer = _watched(function, exercise, used) if without_package else function
+    try:
+        verdict = getattr(checks, exercise.check)(answer)
+    except Exception as error:  # a check that the answer has confused
+        return WRONG, f"the check stops with {type(error).__name__}: {error}.", ""
+    if used:
+        return REFUSED, f"the answer calls {min(used)} of minislam: write it yourself.", ""
+    return verdict.status, verdict.sentence, verdict.hint
+
+
+def _functions() -> dict[str, int]:
+    """Return which functions and classes the loaded modules of the package hold, by name."""
+    return {
+        f"{name}.{key}": id(value)
+        for name, module in list(sys.modules.items())
+        if name.split(".")[0] == "minislam" and module is not None
+        for key, value in list(vars(module).items())
+        if callable(value)
+    }
+
+
+def _watched(function: Any, exercise: Exercise, used: set[str]) -> Callable[..., Any]:
+    """Return the function, which notes what it calls of the package and may not call."""
+    allowed, refused = exercise.may_call.split(), exercise.may_not_call.split()
+
+    def watch(frame: FrameType, event: str, _: Any) -> None:
+        code = frame.f_code
+        name = code.co_qualname
+        if event != "call" or not code.co_filename.startswith(PACKAGE) or name.endswith("__"):
+            return
+        caller = frame.f_back
+        while caller is not None and caller.f_code is not run.__code__:
+            if caller.f_code.co_filename.startswith(PACKAGE):
+                return  # the package calls itself
+            caller = caller.f_back
+        in_geometry = "/geometry/" in code.co_filename.replace("\\", "/")
+        if name in refused or not (in_geometry or name in allowed):
+            used.add(name)
+
+    def run(*arguments: Any) -> Any:
+        sys.setprofile(watch)
+        try:
+            return function(*arguments)
+        finally:
+            sys.setprofile(None)
+
+    return run
+
+
+def main(folder: Path) -> None:
+    """Judge the job of a folder."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the time limit needs it
+    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+
+    def report(line: dict[str, Any]) -> None:
+        with open(folder / "verdicts.txt", "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    judge([tuple(pair) for pair in job["files"]], job["wanted"], job["without_package"], report)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,163 @@
+"""The sub-command `minislam grade`: points for students' notebooks."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import minislam
+from minislam.errors import InputError
+
+if TYPE_CHECKING:
+    from minislam.checks.submission import Part
+
+SILENCE = 120.0  # seconds without a verdict after which an exercise is given up
+MISSING, WRONG, PASSED = "missing", "wrong", "passed"
+COLUMNS = "file key check status points of seconds sentence".split()
+
+
+def add_grade_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Add `grade` to the sub-commands of a parser."""
+    parser = subparsers.add_parser(
+        "grade",
+        help="points for the exercises of students' notebooks",
+        description="Run the exercises of each notebook in a fresh process, only their definitions "
+        "and imports, and count points with the installed checks. It runs the students' code: use "
+        "an account that has nothing to lose. Exit code 0 when all notebooks were graded.",
+    )
+    parser.add_argument("notebooks", metavar="NOTEBOOK", nargs="+", help="a student's .ipynb file")
+    parser.add_argument("--json", metavar="FILE", help="write all verdicts as JSON")
+    parser.add_argument("--csv", metavar="FILE", help="write one line an exercise")
+    parser.add_argument("--seed", type=int, metavar="N", help="also cases that nobody has seen")
+    parser.add_argument(
+        "--no-package", action="store_true", help="refuse answers that call the package's own"
+    )
+    parser.add_argument("--strict", action="store_true", help="exit code 1 below full marks")
+    parser.set_defaults(run=run_grade)
+
+
+def run_grade(args: argparse.Namespace) -> int:
+    """Grade all notebooks, print and write the points; return the exit code."""
+    from minislam.data.files import write_json, write_text  # needs torch
+
+    if args.seed is not None and args.seed < 0:
+        raise InputError(f"expected --seed N with N at least 0, found {args.seed}; give another")
+    graded = []
+    for name in args.notebooks:
+        try:
+            graded.append(_graded(Path(name), args.seed, args.no_package))
+        except InputError as error:
+            none = {"points": 0, "of": 0, "exercises": []}
+            graded.append({"file": name, "error": str(error), **none})
+        _show(graded[-1])
+    points, of = sum(g["points"] for g in graded), sum(g["of"] for g in graded)
+    if len(graded) > 1:
+        print(f"all {len(graded)} notebooks: {points} of {of} points")
+    if args.json:
+        about = {"minislam": minislam.__version__, "seed": args.seed, "points": points, "of": of}
+        write_json(args.json, {**about, "notebooks": graded})
+    if args.csv:
+        table = io.StringIO()
+        writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        for notebook in graded:
+            writer.writerows({"file": notebook["file"], **row} for row in notebook["exercises"])
+        write_text(args.csv, table.getvalue())
+    failed = any("error" in notebook for notebook in graded)
+    return int(failed or (args.strict and points < of))
+
+
+def _show(graded: dict[str, Any]) -> None:
+    print(graded["file"])
+    if "error" in graded:
+        print(f"  {graded['error']}")
+        return
+    for row in graded["exercises"]:
+        print(f"  {row['key']:7} {row['points']}/{row['of']}  {row['status']:7}  {row['sentence']}")
+    print(f"  {graded['points']} of {graded['of']} points")
+
+
+def _graded(path: Path, seed: int | None, without_package: bool) -> dict[str, Any]:
+    """Return the points of one notebook; InputError if it is none of the course."""
+    from minislam.checks.submission import exercises_of, parts_of
+    from minislam.data.files import read_json
+
+    notebook = read_json(path)
+    exercises = exercises_of(notebook, path.name)
+    parts = parts_of(notebook, exercises)
+    broken = {part.key: part.error for part in parts if part.key and part.error}
+    wanted = [e.key for e in exercises if any(p.key == e.key and not p.error for p in parts)]
+    verdicts = _judged(parts, wanted, seed, without_package)
+    rows = []
+    for exercise in exercises:
+        sentence = f"the cell with checks.{exercise.check}(...) is missing: put it back."
+        if exercise.key in broken:
+            sentence = f"{broken[exercise.key]}."
+        status = WRONG if exercise.key in broken else MISSING
+        verdict: dict[str, Any] = {"status": status, "sentence": sentence, "hint": ""}
+        verdict.update({"seconds": 0.0, **verdicts.get(exercise.key, {})})
+        points = exercise.points if verdict["status"] == PASSED else 0
+        about = {"key": exercise.key, "check": exercise.check, "points": points}
+        rows.append({**about, "of": exercise.points, **verdict})  # in the columns' order
+    points, of = sum(row["points"] for row in rows), sum(row["of"] for row in rows)
+    about = {"file": str(path), "notebook": exercises[0].notebook}
+    return {**about, "points": points, "of": of, "exercises": rows}
+
+
+def _judged(
+    parts: list[Part], wanted: list[str], seed: int | None, without_package: bool
+) -> dict[str, dict[str, Any]]:
+    """Return the verdict of each wanted exercise, whatever its code does to the process."""
+    verdicts: dict[str, dict[str, Any]] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        files = [(str(folder / f"cell_{n}.py"), part.key) for n, part in enumerate(parts)]
+        for (file, _), part in zip(files, parts, strict=True):
+            Path(file).write_text(part.text, encoding="utf-8")
+        while remaining := [key for key in wanted if key not in verdicts]:
+            job = {"files": files, "wanted": remaining, "without_package": without_package}
+            (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
+            (folder / "verdicts.txt").write_text("", encoding="utf-8")
+            ending = _run_judge(folder, seed)
+            lines = (folder / "verdicts.txt").read_text(encoding="utf-8").splitlines()
+            found = [json.loads(line) for line in lines]
+            verdicts.update({row["key"]: row for row in found if "status" in row})
+            begun = [row["key"] for row in found if row["key"] not in verdicts]
+            # Who ends the process before any exercise has begun would do so again.
+            guilty = begun or [key for key in remaining if key not in verdicts and not found]
+            for key in guilty:
+                verdicts[key] = {"status": WRONG, "sentence": ending, "hint": "", "seconds": 0.0}
+    return verdicts
+
+
+def _run_judge(folder: Path, seed: int | None) -> str:
+    """Run minislam.checks.judge; return a sentence for the exercise it did not come back from."""
+    root = str(Path(minislam.__file__).parent.parent)
+    environment = {name: v for name, v in os.environ.items() if not name.startswith("MINISLAM_S")}
+    environment["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
+    environment["MPLBACKEND"] = "Agg"
+    if seed is not None:
+        environment["MINISLAM_SEED"] = str(seed)
+    command = [sys.executable, "-P", "-m", "minislam.checks.judge", str(folder)]
+    null = subprocess.DEVNULL  # of what the notebook prints
+    with subprocess.Popen(
+        command, cwd=folder, env=environment, stdin=null, stdout=null, stderr=null
+    ) as process:
+        size, since = 0, time.monotonic()
+        while process.poll() is None:
+            time.sleep(0.05)
+            if (folder / "verdicts.txt").stat().st_size != size:
+                size, since = (folder / "verdicts.txt").stat().st_size, time.monotonic()
+            if time.monotonic() - since > SILENCE:
+                process.kill()
+                return f"it has no answer after {SILENCE:.0f} seconds."
+    return f"it ends the whole program (exit code {process.returncode})."
