@@ -16,16 +16,28 @@ ROOT = Path(__file__).parent
 
 
 class BuildWithNotebooks(build_py):
-    """Copy notebooks/ to minislam/notebooks/ in a wheel. An editable install finds the former."""
+    """Copy notebooks/ and the licence to minislam/notebooks/ in a wheel.
+
+    An editable install finds notebooks/ in the repository.
+    """
 
     def run(self) -> None:
         """Build the package, then add the notebooks."""
         super().run()
         if not self.editable_mode:
             target = Path(self.build_lib) / "minislam" / "notebooks"
-            self.mkpath(str(target))
-            for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-                self.copy_file(str(path), str(target / path.name))
+            notebooks = sorted((ROOT / "notebooks").glob("*.ipynb"))
+            text = b"".join(path.read_bytes() for path in notebooks)
+            for path in [
+                *notebooks,
+                *(ROOT / "notebooks").glob("*.md"),
+                *ROOT.glob("notebooks/*/*.*"),
+            ]:
+                name = path.relative_to(ROOT / "notebooks")
+                if path.parent.name == "notebooks" or name.as_posix().encode() in text:
+                    self.mkpath(str((target / name).parent))
+                    self.copy_file(str(path), str(target / name))
+            self.copy_file(str(ROOT / "LICENSE"), str(target / "LICENSE"))
 
 
 def readme() -> str:

@@ -58,6 +58,14 @@ def test_it_is_small_and_in_the_stored_form(path: Path):
     assert load(path)["metadata"]["kernelspec"]["name"] == "python3"
 
 
+def test_of_the_metadata_only_nbgraders_is_stored():
+    grading = {"grade": True, "points": 2}
+    cell = {"source": [], "metadata": {"nbgrader": grading, "execution": {"busy": "now"}}}
+    stored = cleaned({"cells": [cell], "metadata": {"widgets": {}}})
+    assert stored["cells"][0]["metadata"] == {"nbgrader": grading}
+    assert set(stored["metadata"]) == {"kernelspec", "language_info"}
+
+
 @each_notebook
 def test_its_cells_are_short(path: Path):
     cells = load(path)["cells"]

@@ -1,4 +1,4 @@
-"""The sub-command `minislam notebooks`: copies of the course, for students without solutions."""
+"""The sub-command `minislam notebooks`: copies of the course, with or without solutions."""
 
 from __future__ import annotations
 
@@ -18,34 +18,43 @@ def add_notebooks_parser(subparsers: argparse._SubParsersAction) -> None:
     """Add `notebooks` to the sub-commands of a parser."""
     parser = subparsers.add_parser("notebooks", help="copy the course's notebooks into a folder")
     parser.add_argument("folder", metavar="DIR", help="where to; made if it does not exist")
-    parser.add_argument("--student", action="store_true", help="without the exercises' solutions")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--student", action="store_true", help="without solutions and outputs")
+    kind.add_argument("--solutions", action="store_true", help="with solutions, as without a flag")
     parser.set_defaults(run=run_notebooks)
 
 
 def run_notebooks(args: argparse.Namespace) -> int:
-    """Copy all notebooks, never over a file that is there; return the exit code."""
-    from minislam.data.files import read_text, write_text  # needs torch
+    """Copy all notebooks and what they name, never over a file; return the exit code."""
+    from minislam.data.files import atomic_write, read_bytes  # needs torch
 
     # A wheel holds the notebooks inside the package, the repository beside it.
     folder, package = Path(args.folder).expanduser(), Path(minislam.__file__).parent
-    paths = sorted(package.glob("notebooks/*.ipynb")) or sorted(
-        package.glob("../notebooks/*.ipynb")
-    )
-    if not paths:
+    sources = [package / "notebooks", package.parent / "notebooks"]
+    source = next((path for path in sources if any(path.glob("*.ipynb"))), None)
+    if source is None:
         raise InputError(f"expected notebooks in {package} or beside it, found none; install again")
-    there = [path.name for path in paths if (folder / path.name).exists()]
+    copies = {path.name: read_bytes(path) for path in sorted(source.glob("*.ipynb"))}
+    count, texts = len(copies), b"".join(copies.values())
+    if args.student:
+        for name, content in copies.items():
+            copies[name] = as_text(without_solutions(json.loads(content))).encode()
+    for path in sorted(source.glob("*/*.*")):
+        if path.relative_to(source).as_posix().encode() in texts:
+            copies[path.relative_to(source).as_posix()] = read_bytes(path)
+    for path in (source / "SYLLABUS.md", source / "LICENSE", source.parent / "LICENSE"):
+        if path.is_file():
+            copies[path.name] = read_bytes(path)
+    there = [name for name in copies if (folder / name).exists()]
     if there:
         raise InputError(
             f"expected a folder without these notebooks, found {there[0]} in {folder}; give "
             "another one, so that nobody's work is lost"
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in paths:
-        text = read_text(path)
-        if args.student:
-            text = as_text(without_solutions(json.loads(text)))
-        write_text(folder / path.name, text)
-    print(f"{len(paths)} notebooks in {folder}; open them with: jupyter lab {folder}")
+    for name, content in copies.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(folder / name, content)
+    print(f"{count} notebooks in {folder}; open them with: jupyter lab {folder}")
     return 0
 
 

@@ -1,4 +1,7 @@
-"""The table of points agrees with the notebooks: exercises, checks, headings."""
+"""The table of points agrees with the notebooks: exercises, checks, headings; and the syllabus.
+
+`python -m tests.checks.test_points` rewrites the table of notebooks/SYLLABUS.md.
+"""
 
 import re
 from itertools import pairwise
@@ -7,8 +10,11 @@ import pytest
 
 from minislam import checks
 from minislam.checks.points import EXERCISES
-from tests.notebook_files import NOTEBOOKS, is_exercise, load, source
+from tests.notebook_files import NOTEBOOKS, ROOT, is_exercise, load, source
 
+SYLLABUS = ROOT / "notebooks/SYLLABUS.md"
+GENERATED = re.compile(r"(<!-- points: [^\n]+ -->\n).*?(<!-- end of points -->)", re.S)
+WARM_UP = 2  # points
 HEADING = re.compile(
     r"### Exercise (\d): [^\n]+ \((★{1,3})(☆{0,2}), (\d+) minutes, (\d) points\)\n"
 )
@@ -43,3 +49,31 @@ def test_headings_say_what_the_table_says(path):
     rows = [e for e in EXERCISES if e.notebook == path.stem]
     expected = [(e.key, e.notebook, e.check, e.points, e.stars, e.minutes) for e in rows]
     assert found == expected
+
+
+def table_of_points() -> str:
+    rows = ["| notebook | warm-ups | building | points | minutes |", "|---|---|---|---|---|"]
+    for notebook in sorted({e.notebook for e in EXERCISES}):
+        own = [e for e in EXERCISES if e.notebook == notebook]
+        warm = sum(e.points == WARM_UP for e in own)
+        points, minutes = sum(e.points for e in own), sum(e.minutes for e in own)
+        rows.append(f"| {notebook} | {warm} | {len(own) - warm} | {points} | {minutes} |")
+    first = sum(e.points for e in EXERCISES if e.notebook < "05")
+    whole = sum(e.points for e in EXERCISES)
+    last = f"Hand-in 1 (00 to 04): {first} points. Hand-in 2 (05 to 10): {whole - first} points."
+    return "\n".join([*rows, "", last, ""])
+
+
+def test_the_syllabus_counts_the_same_points():
+    if not SYLLABUS.exists():
+        pytest.skip("no notebooks in this copy")
+    text = SYLLABUS.read_text(encoding="utf-8")
+    assert written(text) == text, "run python -m tests.checks.test_points"
+
+
+def written(text: str) -> str:
+    return GENERATED.sub(lambda match: match[1] + table_of_points() + match[2], text)
+
+
+if __name__ == "__main__":
+    SYLLABUS.write_text(written(SYLLABUS.read_text(encoding="utf-8")), encoding="utf-8")

@@ -7,26 +7,50 @@ import pytest
 
 import minislam
 from minislam.cli.main import main
-from tests.notebook_files import NOTEBOOKS
+from tests.notebook_files import NOTEBOOKS, ROOT, is_exercise, load
 
 pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy")
 
 
-def test_copies_are_the_notebooks(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["notebooks", str(tmp_path / "course")]) == 0
+@pytest.mark.parametrize("flags", [[], ["--solutions"]])
+def test_copies_are_the_notebooks(tmp_path: Path, capsys: pytest.CaptureFixture[str], flags):
+    assert main(["notebooks", str(tmp_path / "course"), *flags]) == 0
     assert f"jupyter lab {tmp_path / 'course'}" in capsys.readouterr().out
-    copies = sorted((tmp_path / "course").iterdir())
+    copies = sorted((tmp_path / "course").glob("*.ipynb"))
     assert [path.name for path in copies] == [path.name for path in NOTEBOOKS]
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(copies, NOTEBOOKS, strict=True))
+    for name in ("notebooks/SYLLABUS.md", "LICENSE"):
+        copy = tmp_path / "course" / Path(name).name
+        assert copy.read_bytes() == (ROOT / name).read_bytes()
 
 
 def test_copies_for_students_have_no_solution(tmp_path: Path):
     assert main(["notebooks", str(tmp_path), "--student"]) == 0
-    for path in tmp_path.iterdir():
+    for path in tmp_path.glob("*.ipynb"):
         text = path.read_text(encoding="utf-8")
-        assert "SOLUTION" not in text and "NotImplementedError" in text, path.name
+        assert "SOLUTION" not in text
+        solved = load(ROOT / "notebooks" / path.name)["cells"]
+        assert ("NotImplementedError" in text) == any(map(is_exercise, solved))
         cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
         assert not any(cell["outputs"] or cell["execution_count"] for cell in cells)
+
+
+def test_it_is_either_with_or_without_solutions(tmp_path: Path, capsys):
+    with pytest.raises(SystemExit):
+        main(["notebooks", str(tmp_path), "--student", "--solutions"])
+    assert "not allowed with" in capsys.readouterr().err
+
+
+def test_files_that_a_notebook_names_come_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    package = tmp_path / "site-packages/minislam"
+    for name in ("images/a.png", "images/b.png", "data/rows.json"):
+        (package / "notebooks" / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / "notebooks" / name).write_text(name)
+    (package / "notebooks/00_first.ipynb").write_text('{"cells": ["images/a.png data/rows.json"]}')
+    monkeypatch.setattr(minislam, "__file__", str(package / "__init__.py"))
+    assert main(["notebooks", str(tmp_path / "course")]) == 0
+    files = {p.relative_to(tmp_path / "course").as_posix() for p in tmp_path.glob("course/**/*.*")}
+    assert files == {"00_first.ipynb", "images/a.png", "data/rows.json"}
 
 
 def test_an_installed_package_brings_its_notebooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
