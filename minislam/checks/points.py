@@ -31,6 +31,7 @@ EXERCISES = (
     Exercise("ex01_2", "01_geometry", "check_reproject", 2, 1, 5),
     Exercise("ex02_1", "02_splatting", "check_projected_covariance", 2, 1, 10),
     Exercise("ex02_2", "02_splatting", "check_pixel_color", 2, 1, 10),
+    Exercise("ex02_3", "02_splatting", "check_rendered_image", 8, 2, 40),
     Exercise("ex03_1", "03_splatting_gradients", "check_conic_vjp", 2, 2, 20),
     Exercise("ex03_2", "03_splatting_gradients", "check_twist_vjp", 2, 2, 15),
     Exercise("ex04_1", "04_uncertainty", "check_best_beta", 2, 1, 5),

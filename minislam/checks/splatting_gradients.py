@@ -116,10 +116,14 @@ def check_twist_vjp(student: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor])
     return check_function(student, to_camera_twist_vjp, cases, 1e-9, hints, draw)
 
 
-def check_picture_gradient(student: Callable[[Tensor, Tensor], Tensor]) -> Verdict:
-    """Check (gaussians (K, 9), target (H, W, 3)) -> dL/d(gaussians) (K, 9)."""
+def check_picture_gradient(
+    student: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+) -> Verdict:
+    """Check (gaussians (K, 9), target (H, W, 3)) -> image (H, W, 3), dL/d(gaussians) (K, 9)."""
 
-    def reference(gaussians: Tensor, target: Tensor, fixed_light: bool = False) -> Tensor:
+    def reference(
+        gaussians: Tensor, target: Tensor, fixed_light: bool = False
+    ) -> tuple[Tensor, Tensor]:
         leaf = gaussians.detach().clone().requires_grad_()
         mean_u, mean_v, a, b, c, log_o = leaf[:, :6, None, None].unbind(1)
         rows, columns = torch.meshgrid(*map(torch.arange, target.shape[:2]), indexing="ij")
@@ -128,12 +132,17 @@ def check_picture_gradient(student: Callable[[Tensor, Tensor], Tensor]) -> Verdi
         light = torch.cat([torch.ones_like(alphas[:1]), (1 - alphas).cumprod(0)])[:-1]
         light = light.detach() if fixed_light else light
         image = torch.einsum("khw,kc->hwc", light * alphas, leaf[:, 6:])
-        return torch.autograd.grad((image - target).square().sum(), leaf)[0]
+        return image.detach(), torch.autograd.grad((image - target).square().sum(), leaf)[0]
 
     def scaled(factor: float, *columns: int) -> Function:
         scale = torch.ones(9, dtype=torch.float64)
         scale[list(columns)] = factor
-        return lambda gaussians, target: scale * reference(gaussians, target)
+
+        def answer(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+            image, gradient = reference(gaussians, target)
+            return image, scale * gradient
+
+        return answer
 
     def draw(seed: int) -> Case:
         return Case(
@@ -158,4 +167,6 @@ def check_picture_gradient(student: Callable[[Tensor, Tensor], Tensor]) -> Verdi
         (scaled(0.5, 3), "b stands twice in the quadratic form: v_b = -sum g du dv."),
         (partial(reference, fixed_light=True), "A Gaussian also hides what is behind it: R_{k+1}."),
     ]
-    return check_function(student, reference, cases, 1e-7, hints, draw)
+    return check_function(
+        student, reference, cases, 1e-7, hints, draw, ("the image", "the gradient")
+    )

@@ -9,7 +9,7 @@ from minislam.checks import check_picture_gradient
 from tests.helpers import assert_variants
 
 
-def picture_gradient(gaussians: Tensor, target: Tensor, flaw: str = "") -> Tensor:
+def picture_gradient(gaussians: Tensor, target: Tensor, flaw: str = "") -> tuple[Tensor, Tensor]:
     rows, columns = torch.meshgrid(*map(torch.arange, target.shape[:2]), indexing="ij")
     layers, image, light = [], torch.zeros_like(target), torch.ones_like(target[..., 0])
     for mean_u, mean_v, a, b, c, log_o, *color in gaussians:
@@ -28,37 +28,37 @@ def picture_gradient(gaussians: Tensor, target: Tensor, flaw: str = "") -> Tenso
         v_conic = [-0.5 * (g * du**2).sum(), -(g * du * dv).sum(), -0.5 * (g * dv**2).sum()]
         v_color = torch.einsum("hw,hwc->c", light * alpha, v)
         gradient.append(torch.cat([v_mean, torch.stack([*v_conic, g.sum()]), v_color]))
-    return torch.stack(gradient[::-1])
+    return image, torch.stack(gradient[::-1])
 
 
-def gradient_of_each_number(gaussians: Tensor, target: Tensor) -> Tensor:
-    def loss(values: Tensor) -> Tensor:
+def gradient_by_autograd(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    def loss(values: Tensor) -> tuple[Tensor, Tensor]:
         rows, columns = torch.meshgrid(*map(torch.arange, target.shape[:2]), indexing="ij")
         image = torch.zeros_like(target)
         for mean_u, mean_v, a, b, c, log_o, *color in values.flip(0):  # from the back
             du, dv = columns - mean_u, rows - mean_v
             alpha = torch.exp(log_o - 0.5 * (a * du**2 + 2 * b * du * dv + c * dv**2))
             image = alpha[..., None] * torch.stack(color) + (1 - alpha[..., None]) * image
-        return ((image - target) ** 2).sum()
+        return ((image - target) ** 2).sum(), image
 
-    return torch.func.grad(loss)(gaussians)
+    return torch.func.grad(loss, has_aux=True)(gaussians)[::-1]
 
 
 def test_the_gradient_of_a_picture_is_told_from_a_wrong_one():
     def scaled(factor: float, *columns: int):
         scale = torch.ones(9, dtype=torch.float64)
         scale[list(columns)] = factor
-        return lambda *a: scale * picture_gradient(*a)
+        return lambda *a: (picture_gradient(*a)[0], scale * picture_gradient(*a)[1])
 
     wrong = {
         "sign is flipped": scaled(-1, *range(9)),
         "factor 2": scaled(0.5, *range(9)),
-        "not a mean": lambda g, target: picture_gradient(g, target) / target.numel(),
+        "not a mean": scaled(1 / 189, *range(9)),
         "falls as mu' grows": scaled(-1, 0, 1),
         "b stands twice": scaled(0.5, 3),
         "hides what is behind it": partial(picture_gradient, flaw="fixed"),
         "shades itself": partial(picture_gradient, flaw="own shade"),
-        "reversed": lambda g, target: picture_gradient(g.flip(0), target).flip(0),
+        "reversed": lambda g, target: picture_gradient(g.flip(0), target),
     }
-    right = {"by hand": picture_gradient, "autograd": gradient_of_each_number}
+    right = {"by hand": picture_gradient, "autograd": gradient_by_autograd}
     assert_variants(check_picture_gradient, right, wrong)
