@@ -34,6 +34,7 @@ def run(
     settings: Mapping[str, Any] | None = None,  # by their names with dots: minislam settings
     overwrite: bool = False,  # replace an earlier run in `output`
     quiet: bool = False,  # no progress on stderr
+    workers: int | None = None,  # processes; as many as there are idle cores, at most 4
     **options: Any,  # as on the command line: stride, max_frames, fx, depth, device, ...
 ) -> Run:
     """Run SLAM on a sequence, write its folder and return the run, as `minislam run` does.
@@ -57,7 +58,9 @@ def run(
     is_main = threading.current_thread() is threading.main_thread()
     with ending_signals(progress.interrupt) if is_main else nullcontext():
         observer = None if quiet else progress
-        run_in_folder(sequence, config, choice, Path(output), observer, overwrite=overwrite)
+        run_in_folder(
+            sequence, config, choice, Path(output), observer, overwrite=overwrite, workers=workers
+        )
     return Run(output)
 
 

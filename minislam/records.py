@@ -1,7 +1,7 @@
 """The data that one stage gives to another (frozen), and the protocols of the input."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol
@@ -131,3 +131,23 @@ class Sequence(Protocol):
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) [m], 0 where unknown; None without a sensor."""
+
+
+@dataclass
+class MappingHistory:
+    """The losses and the size of the map, one entry per iteration, for plots."""
+
+    render: list[float] = field(default_factory=list)  # L_render
+    color: list[float] = field(default_factory=list)  # weighted L_color
+    depth: list[float] = field(default_factory=list)  # weighted L_depth
+    isotropic: list[float] = field(default_factory=list)  # L_iso
+    uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
+    gaussians: list[int] = field(default_factory=list)  # size of the map
+
+    def add(self, parts: list[float], uncertainty: float, gaussians: int) -> None:
+        """Append one iteration, with the first four numbers in `parts`."""
+        columns = self.render, self.color, self.depth, self.isotropic
+        for column, part in zip(columns, parts, strict=True):
+            column.append(part)
+        self.uncertainty.append(uncertainty)
+        self.gaussians.append(gaussians)

@@ -1,4 +1,4 @@
-"""The whole system (paper Fig. 2): one process, one loop. `Slam.run` shows it on one screen.
+"""The whole system (paper Fig. 2): one loop. `Slam.run` shows it on one screen.
 
     frame -> tracker -> keyframe (pose, disparity) -> mapper -> Gaussian map
                 ^                                       |
@@ -36,6 +36,9 @@ from minislam.tracking.safeguards.focal_length import (
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty import beta_of_mask, tracking_weight
+from minislam.workers import Workers
+
+FRAMES_AT_ONCE = 8  # between two keyframes, refined side by side: more make Ctrl-C wait
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,9 @@ class Slam(Stateful):
         observer: Observer | None = None,
         save_checkpoint: Callable[[bool], None] = lambda force: None,
         device: str = "cpu",  # of all tensors; the networks are where the priors put them
+        workers: Workers | None = None,  # share what is independent; the result is the same
     ) -> None:
-        self.sequence, self.device = sequence, device
+        self.sequence, self.device, self.workers = sequence, device, workers or Workers()
         self.config = config
         self.steps = Steps(observer or SilentObserver(), save_checkpoint)
         self._features = priors.features
@@ -106,7 +110,7 @@ class Slam(Stateful):
         config, dimension = self.config, self._features.dimension
         camera = self.tracker.grid.camera
         parts = config.mapping, config.uncertainty
-        return Mapper(camera, *parts, dimension, config.seed, self.device)
+        return Mapper(camera, *parts, dimension, config.seed, self.device, self.workers)
 
     def frame(self, frame_index: int) -> Frame:
         """Read a frame; its image moves to the device of the run."""
@@ -185,12 +189,13 @@ class Slam(Stateful):
         stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
         others = [index for index in self._poses if index not in keyframes]
-        for done in range(self.steps.done(stage), len(others)):
-            frame = self.frame(others[done])
-            pose = self._poses[frame.frame_index]
-            beta = self._beta(frame, None)
-            self._poses[frame.frame_index] = self.mapper.refine_pose(pose, frame.image, beta)
-            self.steps.finish(stage, done + 1, len(others))
+        for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
+            frames = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
+            start, images = [self._poses[f.frame_index] for f in frames], [f.image for f in frames]
+            betas = [self._beta(frame, None) for frame in frames]
+            poses = self.mapper.refine_poses(start, images, betas)
+            self._poses |= {f.frame_index: pose for f, pose in zip(frames, poses, strict=True)}
+            self.steps.finish(stage, first + len(frames), len(others))
 
     def _static_weight(self, index: int) -> Tensor:
         """Return the static weight (h, w) of the cells of a keyframe, in (0, 1], by the MLP.
@@ -235,15 +240,12 @@ class Slam(Stateful):
         for index in range(first, len(store)):
             frame, depth = store.frames[index], store.metric_depths[index]
             record = Keyframe(
-                keyframe_index=index,
-                frame_index=frame.frame_index,
-                timestamp=frame.timestamp,
-                image=frame.image,
-                features=store.features[index],
+                keyframe_index=index, frame_index=frame.frame_index, timestamp=frame.timestamp,
+                image=frame.image, features=store.features[index],
                 depth=unknown if depth is None else depth,
                 T_camera_world=store.T_camera_world[index],
                 moving_mask=self._given_mask(frame.frame_index),
-            )
+            )  # fmt: skip
             result.append(record)
         return result
 

@@ -78,6 +78,17 @@ def add_talk(parser: argparse.ArgumentParser) -> None:
     how_much.add_argument("-v", "--verbose", action="store_true", help="a line for every step")
 
 
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add how many processes share the work."""
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes that share the work, without effect on the result; default: one per idle"
+        " core, at most 4; on a GPU 1",
+    )
+
+
 def add_lpips(parser: argparse.ArgumentParser) -> None:
     """Add the files of LPIPS, a measure for which nothing comes with the package."""
     group = parser.add_argument_group("LPIPS", "measured if both files are given")

@@ -25,6 +25,7 @@ def add_demo_parser(subparsers: argparse._SubParsersAction) -> None:
     demo = add_command(subparsers, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
     demo.add_argument("-o", "--output", metavar="DIR", help="run folder, output/demo")
     options.add_talk(demo)
+    options.add_workers(demo)
     options.add_settings(demo)
     demo.set_defaults(run=_run, overwrite=True, resume=False, **DEMO)
 
@@ -40,6 +41,7 @@ def add_run_parser(subparsers: argparse._SubParsersAction) -> None:
         "--resume", action="store_true", help="go on with the interrupted run in OUTPUT"
     )
     options.add_talk(run)
+    options.add_workers(run)
     options.add_settings(run)
     options.add_input(run)
     options.add_priors(run, default_depth="simulated for synth:, else none", with_flow=True)
@@ -82,8 +84,9 @@ def _run_recorded(args: argparse.Namespace, log: Log) -> int:
     log.folder = Path(output)
     with ending_signals(progress.interrupt):
         outcome = run_in_folder(
-            sequence, config, choice, output, progress, lpips, args.overwrite, args.resume
-        )
+            sequence, config, choice, output, progress, lpips, args.overwrite, args.resume,
+            args.workers,
+        )  # fmt: skip
     say("\n".join([f"{outcome.state}:", *as_text(outcome.summary)]))
     for warning in outcome.warnings:
         if warning not in sequence.warnings:

@@ -3,7 +3,8 @@
 Read the files in this order:
 
     mapper             when the map gets and loses Gaussians, and when it is optimised
-    optimisation       one iteration: a step of the map on L_render, a step of the MLP on L_uncer
+    optimisation       one step of the map on L_render, and of the MLP on L_uncer
+    view_gradients     what one keyframe adds to a step; worker processes compute it
     losses             L_render, Eq. (6), and L_color, Eq. (7)
     insertion          where a keyframe adds Gaussians, and which lie on dynamic objects
     window             the local window of keyframes, and the probability to draw each keyframe
@@ -20,8 +21,8 @@ from minislam.mapping.config import (
     PoseRefinementConfig,
     paper_mapping,
 )
-from minislam.mapping.losses import MappingHistory
 from minislam.mapping.mapper import Mapper
+from minislam.records import MappingHistory
 
 __all__ = [
     "DensityConfig",

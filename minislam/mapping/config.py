@@ -65,6 +65,12 @@ class MappingConfig:
     """
 
     image_scale: float = parameter(0.5, "size of the images used online, of the full size (0, 1]")
+    views_per_step: int = parameter(
+        2,
+        "keyframes rendered per step, side by side if there are --workers; an iteration is one"
+        " rendered keyframe; paper 1",
+        1,
+    )
     init_iterations: int = parameter(150, "iterations on the first keyframes; official 1050")
     keyframe_iterations: int = parameter(25, "iterations per keyframe; official 450")
     keyframe_stride: int = parameter(
@@ -163,6 +169,7 @@ def paper_mapping() -> MappingConfig:
     """
     return MappingConfig(
         image_scale=1.0,
+        views_per_step=1,
         init_iterations=1050,
         keyframe_iterations=450,
         refine_iterations=20000,

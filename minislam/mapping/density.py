@@ -9,7 +9,6 @@ from minislam.geometry import Camera
 from minislam.geometry.se3 import rotation_from_quaternion
 from minislam.mapping.config import DensityConfig
 from minislam.splatting import GaussianMap, MapOptimizer
-from minislam.state.stateful import Stateful
 
 CHILDREN = 2  # of a Gaussian that is split, 3DGS
 SPLIT_SCALE = 0.02  # median depths: larger ones are split, smaller ones cloned; official 0.06 m
@@ -18,40 +17,23 @@ PRUNE_OPACITY = 0.1  # fainter ones are removed; official 0.005 at first and 0.7
 PRUNE_SCALE = 0.2  # median depths: larger ones are removed, official 0.6 m
 
 
-class ScreenGradients(Stateful):
-    """Mean length of dL/d(projected mean) of each Gaussian over the views that saw it.
+def screen_gradients(
+    v_screen: Tensor,  # (N, 2) dL/d(pixel)
+    radii: Tensor,  # (N,) px, 0 where not seen
+    camera: Camera,
+) -> Tensor:  # (2, N)
+    """Return the length of dL/d(projected mean) in a view, 0 where not seen, and 1 where seen.
 
     The unit of length is half an image, so that one threshold holds for every image size.
     """
-
-    total: Tensor  # (N,) sum of the lengths
-    views: Tensor  # (N,) number of views
-
-    def __init__(self, like: Tensor) -> None:
-        """Start at zero, for as many Gaussians as a tensor (N,) has, and on its device."""
-        self.total, self.views = torch.zeros_like(like), torch.zeros_like(like)
-
-    def add(
-        self,
-        v_screen: Tensor,  # (N, 2) dL/d(pixel)
-        radii: Tensor,  # (N,) px, 0 where not seen
-        camera: Camera,
-    ) -> None:
-        """Add the gradients of one view."""
-        half_image = v_screen.new_tensor([camera.width / 2, camera.height / 2])
-        seen = radii > 0
-        self.total += torch.where(seen, (v_screen * half_image).norm(dim=-1), 0)
-        self.views += seen
-
-    @property
-    def mean(self) -> Tensor:
-        """Return the means (N,); 0 for Gaussians that no view saw."""
-        return self.total / self.views.clamp_min(1)
+    half_image = v_screen.new_tensor([camera.width / 2, camera.height / 2])
+    seen = (radii > 0).to(v_screen)
+    return torch.stack([seen * (v_screen * half_image).norm(dim=-1), seen])
 
 
 def densify(
     optimizer: MapOptimizer,
-    gradients: Tensor,  # (N,) mean screen gradient
+    gradients: Tensor,  # (2, N) screen gradients summed over views
     median_depth: float,  # world units, of the scene
     config: DensityConfig,
     generator: torch.Generator,
@@ -65,10 +47,12 @@ def densify(
     capacity = config.max_gaussians - len(gaussians)
     if capacity <= 0:
         return 0
-    chosen = gradients > config.gradient
+    lengths, views = gradients
+    means = lengths / views.clamp_min(1)
+    chosen = means > config.gradient
     if int(chosen.sum()) > capacity:
         # There is no place for all: take those of the largest gradients.
-        chosen &= gradients >= gradients.topk(capacity).values[-1]
+        chosen &= means >= means.topk(capacity).values[-1]
     large = gaussians.scales.max(-1).values > SPLIT_SCALE * median_depth
     clones = gaussians.prune(chosen & ~large)
     parents = gaussians.prune(chosen & large)

@@ -1,6 +1,6 @@
 """The terms of L_render, which moves the Gaussians and nothing else (Sec. 3.4)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -25,27 +25,6 @@ class RenderLoss:
     color: Tensor  # () weighted mean of L_color
     depth: Tensor  # () weighted mean of L_depth [m, see `metre`]
     isotropic: Tensor  # () L_iso [m]
-
-
-@dataclass
-class MappingHistory:
-    """The losses and the size of the map, one entry per iteration, for plots."""
-
-    render: list[float] = field(default_factory=list)  # L_render
-    color: list[float] = field(default_factory=list)  # weighted L_color
-    depth: list[float] = field(default_factory=list)  # weighted L_depth
-    isotropic: list[float] = field(default_factory=list)  # L_iso
-    uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
-    gaussians: list[int] = field(default_factory=list)  # size of the map
-
-    def add(self, loss: RenderLoss, uncertainty: float, gaussians: int) -> None:
-        """Append one iteration."""
-        parts = torch.stack([loss.total, loss.color, loss.depth, loss.isotropic]).tolist()
-        columns = self.render, self.color, self.depth, self.isotropic
-        for column, part in zip(columns, parts, strict=True):
-            column.append(part)
-        self.uncertainty.append(uncertainty)
-        self.gaussians.append(gaussians)
 
 
 def metre(median_depth: float) -> float:

@@ -4,6 +4,8 @@ Read `initialise`, `integrate` and `refine` first: they are the three moments at
 built. `update_keyframes` moves it when the tracker has corrected poses.
 """
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -16,6 +18,7 @@ from minislam.mapping.views import MappedKeyframe, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe
 
+RECHECKED = 10  # keyframes beside the window whose Gaussians are looked at with every new one
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
 
 
@@ -50,7 +53,8 @@ class Mapper(JointOptimisation):
             for position in [new, *self.window]
         }
         self.window = update_window(self.window, new, seen, poses, self.config.window_size)
-        self._remove_dynamic_gaussians()
+        turn = range(new * RECHECKED, (new + 1) * RECHECKED)  # a constant number per keyframe
+        self._remove_dynamic_gaussians({*self.window, *(number % new for number in turn)})
         self._insert(self.keyframes[new])
         if new % self.config.keyframe_stride != 0:
             return  # Fast mode: this keyframe waits for the next optimisation.
@@ -88,18 +92,18 @@ class Mapper(JointOptimisation):
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
         self._optimise(cameras, uniform, progress, self.config.refine_rate_end, done)
 
-    def refine_pose(
+    def refine_poses(
         self,
-        T_camera_world: Tensor,  # (4, 4) float64
-        image: Tensor,  # (H, W, 3) RGB in [0, 1] of a frame that is no keyframe
-        beta: Tensor,  # (h', w') of that frame
-    ) -> Tensor:  # (4, 4) float64
-        """Return the pose near the given one from which the map looks most like the image."""
-        weight = self.static_weight(beta, self.camera)
-        settings = self.config.pose_refinement
-        return refine_pose(
-            self.gaussians, self.camera, T_camera_world, image, weight, self.background, settings
-        )
+        T_camera_world: list[Tensor],  # (4, 4) float64 each, of frames that are no keyframes
+        images: list[Tensor],  # (H, W, 3) RGB in [0, 1]
+        betas: list[Tensor],  # (h', w')
+    ) -> list[Tensor]:  # (4, 4) float64
+        """Return the poses near the given ones from which the map looks most like the images."""
+        weights = [self.static_weight(beta, self.camera) for beta in betas]
+        fixed = self.background, self.config.pose_refinement
+        views = zip(T_camera_world, images, weights, strict=True)
+        calls = [(self.gaussians, self.camera, *view, *fixed) for view in views]
+        return self._workers.map(refine_pose, calls)
 
     def anchor_rows(self) -> Tensor:
         """Return (N,) the position in `keyframes` of the keyframe that inserted each Gaussian."""
@@ -123,11 +127,12 @@ class Mapper(JointOptimisation):
         self._optimizer.append(new)
         self._reset_gradients()
 
-    def _remove_dynamic_gaussians(self) -> None:
-        """Remove Gaussians that were inserted on an object before the MLP knew that it moves."""
+    def _remove_dynamic_gaussians(self, positions: Iterable[int]) -> None:
+        """Remove Gaussians that keyframes inserted on an object before the MLP knew it moves."""
         gaussians, rows = self.gaussians, self.anchor_rows()
         keep = torch.ones_like(rows, dtype=torch.bool)
-        for position, keyframe in enumerate(self.keyframes):
+        for position in positions:
+            keyframe = self.keyframes[position]
             anchored = (rows == position).nonzero().squeeze(-1)
             weight = self.static_weight(self.beta_of(keyframe), self._online_camera)
             keep[anchored] = ~is_on_dynamic_object(
@@ -138,6 +143,6 @@ class Mapper(JointOptimisation):
 
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""
-        self._remove_dynamic_gaussians()
+        self._remove_dynamic_gaussians(range(len(self.keyframes)))
         for keyframe in self.keyframes:
             self._insert(keyframe)

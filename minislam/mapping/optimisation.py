@@ -1,24 +1,29 @@
-"""Optimise the map on L_render and the uncertainty MLP on L_uncer, one step of each in turn."""
+"""Optimise the map on L_render and the uncertainty MLP on L_uncer, in turn."""
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.mapping.config import MappingConfig
-from minislam.mapping.density import ScreenGradients, densify, useful_rows
-from minislam.mapping.losses import MappingHistory, metre, render_loss
-from minislam.mapping.views import MappedKeyframe, keyframe_rendering_error
+from minislam.mapping.density import densify, useful_rows
+from minislam.mapping.losses import metre
+from minislam.mapping.view_gradients import ViewGradients, view_gradients
+from minislam.mapping.views import Comparison, MappedKeyframe
+from minislam.records import MappingHistory
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.stateful import Stateful
 from minislam.uncertainty import (
+    RenderingError,
     UncertaintyConfig,
     UncertaintyMLP,
     UncertaintyTrainer,
     mapping_weight,
 )
+from minislam.workers import Workers
 
 CONFIRMED_BETA = 0.4  # fraction of beta that is taken away where other views confirm [-]
 
@@ -40,7 +45,7 @@ class JointOptimisation(Stateful):
     _trainer: UncertaintyTrainer
     _generator: torch.Generator
     _optimizer: MapOptimizer
-    _gradients: ScreenGradients
+    _gradients: Tensor  # (2, N) screen gradients of the views since the last change of density
     _iteration: int = 0
     _frozen_until: int = 0  # iteration before which the MLP is not trained
 
@@ -52,6 +57,7 @@ class JointOptimisation(Stateful):
         feature_dimension: int,  # C
         seed: int,
         device: str = "cpu",  # of all tensors; keyframes must be there, too
+        workers: Workers | None = None,  # render the views of a step
     ) -> None:
         self.camera = camera
         self.config = config
@@ -60,6 +66,7 @@ class JointOptimisation(Stateful):
         self.window = []
         self.background = torch.zeros(3, device=device)
         self.history = MappingHistory()
+        self._workers = workers or Workers()
         self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed, device)
         self._generator = torch.Generator().manual_seed(seed + 1)
         self._optimizer = MapOptimizer(GaussianMap.empty(device=device), LearningRates())
@@ -111,60 +118,64 @@ class JointOptimisation(Stateful):
         last_rate: float = 1.0,  # last step over the first one, log-linear in between
         first: int = 0,  # iteration to begin with
     ) -> None:
-        """Run the iterations, each on a keyframe drawn at random."""
+        """Run the iterations. Each renders a keyframe drawn at random; a few make a step."""
         if len(self._optimizer.gaussians) == 0:
             return  # There is nothing to optimise: all was pruned, or nothing was inserted.
-        for done in range(first, len(cameras)):
-            position = torch.multinomial(probabilities, 1, generator=self._generator)
-            self._step(int(position), cameras[done], last_rate ** (done / len(cameras)))
-            if self._iteration % self.config.density.interval == 0:
+        interval, total = self.config.density.interval, len(cameras)
+        for done in range(first, total, self.config.views_per_step):
+            count = min(self.config.views_per_step, total - done)
+            repeats = int((probabilities > 0).sum()) < count
+            drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)
+            rounds = self._iteration // interval
+            self._step(drawn.tolist(), cameras[done], last_rate ** (done / total))
+            if self._iteration // interval > rounds:
                 self._change_density()
             if progress is not None:
-                progress(done + 1, len(cameras))
+                progress(done + count, total)
 
-    def _step(self, position: int, camera: Camera, rate_factor: float) -> None:
-        """Take one step of the map on L_render and one of the MLP on L_uncer."""
-        keyframe = self.keyframes[position]
-        view = keyframe.view(camera)
-        gaussians = self._optimizer.gaussians
-        offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
-        pose = keyframe.T_camera_world.float()
-        rendering = render(gaussians, camera, pose, self.background, screen_offsets=offsets)
-        weight = self.static_weight(self.beta_of(keyframe), camera)
-        loss = render_loss(
-            gaussians, rendering, view.image, view.depth, weight, self.median_depth, self.config
-        )
-        loss.total.backward()
-        assert offsets.grad is not None
-        self._gradients.add(offsets.grad, rendering.radii, camera)
-        rates = self.config.rates_at(self._iteration, self.median_depth, rate_factor)
-        self._optimizer.rates = rates
+    def _step(self, positions: list[int], camera: Camera, rate_factor: float) -> None:
+        """Take one step of the map on the mean L_render of some keyframes, then train the MLP.
+
+        The mean of n gradients is less noisy, so the step is sqrt(n) times as long.
+        """
+        trains = self.uncertainty.is_learnt and self._iteration >= self._frozen_until
+        calls = [self._call(self.keyframes[position], camera, trains) for position in positions]
+        shares: list[ViewGradients] = self._workers.map(view_gradients, calls)
+        count = len(positions)
+        for name, values in self._optimizer.gaussians.parameters.items():
+            values.grad = torch.stack([share.by_parameter[name] for share in shares]).mean(0)
+        self._gradients += torch.stack([share.screen for share in shares]).sum(0)
+        factor = rate_factor * math.sqrt(count)
+        self._optimizer.rates = self.config.rates_at(self._iteration, self.median_depth, factor)
         self._optimizer.step()
+        for position, share in zip(positions, shares, strict=True):
+            loss = math.nan if share.error is None else self._train_mlp(position, share.error)
+            self.history.add(share.losses, loss, len(self._optimizer.gaussians))
+        self._iteration += count
 
-        uncertainty = math.nan
-        if self.uncertainty.is_learnt and self._iteration >= self._frozen_until:
-            uncertainty = self._train_mlp(position, rendering)
-        self.history.add(loss, uncertainty, len(gaussians))
-        self._iteration += 1
+    def _call(self, keyframe: MappedKeyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
+        """Return the arguments of `view_gradients`."""
+        (rows, columns, _), unit = keyframe.features.shape, metre(self.median_depth)
+        grid = self._online_camera, (rows, columns), keyframe.confirmation, unit, self.uncertainty
+        pose, weight = keyframe.T_camera_world, self.static_weight(self.beta_of(keyframe), camera)
+        view = camera, pose.float(), self.background, keyframe.view(camera), weight
+        comparison = Comparison(*grid) if trains else None
+        return self.gaussians, *view, self.median_depth, self.config, comparison
 
-    def _train_mlp(self, position: int, rendering: Rendering) -> float:
-        """Take one step of the MLP, for which the rendering is a constant; return L_uncer."""
-        keyframe = self.keyframes[position]
+    def _train_mlp(self, position: int, error: RenderingError) -> float:
+        """Take one step of the MLP on the rendering error of a keyframe; return L_uncer."""
         reach = self.uncertainty.neighbour_keyframes
         nearby = self.keyframes[max(0, position - reach) : position + reach + 1]
         cells = torch.cat([k.features.flatten(0, 1) for k in nearby])
-        error = keyframe_rendering_error(
-            keyframe, rendering, self._online_camera, metre(self.median_depth), self.uncertainty
-        )
-        return self._trainer.step(keyframe.features, error, cells)
+        return self._trainer.step(self.keyframes[position].features, error, cells)
 
     def _reset_gradients(self) -> None:
-        self._gradients = ScreenGradients(self.gaussians.opacity_logits)
+        self._gradients = self.gaussians.means.new_zeros(2, len(self.gaussians))
 
     def _change_density(self) -> None:
         """Clone, split and prune, then let the map settle before the MLP learns again."""
         config = self.config.density
-        densify(self._optimizer, self._gradients.mean, self.median_depth, config, self._generator)
+        densify(self._optimizer, self._gradients, self.median_depth, config, self._generator)
         self._optimizer.prune(useful_rows(self.gaussians, self.median_depth))
         self._reset_gradients()
         self._frozen_until = self._iteration + self.config.freeze_iterations

@@ -83,34 +83,33 @@ def median_depth(keyframes: list[Keyframe]) -> float:  # world units
     return float(depths.median())
 
 
-@torch.no_grad()
-def keyframe_rendering_error(
-    keyframe: MappedKeyframe,
-    rendering: Rendering,  # of any size
-    camera: Camera,  # of the size at which they are compared
-    depth_unit: float,  # world units that count as 1 in L_depth
-    config: UncertaintyConfig,
-) -> RenderingError:
-    """Compare a rendering with its keyframe at the size of `camera`.
+@dataclass(frozen=True)
+class Comparison:
+    """How the MLP compares a keyframe with its rendering.
 
-    All calls of a run must use one size, because the windows of the SSIM are in pixels: at another
+    All of a run use one camera, because the windows of the SSIM are in pixels: at another image
     size the same rendering has another error, and beta learns another value.
     """
-    size = (camera.height, camera.width)
-    view = keyframe.view(camera)
+
+    camera: Camera  # of the size at which they are compared
+    grid_shape: tuple[int, int]  # (h', w') cells
+    confirmation: Tensor | None  # (h', w') of the keyframe
+    depth_unit: float  # world units that count as 1 in L_depth
+    config: UncertaintyConfig
+
+
+@torch.no_grad()
+def keyframe_rendering_error(view: View, rendering: Rendering, how: Comparison) -> RenderingError:
+    """Compare a keyframe with its rendering of the same size."""
+    size = (how.camera.height, how.camera.width)
     depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
     depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
-    error = rendering_error(
-        view.image,
-        view.depth,
-        shrink_image(rendering.color, *size),
-        depth,
-        opacity,
-        (keyframe.features.shape[0], keyframe.features.shape[1]),
-        depth_unit,
-        config,
-    )
-    if keyframe.confirmation is not None:
-        doubt = (1 - CONFIRMED_ERROR * keyframe.confirmation).clamp_min(0)
+    image, color = shrink_image(view.image, *size), shrink_image(rendering.color, *size)
+    reference = shrink_depth(view.depth, *size)
+    rendered = color, depth, opacity
+    grid = how.grid_shape, how.depth_unit, how.config
+    error = rendering_error(image, reference, *rendered, *grid)
+    if how.confirmation is not None:
+        doubt = (1 - CONFIRMED_ERROR * how.confirmation).clamp_min(0)
         error = replace(error, ssim=doubt * error.ssim, depth=doubt * error.depth)
     return error

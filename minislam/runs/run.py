@@ -28,6 +28,7 @@ from minislam.runs.resume import Checkpoints
 from minislam.runs.summary import Line, summarise
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer, SilentObserver
+from minislam.workers import Workers, idle_cores
 
 FAILED_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 3, 130  # exit codes of a run that is not complete
 
@@ -77,6 +78,7 @@ def run_in_folder(
     lpips: Lpips | None = None,
     overwrite: bool = False,  # replace an earlier run
     resume: bool = False,  # go on with an interrupted one
+    workers: int | None = None,  # processes; as many as there are idle cores, at most 4
 ) -> RunOutcome:
     """Check everything that may be wrong, then run SLAM into a folder of its own.
 
@@ -87,12 +89,16 @@ def run_in_folder(
         sequence.given_mask(index)
     priors = choose_priors(choice, sequence, config)
     threads = torch.get_num_threads()
+    count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
     with locked(output):
         folder = (
             RunFolder(output) if resume else RunFolder.create(output, overwrite, sequence.files)
         )
         try:
-            return run_sequence(sequence, config, choice, priors, folder, observer, lpips, resume)
+            with Workers(count, config.threads, (observer or SilentObserver()).warn) as helpers:
+                return run_sequence(
+                    sequence, config, choice, priors, folder, observer, lpips, resume, helpers
+                )
         finally:
             torch.set_num_threads(threads)
 
@@ -106,6 +112,7 @@ def run_sequence(
     observer: Observer | None = None,
     lpips: Lpips | None = None,
     resume: bool = False,
+    workers: Workers | None = None,
 ) -> RunOutcome:
     """Run SLAM, or with `resume` the rest of it, and write the folder, however the run ends."""
     torch.set_num_threads(config.threads)
@@ -117,7 +124,7 @@ def run_sequence(
         alarms.check(slam)
         checkpoints.save(slam, force)
 
-    slam = Slam(sequence, config, priors, preview, between_steps, choice.device)
+    slam = Slam(sequence, config, priors, preview, between_steps, choice.device, workers)
     preview.watch(slam, lambda: run_facts(slam, choice, checkpoints, "running", None))
     if resume:
         checkpoints.restore(slam)

@@ -122,17 +122,12 @@ def bundle_problem(
     return BundleProblem(
         camera=grid.camera,
         rays=grid.rays,
-        edges_source=sources,
-        edges_target=edges_target,
-        targets=targets,
+        edges_source=sources, edges_target=edges_target, targets=targets,
         weights=confidences * weights[:, None],
-        prior_disparities=prior,
-        prior_weights=strength * (prior > 0) * keyframes.prior_masks,
-        free_poses=free_poses,
-        free_disparities=free,
-        robust=graph.robust,
+        prior_disparities=prior, prior_weights=strength * (prior > 0) * keyframes.prior_masks,
+        free_poses=free_poses, free_disparities=free, robust=graph.robust,
         disparity_damping=graph.flow.disparity_damping(len(keyframes)),
-    )
+    )  # fmt: skip
 
 
 def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool

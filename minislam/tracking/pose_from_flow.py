@@ -43,18 +43,11 @@ def motion_only_problem(
     count = len(free_poses)
     no_prior = grid.rays.new_zeros(count, len(grid.rays))
     return BundleProblem(
-        camera=grid.camera,
-        rays=grid.rays,
-        edges_source=edges_source,
-        edges_target=edges_target,
-        targets=targets,
-        weights=weights,
-        prior_disparities=no_prior,
-        prior_weights=no_prior,
-        free_poses=free_poses,
-        free_disparities=torch.zeros_like(free_poses),
-        robust=robust,
-    )
+        camera=grid.camera, rays=grid.rays,
+        edges_source=edges_source, edges_target=edges_target, targets=targets, weights=weights,
+        prior_disparities=no_prior, prior_weights=no_prior,
+        free_poses=free_poses, free_disparities=torch.zeros_like(free_poses), robust=robust,
+    )  # fmt: skip
 
 
 def start_pose(

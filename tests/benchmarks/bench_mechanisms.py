@@ -123,7 +123,7 @@ def refined(slam: Slam, start: Trajectory) -> Trajectory:
             continue
         frame = slam.sequence.frame(numbers[timestamp])
         beta = slam.mapper.predict_beta(features(frame))
-        pose = slam.mapper.refine_pose(se3_inverse(poses[row]), frame.image, beta)
+        (pose,) = slam.mapper.refine_poses([se3_inverse(poses[row])], [frame.image], [beta])
         poses[row] = se3_inverse(pose)
     return Trajectory(start.timestamps, poses.numpy())
 

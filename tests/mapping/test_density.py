@@ -1,11 +1,10 @@
 from dataclasses import replace
 
-import pytest
 import torch
 
 from minislam.geometry import Camera
 from minislam.mapping import DensityConfig
-from minislam.mapping.density import ScreenGradients, densify, split, useful_rows
+from minislam.mapping.density import densify, screen_gradients, split, useful_rows
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer
 from tests.helpers import generator
 
@@ -24,21 +23,24 @@ def map_of(scales: list[float], opacity_logit: float = 2.0) -> GaussianMap:
     )
 
 
+def over_three_views(means: torch.Tensor) -> torch.Tensor:
+    return torch.stack([3 * means, torch.full_like(means, 3)])
+
+
 # Known answers
 
 
 def test_screen_gradient_is_in_half_images_and_counts_only_views_that_see():
-    gradients = ScreenGradients(torch.zeros(2))
     camera = Camera(10.0, 10.0, 4.0, 2.0, 20, 10)
-    gradients.add(torch.tensor([[0.3, 0.0], [1.0, 1.0]]), torch.tensor([2.0, 0.0]), camera)
-    gradients.add(torch.tensor([[0.0, 0.2], [1.0, 1.0]]), torch.tensor([2.0, 0.0]), camera)
-    # (0.3 * 10 + 0.2 * 5) / 2 = 2.
-    assert gradients.mean.tolist() == pytest.approx([2.0, 0.0])
+    radii = torch.tensor([2.0, 0.0])
+    first = screen_gradients(torch.tensor([[0.3, 0.4], [1.0, 1.0]]), radii, camera)
+    # |(0.3 * 10, 0.4 * 5)| = sqrt(13).
+    torch.testing.assert_close(first, torch.tensor([[13**0.5, 0.0], [1.0, 0.0]]))
 
 
 def test_small_ones_are_cloned_and_large_ones_split():
     optimizer = MapOptimizer(map_of([0.01, 0.01, 0.5]), LearningRates())
-    gradients = torch.tensor([1.0, 0.0, 1.0])
+    gradients = over_three_views(torch.tensor([1.0, 0.0, 1.0]))
     added = densify(optimizer, gradients, 1.0, CONFIG, generator(0))
     gaussians = optimizer.gaussians
     assert added == 2 and len(gaussians) == 5
@@ -69,10 +71,10 @@ def test_children_are_spread_like_their_parent():
 def test_no_more_than_the_largest_number_of_gaussians():
     config = replace(CONFIG, max_gaussians=6)
     optimizer = MapOptimizer(map_of([0.01] * 5), LearningRates())
-    gradients = torch.tensor([1.0, 5.0, 2.0, 3.0, 4.0])
+    gradients = over_three_views(torch.tensor([1.0, 5.0, 2.0, 3.0, 4.0]))
     assert densify(optimizer, gradients, 1.0, config, generator(0)) == 1
     assert optimizer.gaussians.anchor_keyframe[-1] == 1
-    assert densify(optimizer, torch.ones(6), 1.0, config, generator(0)) == 0
+    assert densify(optimizer, over_three_views(torch.ones(6)), 1.0, config, generator(0)) == 0
 
 
 # Degenerate input
@@ -80,5 +82,5 @@ def test_no_more_than_the_largest_number_of_gaussians():
 
 def test_an_empty_map_stays_empty():
     optimizer = MapOptimizer(GaussianMap.empty(), LearningRates())
-    assert densify(optimizer, torch.zeros(0), 1.0, CONFIG, generator(0)) == 0
+    assert densify(optimizer, torch.zeros(2, 0), 1.0, CONFIG, generator(0)) == 0
     assert useful_rows(optimizer.gaussians, 1.0).tolist() == []

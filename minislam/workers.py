@@ -1,0 +1,230 @@
+"""Processes that share the work: `Workers.map` computes independent calls side by side.
+
+A helper is a second Python that runs `serve`. Calls and results go through its standard input and
+output: the name of a function of this package, plain values, and the bytes of tensors. It never
+imports the script of the user, as `multiprocessing` does under spawn, so neither a script nor a
+notebook needs `if __name__ == "__main__"`, and there is no shared memory that somebody must free.
+
+A helper keeps nothing between two calls. So only the time depends on the helpers, never the
+result: a call whose helper has ended is computed in this process. A helper ends when its input
+does, that is at the latest with this process, however that ends.
+"""
+
+import importlib
+import json
+import math
+import os
+import signal
+import struct
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import cache
+from threading import Thread
+from typing import Any, get_type_hints
+
+import torch
+from torch import Tensor
+
+from minislam.errors import InputError
+from minislam.records import Frame
+from minislam.state.stateful import Tree, from_tree, to_tree
+
+MOST_WORKERS = 4  # by default
+_TENSOR = "tensor"  # key of what stands for a tensor in the JSON of a message
+_START = "import sys; sys.path[:] = sys.argv[2:]; from minislam.workers import serve; serve()"
+
+
+def idle_cores() -> int:
+    """Return how many workers the idle cores can feed, at most 4; MINISLAM_WORKERS replaces it."""
+    given = os.environ.get("MINISLAM_WORKERS", "")
+    if given.isdigit():
+        return max(1, int(given))
+    has_affinity = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    return max(1, min(MOST_WORKERS, math.ceil(cores - busy)))
+
+
+class Workers:
+    """This process and its helpers; one worker is this process alone."""
+
+    def __init__(
+        self,
+        count: int = 1,  # processes in all
+        threads: int = 1,  # of torch in each helper, as many as here: the bytes depend on it
+        warn: Callable[[str], None] = lambda text: None,  # told when helpers are lost
+    ) -> None:
+        if count < 1:
+            raise InputError(f"expected at least 1 worker, found {count}; give --workers 1 or more")
+        self._warn = warn
+        self._helpers: list[_Helper] = []
+        try:
+            for _ in range(count - 1):
+                self._helpers.append(_Helper(threads))
+        except OSError as error:
+            warn(f"a worker could not be started ({error}); the run goes on with fewer")
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all helpers, also one that computes: nobody wants its answer any more."""
+        for helper in self._helpers:
+            helper.end()
+        self._helpers = []
+
+    def map(self, function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Return function(*call) for every call, in their order; what it raises is raised here.
+
+        It must be a function of a module of this package, with annotated arguments and result:
+        tensors, plain values, and dataclasses, lists or dictionaries of them.
+        """
+        *kinds, kind = _kinds(function)
+        # Tensors are contiguous, as a helper gets them: the layout can change the last bits.
+        tidy = [[_tidy(k, a) for k, a in zip(kinds, call, strict=True)] for call in calls]
+        results: list[Any] = [None] * len(calls)
+        left = deque(range(len(calls)))
+
+        def compute(helper: _Helper | None = None) -> None:
+            while left:
+                try:
+                    number = left.popleft()
+                except IndexError:  # another thread was faster
+                    return
+                if helper is None:
+                    results[number] = _tidy(kind, function(*tidy[number]))
+                    continue
+                try:
+                    results[number] = _of_tree(kind, helper.answer(function, tidy[number]))
+                except (EOFError, OSError, ValueError):
+                    left.append(number)  # for this process, where an error of the function is seen
+                    return
+
+        helpers = self._helpers[: max(0, len(calls) - 1)]
+        threads = [Thread(target=compute, args=(helper,), daemon=True) for helper in helpers]
+        for thread in threads:
+            thread.start()
+        try:
+            compute()
+            for thread in threads:
+                thread.join()
+            compute()
+        except BaseException:
+            self.close()  # else a late answer would be taken for that of the next call
+            raise
+        alive = [helper for helper in self._helpers if helper.runs]
+        if len(alive) < len(self._helpers):
+            self._warn(f"a worker process has ended; the run goes on with {len(alive) + 1}")
+        self._helpers = alive
+        return results
+
+
+class _Helper:
+    """A process that computes calls, one at a time."""
+
+    def __init__(self, threads: int) -> None:
+        command = [sys.executable, "-c", _START, str(threads), *sys.path]
+        # In a session of its own Ctrl-C does not reach it: the run ends after its present step.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+        )
+        self.runs = True
+
+    def answer(self, function: Callable[..., Any], arguments: list[Any]) -> Tree:
+        """Return function(*arguments) as a tree."""
+        try:
+            _send(self._process.stdin, [function.__module__, function.__name__, arguments])
+            return _receive(self._process.stdout)
+        except (EOFError, OSError, ValueError):
+            self.end()
+            raise
+
+    def end(self) -> None:
+        self.runs = False
+        self._process.kill()
+        self._process.wait()
+
+
+def serve() -> None:
+    """Answer calls from standard input until it ends, or until a call fails."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the parent decides when it ends
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever a library prints must not get among the answers
+    torch.set_num_threads(int(sys.argv[1]))
+    try:
+        while True:
+            module, name, arguments = _receive(sys.stdin.buffer)
+            function = getattr(importlib.import_module(module), name)
+            *kinds, _ = _kinds(function)
+            values = [_of_tree(k, a) for k, a in zip(kinds, arguments, strict=True)]
+            _send(answers, function(*values))
+    except Exception:  # the parent has ended, or computes the call itself and sees the error
+        return
+
+
+@cache
+def _kinds(function: Callable[..., Any]) -> list[Any]:
+    """Return the annotated types of the arguments, and last that of the result."""
+    return list(get_type_hints(function).values())
+
+
+def _tidy(kind: Any, value: Any) -> Any:
+    """Return a value as it would be after a way through a pipe."""
+    return _of_tree(kind, _each_tensor(to_tree(value), lambda t: t.detach().contiguous()))
+
+
+def _of_tree(kind: Any, tree: Tree) -> Any:
+    def no_frame(index: int) -> Frame:
+        raise TypeError(f"expected a call without frames, found frame {index}; give its image")
+
+    return from_tree(kind, tree, no_frame)
+
+
+def _each_tensor(tree: Tree, change: Callable[[Tensor], Any]) -> Tree:
+    """Return a tree whose tensors are changed."""
+    if isinstance(tree, Tensor):
+        return change(tree)
+    if isinstance(tree, dict):
+        return {key: _each_tensor(item, change) for key, item in tree.items()}
+    return [_each_tensor(item, change) for item in tree] if isinstance(tree, list) else tree
+
+
+def _send(stream: Any, value: Any) -> None:
+    """Write the length of a JSON text, the text, and the bytes of the tensors it names."""
+    tensors: list[Tensor] = []
+
+    def named(tensor: Tensor) -> Tree:
+        tensors.append(tensor.detach().contiguous())
+        return {_TENSOR: [str(tensor.dtype).removeprefix("torch."), list(tensor.shape)]}
+
+    text = json.dumps(_each_tensor(to_tree(value), named)).encode()
+    stream.write(struct.pack("<Q", len(text)) + text)
+    for tensor in tensors:
+        stream.write(tensor.numpy().data)
+    stream.flush()
+
+
+def _receive(stream: Any) -> Tree:
+    """Read what `_send` has written."""
+
+    def filled(node: dict[str, Any]) -> Tree:  # called in the order of the text
+        if _TENSOR not in node:
+            return node
+        name, shape = node[_TENSOR]
+        tensor = torch.empty(shape, dtype=getattr(torch, name))
+        if stream.readinto(tensor.numpy().data) != tensor.nbytes:
+            raise EOFError
+        return tensor
+
+    size = stream.read(8)
+    text = stream.read(*struct.unpack("<Q", size)) if len(size) == 8 else b""
+    if not text:
+        raise EOFError
+    return json.loads(text, object_hook=filled)

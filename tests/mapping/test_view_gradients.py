@@ -1,0 +1,36 @@
+import torch
+
+from minislam.mapping.losses import render_loss
+from minislam.mapping.view_gradients import view_gradients
+from minislam.splatting import render
+from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
+
+# Identities
+
+
+def test_the_gradients_are_those_of_the_loss_of_one_keyframe():
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0)])
+    keyframe, gaussians = mapper.keyframes[0], mapper._optimizer.gaussians
+    mapper._optimizer.zero_grad()
+    share = view_gradients(*mapper._call(keyframe, CAMERA, trains=False))
+    assert all(parameter.grad is None for parameter in gaussians.parameters.values())
+
+    pose, view = keyframe.T_camera_world.float(), keyframe.view(CAMERA)
+    rendering = render(gaussians, CAMERA, pose, mapper.background)
+    weight = mapper.static_weight(mapper.beta_of(keyframe), CAMERA)
+    reference = view.image, view.depth, weight, mapper.median_depth, mapper.config
+    loss = render_loss(gaussians, rendering, *reference)
+    loss.total.backward()
+    for name, parameter in gaussians.parameters.items():
+        torch.testing.assert_close(share.by_parameter[name], parameter.grad)
+    assert share.losses[0] == float(loss.total.detach())
+    assert share.screen.shape == (2, len(gaussians)) and share.error is None
+
+
+def test_the_error_for_the_mlp_comes_on_its_grid():
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0)])
+    share = view_gradients(*mapper._call(mapper.keyframes[0], CAMERA, trains=True))
+    assert share.error.ssim.shape == mapper.keyframes[0].features.shape[:2]
+    assert not share.error.ssim.requires_grad
