@@ -61,10 +61,7 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
     ]
     hints: Hints = [
         (of_the_point, "X is d times the point, so it moves by d rho, not by rho."),
-        (
-            signed(1, 1, 1, -1, -1, -1),
-            "The rotation is the wrong way round: phi x X = -hat(X) phi.",
-        ),
+        (signed(1, 1, 1, -1, -1, -1), "The rotation is the wrong way round: it is -hat(X) phi."),
         (signed(-1, -1, -1, -1, -1, -1), "This is the derivative of the residual p~ - p."),
         (rotation_first, "The order is (rho, phi), translation first."),
         (turned_with_depth, "A rotation moves X by phi x X, without another d."),

@@ -45,24 +45,18 @@ def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> V
         Case((CAMERA, 202, 106), "twice the size"),
         Case((CAMERA, 33, 26), "33 x 26 pixels"),
     ]
+    right = shifted(0.5, -0.5)
     hints = [
-        (
-            shifted(0, 0),
-            "This is cx * s: the image starts at -0.5, so scale cx + 0.5 and take 0.5 off again.",
-        ),
+        (shifted(0, 0), "The image starts at -0.5: scale cx + 0.5, then take 0.5 off again."),
         (shifted(-0.5, 0.5), "The image starts at -0.5, not at 0.5: both signs are the other one."),
         (shifted(0.5, 0), "Take 0.5 off again after scaling: the new image starts at -0.5, too."),
         (shifted(0, -0.5), "Add 0.5 before scaling, where 0.5 is taken off after it."),
         (lambda c, w, h: reference(c, w, h)[[0, 2, 1, 3]], "The order is fx, fy, cx, cy."),
-        (lambda c, w, h: reference(c, w, h)[[2, 3, 0, 1]], "The order is fx, fy, cx, cy."),
         (
-            lambda c, w, h: shifted(0.5, -0.5)(c, c.width * h / c.height, h),
+            lambda c, w, h: right(c, c.width * h / c.height, h),
             "Width and height have a scale each.",
         ),
-        (
-            lambda c, w, h: shifted(0.5, -0.5)(c, c.width**2 / w, c.height**2 / h),
-            "The scale is the new size over the old one.",
-        ),
+        (lambda c, w, h: right(c, c.width**2 / w, c.height**2 / h), "Scale by new over old size."),
     ]
     return check_function(student, reference, cases, 1e-9, hints, draw)
 

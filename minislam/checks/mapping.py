@@ -108,10 +108,7 @@ def check_deformed_means(
     ]
     hints: Hints = [
         (lambda x, r, a, b: moved(se3_inverse(a) @ b, x, r), "The old pose comes first."),
-        (
-            lambda x, r, a, b: moved(b @ se3_inverse(a), x, r),
-            "This moves points of a camera frame.",
-        ),
+        (lambda x, r, a, b: moved(b @ se3_inverse(a), x, r), "This moves points of a camera."),
         (lambda x, r, a, b: reference(x, 0 * r, a, b), "All follow the first keyframe."),
         (lambda x, r, a, b: x, "The means have not moved."),
         (lambda x, r, a, b: moved(a, x, r), "In the camera now: the new pose takes them back."),

@@ -77,7 +77,7 @@ def check_flow_distance(
         (changed(lambda f: f.square().sum(1).mean()), "A length is the root of u^2 + v^2."),
         (
             changed(lambda f: f.norm(dim=1).mean(), True),
-            "The second flow is without rotation, not without translation.",
+            "Leave out the rotation, not the translation.",
         ),
     ]
     return check_function(student, reference, cases, 1e-9, hints, draw)

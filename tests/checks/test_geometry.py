@@ -30,7 +30,7 @@ def test_known_mistakes_are_named():
     verdict = check_resized_intrinsics(lambda c, w, h: torch.tensor(
         [c.fx * w / c.width, c.fy * h / c.height, c.cx * w / c.width, c.cy * h / c.height]
     ))  # fmt: skip
-    assert "the image starts at -0.5" in verdict.sentence
+    assert "The image starts at -0.5" in verdict.sentence
     assert "for twice the size element [2] is 82.6, expected 83.1" in verdict.sentence
     inverse = check_reproject(lambda p, d, c, pose: reprojected(p, d, c, se3_inverse(pose)))
     assert "inverse motion" in inverse.sentence
