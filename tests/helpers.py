@@ -105,6 +105,7 @@ def assert_variants(
 
     `named` is the smallest fraction of the wrong ones that get a hint.
     """
+    assert len(right) >= 2 and len(wrong) >= 6
     for name, answer in right.items():
         verdict = check(answer)
         assert verdict.status == PASSED, f"{name}: {verdict}"
