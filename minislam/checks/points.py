@@ -34,6 +34,7 @@ EXERCISES = (
     Exercise("ex02_3", "02_splatting", "check_rendered_image", 8, 2, 40),
     Exercise("ex03_1", "03_splatting_gradients", "check_conic_vjp", 2, 2, 20),
     Exercise("ex03_2", "03_splatting_gradients", "check_twist_vjp", 2, 2, 15),
+    Exercise("ex03_3", "03_splatting_gradients", "check_picture_gradient", 8, 3, 45),
     Exercise("ex04_1", "04_uncertainty", "check_best_beta", 2, 1, 5),
     Exercise("ex04_2", "04_uncertainty", "check_feature_variance", 2, 2, 15),
     Exercise("ex05_1", "05_bundle_adjustment", "check_target_jacobian", 2, 2, 20),
