@@ -64,6 +64,7 @@ def check_projected_covariance(
         (not_turned, "Sigma is still in the world frame: turn it by W before J."),
         (turned_back, "This turns Sigma the wrong way: it is W Sigma W^T."),
         (spread, "0.3 stands on the diagonal alone: 0.3 I."),
+        (lambda *a: torch.linalg.inv(reference(*a)), "This is the conic, the inverse of Sigma'."),
         (in_world, "J is taken at the world point: move the mean into the camera frame first."),
     ]
     return check_function(student, reference, cases, 1e-9, hints, draw)
