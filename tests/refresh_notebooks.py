@@ -1,4 +1,4 @@
-"""Run notebooks from top to bottom and store them with their outputs.
+"""Run notebooks from top to bottom and store them with their outputs; count the syllabus's points.
 
 python -m tests.refresh_notebooks                    all of them
 python -m tests.refresh_notebooks 01 03              those whose names start so
@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from minislam.cli.notebooks import as_text
+from tests.checks.test_points import write_syllabus
 from tests.notebook_files import NOTEBOOKS, ROOT, cleaned, load
 
 
@@ -32,6 +33,7 @@ def main(arguments: list[str]) -> None:
         if not arguments or path.name.startswith(tuple(arguments)):
             print(path.name, flush=True)
             execute(path)
+    write_syllabus()
 
 
 if __name__ == "__main__":

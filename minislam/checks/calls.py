@@ -51,7 +51,7 @@ def call(
         except NotImplementedError:
             raise
         except TimeoutError:
-            raise Stopped(f"has no answer after {seconds:.1f} seconds: an endless loop?") from None
+            raise Stopped(f"has no answer after {seconds:.1f} seconds (an endless loop?)") from None
         except (Exception, SystemExit) as error:  # any mistake is an answer, not a crash
             mixes = isinstance(error, RuntimeError) and "type" in str(error)  # "dtype", "type"
             if not mixes or given is attempts[-1]:

@@ -75,5 +75,9 @@ def written(text: str) -> str:
     return GENERATED.sub(lambda match: match[1] + table_of_points() + match[2], text)
 
 
-if __name__ == "__main__":
+def write_syllabus() -> None:
     SYLLABUS.write_text(written(SYLLABUS.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_syllabus()
