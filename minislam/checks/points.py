@@ -29,6 +29,7 @@ EXERCISES = (
         "ex01_1", "01_geometry", "check_resized_intrinsics", 2, 1, 5, may_not_call="Camera.resized"
     ),
     Exercise("ex01_2", "01_geometry", "check_reproject", 2, 1, 5),
+    Exercise("ex01_3", "01_geometry", "check_warped_photo", 8, 2, 30),
     Exercise("ex02_1", "02_splatting", "check_projected_covariance", 2, 1, 10),
     Exercise("ex02_2", "02_splatting", "check_pixel_color", 2, 1, 10),
     Exercise("ex02_3", "02_splatting", "check_rendered_image", 8, 2, 40),
