@@ -20,6 +20,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
 from threading import Thread
 from typing import Any, get_type_hints
@@ -148,6 +149,9 @@ class _Helper:
         self.runs = False
         self._process.kill()
         self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):  # what was not sent is lost with the helper
+                stream.close()  # type: ignore[union-attr]
 
 
 def serve() -> None:
