@@ -148,11 +148,11 @@ def test_the_student_copy_has_the_signature_and_no_solution():
 
 
 @each_notebook
-def test_each_exercise_passes_with_its_solution_and_says_not_yet_without(
-    path: Path, tmp_path: Path
-):
+def test_each_exercise_passes_solved_and_says_not_yet_unsolved(path: Path, tmp_path: Path):
     solved = load(path)
     count = sum(map(is_exercise, solved["cells"]))
+    if count == 0:
+        pytest.skip("this notebook has no exercise")
     assert judged(solved, path, tmp_path / "solved") == [PASSED] * count
     student = without_solutions(solved)
     stubs = [cell for cell in student["cells"] if "NotImplementedError" in source(cell)]
