@@ -90,15 +90,15 @@ def run_in_folder(
     priors = choose_priors(choice, sequence, config)
     threads = torch.get_num_threads()
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
-    with locked(output):
+    warn = (observer or SilentObserver()).warn
+    with locked(output), Workers(count, config.threads, warn) as helpers:
         folder = (
             RunFolder(output) if resume else RunFolder.create(output, overwrite, sequence.files)
         )
         try:
-            with Workers(count, config.threads, (observer or SilentObserver()).warn) as helpers:
-                return run_sequence(
-                    sequence, config, choice, priors, folder, observer, lpips, resume, helpers
-                )
+            return run_sequence(
+                sequence, config, choice, priors, folder, observer, lpips, resume, helpers
+            )
         finally:
             torch.set_num_threads(threads)
 
