@@ -19,6 +19,7 @@ from minislam.checks.grading import (
     is_written,
 )
 from minislam.checks.mapping import check_deformed_means, check_sampling
+from minislam.checks.real_video import check_gains, check_stride
 from minislam.checks.slam import check_ate, check_separability
 from minislam.checks.splatting import (
     check_pixel_color,
@@ -56,6 +57,7 @@ __all__ = [
     "check_flow_distance",
     "check_flow_estimator",
     "check_function",
+    "check_gains",
     "check_mapping_weight",
     "check_picture_gradient",
     "check_pixel_color",
@@ -67,6 +69,7 @@ __all__ = [
     "check_sampling",
     "check_schur_step",
     "check_separability",
+    "check_stride",
     "check_suppressed",
     "check_target_jacobian",
     "check_training",

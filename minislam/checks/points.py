@@ -55,4 +55,6 @@ EXERCISES = (
     Exercise("ex07b_1", "07b_dense_structure", "check_plane_homography", 2, 2, 10),
     Exercise("ex08_1", "08_full_slam", "check_ate", 2, 1, 10),
     Exercise("ex08_2", "08_full_slam", "check_separability", 2, 1, 10),
+    Exercise("ex09_1", "09_real_video", "check_gains", 2, 1, 10),
+    Exercise("ex09_2", "09_real_video", "check_stride", 8, 3, 40),
 )

@@ -110,11 +110,12 @@ def colour_bar(
 ) -> None:
     """Add the colour bar of pictures that stand in the colours of a kind."""
     norm = (LogNorm if kind == "beta" else Normalize)(*limits)
-    every = [axes] if isinstance(axes, Axes) else list(axes)
-    colours = ScalarMappable(norm, _COLORMAPS[kind])
-    figure = every[0].get_figure()
-    assert figure is not None, "expected axes of a figure"
-    figure.colorbar(colours, ax=every, label=kind if label is None else label)
+    colours, label = ScalarMappable(norm, _COLORMAPS[kind]), kind if label is None else label
+    if isinstance(axes, Axes):  # as tall as the picture
+        beside = axes.inset_axes((1.03, 0.0, 0.05, 1.0))
+        axes.figure.colorbar(colours, cax=beside, label=label)
+    else:
+        axes[0].figure.colorbar(colours, ax=list(axes), label=label)
 
 
 def _limits(values: np.ndarray, kind: str) -> tuple[float, float]:

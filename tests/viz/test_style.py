@@ -53,7 +53,8 @@ def test_a_map_of_errors_is_white_at_zero_and_red_above():
     show_map(axes := figure.subplots(), np.array([[-2.0, 0.0, 2.0]]), "error", "t", label="cm")
     left, middle, right = np.asarray(axes.images[0].get_array())[0]
     assert middle.min() > 0.95 and right[0] > right[2] and left[2] > left[0]
-    assert figure.axes[-1].get_ylim() == (-2, 2) and figure.axes[-1].get_ylabel() == "cm"
+    (bar,) = axes.child_axes
+    assert bar.get_ylim() == (-2, 2) and bar.get_ylabel() == "cm"
 
 
 @pytest.mark.parametrize("kind", ["beta", "depth"])
