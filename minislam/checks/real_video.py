@@ -1,6 +1,7 @@
 """Exercises of notebook 09: the light of a phone, and how far apart frames have to be."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,10 +13,16 @@ _ROUNDS = 10
 _LEAST = 0.5  # px, below which a residual gains no more weight
 
 
+def _median(values: Tensor) -> Tensor:
+    return values.quantile(0.5)
+
+
 def check_gains(student: Callable[[Tensor, Tensor], Tensor]) -> Verdict:
     """Check (first (N, 3), second (N, 3)): colours of points -> gain (3,) of each channel."""
 
-    def reference(first: Tensor, second: Tensor, lowest=DARKEST, highest=BRIGHTEST) -> Tensor:
+    def reference(
+        first: Tensor, second: Tensor, lowest: float = DARKEST, highest: float = BRIGHTEST
+    ) -> Tensor:
         def usable(values: Tensor) -> Tensor:
             return (values > lowest) & (values < highest)
 
@@ -50,7 +57,14 @@ def check_gains(student: Callable[[Tensor, Tensor], Tensor]) -> Verdict:
 def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
     """Check (rays (N, 2), flows (S, M, N, 2), strides, needed) -> parallaxes (S,), stride."""
 
-    def residuals(rays: Tensor, flow: Tensor, rounds=_ROUNDS, power=1.0, columns=3, curve=1.0):
+    def residuals(
+        rays: Tensor,
+        flow: Tensor,
+        rounds: int = _ROUNDS,
+        power: float = 1.0,
+        columns: int = 3,
+        curve: float = 1.0,
+    ) -> Tensor:
         x, y = rays.T
         across = torch.stack([-x * y, 1 + curve * x * x, -y], 1)
         down = torch.stack([-(1 + curve * y * y), x * y, x], 1)
@@ -63,8 +77,11 @@ def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
             weight = rest.norm(dim=1).clamp_min(_LEAST) ** -power
         return rest.norm(dim=1)
 
-    def medians(flows: Tensor, left: Callable[[Tensor], Tensor], middle=None) -> Tensor:
-        middle = middle or (lambda values: values.quantile(0.5))
+    def medians(
+        flows: Tensor,
+        left: Callable[[Tensor], Tensor],
+        middle: Callable[[Tensor], Tensor] = _median,
+    ) -> Tensor:
         pairs = [[middle(left(flow)) for flow in of_stride] for of_stride in flows]
         return torch.stack([middle(torch.stack(lengths)) for lengths in pairs])
 
@@ -72,8 +89,12 @@ def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
         enough = [s for s, p in zip(strides, parallaxes, strict=True) if p >= needed]
         return parallaxes, enough[0] if enough else 0
 
-    def variant(middle=None, **options) -> Callable[..., tuple[Tensor, int]]:
-        def answer(rays: Tensor, flows: Tensor, strides: list[int], needed: float):
+    def variant(
+        middle: Callable[[Tensor], Tensor] = _median, **options: Any
+    ) -> Callable[..., tuple[Tensor, int]]:
+        def answer(
+            rays: Tensor, flows: Tensor, strides: list[int], needed: float
+        ) -> tuple[Tensor, int]:
             found = medians(flows, lambda flow: residuals(rays, flow, **options), middle)
             return chosen(found, strides, needed)
 
@@ -81,23 +102,33 @@ def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
 
     reference = variant()
 
-    def whole_flow(rays: Tensor, flows: Tensor, strides: list[int], needed: float):
+    def whole_flow(
+        rays: Tensor, flows: Tensor, strides: list[int], needed: float
+    ) -> tuple[Tensor, int]:
         return chosen(medians(flows, lambda flow: flow.norm(dim=1)), strides, needed)
 
-    def less_mean(rays: Tensor, flows: Tensor, strides: list[int], needed: float):
+    def less_mean(
+        rays: Tensor, flows: Tensor, strides: list[int], needed: float
+    ) -> tuple[Tensor, int]:
         return chosen(
             medians(flows, lambda flow: (flow - flow.mean(0)).norm(dim=1)), strides, needed
         )
 
-    def longest(rays: Tensor, flows: Tensor, strides: list[int], needed: float):
+    def longest(
+        rays: Tensor, flows: Tensor, strides: list[int], needed: float
+    ) -> tuple[Tensor, int]:
         parallaxes, stride = reference(rays, flows, strides, needed)
         return parallaxes, strides[-1] if stride else 0
 
-    def always(rays: Tensor, flows: Tensor, strides: list[int], needed: float):
+    def always(
+        rays: Tensor, flows: Tensor, strides: list[int], needed: float
+    ) -> tuple[Tensor, int]:
         parallaxes, stride = reference(rays, flows, strides, needed)
         return parallaxes, stride or strides[-1]
 
-    def number(rays: Tensor, flows: Tensor, strides: list[int], needed: float):
+    def number(
+        rays: Tensor, flows: Tensor, strides: list[int], needed: float
+    ) -> tuple[Tensor, int]:
         parallaxes, stride = reference(rays, flows, strides, needed)
         return parallaxes, strides.index(stride) if stride else 0
 
