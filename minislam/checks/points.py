@@ -38,6 +38,9 @@ EXERCISES = (
     Exercise("ex03_3", "03_splatting_gradients", "check_picture_gradient", 8, 3, 45),
     Exercise("ex04_1", "04_uncertainty", "check_best_beta", 2, 1, 5),
     Exercise("ex04_2", "04_uncertainty", "check_feature_variance", 2, 2, 15),
+    Exercise(
+        "ex04_3", "04_uncertainty", "check_training", 8, 2, 30, may_call="UncertaintyMLP.forward"
+    ),
     Exercise("ex05_1", "05_bundle_adjustment", "check_target_jacobian", 2, 2, 20),
     Exercise("ex05_2", "05_bundle_adjustment", "check_schur_step", 2, 1, 10),
     Exercise(

@@ -11,39 +11,14 @@ from matplotlib.figure import Figure
 from minislam.records import Trajectory
 from minislam.viz.style import (
     ESTIMATE_STYLE,
-    STRIP,
     TRUTH_STYLE,
     WIDE,
-    beta_limits,
     beta_to_rgb,
-    depth_to_rgb,
     new_figure,
     show_image,
 )
 
 _AVERAGED = 30  # iterations in the running mean of a loss
-
-
-def keyframe_strip(
-    image: np.ndarray,  # (H, W, 3) RGB in [0, 1], what the camera saw
-    depth: np.ndarray,  # (H, W) world units, 0 where unknown
-    beta: np.ndarray,  # (h, w) > 0
-    render: np.ndarray,  # (H, W, 3) RGB, the static map from the same pose
-    title: str = "",
-) -> Figure:
-    """Draw one keyframe: input, depth, uncertainty, render."""
-    figure = new_figure(STRIP)
-    pictures = {
-        "input": image,
-        "depth": depth_to_rgb(depth),
-        "uncertainty beta": beta_to_rgb(beta),
-        "render": render,
-    }
-    for axes, (name, picture) in zip(figure.subplots(1, 4), pictures.items(), strict=True):
-        show_image(axes, picture, name, image.shape[:2])
-    if title:
-        figure.suptitle(title, fontsize=10)
-    return figure
 
 
 def trajectory_plot(
@@ -140,24 +115,6 @@ def keyframe_health(
     axes.set_xlim(-0.5, max([1, *frames, *lost]) + 0.5)
     axes.legend(loc="lower left")
     axes.grid(alpha=0.3)
-    return figure
-
-
-def online_uncertainty(
-    image: np.ndarray,  # (H, W, 3) RGB in [0, 1] of one frame
-    betas: Mapping[str, np.ndarray],  # caption of an earlier MLP -> its beta (h, w)
-    title: str = "",
-) -> Figure:
-    """Draw beta of one frame as predicted by the MLP at several times, in the same colours."""
-    figure = new_figure((WIDE[0], STRIP[1]))
-    axes = figure.subplots(1, 1 + len(betas))
-    show_image(axes[0], image, "input")
-    together = np.concatenate([np.ravel(beta) for beta in betas.values()])
-    limits = beta_limits(together)
-    for place, (name, beta) in zip(axes[1:], betas.items(), strict=True):
-        show_image(place, beta_to_rgb(beta, limits), name, image.shape[:2])
-    if title:
-        figure.suptitle(title, fontsize=10)
     return figure
 
 

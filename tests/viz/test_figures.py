@@ -11,10 +11,8 @@ from minislam.viz import (
     ate_over_time,
     figure_png,
     keyframe_health,
-    keyframe_strip,
     loss_curves,
     map_growth,
-    online_uncertainty,
     overview,
     trajectory_plot,
 )
@@ -32,7 +30,6 @@ def path(count: int) -> Trajectory:
 
 
 FIGURES = {
-    "strip": lambda: keyframe_strip(IMAGE, DEPTH, BETA, IMAGE, "keyframe 3"),
     "trajectory": lambda: trajectory_plot(path(9), path(20), "m"),
     "trajectory without truth": lambda: trajectory_plot(path(9)),
     "one pose": lambda: trajectory_plot(path(1)),
@@ -43,7 +40,6 @@ FIGURES = {
     "growth": lambda: map_growth([10, 30, 20]),
     "health": lambda: keyframe_health([0, 4, 9], [None, 0.9, 0.3], 0.8, [(9, 12)], [13, 14]),
     "empty map": lambda: map_growth([]),
-    "online": lambda: online_uncertainty(IMAGE, {"first": BETA, "last": 3 * BETA}, "frame 5"),
     "no losses": lambda: loss_curves({}),
     "overview": lambda: overview(IMAGE, BETA, IMAGE, path(9), path(9)),
 }
@@ -70,13 +66,6 @@ def test_losses_of_both_signs_have_a_linear_panel_of_their_own():
     assert [axes.get_yscale() for axes in figure.axes] == ["log", "linear"]
     mean = figure.axes[1].lines[1]
     np.testing.assert_allclose(mean.get_xydata(), [[0, 0.5], [2, -0.25]])  # the pause is left out
-
-
-def test_online_betas_share_their_colours():
-    figure = online_uncertainty(IMAGE, {"first": BETA, "last": 3 * BETA})
-    first, last = (axes.images[0].get_array()[0, 0] for axes in figure.axes[1:])
-    assert not np.allclose(first, last)
-    assert [axes.get_title() for axes in figure.axes] == ["input", "first", "last"]
 
 
 def test_figures_do_not_touch_the_state_of_pyplot():
