@@ -1,7 +1,6 @@
 """Exercises of notebook 09: the light of a phone, and how far apart frames have to be."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -90,12 +89,13 @@ def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
         return parallaxes, enough[0] if enough else 0
 
     def variant(
-        middle: Callable[[Tensor], Tensor] = _median, **options: Any
+        left: Callable[[Tensor, Tensor], Tensor] = residuals,
+        middle: Callable[[Tensor], Tensor] = _median,
     ) -> Callable[..., tuple[Tensor, int]]:
         def answer(
             rays: Tensor, flows: Tensor, strides: list[int], needed: float
         ) -> tuple[Tensor, int]:
-            found = medians(flows, lambda flow: residuals(rays, flow, **options), middle)
+            found = medians(flows, lambda flow: left(rays, flow), middle)
             return chosen(found, strides, needed)
 
         return answer
@@ -145,11 +145,26 @@ def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
         return Case((rays, flows, strides, needed), what)
 
     hints = [
-        (variant(rounds=1), "Weigh by 1/max(residual, 0.5) and fit anew, ten times in all."),
-        (variant(power=2.0), "The weight is 1/residual, not 1/residual^2."),
-        (variant(columns=2), "The third column, a roll about the viewing axis, is missing."),
-        (variant(curve=0.0), "Away from the centre a turn moves a point more: 1 + x^2, 1 + y^2."),
-        (variant(lambda values: values.mean()), "Take medians: the mean follows what moves."),
+        (
+            variant(lambda a, b: residuals(a, b, rounds=1)),
+            "Weigh by 1/max(residual, 0.5) and fit anew, ten times in all.",
+        ),
+        (
+            variant(lambda a, b: residuals(a, b, power=2.0)),
+            "The weight is 1/residual, not 1/residual^2.",
+        ),
+        (
+            variant(lambda a, b: residuals(a, b, columns=2)),
+            "The third column, a roll about the viewing axis, is missing.",
+        ),
+        (
+            variant(lambda a, b: residuals(a, b, curve=0.0)),
+            "Away from the centre a turn moves a point more: 1 + x^2, 1 + y^2.",
+        ),
+        (
+            variant(middle=lambda values: values.mean()),
+            "Take medians: the mean follows what moves.",
+        ),
         (whole_flow, "This is the whole flow: take away what a turn explains."),
         (less_mean, "A turn is not the mean flow: it moves points at the border more."),
         (longest, "The smallest stride that suffices is asked for."),
