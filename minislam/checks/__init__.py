@@ -18,9 +18,15 @@ from minislam.checks.grading import (
     check_function,
     is_written,
 )
+from minislam.checks.growing import check_followed_pose, check_insertion, check_map_loss
 from minislam.checks.mapping import check_deformed_means, check_sampling
 from minislam.checks.real_video import check_gains, check_stride
-from minislam.checks.slam import check_ate, check_separability
+from minislam.checks.slam import (
+    check_alignment,
+    check_ate,
+    check_separability,
+    check_sign_test,
+)
 from minislam.checks.splatting import (
     check_pixel_color,
     check_projected_covariance,
@@ -32,7 +38,7 @@ from minislam.checks.splatting_gradients import (
     check_twist_vjp,
 )
 from minislam.checks.start_here import check_mapping_weight
-from minislam.checks.stereo import check_plane_homography
+from minislam.checks.stereo import check_plane_cost, check_plane_homography
 from minislam.checks.tracking import check_flow_distance, check_suppressed
 from minislam.checks.uncertainty import check_best_beta, check_feature_variance, check_training
 from minislam.priors.conformance import (
@@ -47,6 +53,7 @@ __all__ = [
     "WRONG",
     "Case",
     "Verdict",
+    "check_alignment",
     "check_ate",
     "check_best_beta",
     "check_conic_vjp",
@@ -56,11 +63,15 @@ __all__ = [
     "check_feature_variance",
     "check_flow_distance",
     "check_flow_estimator",
+    "check_followed_pose",
     "check_function",
     "check_gains",
+    "check_insertion",
+    "check_map_loss",
     "check_mapping_weight",
     "check_picture_gradient",
     "check_pixel_color",
+    "check_plane_cost",
     "check_plane_homography",
     "check_projected_covariance",
     "check_rendered_image",
@@ -69,6 +80,7 @@ __all__ = [
     "check_sampling",
     "check_schur_step",
     "check_separability",
+    "check_sign_test",
     "check_stride",
     "check_suppressed",
     "check_target_jacobian",

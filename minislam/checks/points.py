@@ -55,9 +55,19 @@ EXERCISES = (
     Exercise("ex06_2", "06_tracking", "check_suppressed", 2, 2, 15),
     Exercise("ex07_1", "07_mapping", "check_sampling", 2, 1, 10),
     Exercise("ex07_2", "07_mapping", "check_deformed_means", 2, 2, 15),
+    Exercise("ex07_3", "07_mapping", "check_insertion", 8, 2, 25),
+    Exercise("ex07_4", "07_mapping", "check_map_loss", 2, 2, 15),
+    Exercise(
+        "ex07_5", "07_mapping", "check_followed_pose", 8, 3, 40, may_call="render _Render.backward"
+    ),
     Exercise("ex07b_1", "07b_dense_structure", "check_plane_homography", 2, 2, 10),
+    Exercise("ex07b_2", "07b_dense_structure", "check_plane_cost", 8, 2, 25),
     Exercise("ex08_1", "08_full_slam", "check_ate", 2, 1, 10),
     Exercise("ex08_2", "08_full_slam", "check_separability", 2, 1, 10),
+    Exercise(
+        "ex08_3", "08_full_slam", "check_alignment", 8, 2, 30, may_not_call="umeyama fit_alignment"
+    ),
     Exercise("ex09_1", "09_real_video", "check_gains", 2, 1, 10),
     Exercise("ex09_2", "09_real_video", "check_stride", 8, 3, 40),
+    Exercise("ex10_1", "10_results", "check_sign_test", 2, 2, 15),
 )

@@ -1,12 +1,13 @@
-"""Exercises of notebook 08."""
+"""Exercises of notebooks 08 and 10."""
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 
 from minislam.checks.grading import Case, Hints, Verdict, check_function
 from minislam.evaluation.images import auroc
-from minislam.geometry.alignment import umeyama
+from minislam.geometry.alignment import Similarity, umeyama
 
 
 def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
@@ -96,3 +97,88 @@ def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Ve
         (at_the_median, "No threshold is asked for: compare all pairs."),
     ]
     return check_function(student, auroc, cases, 1e-9, hints, draw)
+
+
+def check_alignment(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Verdict:
+    """Check (estimated (N, 3), true centres (N, 3)) -> the best Sim(3) as [s R, t; 0, 1] (4, 4)."""
+
+    def matrix(scale: float, R: np.ndarray, estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+        A = np.eye(4)
+        A[:3, :3] = scale * R
+        A[:3, 3] = truth.mean(0) - A[:3, :3] @ estimate.mean(0)
+        return A
+
+    def best(e: np.ndarray, t: np.ndarray, with_scale: bool = True) -> Similarity:
+        return umeyama(e, t, with_scale)
+
+    def reference(e: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return matrix(best(e, t).scale, best(e, t).rotation, e, t)
+
+    def mirrored(e: np.ndarray, t: np.ndarray) -> np.ndarray:
+        u, d, v = np.linalg.svd((t - t.mean(0)).T @ (e - e.mean(0)))
+        return matrix(d.sum() / ((e - e.mean(0)) ** 2).sum(), u @ v, e, t)
+
+    def by_spread(e: np.ndarray, t: np.ndarray) -> np.ndarray:
+        ratio = np.linalg.norm(t - t.mean(0)) / np.linalg.norm(e - e.mean(0))
+        return matrix(float(ratio), best(e, t).rotation, e, t)
+
+    def centred(e: np.ndarray, t: np.ndarray) -> np.ndarray:
+        A = reference(e, t)
+        A[:3, 3] = t.mean(0) - e.mean(0)
+        return A
+
+    def case(scale: float, noise: float, mirror: float, count: int, description: str) -> Case:
+        source = np.random.default_rng(4)
+        truth = np.cumsum(source.normal(size=(count, 3)), axis=0) * [1.0, 0.6, 0.2]
+        seen = (truth + noise * source.normal(size=truth.shape)) * [1, 1, mirror]
+        return Case((scale * seen[:, [2, 0, 1]] + [3.0, -1.0, 2.0], truth), description)
+
+    cases = [
+        case(1.0, 0.0, 1.0, 20, "an estimate in another frame"),
+        case(0.25, 0.0, 1.0, 20, "an estimate in another unit and frame"),
+        case(0.25, 0.3, 1.0, 20, "an estimate with errors"),
+        case(2.0, 0.1, -1.0, 20, "points that a reflection would fit better"),
+        case(2.0, 0.1, 1.0, 3, "three points"),
+    ]
+    hints: Hints = [
+        (lambda e, t: matrix(1.0, best(e, t).rotation, e, t), "Monocular: the scale is unknown."),
+        (mirrored, "A rotation has determinant +1: turn the last column of U if it is -1."),
+        (by_spread, "With errors s is trace(D S) over the variance of the estimate."),
+        (lambda e, t: np.linalg.inv(reference(e, t)), "This maps the truth to the estimate."),
+        (lambda e, t: reference(t, e), "This maps the truth to the estimate."),
+        (centred, "t maps the TURNED and scaled mean of the estimate to that of the truth."),
+        (lambda e, t: matrix(best(e, t).scale, best(e, t).rotation.T, e, t), "This is R^T."),
+    ]
+    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
+
+
+def check_sign_test(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
+    """Check (errors with, errors without (N,)) -> how often chance does at least as much.
+
+    Of all 2^N choices of signs for the differences, the fraction whose mean is at least as far
+    from 0 as the mean that was measured.
+    """
+
+    def reference(a: np.ndarray, b: np.ndarray, slack: float = 1e-12, sided: int = 2) -> float:
+        d = np.asarray(a) - np.asarray(b)
+        means = np.array([np.mean(d * signs) for signs in product([1, -1], repeat=len(d))])
+        if sided == 1:
+            return float((means * np.sign(d.mean()) >= abs(d.mean()) - slack).mean())
+        return float((np.abs(means) >= abs(d.mean()) - slack).mean())
+
+    def case(with_it: list[float], without: list[float], description: str) -> Case:
+        return Case((np.array(with_it), np.array(without)), description)
+
+    cases = [
+        case([1.0, 2.0, 3.0], [2.0, 4.0, 6.0], "three clips that all get better"),
+        case([0.4, 0.9, 0.3, 0.8], [0.5, 0.6, 0.7, 2.8], "four clips, one gets worse"),
+        case([2.0], [1.0], "a single clip"),
+        case([1.0, 2.0, 1.5], [1.0, 2.0, 1.5], "no difference at all"),
+    ]
+    hints: Hints = [
+        (lambda a, b: reference(a, b, sided=1), "A difference the other way is as surprising."),
+        (lambda a, b: reference(a, b, -1e-12), "At least as far: the measured one counts as well."),
+        (lambda a, b: 1 - reference(a, b), "This is the fraction of the others."),
+        (lambda a, b: reference(a, b) * 2 ** len(a), "Divide by the number of choices, 2^N."),
+    ]
+    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)

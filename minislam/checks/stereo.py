@@ -1,12 +1,13 @@
-"""Exercise of notebook 09."""
+"""Exercises of notebook 07b."""
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Verdict, check_function, normals
+from minislam.checks.grading import Case, Hints, Verdict, check_function, normals
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.stereo.sweep import plane_homographies
 
@@ -55,3 +56,55 @@ def check_plane_homography(student: Callable[[Tensor, Tensor, float], Tensor]) -
         (lambda K, T, q: reference(K, T, q) @ K @ K, "The last factor is K^-1, not K."),
     ]
     return check_function(student, reference, cases, 1e-9, hints, draw)
+
+
+def check_plane_cost(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Verdict:
+    """Check (grey image (h, w), V warped images (V, h, w)) -> cost of one plane (h, w).
+
+    A negative value is outside of its image. The absolute difference, meant over 5x5 px, of the
+    better half of the views that see the pixel; 1 where none does.
+    """
+
+    def reference(
+        gray: np.ndarray,
+        warped: np.ndarray,
+        window: int = 5,
+        every: bool = False,
+        worse: bool = False,
+        up: int = 1,
+        unseen: float = 1.0,
+    ) -> np.ndarray:
+        seen = warped >= 0
+        difference = np.where(seen, np.abs(warped - gray), 0)
+        blurred = [cv2.blur(picture, (window, window)) for picture in difference]
+        ordered = np.sort(np.where(seen, blurred, np.inf), 0)[:: -1 if worse else 1]
+        number = seen.sum(0)
+        taken = np.maximum(number if every else (number + up) // 2, 1)
+        inside = (np.arange(len(warped))[:, None, None] < taken) & np.isfinite(ordered)
+        total = np.where(inside, ordered, 0).sum(0)
+        return np.where(number > 0, total / taken, unseen)
+
+    def unmasked(gray: np.ndarray, warped: np.ndarray) -> np.ndarray:
+        return reference(gray, np.abs(np.where(warped < 0, 0, warped)))
+
+    source = np.random.default_rng(0)
+    gray, warped = source.random((12, 15)), source.random((4, 12, 15))
+    partly = np.where(source.random((4, 12, 15)) < 0.5, -1.0, warped)
+    cases = [
+        Case((gray, gray[None] + 0.1), "one view, everywhere a little brighter"),
+        Case((gray, warped), "four views"),
+        Case((gray, warped[:3]), "three views, of which two are the better half"),
+        Case((gray, partly), "views that do not see every pixel"),
+    ]
+    hints: Hints = [
+        (
+            lambda g, w: reference(g, w, every=True),
+            "Only the better half of the views is averaged.",
+        ),
+        (lambda g, w: reference(g, w, worse=True), "This is the worse half."),
+        (lambda g, w: reference(g, w, window=1), "Average over the 5x5 px around the pixel."),
+        (lambda g, w: reference(g, w, up=0), "Of three views two are the half: round up."),
+        (lambda g, w: reference(g, w, unseen=0.0), "A pixel that no view sees costs 1."),
+        (unmasked, "A negative value is outside of the image: that view does not count there."),
+    ]
+    return check_function(student, reference, cases, tolerance=1e-6, hints=hints)

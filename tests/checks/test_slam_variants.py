@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.checks import check_ate, check_separability
+from minislam.checks import check_alignment, check_ate, check_separability, check_sign_test
 from minislam.geometry.alignment import umeyama
 from tests.helpers import assert_variants
 
@@ -77,3 +77,67 @@ def test_separability():
         "of the sums": lambda b, m: b[m].sum() / b.sum(),
     }
     assert_variants(check_separability, right, wrong)
+
+
+def similarity(estimate, truth, mirror=False, spread=False, **how):
+    """Return the best Sim(3) as a matrix, with the mistake that is asked for."""
+    e, t = estimate - estimate.mean(0), truth - truth.mean(0)
+    u, d, v = np.linalg.svd(t.T @ e)
+    signs = np.array([1, 1, 1 if mirror else np.sign(np.linalg.det(u @ v))])
+    scale = np.sqrt((t**2).sum() / (e**2).sum()) if spread else (d * signs).sum() / (e**2).sum()
+    A = np.eye(4)
+    turn = (u * signs) @ v
+    A[:3, :3] = how.get("scale", scale) * (turn.T if how.get("transposed") else turn)
+    A[:3, 3] = truth.mean(0) - (np.eye(3) if how.get("unturned") else A[:3, :3]) @ estimate.mean(0)
+    return A
+
+
+def by_umeyama(estimate, truth):
+    found = umeyama(estimate, truth)
+    last = torch.tensor([[0, 0, 0, 1.0]])
+    upper = np.hstack([found.scale * found.rotation, found.translation[:, None]])
+    return torch.cat([torch.tensor(upper), last.double()])
+
+
+@pytest.mark.ex08_3
+def test_alignment():
+    wrong = {
+        "no scale": lambda e, t: similarity(e, t, scale=1.0),
+        "reflection": lambda e, t: similarity(e, t, mirror=True),
+        "ratio of spreads": lambda e, t: similarity(e, t, spread=True),
+        "truth to estimate": lambda e, t: similarity(t, e),
+        "inverse": lambda e, t: np.linalg.inv(similarity(e, t)),
+        "mean not turned": lambda e, t: similarity(e, t, unturned=True),
+        "transposed": lambda e, t: similarity(e, t, transposed=True),
+    }
+    assert_variants(check_alignment, {"svd": similarity, "torch": by_umeyama}, wrong)
+
+
+def chance(a, b, slack=1e-12, one_sided=False):
+    d = np.asarray(a) - np.asarray(b)
+    signs = np.array(np.meshgrid(*[[1, -1]] * len(d))).reshape(len(d), -1)
+    means = d @ signs / len(d)
+    if one_sided:
+        return np.mean(means * np.sign(d.mean()) >= abs(d.mean()) - slack)
+    return np.mean(abs(means) >= abs(d.mean()) - slack)
+
+
+def chance_in_a_loop(a, b):
+    d, count = [float(x - y) for x, y in zip(a, b, strict=True)], 0
+    for k in range(2 ** len(d)):
+        total = sum(x if k >> n & 1 else -x for n, x in enumerate(d))
+        count += abs(total) >= abs(sum(d)) - 1e-12
+    return count / 2 ** len(d)
+
+
+@pytest.mark.ex10_1
+def test_sign_test():
+    wrong = {
+        "one-sided": lambda a, b: chance(a, b, one_sided=True),
+        "farther": lambda a, b: chance(a, b, slack=-1e-9),
+        "the others": lambda a, b: 1 - chance(a, b),
+        "a count": lambda a, b: chance(a, b) * 2 ** len(a),
+        "mean difference": lambda a, b: float(np.mean(a - b)),
+        "which are better": lambda a, b: float(np.mean(a < b)),
+    }
+    assert_variants(check_sign_test, {"vectors": chance, "loop": chance_in_a_loop}, wrong, 0.6)
