@@ -62,7 +62,9 @@ def notebooks_of(item: pytest.Item) -> set[str]:
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Return where the runs go; the frames are rendered once, into a cache beside them."""
+    from tests.brief import frames_rendered_once  # only here: it needs torch
+
     root = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, frames_rendered_once():
         patch.setenv("MINISLAM_CACHE", str(root / "cache"))
         yield root

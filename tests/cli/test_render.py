@@ -12,13 +12,13 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def folder(root: Path) -> str:
-    command = ["run", "synth:person", "--stride", "3", "--max-frames", "8", "--size", "96x72"]
+    command = ["run", "synth:person", "--stride", "3", "--max-frames", "5", "--size", "96x72"]
     assert main([*command, "--preset", "test", "-o", str(root / "run")]) == 0
     return str(root / "run")
 
 
 @pytest.mark.parametrize(
-    ("path", "count", "width"), [("trajectory", 8, 64), ("orbit", 90, 64), ("side-by-side", 8, 192)]
+    ("path", "count", "width"), [("trajectory", 5, 64), ("orbit", 90, 64), ("side-by-side", 5, 192)]
 )
 def test_paths(folder: str, tmp_path: Path, capsys, path: str, count: int, width: int):
     file = tmp_path / "fly.webp"
@@ -30,7 +30,7 @@ def test_paths(folder: str, tmp_path: Path, capsys, path: str, count: int, width
 
 def test_a_run_leaves_its_clip(folder: str):
     _, animation = cv2.imreadanimation(str(Path(folder) / "clip.webp"))
-    assert len(animation.frames) == 8
+    assert len(animation.frames) == 5
 
 
 def test_nonsense_is_one_sentence(folder: str, tmp_path: Path, capsys):

@@ -20,11 +20,11 @@ from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 
 pytestmark = pytest.mark.slow
 
-FRAMES = 16
+FRAMES = 13
 INPUT = ["--stride", "3", "--max-frames", str(FRAMES), "--size", "96x72"]
 SETTINGS = [
-    "--preset", "test", "--mapping.init_iterations", "20", "--mapping.keyframe_iterations", "5",
-    "--mapping.refine_iterations", "20",
+    "--preset", "test", "--mapping.init_iterations", "8", "--mapping.keyframe_iterations", "2",
+    "--mapping.refine_iterations", "8",
 ]  # fmt: skip
 SAME = ("trajectory.txt", "keyframe_trajectory.txt", "lost_frames.txt", "map.ply", "config.json")
 OF_TIME = ("seconds_total", "frames_per_second", "peak_memory_mb")  # all that may differ
@@ -194,8 +194,8 @@ def interrupted(whole: Path, root: Path) -> Path:
 
 REFUSALS = [
     (
-        ["--stride", "2", "--max-frames", "24", *INPUT[4:]],  # the same frames are rendered
-        "expected sequence.description = .*16 of 48.* found .*24 of 48",
+        ["--stride", "1", "--max-frames", "39", *INPUT[4:]],  # the same frames are rendered
+        "expected sequence.description = .*13 of 39.* found .*39 of 39",
     ),
     ([*INPUT, "--fx", "99"], "expected sequence.description = .* found .*given"),
     ([*INPUT, "--focal", "refine"], "found .* to be refined"),

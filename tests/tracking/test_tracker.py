@@ -89,7 +89,7 @@ def test_the_modes_follow_each_other():
 
 def test_the_last_frame_becomes_a_keyframe():
     tracker = new_tracker(with_depth=True)
-    run(tracker, frames())
+    run(tracker, frames()[:14])
     followed = [t.frame_index for t in tracker.tracked if t.status.is_followed]
     tracker.end()
     assert followed[-1] - tracker.keyframes.frames[-1].frame_index <= LONGEST_TAIL
@@ -107,7 +107,7 @@ def test_two_runs_are_the_same_to_the_bit():
 
 @pytest.mark.parametrize("kind", ["noise", "black"])
 def test_a_spoilt_frame_is_lost_and_the_next_is_found_again(kind: str):
-    images = frames()
+    images = frames()[: WHERE_LOST + 6]
     source = torch.Generator().manual_seed(0)
     noise = torch.rand(images[0].image.shape, generator=source)
     spoilt = noise if kind == "noise" else torch.zeros_like(noise)

@@ -1,5 +1,7 @@
 """A frame is found again among keyframes of a recording, or not at all."""
 
+from functools import cache
+
 import pytest
 import torch
 
@@ -11,6 +13,7 @@ from tests.tracking.recording import frames, new_tracker, recording, run
 pytestmark = pytest.mark.slow
 
 
+@cache
 def finder() -> tuple[Relocaliser, Tracker]:
     """Return a relocaliser that knows the keyframes of the first twelve frames."""
     tracker = new_tracker(with_depth=True)
