@@ -6,6 +6,7 @@ question of `tests/test_slam.py`, which runs with the real budgets and draws the
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ BUDGETS = {
     "mapping.pose_refinement.iterations": 1,
 }
 BLANK = encode_png(np.zeros((2, 2, 3), np.uint8))
-_rendered: dict[tuple[str, int, Intrinsics, int], SyntheticFrame] = {}
+_rendered: dict[tuple[Any, ...], SyntheticFrame] = {}
 
 
 @contextmanager
@@ -56,9 +57,9 @@ def frames_rendered_once() -> Iterator[None]:
         yield
 
 
-def render_once(view: Scene, intrinsics: Intrinsics, index: int) -> SyntheticFrame:
+def render_once(view: Scene, intrinsics: Intrinsics, index: int, **how: Any) -> SyntheticFrame:
     """Return what `render_frame` returns, which depends on nothing else."""
-    key = (view.name, view.seed, intrinsics, index)
+    key = (view.name, view.seed, intrinsics, index, *how.items())
     if key not in _rendered:
-        _rendered[key] = render_frame(view, intrinsics, index)
+        _rendered[key] = render_frame(view, intrinsics, index, **how)
     return _rendered[key]
