@@ -67,6 +67,7 @@ ROOMS_BORDERS = {
     "priors/dense_flow.py", "priors/flow.py", "priors/features.py",
     "tracking/bundle_adjustment.py", "tracking/frame_graph.py", "tracking/keyframe_graph.py",
     "tracking/pose_from_flow.py", "tracking/safeguards/first_depth.py",
+    "tracking/safeguards/overlay.py", "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py",
     "mapping/losses.py", "stereo/second_adjustment.py", "stereo/dense_structure.py",
     "slam.py", "splatting/gaussians.py",

@@ -184,7 +184,7 @@ def _warnings(slam: Slam) -> list[str]:
             f"{failed} of {adjustments} bundle adjustments failed and changed nothing: poses and "
             "depths there are those of the start"
         )
-    warnings += _focal_length_warnings(slam) + _parallax_warnings(slam)
+    warnings += _focal_length_warnings(slam) + _parallax_warnings(slam) + _overlay_warnings(slam)
     if not slam.tracker.keyframes.has_prior:
         warnings.append("without a depth prior the unit of length is arbitrary")
     return warnings
@@ -216,7 +216,8 @@ def _focal_length_warnings(slam: Slam) -> list[str]:
     factor = f"{fit.factor:.2f}"
     return [
         f"the flow fits {factor} times the present focal length better, with {fit.saved:.0%} less "
-        f"cost: check the calibration, or give {factor} times the present --fx and --fy"
+        f"cost: check the calibration, or give {factor} times the present --fx and --fy. If the "
+        "lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
     ]
 
 
@@ -229,4 +230,14 @@ def _parallax_warnings(slam: Slam) -> list[str]:
     return [
         f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera turned or "
         "stood still, so the distances it moved are not determined"
+    ]
+
+
+def _overlay_warnings(slam: Slam) -> list[str]:
+    overlay = slam.tracker.keyframes.overlay
+    if overlay is None:
+        return []
+    return [
+        f"{float((overlay == 0).float().mean()):.0%} of the image stand still while the rest moves "
+        "(a logo, a dashboard, bars?): tracking leaves them out, the map does not; crop the images"
     ]

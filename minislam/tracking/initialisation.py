@@ -27,6 +27,7 @@ from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_d
 from minislam.tracking.safeguards.first_depth import essential_disparities
 from minislam.tracking.safeguards.focal_length import seek_focal_length
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, update_motion_weight
+from minislam.tracking.safeguards.overlay import overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.tracking.safeguards.two_views import pose_with_depth
 
@@ -57,11 +58,12 @@ def chain_state(
     robust: RobustKernel | None,
     memory_scale: float | None,  # px; None: motion is not remembered
     prior_strength: float,  # lambda_4 fx^2
+    first_weights: Tensor | None = None,  # (N,) in [0, 1] of the first keyframe; None: ones
 ) -> tuple[BundleState, Tensor]:  # and the motion weights (K, N)
     """Return poses and disparities of K keyframes, each from its predecessor."""
     poses = [torch.eye(4, dtype=torch.float64, device=first_disparities.device)]
     disparities = [first_disparities]
-    weights = [torch.ones_like(first_disparities)]
+    weights = [torch.ones_like(first_disparities) if first_weights is None else first_weights]
     for index, matches in enumerate(flow_to_next):
         last, of_last = poses[-1], disparities[-1]
         starts = [last]
@@ -116,6 +118,7 @@ def first_geometry(
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
     keyframes = graph.keyframes
+    keyframes.overlay = overlay_weights(flow_to_next, graph.grid)
     for target in range(1, len(keyframes)):
         graph.match_composed(target)
     guesses = first_disparity_hypotheses(
@@ -123,10 +126,8 @@ def first_geometry(
     )
     known = keyframes.prior_disparities
     strength = graph.config.lambda_disparity_prior * graph.grid.camera.fx**2
-    hypotheses = [
-        chain_state(graph.grid, flow_to_next, guess, known, graph.robust, memory_scale, strength)
-        for guess in guesses
-    ]
+    settings = known, graph.robust, memory_scale, strength, keyframes.cell_weights[0]
+    hypotheses = [chain_state(graph.grid, flow_to_next, guess, *settings) for guess in guesses]
     if memory_scale is not None:  # then there is a depth prior, and with it one hypothesis
         for index, weight in enumerate(hypotheses[0][1]):
             keyframes.set_motion_weight(index, weight)

@@ -19,6 +19,9 @@ class KeyframeStore(Stateful):
     prior_masks: Tensor  # (K, N) M; False: prior off
     static_weights: Tensor  # (K, N) in [0, 1], from beta
     motion_weights: Tensor  # (K, N) in [0, 1], how well a cell's flow has fitted the camera motion
+    overlay: Tensor | None = (
+        None  # (N,) 0 on what covers every image, such as a logo; None: no cell
+    )
 
     def __init__(self, like: Tensor) -> None:
         """Start empty, for as many cells as a tensor (N,) has, and on its device."""
@@ -46,7 +49,8 @@ class KeyframeStore(Stateful):
     @property
     def cell_weights(self) -> Tensor:  # (K, N) in [0, 1]
         """Return the weight of each cell: by its appearance (beta) and by its motion so far."""
-        return self.static_weights * self.motion_weights
+        weights = self.static_weights * self.motion_weights
+        return weights if self.overlay is None else weights * self.overlay
 
     def append(
         self,

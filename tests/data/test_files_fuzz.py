@@ -1,18 +1,30 @@
-"""Two thousand random mutations of a valid file per parser: finite values, or InputError."""
+"""Random mutations of a valid file per parser: finite values, or InputError."""
 
+import io
+import json
 import random
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from minislam.config import SlamConfig, as_json, from_json
 from minislam.data.calibration import parse_calibration
+from minislam.data.checkpoint import read_checkpoint, write_checkpoint
+from minislam.data.files import read_json
+from minislam.data.images import encode_jpeg, encode_png, read_color
 from minislam.data.ply import GaussianArrays, decode_ply, encode_ply
+from minislam.data.sources import VideoImages
 from minislam.data.trajectory import parse_trajectory
 from minislam.data.tum import parse_image_list
 from minislam.errors import InputError
+from minislam.priors.files import read_array
+from tests.recordings import picture, video
 
 MUTATIONS = 2000
+OF_FILES = 250  # mutations of what is read from the disk
 _TEXT_PIECES = [
     "nan", "inf", "-", "1e400", "#", "\n", " ", "\t", ",", "\0", "0", "-1", "\ufeff", "é", "1_0",
 ]  # fmt: skip
@@ -90,3 +102,78 @@ def test_mutated_maps():
         for array in (read.means, read.log_scales, read.quats_wxyz, read.colors):
             assert np.isfinite(array).all()
     assert 0 < refused < MUTATIONS
+
+
+# Whole files on the disk
+
+
+def check_settings(path: Path) -> None:
+    assert isinstance(from_json(read_json(path)), SlamConfig)
+
+
+def check_array(path: Path) -> None:
+    assert read_array(path, "depth").dtype.kind == "f"
+
+
+def check_checkpoint(path: Path) -> None:
+    assert isinstance(read_checkpoint(path), dict | list | str | int | float | None)
+
+
+def check_picture(path: Path) -> None:
+    image = read_color(path)
+    assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
+
+
+def settings_file() -> bytes:
+    return json.dumps(as_json(SlamConfig())).encode()
+
+
+def array_file() -> bytes:
+    file = io.BytesIO()
+    np.save(file, np.linspace(1, 2, 12, dtype=np.float32).reshape(3, 4))
+    return file.getvalue()
+
+
+def checkpoint_file(folder: Path) -> bytes:
+    write_checkpoint(folder / "whole.npz", {"a": [torch.ones(3), None], "b": {"c": 1.5}})
+    return (folder / "whole.npz").read_bytes()
+
+
+@pytest.mark.filterwarnings("ignore:.*may be damaged")
+@pytest.mark.parametrize(
+    ("check", "make", "name"),
+    [
+        (check_settings, lambda _: settings_file(), "a.json"),
+        (check_array, lambda _: array_file(), "a.npy"),
+        (check_checkpoint, checkpoint_file, "a.npz"),
+        (check_picture, lambda _: encode_png(picture(3)), "a.png"),
+        (check_picture, lambda _: encode_jpeg(picture(3), 48), "a.jpg"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_mutated_files(check: Callable[[Path], None], make, name: str, tmp_path: Path):
+    valid, source, refused = make(tmp_path), random.Random(0), 0
+    path = tmp_path / name
+    path.write_bytes(valid)
+    check(path)
+    for _ in range(OF_FILES):
+        content = mutated_bytes(valid, source)
+        path.write_bytes(content[: source.choice([len(content), source.randrange(len(content))])])
+        try:
+            check(path)
+        except InputError:
+            refused += 1
+    assert 0 < refused <= OF_FILES
+
+
+def test_mutated_videos(tmp_path: Path):
+    valid, source = video(tmp_path / "a.mp4", 6, (48, 32)).read_bytes(), random.Random(0)
+    for _ in range(40):
+        (tmp_path / "a.mp4").write_bytes(mutated_bytes(valid, source))
+        try:
+            images = VideoImages(tmp_path / "a.mp4", 20)
+        except InputError:
+            continue
+        assert np.isfinite(images.timestamps).all() and len(images) <= 20
+        for index in range(len(images)):
+            assert images.read(index).dtype == np.uint8

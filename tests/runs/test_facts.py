@@ -33,7 +33,9 @@ def slam(**parts: object) -> SimpleNamespace:
             breaks=parts.pop("breaks", []),
             segments=[(0, 1), (3, 3)],
         ),
-        keyframes=SimpleNamespace(has_prior=parts.pop("has_prior", True)),
+        keyframes=SimpleNamespace(
+            has_prior=parts.pop("has_prior", True), overlay=parts.pop("overlay", None)
+        ),
     )
     lost = parts.pop("lost", 0)
     return SimpleNamespace(
@@ -55,6 +57,8 @@ WARNINGS = [
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"seeks_focal": True}, "the motion does not tell it"),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
+    ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),
+    ({"overlay": torch.tensor([0.0, 1, 1, 1])}, "25% of the image stand still while the rest mov"),
     ({"has_prior": False}, "the unit of length is arbitrary"),
 ]
 

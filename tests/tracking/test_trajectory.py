@@ -1,5 +1,6 @@
 """Poses between the keyframes: the constant twist, and its correction on exact flow."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_interpolate, se3_inverse, se3_log
 from minislam.priors.interfaces import FlowMatches
-from minislam.records import TrackedFrame, TrackingStatus
+from minislam.records import Frame, TrackedFrame, TrackingStatus
 from minislam.tracking.trajectory import pose_all_frames
 from tests.helpers import random_transforms
 from tests.tracking.wall import FRAMES, GRID, TrueFlow, true_graph, true_poses, wall_frame
@@ -17,7 +18,7 @@ KEYFRAMES = [0, 3, 5, 8]
 LOST = 6
 
 
-def posed(progress=None, flow: TrueFlow | None = None) -> dict[int, Tensor]:
+def posed(progress=None, flow: TrueFlow | None = None, frame=wall_frame) -> dict[int, Tensor]:
     """Return the poses of twelve frames, four of which are keyframes and one of which is lost."""
     graph = true_graph(KEYFRAMES, flow=flow)
     tracked = [
@@ -31,7 +32,7 @@ def posed(progress=None, flow: TrueFlow | None = None) -> dict[int, Tensor]:
         graph=graph,
         tracked=tracked,
     )
-    poses = pose_all_frames(tracker, SimpleNamespace(frame=wall_frame), progress)
+    poses = pose_all_frames(tracker, SimpleNamespace(frame=frame), progress)
     assert set(graph.flow.numbers) == set(range(len(KEYFRAMES)))  # nothing left behind
     return poses
 
@@ -82,6 +83,18 @@ def test_beyond_the_last_keyframe_nobody_takes_the_pose_along():
 def test_keyframes_keep_their_poses_to_the_bit():
     poses, truth = posed(), true_poses()
     assert all(torch.equal(poses[number], truth[number]) for number in KEYFRAMES)
+
+
+def test_a_frame_that_repeats_the_one_before_it_has_its_pose_however_often():
+    shown = {1: 0, 2: 0, 7: 5, 10: 9}  # 0 and 5 are keyframes; between 5 and 7 the camera was lost
+
+    def frozen(number: int) -> Frame:
+        like, noise = wall_frame(shown.get(number, number)), 0.0005 * (number % 2)
+        return replace(like, frame_index=number, image=like.image + noise)
+
+    poses = posed(frame=frozen)
+    assert torch.equal(poses[1], poses[0]) and torch.equal(poses[2], poses[0])
+    assert torch.equal(poses[10], poses[9]) and not torch.equal(poses[7], poses[5])
 
 
 def test_progress_counts_the_frames_that_are_not_keyframes():

@@ -21,6 +21,7 @@ LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
 # Residuals of a flow that a pose explains: the first updates go a part of the way, but that way.
 EXPLAINED = 3.0, 0.25  # px at 320x240, and part of the flow
 CHANCE = 0.25  # of the weight of a random flow is explained as well; .95 and more of a good one [-]
+REPEATED = 0.001  # mean difference of an image from the one that it repeats, encoded again [-]
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,11 @@ def retry_doubtful(
     for index in lost:
         del fits[index]
     return lost
+
+
+def repeats(image: Tensor, before: Tensor | None) -> bool:
+    """Tell whether an image (H, W, 3) repeats the one before it. Sensor noise differs by more."""
+    return before is not None and float((image - before).abs().mean()) < REPEATED
 
 
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:

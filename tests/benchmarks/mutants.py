@@ -1,0 +1,225 @@
+"""Break the package one line at a time: does a fast test of the same room notice?
+
+    python -m tests.benchmarks.mutants [WORD ...]
+
+Each mutant is one replacement in one file, tried in a scratch copy of the clone, on the tests that
+stand beside it. A survivor needs a test, or is an equivalent: a change that changes nothing.
+With words, only mutants whose file contains one of them.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+import cv2  # noqa: F401  (imported once here, not once per mutant)
+import numpy  # noqa: F401
+import pytest
+import scipy.spatial.transform  # noqa: F401
+import torch
+
+ROOT = Path(__file__).parents[2]
+ALARM = 120  # s; a mutant that takes longer hangs, and that is noticed
+
+# (file below minislam/, test files below tests/): what it says, what the mutant says
+MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
+    ("geometry/se3.py", "geometry/test_se3.py"): [
+        ("-(rotation_t @ transforms", "(rotation_t @ transforms"),
+        ("aw * by - ax * bz", "aw * by + ax * bz"),
+        ("1.5 * eye - 0.5 *", "1.5 * eye - 0.4 *"),
+        ("torch.where(q[..., :1] < 0, -q, q)", "q"),
+    ],
+    ("geometry/camera.py", "geometry/test_camera.py"): [
+        ("(self.cx + 0.5) * sx - 0.5", "self.cx * sx"),
+        ("fx * (1 + a * a)", "fx * (1 - a * a)"),
+        ("self.cx - left", "self.cx + left"),
+        ("u <= self.width - 1", "u <= self.width"),
+    ],
+    ("geometry/alignment.py", "geometry/test_alignment.py"): [
+        ("signs[2] = -1.0", "signs[2] = 1.0"),
+        ("target_mean - scale *", "target_mean -"),
+    ],
+    ("uncertainty/weights.py", "uncertainty/test_weights.py"): [
+        ("1 + (1 - position)", "1 - (1 - position)"),
+        (".clamp_max(TRACKING_CAP)", ""),
+        ("weight < MAPPING_CUT", "weight > MAPPING_CUT"),
+    ],
+    ("uncertainty/losses.py", "uncertainty/test_losses.py"): [
+        ("contrast.clamp_max(STRUCTURE_CAP)", "contrast"),
+        ("opacity >= SURFACE_OPACITY", "opacity >= 0"),
+        ("& (reference_depth < far_limit)", ""),
+        ('mode="reflect"', 'mode="constant"'),
+        ("/ beta**2 +", "/ beta +"),
+    ],
+    ("mapping/window.py", "mapping/test_window.py"): [
+        ("min(int(seen_a.sum()), ", "max(int(seen_a.sum()), "),
+        ("non_overlapping[-1]", "non_overlapping[0]"),
+        ("crowding = candidates.sum(-1)", "crowding = -candidates.sum(-1)"),
+        ("(1 - window_probability) / (", "window_probability / ("),
+    ],
+    ("mapping/insertion.py", "mapping/test_insertion.py"): [
+        ("& (weight > 0)", ""),
+        ("opacity < EXPLAINED_OPACITY", "opacity > EXPLAINED_OPACITY"),
+        ("torch.where(known, priority, -1)", "priority"),
+        ("in_front & (weight", "(weight"),
+        ("config.cell * z / focal", "config.cell / focal"),
+    ],
+    ("mapping/losses.py", "mapping/test_losses.py"): [
+        ("slopes * (v_loss / -len(x))", "slopes * (v_loss / len(x))"),
+        ("image.sum(-1) > BLACK", "image.sum(-1) >= 0"),
+        ("in_front & (opacity", "(opacity"),
+        ("(scales - scales.mean(-1, keepdim=True))", "scales"),
+    ],
+    ("tracking/bundle_adjustment.py", "tracking/test_bundle_adjustment_steps.py"): [
+        ("trial.cost <= current.cost", "trial.cost <= 1.001 * current.cost"),
+    ],
+    ("tracking/bundle_adjustment.py",
+     "tracking/test_bundle_adjustment_steps.py tracking/test_bundle_adjustment.py"): [
+        ("level = max(level / 10, damping)", "level = damping"),
+    ],
+    ("tracking/safeguards/robust.py", "tracking/safeguards/test_robust.py"): [
+        ("-self.power", "-1"),
+        ("self.scale**2 * torch.log1p", "torch.log1p"),
+    ],
+    ("tracking/safeguards/motion_memory.py", "tracking/safeguards/test_motion_memory.py"): [
+        ("LOSS_RATE, RECOVERY_RATE)", "RECOVERY_RATE, LOSS_RATE)"),
+        ('"amin"', '"amax"'),
+        ("+ DEPTH_ERROR**2 * parallax", ""),
+    ],
+    ("tracking/safeguards/settling.py", "tracking/safeguards/test_settling.py"): [
+        ("information > SETTLED", "information < SETTLED"),
+        (".clamp_min(LEAST)", ""),
+    ],
+    ("tracking/safeguards/overlay.py", "tracking/safeguards/test_overlay.py"): [
+        ("counts & (flow < STANDS)", "flow < STANDS"),
+        ("> MOVES", "> 0"),
+        (">= ALWAYS", "> 0"),
+        ("len(still) < MIN_PAIRS", "not still"),
+        ("3, 1, 1)", "1, 1, 0)"),
+    ],
+    ("tracking/safeguards/pose_support.py", "tracking/safeguards/test_pose_support.py"): [
+        ("fits[index].support < LOST_SUPPORT", "fits[index].support < 0 *"),
+        ("key=lambda fit: fit.support", "key=lambda fit: -fit.support"),
+    ],
+    ("tracking/safeguards/first_frame.py", "tracking/safeguards/test_first_frame.py"): [
+        ("lost_in_a_row < sum", "lost_in_a_row <= sum"),
+    ],
+    ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
+        ("weak >= LONG or error", "error"),
+        ("index - last <= HEALED_AFTER", "False"),
+    ],
+    ("tracking/disparity_prior.py", "tracking/test_disparity_prior.py"): [
+        ("(depth > 0) & (warped > 0)", "(warped > 0)"),
+        ('"amin"', '"amax"'),
+        ("counts.consistent < ", "counts.consistent <= "),
+    ],
+    ("tracking/frame_graph.py", "tracking/test_frame_graph.py"): [
+        ("ratio >= KEPT_FRACTION *", "ratio >= 0 *"),
+        ("(1 - rotation_weight)", "rotation_weight"),
+        ("min(abs(i - j) - 2, suppression)", "suppression"),
+    ],
+    ("stereo/aggregation.py", "stereo/test_aggregation.py"): [
+        ("before[:, :-1] + STEP_COST", "before[:, :-1]"),
+        ("0.5 * (left - right)", "0.5 * (right - left)"),
+    ],
+    ("stereo/votes.py", "stereo/test_votes.py"): [
+        ("expected - 2 * tolerance", "expected"),
+        ("& (other.cost[v, u] < WELL_MATCHED)", ""),
+    ],
+    ("evaluation/images.py", "evaluation/test_images_separability.py"): [
+        ("- positives * (positives + 1) / 2", ""),
+    ],
+    ("evaluation/images.py", "evaluation/test_images_depth.py"): [
+        ("scale * depth - reference", "depth - reference"),
+    ],
+    ("evaluation/trajectory.py", "evaluation/test_trajectory.py"): [
+        ("<= max_difference", "<= 2 * max_difference"),
+    ],
+    ("data/sources.py", "data"): [
+        ("self.promised > len(self) > 1", "len(self) > 1"),
+    ],
+    ("data/checkpoint.py", "test_architecture.py"): [
+        ("allow_pickle=False", "allow_pickle=True"),
+    ],
+    ("data/run_folder.py", "data/test_run_folder.py"): [
+        ("os.O_EXCL", "0"),
+    ],
+    ("runs/run.py", "runs/test_run_ending.py"): [
+        ("if slam.lost_frames() or slam.sequence.lost:", "if False:"),
+        ("2 * failed > adjustments", "failed > adjustments"),
+        ("if slam.tracker.watch.is_broken:", "if False:"),
+    ],
+    ("runs/facts.py", "runs/test_facts.py"): [
+        ("2 * without < len", "2 * without >= len"),
+        ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),
+    ],
+    ("viz/report.py", "viz/test_report.py"): [
+        ("title=escape(report.title)", "title=report.title"),
+        ('class="warning">{escape(text)}', 'class="warning">{text}'),
+    ],
+}  # fmt: skip
+# Mutants that change nothing, each with the reason.
+EQUIVALENT: dict[tuple[str, str], str] = {}
+
+
+def verdict(scratch: Path, name: str, tests: str, old: str, new: str) -> str:
+    """Return how the tests answer a mutant: killed, survived, or stale where the line is gone."""
+    path = scratch / "minislam" / name
+    whole = path.read_text(encoding="utf-8")
+    if old not in whole:
+        return "stale"
+    path.write_text(whole.replace(old, new, 1), encoding="utf-8")
+    try:
+        child = os.fork()
+        if child == 0:
+            os._exit(_tested(scratch, tests.split()))
+        _, status = os.waitpid(child, 0)
+    finally:
+        path.write_text(whole, encoding="utf-8")
+    return "survived" if status == 0 else "killed"
+
+
+def _tested(scratch: Path, tests: list[str]) -> int:
+    """Run tests in this process, which is a copy; return 0 if they all pass."""
+    signal.alarm(ALARM)
+    torch.set_num_threads(1)
+    os.chdir(scratch)
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        files = [str(scratch / "tests" / name) for name in tests]
+        return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:nbmake", *files,
+                                "-o", "addopts=--import-mode=importlib"]))  # fmt: skip
+
+
+def main() -> None:
+    """Print one line per mutant and the score."""
+    words = sys.argv[1:]
+    chosen = [
+        (name, tests, *change)
+        for (name, tests), changes in MUTANTS.items()
+        for change in changes
+        if not words or any(word in name for word in words)
+    ]
+    sys.dont_write_bytecode = True  # the files change faster than their times
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    score: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder) / "clone"
+        left_out = shutil.ignore_patterns(".git", "__pycache__", "notebooks", "output")
+        shutil.copytree(ROOT, scratch, ignore=left_out)
+        sys.path[:] = [str(scratch), *(entry for entry in sys.path if Path(entry or ".") != ROOT)]
+        os.environ["PYTHONPATH"] = str(scratch)
+        for name, tests, old, new in chosen:
+            found = verdict(scratch, name, tests, old, new)
+            if found == "survived" and (name, old) in EQUIVALENT:
+                found = "equivalent"
+            score[found] += 1
+            print(f"{found:10s} {name}: {old} -> {new}", flush=True)
+    print(", ".join(f"{count} {kind}" for kind, count in score.items()), f"of {len(chosen)}")
+
+
+if __name__ == "__main__":
+    main()

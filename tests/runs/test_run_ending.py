@@ -1,0 +1,34 @@
+"""How a run says that it ended: the state in run.json, and the exit code of README."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from minislam.records import AdjustmentCount
+from minislam.runs.run import _ending
+
+
+def ended(lost: int = 0, undecoded: int = 0, failed: int = 0, broken: bool = False) -> object:
+    graph = SimpleNamespace(adjustments=AdjustmentCount(5, failed, ""))
+    tracker = SimpleNamespace(graph=graph, watch=SimpleNamespace(is_broken=broken))
+    sequence = SimpleNamespace(lost=[(0.1, "damaged")] * undecoded)
+    return SimpleNamespace(tracker=tracker, sequence=sequence, lost_frames=lambda: [None] * lost)
+
+
+@pytest.mark.parametrize(
+    ("parts", "ending"),
+    [
+        ({}, ("finished", 0)),
+        ({"failed": 2}, ("finished", 0)),
+        ({"failed": 3}, ("finished, most bundle adjustments failed", 3)),
+        ({"broken": True, "lost": 1}, ("finished, broken", 3)),
+        ({"lost": 1}, ("finished, partly lost", 3)),
+        ({"undecoded": 1}, ("finished, partly lost", 3)),
+    ],
+)
+def test_a_run_that_is_not_whole_ends_with_three(parts: dict, ending: tuple[str, int]):
+    assert _ending(ended(**parts), interrupted=False) == ending
+
+
+def test_an_interrupted_run_is_that_first_of_all():
+    assert _ending(ended(lost=1), interrupted=True) == ("interrupted", 130)
