@@ -14,6 +14,7 @@ import signal
 import sys
 import tempfile
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import cv2  # noqa: F401  (imported once here, not once per mutant)
@@ -167,20 +168,30 @@ EQUIVALENT: dict[tuple[str, str], str] = {}
 
 
 def verdict(scratch: Path, name: str, tests: str, old: str, new: str) -> str:
-    """Return how the tests answer a mutant: killed, survived, or stale where the line is gone."""
+    """Return how the tests answer a mutant: killed, survived, stale or void.
+
+    Stale: the line is gone. Void: the tests fail without the mutant as well.
+    """
     path = scratch / "minislam" / name
     whole = path.read_text(encoding="utf-8")
     if old not in whole:
         return "stale"
+    if not passes(scratch, tests):
+        return "void"  # they fail without the mutant as well
     path.write_text(whole.replace(old, new, 1), encoding="utf-8")
     try:
-        child = os.fork()
-        if child == 0:
-            os._exit(_tested(scratch, tests.split()))
-        _, status = os.waitpid(child, 0)
+        return "survived" if passes.__wrapped__(scratch, tests) else "killed"
     finally:
         path.write_text(whole, encoding="utf-8")
-    return "survived" if status == 0 else "killed"
+
+
+@cache
+def passes(scratch: Path, tests: str) -> bool:
+    """Tell whether tests pass, in a process that has imported the large packages already."""
+    child = os.fork()
+    if child == 0:
+        os._exit(_tested(scratch, tests.split()))
+    return os.waitpid(child, 0)[1] == 0
 
 
 def _tested(scratch: Path, tests: list[str]) -> int:
