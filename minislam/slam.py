@@ -24,7 +24,6 @@ from minislam.mapping import Mapper
 from minislam.priors.high_resolution import HighResolutionFeatures
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
-from minislam.state.finite import check_finite
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
@@ -179,7 +178,6 @@ class Slam(Stateful):
         stage = "refining the map"
         iterations = self.config.mapping.refine_iterations
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
-        check_finite("the map", *self.mapper.gaussians.parameters.values())
 
     def _pose_all_frames(self) -> None:
         self.focal_length = check_focal_length(self.tracker.graph)  # the last adjustment is done
@@ -212,7 +210,6 @@ class Slam(Stateful):
         if not (uncertainty.enabled and is_known):
             return torch.ones(self.tracker.grid.shape, device=self.device)
         beta = self._beta(keyframes.frames[index], keyframes.features[index])
-        check_finite(f"beta of keyframe {index}", beta)
         return tracking_weight(beta, self.sequence.camera, self._stride)
 
     def _beta(self, frame: Frame, features: Tensor | None) -> Tensor:
@@ -242,7 +239,6 @@ class Slam(Stateful):
         result = []
         for index in range(first, len(store)):
             frame, depth = store.frames[index], store.metric_depths[index]
-            check_finite(f"pose of keyframe {index}", store.T_camera_world[index])
             record = Keyframe(
                 keyframe_index=index, frame_index=frame.frame_index, timestamp=frame.timestamp,
                 image=frame.image, features=store.features[index],

@@ -27,6 +27,7 @@ from minislam.runs.pictures import Preview, write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.runs.summary import Line, summarise
 from minislam.slam import Priors, Slam
+from minislam.state.finite import check_finite
 from minislam.state.steps import Observer, SilentObserver
 from minislam.workers import Workers, idle_cores
 
@@ -122,6 +123,11 @@ def run_sequence(
 
     def between_steps(force: bool) -> None:
         alarms.check(slam)
+        keyframes, gaussians = slam.tracker.keyframes, slam.mapper.gaussians
+        check_finite("poses", keyframes.T_camera_world)
+        check_finite("disparities", keyframes.disparities)
+        check_finite("static weights from beta", keyframes.static_weights)
+        check_finite("the map", *gaussians.parameters.values())
         checkpoints.save(slam, force)
 
     slam = Slam(sequence, config, priors, preview, between_steps, choice.device, workers)
