@@ -15,8 +15,9 @@ from tests.notebook_files import NOTEBOOKS, ROOT, is_exercise, load, source
 SYLLABUS = ROOT / "notebooks/SYLLABUS.md"
 GENERATED = re.compile(r"(<!-- points: [^\n]+ -->\n).*?(<!-- end of points -->)", re.S)
 WARM_UP = 2  # points
+WITHOUT_HEADINGS = ("05_bundle_adjustment", "06_tracking")  # until they are unfolded
 HEADING = re.compile(
-    r"### Exercise (\d): [^\n]+ \((★{1,3})(☆{0,2}), (\d+) minutes, (\d) points\)\n"
+    r"(?:## [^\n]+\n\n)?### Exercise (\d): [^\n]+ \((★{1,3})(☆{0,2}), (\d+) minutes, (\d) points\)\n"
 )
 
 
@@ -33,6 +34,9 @@ def test_each_exercise_has_its_own_key_and_a_check():
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_headings_say_what_the_table_says(path):
     cells = load(path)["cells"]
+    is_told = any("### Exercise " in source(cell) for cell in cells)
+    if path.stem in WITHOUT_HEADINGS and not is_told:
+        pytest.skip("this notebook has no such headings yet")
     found = []
     for above, cell in pairwise(cells):
         if is_exercise(cell):
