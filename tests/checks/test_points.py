@@ -17,7 +17,8 @@ GENERATED = re.compile(r"(<!-- points: [^\n]+ -->\n).*?(<!-- end of points -->)"
 WARM_UP = 2  # points
 WITHOUT_HEADINGS = ("05_bundle_adjustment", "06_tracking")  # until they are unfolded
 HEADING = re.compile(
-    r"(?:## [^\n]+\n\n)?### Exercise (\d): [^\n]+ \((★{1,3})(☆{0,2}), (\d+) minutes, (\d) points\)\n"
+    r"(?:## [^\n]+\n\n)?"  # a section may begin here
+    r"### Exercise (\d): [^\n]+ \((★{1,3})(☆{0,2}), (\d+) minutes, (\d) points\)\n"
 )
 
 
