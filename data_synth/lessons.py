@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .poses import Array, Intrinsics
+from .poses import Array, Intrinsics, default_intrinsics
 from .scenes import scene
-from .sequence import SyntheticSequence, render_view
+from .sequence import in_order, render_frame, render_view
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,28 @@ def known_views(name: str, timestamps: Series[float], intrinsics: Intrinsics) ->
     return KnownViews(intrinsics, np.array(timestamps), relative, rgb, depth, masks)
 
 
+def known_clip(name: str, frames: Series[int], size: tuple[int, int]) -> KnownViews:
+    """Return these frames of a sequence with seed 0, as `generate` does, sensor noise included."""
+    room, intrinsics = scene(name), default_intrinsics(size)
+    shown = list(in_order(lambda n: render_frame(room, intrinsics, frames[n]), len(frames)))
+    path = np.array([frame.T_world_camera for frame in shown])
+    return KnownViews(
+        intrinsics=intrinsics,
+        timestamps=np.array([frame.timestamp for frame in shown]),
+        T_world_camera=np.linalg.inv(path[0]) @ path,
+        rgb=np.array([frame.rgb for frame in shown]) / np.float32(255),
+        depth=np.array([frame.depth for frame in shown]),
+        masks=np.array([frame.mask for frame in shown]),
+    )
+
+
 def of_cells(pictures: Array, stride: int) -> Array:  # (K, height, width) -> (K, N) float64
     """Return the values at every `stride`-th pixel, row by row."""
     return pictures[:, ::stride, ::stride].reshape(len(pictures), -1).astype(np.float64)
 
 
 def flow_of_cells(
-    views: KnownViews | SyntheticSequence,
+    views: KnownViews,
     source: Series[int],  # (E,) views
     target: Series[int],  # (E,) views
     stride: int,  # px between cells

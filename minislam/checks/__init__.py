@@ -7,7 +7,12 @@ still runs from top to bottom. Three more are for authors of priors: `check_dept
 its interface asks for.
 """
 
-from minislam.checks.bundle_adjustment import check_schur_step, check_target_jacobian
+from minislam.checks.bundle_adjustment import (
+    check_bundle_adjustment,
+    check_prior_mask,
+    check_schur_step,
+    check_target_jacobian,
+)
 from minislam.checks.geometry import check_reproject, check_resized_intrinsics, check_warped_photo
 from minislam.checks.grading import (
     NOT_YET,
@@ -39,7 +44,12 @@ from minislam.checks.splatting_gradients import (
 )
 from minislam.checks.start_here import check_mapping_weight
 from minislam.checks.stereo import check_plane_cost, check_plane_homography
-from minislam.checks.tracking import check_flow_distance, check_suppressed
+from minislam.checks.tracking import (
+    check_flow_distance,
+    check_keyframes,
+    check_motion_memory,
+    check_suppressed,
+)
 from minislam.checks.uncertainty import check_best_beta, check_feature_variance, check_training
 from minislam.priors.conformance import (
     check_depth_prior,
@@ -56,6 +66,7 @@ __all__ = [
     "check_alignment",
     "check_ate",
     "check_best_beta",
+    "check_bundle_adjustment",
     "check_conic_vjp",
     "check_deformed_means",
     "check_depth_prior",
@@ -67,12 +78,15 @@ __all__ = [
     "check_function",
     "check_gains",
     "check_insertion",
+    "check_keyframes",
     "check_map_loss",
     "check_mapping_weight",
+    "check_motion_memory",
     "check_picture_gradient",
     "check_pixel_color",
     "check_plane_cost",
     "check_plane_homography",
+    "check_prior_mask",
     "check_projected_covariance",
     "check_rendered_image",
     "check_reproject",

@@ -1,6 +1,8 @@
-"""Exercises of notebook 05."""
+"""Exercises of notebooks 05 and 05b."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,8 +17,17 @@ from minislam.checks.grading import (
     doubles,
     normals,
 )
-from minislam.geometry import Camera, se3_exp
-from minislam.tracking.reprojection import reproject_with_jacobians, scaled_points
+from minislam.geometry import Camera, se3_exp, se3_inverse
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.disparity_prior import DepthView, depth_consistency
+from minislam.tracking.grid import Grid
+from minislam.tracking.reference import dense_normal_equations, moved
+from minislam.tracking.reprojection import (
+    relative_transforms,
+    reproject,
+    reproject_with_jacobians,
+    scaled_points,
+)
 
 
 def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -> Verdict:
@@ -124,3 +135,137 @@ def check_schur_step(
         (lambda *a: solved(*a)[::-1], "The poses come first: xi, then delta."),
     ]
     return check_function(student, solved, cases, 1e-9, hints, draw, ("xi", "delta"))
+
+
+def check_bundle_adjustment(
+    student: Callable[[BundleProblem, BundleState, int, float], BundleState],
+) -> Verdict:
+    """Check (problem, state, steps, damping) -> the state after so many Gauss-Newton steps."""
+    rays = CAMERA.rays(CAMERA.pixel_grid(25, torch.float64).flatten(0, 1))
+    source, target = (1 - torch.eye(3)).nonzero().T
+
+    def loop(
+        sign: float = 1.0, left: bool = True, most: int = 99, damped: bool = True, **changed: Tensor
+    ) -> Function:
+        def run(problem: BundleProblem, state: BundleState, steps: int, damping: float) -> Any:
+            problem = replace(problem, **changed)  # type: ignore[arg-type]
+            for _ in range(min(steps, most)):
+                equations = dense_normal_equations(problem, state)
+                diagonal = (damping if damped else 1e-9) * torch.ones(len(equations.vector))
+                step = torch.linalg.solve(equations.matrix + diagonal.diag(), equations.vector)
+                after, before = moved(problem, state, sign * step), state.T_camera_world
+                poses = after.T_camera_world
+                poses = poses if left else before @ poses @ se3_inverse(before)
+                state = BundleState(poses, after.disparities)
+            return state.T_camera_world, state.disparities
+
+        return run
+
+    def answered(*arguments: Any) -> Any:
+        state = student(*arguments)
+        if not isinstance(state, BundleState):
+            return state
+        return state.T_camera_world, state.disparities
+
+    def case(steps: int, held: int, weights: Tensor, description: str, seed: int = 1) -> Case:
+        xi, start, noise, scatter = normals(seed, 4, 3, len(rays)).clamp(-2, 2)
+        truth = BundleState(se3_exp(0.1 * xi[:, :6]), 0.5 + 0.1 * scatter.abs())
+        motion = relative_transforms(truth.T_camera_world, source, target)
+        flow = reproject(motion, truth.disparities[source], rays, CAMERA)[0] + noise[:2, :]
+        none, keyframe = torch.zeros_like(scatter), torch.arange(3)
+        edges = source, target, flow, weights
+        free = keyframe >= held, keyframe >= 0
+        problem = BundleProblem(CAMERA, rays, *edges, none, none, *free)
+        nudged = se3_exp(0.02 * start[:, :6]) @ truth.T_camera_world
+        return Case((problem, BundleState(nudged, none + 0.5), steps, 10.0), description)
+
+    def draw(seed: int) -> Case:
+        return case(1 + seed % 2, 1, normals(seed, 6, 2, len(rays)).abs(), "drawn weights", seed)
+
+    ones = torch.ones(6, 2, len(rays)).double()
+    hidden = ones * (torch.arange(len(rays)) > 1)
+    some = normals(5, 6, 2, len(rays)).abs()
+    cases = [
+        case(1, 1, ones, "one step and weights of 1"),
+        case(1, 2, some, "one step, two poses held, weights that differ"),
+        case(1, 1, hidden, "two cells that no other view sees"),
+        case(3, 2, some, "three steps"),
+    ]
+    hints: Hints = [
+        (loop(weights=ones), "Each residual counts with its weight: J^T W J and J^T W r."),
+        (loop(free_poses=torch.ones(3).bool()), "A pose that is not free must not move."),
+        (loop(sign=-1), "The step points uphill: with r = p~ - p it is added."),
+        (loop(left=False), "The step stands on the left: exp(xi) T_camera_world."),
+        (loop(damped=False), "Add the damping to the diagonals of H and of C."),
+        (loop(most=1), "Repeat the step: each one linearises at the state the last one left."),
+        (lambda *a: (loop()(*a)[0], a[1].disparities), "The disparities move as well: + delta."),
+        (lambda *a: (a[1].T_camera_world, loop()(*a)[1]), "The poses move as well: exp(xi) T."),
+    ]
+    return check_function(answered, loop(), cases, 1e-7, hints, draw, ("poses", "disparities"))
+
+
+def check_prior_mask(
+    student: Callable[[Tensor, list[tuple[Tensor, Tensor]], Camera, int, float], Tensor],
+) -> Verdict:
+    """Check (depth, [(depth, T_this_other)], camera, stride, epsilon) -> M (h, w) bool."""
+    camera, stride = Camera(60.0, 60.0, 31.3, 22.6, 64, 48), 4
+    grid = Grid.of(camera, stride)
+
+    def counted(depth: Tensor, others: list, error: float) -> tuple[Tensor, Tensor]:
+        same = torch.ones(1, 1, 1).double()
+        this = DepthView(depth, same, torch.eye(4).double())
+        views = [DepthView(seen, same, se3_inverse(T)) for seen, T in others]
+        counts = depth_consistency(grid, this, views, error, -2.0)
+        return counts.corresponding.view(grid.shape), counts.consistent.view(grid.shape)
+
+    def reference(depth: Tensor, others: list, *rest: Any) -> Tensor:
+        corresponding, consistent = counted(depth, others, rest[-1])
+        return (~((corresponding >= 2) & (consistent < 2))).double()
+
+    def anywhere(depth: Tensor, others: list, *rest: Any) -> Tensor:
+        return (counted(depth, others, rest[-1])[1] >= 2).double()
+
+    def one_is_enough(depth: Tensor, others: list, *rest: Any) -> Tensor:
+        corresponding, consistent = counted(depth, others, rest[-1])
+        return (~((corresponding >= 2) & (consistent < 1))).double()
+
+    def opposite(*arguments: Any) -> Tensor:
+        return 1 - reference(*arguments)
+
+    def backwards(depth: Tensor, others: list, *rest: Any) -> Tensor:
+        return reference(depth, [(seen, se3_inverse(T)) for seen, T in others], *rest)
+
+    def absolute(depth: Tensor, others: list, *rest: Any) -> Tensor:
+        # Where all depths are near 3 m, an absolute error is a third of it, relatively.
+        return reference(depth, others, rest[-1] / 3)
+
+    def wall(T_this_other: Tensor) -> Tensor:
+        """Return the depth of a wall, 3 m before this view, as another view sees it."""
+        rays = camera.rays(camera.pixel_grid(1, torch.float64)) @ T_this_other[:3, :3].T
+        return (3 - T_this_other[2, 3]) / rays[..., 2]
+
+    def case(count: int, patched: float, description: str, seed: int = 2) -> Case:
+        others = [(wall(T), T) for T in se3_exp(0.08 * normals(seed, count, 6).clamp(-2, 2))]
+        depth = wall(torch.eye(4).double())
+        depth[10:30, 8:30] *= patched
+        for number, (seen, _) in enumerate(others):
+            seen[8 * number : 8 * number + 20, 30:50] *= 0.6  # in front of the wall, for one view
+        return Case((depth, others, camera, stride, 0.02), description)
+
+    def draw(seed: int) -> Case:
+        return case(3, 0.8, "three drawn views", seed)
+
+    cases = [
+        case(4, 0.7, "a region whose depth is 30 % too small"),
+        case(4, 1.01, "a region whose depth is 1 % too large"),
+        case(4, 0.0, "a region without depth"),
+        case(1, 0.7, "a single other view"),
+    ]
+    hints: Hints = [
+        (anywhere, "Where fewer than two views have a depth for the cell, M stays 1."),
+        (opposite, "M is 1 where the prior counts, 0 where the views contradict it."),
+        (backwards, "T_this_other takes points of the other view to this one, not back."),
+        (one_is_enough, "Two views must agree, not one."),
+        (absolute, "The difference is relative to the depth that arrives from the other view."),
+    ]
+    return check_function(student, reference, cases, 1e-9, hints, draw)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from data_synth.lessons import KnownViews, flow_of_cells, known_views, of_cells
+from data_synth import generate
+from data_synth.lessons import KnownViews, flow_of_cells, known_clip, known_views, of_cells
 from data_synth.poses import default_intrinsics
 
 STRIDE = 4
@@ -20,6 +21,14 @@ def test_the_first_camera_is_the_world(views: KnownViews):
     assert np.abs(views.T_world_camera[1] - np.eye(4)).max() > 1e-3
     assert views.rgb.shape == (3, 48, 64, 3)
     assert 0 < views.masks.mean() < 0.8
+
+
+def test_a_clip_has_the_frames_of_the_generated_sequence():
+    clip, sequence = known_clip("table2", [0, 2], (32, 24)), generate("table2", 0, 3, (32, 24))
+    assert np.array_equal(clip.rgb, sequence.rgb[::2])
+    assert np.array_equal(clip.depth, sequence.depth[::2])
+    first, _, third = sequence.T_world_camera
+    assert np.allclose(first @ clip.T_world_camera[1], third)
 
 
 def test_cells_are_every_so_manieth_pixel_row_by_row(views: KnownViews):
