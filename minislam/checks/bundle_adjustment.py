@@ -145,10 +145,14 @@ def check_bundle_adjustment(
     source, target = (1 - torch.eye(3)).nonzero().T
 
     def loop(
-        sign: float = 1.0, left: bool = True, most: int = 99, damped: bool = True, **changed: Tensor
+        sign: float = 1.0,
+        left: bool = True,
+        most: int = 99,
+        damped: bool = True,
+        changed: dict[str, Tensor] | None = None,
     ) -> Function:
         def run(problem: BundleProblem, state: BundleState, steps: int, damping: float) -> Any:
-            problem = replace(problem, **changed)  # type: ignore[arg-type]
+            problem = replace(problem, **(changed or {}))  # type: ignore[arg-type]
             for _ in range(min(steps, most)):
                 equations = dense_normal_equations(problem, state)
                 diagonal = (damping if damped else 1e-9) * torch.ones(len(equations.vector))
@@ -192,8 +196,14 @@ def check_bundle_adjustment(
         case(3, 2, some, "three steps"),
     ]
     hints: Hints = [
-        (loop(weights=ones), "Each residual counts with its weight: J^T W J and J^T W r."),
-        (loop(free_poses=torch.ones(3).bool()), "A pose that is not free must not move."),
+        (
+            loop(changed={"weights": ones}),
+            "Each residual counts with its weight: J^T W J and J^T W r.",
+        ),
+        (
+            loop(changed={"free_poses": ones[0, 0, :3] > 0}),
+            "A pose that is not free must not move.",
+        ),
         (loop(sign=-1), "The step points uphill: with r = p~ - p it is added."),
         (loop(left=False), "The step stands on the left: exp(xi) T_camera_world."),
         (loop(damped=False), "Add the damping to the diagonals of H and of C."),

@@ -226,7 +226,7 @@ def check_motion_memory(
         weight = motion_memory.update_motion_weight(grid, matches, *rest)
         return motion_memory.inherit_motion_weight(grid, matches, weight)
 
-    def changed(**constants: float) -> Function:
+    def changed(constants: dict[str, float]) -> Function:
         def run(*arguments: Any) -> Tensor:
             known = {name: getattr(motion_memory, name) for name in constants}
             try:
@@ -267,10 +267,10 @@ def check_motion_memory(
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
     ]
     hints: Hints = [
-        (changed(LOSS_RATE=0.1, RECOVERY_RATE=0.9), "It falls fast and recovers slowly."),
-        (changed(RECOVERY_RATE=0.9), "The rate is 0.9 only where the weight falls."),
-        (changed(DEPTH_ERROR=0.0), "c_m^2 also holds a hundredth of the squared parallax."),
-        (changed(MIN_CONFIDENCE=-1.0), "Cells with a confidence of at most 0.1 say nothing."),
+        (changed({"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9}), "It falls fast and recovers slowly."),
+        (changed({"RECOVERY_RATE": 0.9}), "The rate is 0.9 only where the weight falls."),
+        (changed({"DEPTH_ERROR": 0.0}), "c_m^2 also holds a hundredth of the squared parallax."),
+        (changed({"MIN_CONFIDENCE": -1.0}), "Cells with a confidence of at most 0.1 say nothing."),
         (stays, "These are the weights of the source cells: hand them on along the flow."),
         (zeros_left, "A cell to which nothing flows takes the weight of the nearest one."),
     ]
