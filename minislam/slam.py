@@ -21,7 +21,7 @@ from minislam.errors import InputError, MinislamError, TrackingLost
 from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
-from minislam.priors.high_resolution import HighResolutionFeatures
+from minislam.priors.high_resolution import with_finer_grid
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
@@ -72,9 +72,7 @@ class Slam(Stateful):
         self.sequence, self.device, self.workers = sequence, device, workers or Workers()
         self.config = config
         self.steps = Steps(observer or SilentObserver(), save_checkpoint)
-        self._features = priors.features
-        if config.uncertainty.grid_factor > 1:
-            self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
+        self._features = with_finer_grid(priors.features, config.uncertainty.grid_factor)
         parts = priors.flow, self._features, priors.depth, self._static_weight
         self.tracker = Tracker(sequence.camera, config.tracking, *parts, device)
         self.tracker.graph.seeks_focal = sequence.refines_focal

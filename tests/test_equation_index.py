@@ -21,7 +21,7 @@ DOCUMENTS += [ROOT / "tests/benchmarks/RESULTS.md", PACKAGE / "priors/networks/R
 MOST_WORDS = 1300  # of README, outside tables
 MOST_LINES = 150  # of README, besides tables
 PAPER_BUDGET = 5_600  # lines of the paper's rooms, without their settings
-PACKAGE_BUDGET = 19_400  # lines of minislam/
+PACKAGE_BUDGET = 22_100  # lines of minislam/
 PAPER_ROOMS = ("splatting", "uncertainty", "tracking", "mapping", "slam.py")
 BESIDE_THE_PAPER = ("tracking/safeguards/", "/config.py")
 
@@ -104,7 +104,7 @@ def test_indexed_tests_and_notebooks_exist(row: list[str]):
     tests = re.findall(r"`([\w/]+\.py)`", row[3])
     assert tests and all((ROOT / "tests" / test).exists() for test in tests), tests
     numbers = row[4].split(", ")
-    assert set(numbers) <= {path.stem[:2] for path in NOTEBOOKS}, numbers
+    assert set(numbers) <= {path.stem.split("_")[0] for path in NOTEBOOKS}, numbers
 
 
 @pytest.mark.parametrize("path", MODULES, ids=in_package)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from minislam.checks.grading import Case, Hints, Verdict, check_function, normals
 from minislam.geometry import Camera
-from minislam.uncertainty.weights import MAPPING_CUT, adjusted_beta, mapping_weight
+from minislam.uncertainty.weights import MAPPING_CAP, MAPPING_CUT, adjusted_beta, mapping_weight
 
 
 def check_mapping_weight(student: Callable[[Tensor], Tensor]) -> Verdict:
@@ -17,14 +17,14 @@ def check_mapping_weight(student: Callable[[Tensor], Tensor]) -> Verdict:
     def reference(beta: Tensor) -> Tensor:
         return mapping_weight(beta, camera)
 
-    def uncut(beta: Tensor) -> Tensor:
+    def uncapped(beta: Tensor) -> Tensor:
         return 0.5 / adjusted_beta(beta, camera) ** 2
 
-    def cut(weight: Tensor) -> Tensor:
-        return torch.where(weight < MAPPING_CUT, 0.0, weight)
+    def uncut(beta: Tensor) -> Tensor:
+        return uncapped(beta).clamp_max(MAPPING_CAP)
 
-    def without_floor(beta: Tensor) -> Tensor:
-        return cut(0.5 / (1.6315789 * (beta - 0.099) + 0.1) ** 2)
+    def cut(weight: Tensor) -> Tensor:
+        return torch.where(weight < MAPPING_CUT, 0.0, weight.clamp_max(MAPPING_CAP))
 
     def draw(seed: int) -> Case:
         return Case((1.2 * normals(seed, 2, 3).abs(),), "any beta")
@@ -36,10 +36,14 @@ def check_mapping_weight(student: Callable[[Tensor], Tensor]) -> Verdict:
     ]
     hints: Hints = [
         (uncut, "Weights below 0.1 must be 0: over many iterations a little is too much."),
+        (
+            lambda beta: torch.where(uncut(beta) < MAPPING_CUT, 0.0, uncapped(beta)),
+            "No weight is above 5, that of a beta of about a quarter.",
+        ),
         (lambda beta: uncut(beta).clamp_min(0.1), "Weights below 0.1 become 0, not 0.1."),
         (lambda beta: cut(0.5 / beta**2), "This is 0.5 / beta^2: beta is adjusted first."),
         (lambda beta: cut(0.5 / beta.clamp_min(0.1) ** 2), "beta is cut, but not adjusted yet."),
-        (lambda beta: cut((0.5 * uncut(beta)).sqrt()), "The adjusted beta must be squared."),
-        (without_floor, "Where beta is below 0.1, 0.1 takes its place: max(beta, 0.1)."),
+        (lambda beta: cut(2 * uncapped(beta)), "It is a half by beta_adj^2: 0.5 is missing."),
+        (lambda beta: cut((0.5 * uncapped(beta)).sqrt()), "The adjusted beta must be squared."),
     ]
     return check_function(student, reference, cases, 1e-5, hints, draw)

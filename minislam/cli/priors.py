@@ -82,7 +82,7 @@ def _kinds(
     from minislam.config import as_json
     from minislam.priors.choice import choose_depth, choose_features
     from minislam.priors.files import DEPTH, FEATURES
-    from minislam.priors.high_resolution import HighResolutionFeatures
+    from minislam.priors.high_resolution import with_finer_grid
 
     # Everything the result depends on, so that files of another command are not taken for these.
     tree = as_json(config)
@@ -93,8 +93,7 @@ def _kinds(
         features = choose_features(choice, sequence.camera, config.features, config.networks)
         factor = config.uncertainty.grid_factor
         origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
-        fine = features if factor == 1 else HighResolutionFeatures(features, factor)
-        kinds[FEATURES] = (origin, fine)
+        kinds[FEATURES] = (origin, with_finer_grid(features, factor))
     if choice.depth != "none":
         depth = choose_depth(choice, sequence, config.seed, config.simulated_depth, config.networks)
         origin = f"{choice.depth} {choice.depth_weights}; {conditions}"

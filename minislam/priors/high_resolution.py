@@ -15,6 +15,11 @@ from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Frame
 
 
+def with_finer_grid(extractor: FeatureExtractor, factor: int) -> FeatureExtractor:
+    """Return the extractor, on a grid that is `factor` times as fine."""
+    return HighResolutionFeatures(extractor, factor) if factor > 1 else extractor
+
+
 class HighResolutionFeatures:
     """A feature extractor whose grid is `factor` times as fine as that of the extractor inside.
 

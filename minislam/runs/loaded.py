@@ -15,7 +15,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera, se3_inverse
 from minislam.images import resample
 from minislam.priors.choice import PriorChoice, choose_features
-from minislam.priors.high_resolution import HighResolutionFeatures
+from minislam.priors.high_resolution import with_finer_grid
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
 from minislam.runs.facts import surface_depth, unit_of
@@ -179,9 +179,9 @@ class Run:
     def _features(self) -> FeatureExtractor:
         on_cpu = {"device": "cpu", "precision": "fp32"}
         choice = PriorChoice(**self.folder.read_config()["priors"] | on_cpu)
-        config, factor = self.config, self.config.uncertainty.grid_factor
+        config = self.config
         features = choose_features(choice, self.sequence.camera, config.features, config.networks)
-        return HighResolutionFeatures(features, factor) if factor > 1 else features
+        return with_finer_grid(features, config.uncertainty.grid_factor)
 
     @cached_property
     def _mlp(self) -> UncertaintyMLP:

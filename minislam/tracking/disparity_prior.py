@@ -1,9 +1,8 @@
 """The mask M of the disparity prior: where other views contradict the depth of a single image.
 
 A depth network is wrong in places, and there the prior of Eq. (5) would distort poses and
-disparities. So every connected keyframe j is warped into keyframe i by its own depth. Where
-several views have a correspondence but too few of them agree with D~_i, the prior of i is
-switched off.
+disparities. So every connected keyframe j is warped into keyframe i by its own depth. Where several
+views have a correspondence but too few of them agree with D~_i, the prior of i is switched off.
 """
 
 from dataclasses import dataclass

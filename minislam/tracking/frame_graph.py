@@ -102,9 +102,8 @@ def proximity_pairs(
 ) -> list[tuple[int, int]]:
     """Pick pairs (newer, older) by increasing flow distance, with non-maximum suppression.
 
-    Around every existing or chosen pair (i, j), the pairs (i + a, j + b) with
-    |a| + |b| <= min(|i - j| - 2, suppression) are skipped, because they would measure nearly the
-    same again.
+    Around every existing or chosen pair (i, j), the pairs (i + a, j + b) with |a| + |b| <=
+    min(|i - j| - 2, suppression) are skipped, because they would measure nearly the same again.
     """
     free = torch.ones_like(distances, dtype=torch.bool)
     for i, j in existing:

@@ -19,9 +19,7 @@ class KeyframeStore(Stateful):
     prior_masks: Tensor  # (K, N) M; False: prior off
     static_weights: Tensor  # (K, N) in [0, 1], from beta
     motion_weights: Tensor  # (K, N) in [0, 1], how well a cell's flow has fitted the camera motion
-    overlay: Tensor | None = (
-        None  # (N,) 0 on what covers every image, such as a logo; None: no cell
-    )
+    overlay: Tensor | None = None  # (N,) 0 on what covers every image, such as a logo
 
     def __init__(self, like: Tensor) -> None:
         """Start empty, for as many cells as a tensor (N,) has, and on its device."""

@@ -25,10 +25,9 @@ MIN_DEPTH_RATIO = 0.25
 class Linearisation:
     """Reprojections of E edges with N cells each, with derivatives.
 
-    The derivative by the source pose follows from J_target: because
-    T_target_source = T_t T_s^-1, a step xi_s of the source acts like the step
-    -Ad(T_target_source) xi_s of the target. So J_source = -J_target Ad(T_target_source), with one
-    6x6 matrix for all cells of an edge.
+    The derivative by the source pose follows from J_target: because T_target_source = T_t T_s^-1,
+    a step xi_s of the source acts like the step -Ad(T_target_source) xi_s of the target. So
+    J_source = -J_target Ad(T_target_source), with one 6x6 matrix for all cells of an edge.
     """
 
     positions: Tensor  # (E, 2, N) px
@@ -101,9 +100,8 @@ def reproject_with_jacobians(
 ) -> Linearisation:
     """Return the reprojection with its derivatives (notebook 05 derives them).
 
-    A step of the target's pose moves the point in the target frame, whose ray is X / X_z and
-    whose inverse depth is d / X_z: J_target is `Camera.twist_jacobian` there. A larger d moves X
-    along t.
+    A step of the target's pose moves the point in the target frame, whose ray is X / X_z and whose
+    inverse depth is d / X_z: J_target is `Camera.twist_jacobian` there. A larger d moves X along t.
     """
     x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
     valid = z >= MIN_DEPTH_RATIO

@@ -8,7 +8,7 @@ from torch import Tensor
 from minislam.geometry import se3_interpolate
 from minislam.records import Sequence, TrackedFrame, TrackingStatus
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.safeguards.pose_support import PoseFit, repeats, retry_doubtful
+from minislam.tracking.safeguards.pose_support import PoseFit, ShownImages, retry_doubtful
 from minislam.tracking.tracker import Tracker
 
 
@@ -20,20 +20,17 @@ def pose_all_frames(
     A keyframe keeps its pose. Another frame starts from the interpolated pose and is adjusted on
     the flow from the keyframes around it, whose disparities are held. A pose that little of the
     flow supports starts again from its neighbours; a frame that stays without support is lost.
-    An image that repeats the one before it, as of a recorder that froze, has the pose of that one.
     """
     graph, frames = tracker.graph, tracker.keyframes.frames
     poses = tracker.keyframes.T_camera_world
     fits = {f.frame_index: PoseFit(T, 1.0) for f, T in zip(frames, poses, strict=True)}
     followed = [t for t in tracker.tracked if t.status.is_followed]
     others = {t.frame_index: t for t in followed if t.frame_index not in fits}
-
-    shown = {frame.frame_index: frame.image for frame in frames}
+    shown = ShownImages({frame.frame_index: frame.image for frame in frames})
 
     def fit_from(index: int, start: Tensor) -> PoseFit:
-        image = shown[index] = sequence.frame(index).image.to(poses.device)
-        shown.pop(index - 2, None)
-        if index - 1 in fits and repeats(image, shown.get(index - 1)):
+        image = sequence.frame(index).image.to(poses.device)
+        if shown.repeats(index, image) and index - 1 in fits:
             return fits[index - 1]
         return PoseFit(*graph.fit_pose(image, _around(graph, others[index]), start))
 

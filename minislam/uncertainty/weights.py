@@ -4,7 +4,7 @@ The paper weights residuals by 1 / beta^2 in Eq. (5) and Eq. (6). The official c
 follow here, first stretches beta, then caps the weight in tracking and cuts it in mapping:
 
     beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
-    tracking: w capped at 1,        mapping: w below 0.1 set to 0.
+    tracking: w capped at 1,        mapping: w below 0.1 set to 0, and (ours) capped at 5.
 
 So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41.
 """
@@ -24,6 +24,7 @@ TRACKING_CAP = 1.0  # beta may lower the weight that the flow confidence gives, 
 BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: the largest that L_uncer gives
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
+MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
 
 
 def schlick_bias(position: float, slope: float) -> float:
@@ -54,9 +55,9 @@ def adjusted_beta(beta_raw: Tensor, camera: Camera) -> Tensor:
 def mapping_weight(
     beta_raw: Tensor,  # (h', w') output of the MLP
     camera: Camera,
-) -> Tensor:  # (H, W) 0 or >= 0.1, at most 48.4
-    """Return the weight of each pixel in L_render, Eq. (6): 0.5 / beta_adj^2, cut at 0.1."""
-    weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2
+) -> Tensor:  # (H, W) 0, or from 0.1 to 5
+    """Return the weight of each pixel in L_render, Eq. (6): 0.5 / beta_adj^2, cut and capped."""
+    weight = (WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2).clamp_max(MAPPING_CAP)
     return torch.where(weight < MAPPING_CUT, torch.zeros_like(weight), weight)
 
 

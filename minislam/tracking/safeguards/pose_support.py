@@ -53,9 +53,19 @@ def retry_doubtful(
     return lost
 
 
-def repeats(image: Tensor, before: Tensor | None) -> bool:
-    """Tell whether an image (H, W, 3) repeats the one before it. Sensor noise differs by more."""
-    return before is not None and float((image - before).abs().mean()) < REPEATED
+class ShownImages:
+    """Finds images that repeat the one before, as of a recorder that froze."""
+
+    def __init__(self, images: dict[int, Tensor]) -> None:
+        """Start with the images (H, W, 3) of some frames, by frame index."""
+        self._images = images
+
+    def repeats(self, index: int, image: Tensor) -> bool:
+        """Tell whether an image repeats the one before it. Sensor noise differs by more."""
+        self._images[index] = image
+        self._images.pop(index - 2, None)
+        before = self._images.get(index - 1)
+        return before is not None and float((image - before).abs().mean()) < REPEATED
 
 
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
