@@ -15,16 +15,13 @@ NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 
 
 class NotebooksBeside:
-    """The plugin of a whole run: starts the second process, leaves its files out, reports it."""
+    """The plugin of a whole run: leaves the notebooks to a second process, reports it."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: pytest.Config) -> None:
+        config.args = [folder for folder in config.args if Path(folder).name != NOTEBOOKS.name]
         self._output = tempfile.TemporaryFile(mode="w+", encoding="utf-8")
         command = [sys.executable, "-m", "pytest", str(NOTEBOOKS), "-q"]
         self._process = subprocess.Popen(command, stdout=self._output, stderr=subprocess.STDOUT)
-
-    def pytest_ignore_collect(self, collection_path: Path) -> bool | None:
-        """Leave the notebooks to the other process."""
-        return True if collection_path == NOTEBOOKS else None
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> None:

@@ -37,7 +37,7 @@ def pytest_configure(config) -> None:
     from tests.beside import NotebooksBeside, is_whole
 
     if is_whole(config):
-        config.pluginmanager.register(NotebooksBeside())
+        config.pluginmanager.register(NotebooksBeside(config))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
