@@ -45,6 +45,6 @@ def view_gradients(
     *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.radii, camera)
-    losses = [float(part.detach()) for part in (loss.total, loss.color, loss.depth, loss.isotropic)]
+    parts = torch.stack([loss.total, loss.color, loss.depth, loss.isotropic])  # one transfer
     error = keyframe_rendering_error(view, rendering, comparison) if comparison else None
-    return ViewGradients(by_parameter, screen, losses, error)
+    return ViewGradients(by_parameter, screen, parts.tolist(), error)
