@@ -120,7 +120,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("tracking/frame_graph.py", "tracking/test_frame_graph.py"): [
         ("ratio >= KEPT_FRACTION *", "ratio >= 0 *"),
-        ("(1 - rotation_weight)", "rotation_weight"),
+        ("(without_rotation, 1 - rotation_weight)", "(without_rotation, rotation_weight)"),
         ("min(abs(i - j) - 2, suppression)", "suppression"),
     ],
     ("stereo/aggregation.py", "stereo/test_aggregation.py"): [
@@ -140,14 +140,14 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("evaluation/trajectory.py", "evaluation/test_trajectory.py"): [
         ("<= max_difference", "<= 2 * max_difference"),
     ],
-    ("data/sources.py", "data"): [
+    ("data/sources.py", "data/test_sources.py"): [
         ("self.promised > len(self) > 1", "len(self) > 1"),
     ],
-    ("data/checkpoint.py", "test_architecture.py"): [
+    ("data/checkpoint.py", "data/test_checkpoint.py"): [
         ("allow_pickle=False", "allow_pickle=True"),
     ],
     ("data/run_folder.py", "data/test_run_folder.py"): [
-        ("os.O_EXCL", "0"),
+        ("fcntl.LOCK_EX |", "fcntl.LOCK_SH |"),
     ],
     ("runs/run.py", "runs/test_run_ending.py"): [
         ("if slam.lost_frames() or slam.sequence.lost:", "if False:"),

@@ -123,13 +123,24 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path):
         read_checkpoint(path)
 
 
+class RunsCode:
+    """What a pickle of it does when it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
 def test_a_file_of_another_program_and_one_that_would_run_code_are_refused(tmp_path: Path):
     path = tmp_path / "checkpoint.npz"
     np.savez(path, values=np.zeros(3))
     with pytest.raises(InputError, match="from another program"):
         read_checkpoint(path)
-    np.savez(path, **{"tree.json": np.array([object()])})  # needs pickle
+    np.savez(path, **{"tree.json": np.array([RunsCode(tmp_path / "done")])})  # a pickle
     with pytest.raises(InputError, match="from another program"):
         read_checkpoint(path)
+    assert not (tmp_path / "done").exists()
     with pytest.raises(InputError, match="a readable file"):
         read_checkpoint(tmp_path / "none.npz")

@@ -77,6 +77,7 @@ def test_the_nearest_timestamps_are_paired():
     np.testing.assert_array_equal(pairs, [[0, 1], [0, 2]])
     # The shorter list leads, whichever comes first.
     np.testing.assert_array_equal(associate(second, first, 0.1), [[0, 2], [0, 1]])
+    assert len(associate(np.array([1.0]), np.array([1.15]), 0.1)[0]) == 0
 
 
 def test_a_tie_goes_to_the_earlier_one():

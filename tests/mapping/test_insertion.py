@@ -91,6 +91,8 @@ def test_a_gaussian_on_a_mover_of_its_own_keyframe_is_found():
     means = transform_points(se3_inverse(pose), points).float()
     found = is_on_dynamic_object(means, CAMERA, pose, weight)
     assert found.tolist() == [True, False, True, False]
+    found = is_on_dynamic_object(means, CAMERA, pose, torch.zeros_like(weight))
+    assert found.tolist() == [True, True, True, False]  # behind the camera nothing is seen
 
 
 # Degenerate input

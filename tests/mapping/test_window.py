@@ -42,10 +42,16 @@ def test_a_full_window_drops_a_keyframe_that_is_far_and_close_to_another():
 
 
 @pytest.mark.parametrize(
-    ("count", "inside", "outside"), [(30, 0.05, 0.025), (13, 1 / 13, 1 / 13), (20, 0.05, 0.05)]
+    ("count", "share", "inside", "outside"),
+    [
+        (30, 0.5, 0.05, 0.025),
+        (30, 0.7, 0.07, 0.015),
+        (13, 0.5, 1 / 13, 1 / 13),
+        (20, 0.5, 0.05, 0.05),
+    ],
 )
-def test_sampling_of_a_window_of_ten(count, inside, outside):
-    probabilities = sampling_probabilities(count, list(range(10)), 0.5)
+def test_sampling_of_a_window_of_ten(count, share, inside, outside):
+    probabilities = sampling_probabilities(count, list(range(10)), share)
     assert float(probabilities.sum()) == pytest.approx(1)
     assert float(probabilities[0]) == pytest.approx(inside)
     assert float(probabilities[-1]) == pytest.approx(outside)

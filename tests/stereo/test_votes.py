@@ -58,6 +58,13 @@ def test_a_view_in_front_of_a_point_does_not_refute_it():
     assert not refutes.any() and not agrees[10:20, 10:20].any()
 
 
+def test_a_view_that_looks_a_little_too_far_neither_agrees_nor_refutes():
+    near = view(inverse_depth=0.05)  # planes are 0.01 apart
+    agrees, refutes = vote(CAMERA, near, view(0.1, inverse_depth=0.035))
+    assert not agrees.any() and not refutes.any()
+    assert vote(CAMERA, near, view(0.1, inverse_depth=0.025))[1][:, 2:-2].all()
+
+
 def test_a_badly_matched_view_cannot_refute():
     assert not vote(CAMERA, with_square(view(), 0.8), view(0.1, cost=0.9))[1].any()
 

@@ -61,6 +61,21 @@ def test_a_step_that_raises_the_cost_is_tried_again_with_more_damping(monkeypatc
     assert distance(end, start) > 0
 
 
+def test_damping_falls_by_ten_after_each_good_step_and_no_lower_than_given(monkeypatch):
+    known = known_problem()
+    start, solve, dampings = perturbed(known, 0.02), bundle_adjustment._damped_step, []
+
+    def bad_at_first(problem, state, equations, damping, absolute_damping):
+        dampings.append(damping)
+        step = solve(problem, state, equations, damping, absolute_damping)
+        return step if len(dampings) > 3 else scaled_disparities(state, 3.0)
+
+    monkeypatch.setattr(bundle_adjustment, "_damped_step", bad_at_first)
+    _, report = bundle_adjust(known.problem, start, iterations=4, damping=1e-3)
+    assert dampings == pytest.approx([1e-3, 1e-2, 1e-1, 1.0, 1e-1, 1e-2, 1e-3])
+    assert report.iterations == 4 and report.damping == pytest.approx(1e-3)
+
+
 @pytest.mark.parametrize("factor", [3.0, 1.001, 1.00001])
 def test_steps_that_only_raise_the_cost_leave_the_state_as_it_was(factor: float, monkeypatch):
     known = known_problem()
