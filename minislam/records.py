@@ -1,6 +1,6 @@
 """The data that one stage gives to another (frozen), and the protocols of the input."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -10,6 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from minislam.geometry import Camera
+
+Progress = Callable[[int, int], None]  # called with the steps done and their number
 
 
 @dataclass(frozen=True)

@@ -161,13 +161,13 @@ class Slam(Stateful):
 
     def _adjust_again(self) -> None:
         """Adjust all keyframes again, on what several views confirm to stand still."""
-        adjust_again(self.tracker, self.sequence, self.steps.on_progress)
+        adjust_again(self.tracker, self.sequence, self.steps.on_progress, self.workers)
         self._move_map()
 
     def _rebuild_map(self) -> None:
         """Build map and MLP anew on dense depth. Known depths of a prior with holes stay."""
-        on_progress = self.steps.on_progress("dense depth")
-        swept = sweep_keyframes(self.tracker.graph, self.sequence, self._poses, on_progress)
+        graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
+        swept = sweep_keyframes(graph, self.sequence, self._poses, progress, self.workers)
         self.mapper = self._new_mapper()
         keyframes = fill_depth(self._keyframes(), swept)
         self.mapper.initialise(keyframes, self.steps.on_progress("first map"))

@@ -25,6 +25,7 @@ from functools import cache
 from threading import Thread
 from typing import Any, get_type_hints
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -192,7 +193,9 @@ def _of_tree(kind: Any, tree: Tree) -> Any:
 
 
 def _each_tensor(tree: Tree, change: Callable[[Tensor], Any]) -> Tree:
-    """Return a tree whose tensors are changed."""
+    """Return a tree whose tensors are changed, arrays as well."""
+    if isinstance(tree, np.ndarray):
+        return change(torch.from_numpy(tree))
     if isinstance(tree, Tensor):
         return change(tree)
     if isinstance(tree, dict):

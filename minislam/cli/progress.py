@@ -59,7 +59,8 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
     late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
     online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
     posing = {"posing all frames": 0.12 * per_frame}
-    again = {**posing, "coarse depth": 0.05 * per_frame, "second adjustment": 0.1 * per_frame}
+    coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}
+    again = {**coarse, "second adjustment": 0.06 * per_frame}
     stages = [
         {"tracking and mapping": 0.25 * per_frame + online} | (first_map if has_prior else {}),
         {"final adjustment": 0.05 * per_frame},

@@ -12,11 +12,11 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
-from minislam.mapping.optimisation import JointOptimisation, Progress
+from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import MappedKeyframe, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
-from minislam.records import Keyframe
+from minislam.records import Keyframe, Progress
 
 RECHECKED = 10  # keyframes beside the window whose Gaussians are looked at with every new one
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this

@@ -1,7 +1,6 @@
 """Optimise the map on L_render and the uncertainty MLP on L_uncer, in turn."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from minislam.mapping.density import densify, useful_rows
 from minislam.mapping.losses import metre
 from minislam.mapping.view_gradients import ViewGradients, view_gradients
 from minislam.mapping.views import Comparison, MappedKeyframe
-from minislam.records import MappingHistory
+from minislam.records import MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.stateful import Stateful
 from minislam.uncertainty import (
@@ -26,8 +25,6 @@ from minislam.uncertainty import (
 from minislam.workers import Workers
 
 CONFIRMED_BETA = 0.4  # fraction of beta that is taken away where other views confirm [-]
-
-Progress = Callable[[int, int], None]  # called with the iterations done and their number
 
 
 class JointOptimisation(Stateful):
@@ -141,33 +138,35 @@ class JointOptimisation(Stateful):
         trains = self.uncertainty.is_learnt and self._iteration >= self._frozen_until
         calls = [self._call(self.keyframes[position], camera, trains) for position in positions]
         shares: list[ViewGradients] = self._workers.map(view_gradients, calls)
-        count = len(positions)
         for name, values in self._optimizer.gaussians.parameters.items():
             values.grad = torch.stack([share.by_parameter[name] for share in shares]).mean(0)
         self._gradients += torch.stack([share.screen for share in shares]).sum(0)
-        factor = rate_factor * math.sqrt(count)
+        factor = rate_factor * math.sqrt(len(shares))
         self._optimizer.rates = self.config.rates_at(self._iteration, self.median_depth, factor)
         self._optimizer.step()
-        for position, share in zip(positions, shares, strict=True):
-            loss = math.nan if share.error is None else self._train_mlp(position, share.error)
+        loss = self._train_mlp(positions, shares) if trains else math.nan
+        for share in shares:
             self.history.add(share.losses, loss, len(self._optimizer.gaussians))
-        self._iteration += count
+        self._iteration += len(shares)
 
     def _call(self, keyframe: MappedKeyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
         """Return the arguments of `view_gradients`."""
         (rows, columns, _), unit = keyframe.features.shape, metre(self.median_depth)
-        grid = self._online_camera, (rows, columns), keyframe.confirmation, unit, self.uncertainty
+        small = keyframe.view(self._online_camera)
+        grid = small, (rows, columns), keyframe.confirmation, unit, self.uncertainty
         pose, weight = keyframe.T_camera_world, self.static_weight(self.beta_of(keyframe), camera)
         view = camera, pose.float(), self.background, keyframe.view(camera), weight
         comparison = Comparison(*grid) if trains else None
         return self.gaussians, *view, self.median_depth, self.config, comparison
 
-    def _train_mlp(self, position: int, error: RenderingError) -> float:
-        """Take one step of the MLP on the rendering error of a keyframe; return L_uncer."""
-        reach = self.uncertainty.neighbour_keyframes
-        nearby = self.keyframes[max(0, position - reach) : position + reach + 1]
-        cells = torch.cat([k.features.flatten(0, 1) for k in nearby])
-        return self._trainer.step(self.keyframes[position].features, error, cells)
+    def _train_mlp(self, positions: list[int], shares: list[ViewGradients]) -> float:
+        """Take one step of the MLP on the rendering errors of some keyframes; return L_uncer."""
+        reach, known = self.uncertainty.neighbour_keyframes, range(len(self.keyframes))
+        nearby = {k for at in positions for k in known[max(0, at - reach) : at + reach + 1]}
+        cells = torch.cat([self.keyframes[k].features.flatten(0, 1) for k in sorted(nearby)])
+        features = torch.stack([self.keyframes[position].features for position in positions])
+        parts = zip(*(vars(share.error).values() for share in shares), strict=True)
+        return self._trainer.step(features, RenderingError(*map(torch.stack, parts)), cells)
 
     def _reset_gradients(self) -> None:
         self._gradients = self.gaussians.means.new_zeros(2, len(self.gaussians))

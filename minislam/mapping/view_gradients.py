@@ -46,5 +46,5 @@ def view_gradients(
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.radii, camera)
     parts = torch.stack([loss.total, loss.color, loss.depth, loss.isotropic])  # one transfer
-    error = keyframe_rendering_error(view, rendering, comparison) if comparison else None
+    error = keyframe_rendering_error(rendering, comparison) if comparison else None
     return ViewGradients(by_parameter, screen, parts.tolist(), error)

@@ -87,11 +87,11 @@ def median_depth(keyframes: list[Keyframe]) -> float:  # world units
 class Comparison:
     """How the MLP compares a keyframe with its rendering.
 
-    All of a run use one camera, because the windows of the SSIM are in pixels: at another image
+    All of a run use one size, because the windows of the SSIM are in pixels: at another image
     size the same rendering has another error, and beta learns another value.
     """
 
-    camera: Camera  # of the size at which they are compared
+    reference: View  # the keyframe at the size at which they are compared
     grid_shape: tuple[int, int]  # (h', w') cells
     confirmation: Tensor | None  # (h', w') of the keyframe
     depth_unit: float  # world units that count as 1 in L_depth
@@ -99,16 +99,14 @@ class Comparison:
 
 
 @torch.no_grad()
-def keyframe_rendering_error(view: View, rendering: Rendering, how: Comparison) -> RenderingError:
-    """Compare a keyframe with its rendering of the same size."""
-    size = (how.camera.height, how.camera.width)
+def keyframe_rendering_error(rendering: Rendering, how: Comparison) -> RenderingError:
+    """Compare a keyframe with its rendering of the same size or a larger one."""
+    size = how.reference.depth.shape
     depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
     depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
-    image, color = shrink_image(view.image, *size), shrink_image(rendering.color, *size)
-    reference = shrink_depth(view.depth, *size)
-    rendered = color, depth, opacity
+    color, reference = shrink_image(rendering.color, *size), how.reference
     grid = how.grid_shape, how.depth_unit, how.config
-    error = rendering_error(image, reference, *rendered, *grid)
+    error = rendering_error(reference.image, reference.depth, color, depth, opacity, *grid)
     if how.confirmation is not None:
         doubt = (1 - CONFIRMED_ERROR * how.confirmation).clamp_min(0)
         error = replace(error, ssim=doubt * error.ssim, depth=doubt * error.depth)

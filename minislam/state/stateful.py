@@ -13,15 +13,18 @@ cameras, callbacks, caches.
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from functools import cache
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
+import numpy as np
 import torch
 
 from minislam.records import Frame
 
 # Dictionaries (keys are text) and lists of tensors, arrays, numbers, text and None.
 Tree = Any
+_hints = cache(get_type_hints)
 FrameOf = Callable[[int], Frame]  # reads a frame again, by its frame_index
 
 
@@ -84,9 +87,11 @@ def from_tree(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
         return {of_key(key): from_tree(of_value, item, frame_of) for key, item in tree.items()}
     if kind is Frame:
         return frame_of(tree)
+    if kind is np.ndarray:
+        return np.asarray(tree)  # a pipe to another process carries tensors
     if hasattr(kind, "from_state"):
         return kind.from_state(tree, frame_of)
     if isinstance(kind, type) and is_dataclass(kind):
-        hints = get_type_hints(kind)
+        hints = _hints(kind)
         return kind(**{name: from_tree(hints[name], tree[name], frame_of) for name in hints})
     return kind(tree) if issubclass(kind, Enum) else tree

@@ -1,6 +1,5 @@
 """Dense depth from all posed frames: which views to sweep, and from which others."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -12,10 +11,11 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.images import resample
-from minislam.records import Keyframe, Sequence
+from minislam.records import Keyframe, Progress, Sequence
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
+from minislam.workers import Workers
 
 DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
 WIDTH = 160  # px of the images that are swept for the map
@@ -23,6 +23,7 @@ VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
 BETWEEN = 2  # frames between two keyframes that are swept as well, to vote
+AT_ONCE = 8  # frames whose sweeps are given to the workers together
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
 LARGEST_QUANTILE = 0.98
@@ -51,28 +52,31 @@ def dense_depths(
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
     keyframes: list[int],  # K frame indices, increasing
     disparities: list[np.ndarray],  # K x (n,) known inverse depths of the scene [1/world unit]
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+    workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
 ) -> list[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe.
 
     The known inverse depths of a keyframe and its neighbours say how near the nearest plane is.
     """
-    sweeper = Sweeper(sequence, camera, poses, width)
+    planner, workers = SweepPlanner(sequence, camera, poses, width), workers or Workers()
     frames = swept_frames(keyframes, list(poses))
     swept: list[SweptView] = []
-    for done, frame in enumerate(frames):
-        nearest = int(np.argmin([abs(frame - keyframe) for keyframe in keyframes]))
-        swept.append(
-            sweeper.sweep(frame, np.concatenate(disparities[max(0, nearest - 1) : nearest + 2]))
-        )
+    for first in range(0, len(frames), AT_ONCE):
+        sweeps = []
+        for frame in frames[first : first + AT_ONCE]:
+            nearest = int(np.argmin([abs(frame - keyframe) for keyframe in keyframes]))
+            known = np.concatenate(disparities[max(0, nearest - 1) : nearest + 2])
+            sweeps.append(planner.plan(frame, known))
+        swept += workers.map(swept_view, sweeps)
         if progress:
-            progress(done + 1, len(frames))
+            progress(len(swept), len(frames))
     depths = []
     for keyframe in keyframes:
         at = frames.index(keyframe)
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
-        depths.append(full_size(confirm(sweeper.camera, swept[at], others), camera))
+        depths.append(full_size(confirm(planner.camera, swept[at], others), camera))
     return depths
 
 
@@ -86,8 +90,27 @@ def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
     return sorted(frames)
 
 
-class Sweeper:
-    """Sweeps single frames. It keeps the small grey images that it has read."""
+def swept_view(
+    camera: Camera,  # of all images
+    reference: PosedImage,
+    others: list[PosedImage],
+    planes: np.ndarray,  # (D,) 1/world unit, evenly spaced
+) -> SweptView:
+    """Sweep one image; without others nothing is found. Any process can compute it."""
+    step, pose = float(planes[1]), reference.T_camera_world
+    if not others:
+        nothing = np.full_like(reference.gray, np.nan)
+        return SweptView(nothing, nothing + 1, step, pose)
+    cost = sweep(camera, reference, others, planes)
+    best, fraction = refined_minimum(aggregate(cost, reference.gray))
+    found = ((best + fraction) * step).clip(0).astype(np.float32)
+    found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
+    at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
+    return SweptView(found, at_best, step, pose)
+
+
+class SweepPlanner:
+    """Chooses the views and planes of a sweep. It keeps the small grey images that it has read."""
 
     def __init__(
         self, sequence: Sequence, camera: Camera, poses: dict[int, Tensor], width: int = WIDTH
@@ -98,29 +121,23 @@ class Sweeper:
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
 
-    def _read_image(self, frame_index: int) -> PosedImage:
-        gray = cv2.cvtColor(self._sequence.frame(frame_index).image.numpy(), cv2.COLOR_RGB2GRAY)
-        size = (self.camera.width, self.camera.height)
-        small = cv2.resize(gray, size, None, 0, 0, cv2.INTER_AREA)
-        return PosedImage(small, self._poses[frame_index])
-
-    def sweep(self, frame: int, known: np.ndarray) -> SweptView:
-        """Sweep one frame against frames around it; `known` are inverse depths of its scene."""
-        reference = self._image(frame)
+    def plan(
+        self, frame: int, known: np.ndarray
+    ) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray]:
+        """Return the arguments of `swept_view`; `known` are inverse depths of the scene."""
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
         baseline = max((self._distance(frame, other) for other in others), default=0.0)
         # About one plane per pixel of parallax.
         planes = np.linspace(0, nearest, int(np.clip(baseline * nearest * self.camera.fx, *PLANES)))
-        if baseline == 0:
-            nothing = np.full_like(reference.gray, np.nan)
-            return SweptView(nothing, nothing + 1, planes[1], reference.T_camera_world)
-        cost = sweep(self.camera, reference, [self._image(k) for k in others], planes)
-        best, fraction = refined_minimum(aggregate(cost, reference.gray))
-        found = ((best + fraction) * planes[1]).clip(0).astype(np.float32)
-        found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
-        at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
-        return SweptView(found, at_best, planes[1], reference.T_camera_world)
+        views = [self._image(other) for other in others] if baseline > 0 else []
+        return self.camera, self._image(frame), views, planes
+
+    def _read_image(self, frame_index: int) -> PosedImage:
+        gray = cv2.cvtColor(self._sequence.frame(frame_index).image.numpy(), cv2.COLOR_RGB2GRAY)
+        size = (self.camera.width, self.camera.height)
+        small = cv2.resize(gray, size, None, 0, 0, cv2.INTER_AREA)
+        return PosedImage(small, self._poses[frame_index])
 
     def _views(self, frame: int, inverse_depth: float) -> list[int]:
         """Choose the frames to sweep against, spread evenly over those of moderate parallax."""

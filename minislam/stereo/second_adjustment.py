@@ -11,35 +11,40 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from minislam.records import Sequence
-from minislam.stereo.dense_structure import WIDTH, dense_depths
+from minislam.records import Progress, Sequence
+from minislam.stereo.dense_structure import WIDTH, dense_depths, swept_frames
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import final_global_ba
 from minislam.tracking.safeguards.structure import agreed_disparities
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
+from minislam.workers import Workers
 
 # Static weight of a cell that nothing confirms: where no cell is confirmed, all count alike. [-]
 UNCONFIRMED_WEIGHT = 0.02
 COARSE_WIDTH = 80  # px of the images that are swept: a weight per grid cell needs no more
-
-Progress = Callable[[int, int], None]  # called with the steps done and their number
 
 
 def adjust_again(
     tracker: Tracker,
     sequence: Sequence,
     on_progress: Callable[[str], Progress | None] = lambda stage: None,
+    workers: Workers | None = None,  # sweep side by side
 ) -> None:
     """Sweep the keyframes, then adjust them on what is confirmed, and judge them again.
 
     A frame that finds no pose now may find one afterwards, so it is not yet logged as lost.
     """
-    tracked = list(tracker.tracked)
-    poses = pose_all_frames(tracker, sequence, on_progress("posing all frames"))
+    tracked = tracker.tracked
+    keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
+    followed = [frame.frame_index for frame in tracked if frame.status.is_followed]
+    # The other frames would take two thirds of the time and gain nothing (RESULTS.md).
+    wanted = {*swept_frames(keyframes, followed)}
+    tracker.tracked = [frame for frame in tracked if frame.frame_index in wanted]
+    poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))
     tracker.tracked = tracked
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
-    swept = sweep_keyframes(tracker.graph, sequence, poses, on_sweep, COARSE_WIDTH)
+    swept = sweep_keyframes(tracker.graph, sequence, poses, on_sweep, workers, COARSE_WIDTH)
     adjust_confirmed(tracker.graph, swept, on_round)
     tracker.watch.conclude()
 
@@ -49,12 +54,14 @@ def sweep_keyframes(
     sequence: Sequence,
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
     progress: Progress | None = None,
+    workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
 ) -> list[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of the tracker's keyframes."""
     frames = [frame.frame_index for frame in graph.keyframes.frames]
     known = [agreed_disparities(graph, index).cpu().numpy() for index in range(len(frames))]
-    swept = dense_depths(sequence, graph.grid.camera, poses, frames, known, progress, width)
+    how = progress, workers, width
+    swept = dense_depths(sequence, graph.grid.camera, poses, frames, known, *how)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return [(depth.to(device), confirmation.to(device)) for depth, confirmation in swept]
 

@@ -1,11 +1,12 @@
 """Bundle adjustment, Eq. (5), over parts of the keyframe graph: local BA and global BA."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from minislam.records import Progress
 from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
@@ -46,9 +47,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
     adjust(graph, 0, graph.config.global_iterations, free_focal=graph.focal_is_free)
 
 
-def final_global_ba(
-    graph: KeyframeGraph, progress: Callable[[int, int], None] | None = None
-) -> None:
+def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:
     """Adjust all keyframes together on fresh flow, after the last frame.
 
     The disparity prior is off, because the depth of a single image is worse than that of many

@@ -15,7 +15,7 @@ from minislam.priors.interfaces import (
     FlowEstimator,
     FlowMatches,
 )
-from minislam.records import Frame, TrackedFrame, TrackingStatus
+from minislam.records import Frame, Progress, TrackedFrame, TrackingStatus
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import mask_priors
@@ -287,7 +287,7 @@ class Tracker(Stateful):
         warm_up_ba(self.graph, edges, self.config.warmup_rounds_with_beta)
         self.watch.judge_all()
 
-    def finish(self, progress: Callable[[int, int], None] | None = None) -> None:
+    def finish(self, progress: Progress | None = None) -> None:
         """Run the final global BA, with the newest beta."""
         self._update_static_weights()
         final_global_ba(self.graph, progress)

@@ -1,19 +1,18 @@
 """Poses of the frames between the keyframes."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from torch import Tensor
 
 from minislam.geometry import se3_interpolate
-from minislam.records import Sequence, TrackedFrame, TrackingStatus
+from minislam.records import Progress, Sequence, TrackedFrame, TrackingStatus
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.pose_support import PoseFit, ShownImages, retry_doubtful
 from minislam.tracking.tracker import Tracker
 
 
 def pose_all_frames(
-    tracker: Tracker, sequence: Sequence, progress: Callable[[int, int], None] | None = None
+    tracker: Tracker, sequence: Sequence, progress: Progress | None = None
 ) -> dict[int, Tensor]:
     """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
 

@@ -51,7 +51,7 @@ def test_each_loss_trains_only_its_own_side():
     assert not torch.equal(means, mapper.gaussians.means)
 
     share = view_gradients(*mapper._call(mapper.keyframes[0], CAMERA, True))
-    mapper._train_mlp(0, share.error)
+    mapper._train_mlp([0], [share])
     leaves = mapper._optimizer.gaussians.parameters.values()
     assert all(leaf.grad is None for leaf in leaves)
     assert not torch.equal(weights[0], mapper.mlp.weights[0])

@@ -7,13 +7,14 @@ import torch
 from minislam.geometry import Camera
 from minislam.records import Keyframe
 from minislam.stereo.dense_structure import (
-    Sweeper,
+    SweepPlanner,
     dense_depths,
     fill_depth,
     full_size,
     swept_frames,
 )
 from minislam.stereo.votes import ConfirmedDepth
+from minislam.workers import Workers
 from tests.stereo.clip import KEYFRAMES, SIZE, camera, clip, found, pose, sequence
 
 pytestmark = pytest.mark.slow
@@ -53,12 +54,12 @@ def test_views_of_much_parallax_are_not_used():
     for index in range(20):
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.1 * index
-    sweeper = Sweeper(sequence(), camera(), poses)
-    near = sweeper._views(0, 0.3)
-    largest = max(near) * 0.1 * 0.3 * sweeper.camera.fx
-    assert len(near) >= 2 and largest <= 0.125 * sweeper.camera.width
-    assert sweeper._views(0, 1e-3) == [1, 4, 6, 9, 11, 14, 16, 19]  # spread evenly
-    assert sweeper._views(0, 1e3) == [1, 2]  # the two nearest, if all are too far
+    planner = SweepPlanner(sequence(), camera(), poses)
+    near = planner._views(0, 0.3)
+    largest = max(near) * 0.1 * 0.3 * planner.camera.fx
+    assert len(near) >= 2 and largest <= 0.125 * planner.camera.width
+    assert planner._views(0, 1e-3) == [1, 4, 6, 9, 11, 14, 16, 19]  # spread evenly
+    assert planner._views(0, 1e3) == [1, 2]  # the two nearest, if all are too far
 
 
 # Degenerate input
@@ -77,13 +78,22 @@ def test_a_single_frame_gives_no_depth():
     assert depth.shape == SIZE[::-1] and float(depth.max()) == 0 == float(confirmation.max())
 
 
-def test_progress_is_told_for_every_swept_frame():
+def test_progress_counts_the_swept_frames():
     told = []
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
     dense_depths(
         sequence(), camera(), poses, [0, 2], [np.ones(3)] * 2, lambda *step: told.append(step)
     )
-    assert told == [(1, 2), (2, 2)]
+    assert told == [(2, 2)]
+
+
+def test_a_helper_sweeps_to_the_same_bits():
+    poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
+    calls = sequence(), camera(), poses, [0, 2], [np.ones(3)] * 2
+    with Workers(2) as two:
+        alone, shared = dense_depths(*calls), dense_depths(*calls, workers=two)
+    for (depth, confirmation), other in zip(alone, shared, strict=True):
+        assert torch.equal(depth, other[0]) and torch.equal(confirmation, other[1])
 
 
 # The size of the images
@@ -104,7 +114,7 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
 
 
 def test_the_swept_camera_sees_what_the_camera_sees():
-    small = Sweeper(sequence(), camera(), {}).camera
+    small = SweepPlanner(sequence(), camera(), {}).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx
 
 

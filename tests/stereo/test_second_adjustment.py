@@ -1,5 +1,6 @@
 """Keyframes that are adjusted again on what several views confirm to stand still."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from minislam.geometry import se3_inverse
 from minislam.priors.interfaces import FlowMatches
+from minislam.records import TrackedFrame, TrackingStatus
 from minislam.stereo import second_adjustment
 from minislam.stereo.second_adjustment import (
     COARSE_WIDTH,
@@ -102,7 +104,7 @@ def test_where_nothing_is_confirmed_all_cells_count_alike():
 def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
     told = {}
 
-    def dense_depths(sequence, camera, poses, keyframes, disparities, progress, width):
+    def dense_depths(sequence, camera, poses, keyframes, disparities, *how):
         told.update(camera=camera, poses=poses, keyframes=keyframes, disparities=disparities)
         return []
 
@@ -117,19 +119,26 @@ def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
 
 def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatch):
     graph, done = linked_graph(), []
-    tracker = SimpleNamespace(graph=graph, tracked=["followed"], watch=SimpleNamespace())
-    tracker.watch.conclude = lambda: done.append(("judged", graph.keyframes.static_weights.min()))
+    ok, count = TrackingStatus.OK, NUMBERS[-1] + 1
+    followed = [TrackedFrame(index, float(index), ok, 1.0) for index in range(count)]
+    lost = replace(followed[1], status=TrackingStatus.LOST)
+    tracked = [followed[0], lost, *followed[2:]]
+    watch = SimpleNamespace()
+    watch.conclude = lambda: done.append(("judged", graph.keyframes.static_weights.min()))
+    keyframes = graph.keyframes
+    tracker = SimpleNamespace(graph=graph, keyframes=keyframes, tracked=tracked, watch=watch)
 
     def pose_all_frames(tracker, sequence, progress):
-        tracker.tracked[0] = "lost"
+        assert [frame.frame_index for frame in tracker.tracked] == NUMBERS
+        tracker.tracked[0] = lost
         return {0: torch.eye(4)}
 
-    def sweep(graph, sequence, poses, progress, width):
+    def sweep(graph, sequence, poses, progress, workers, width):
         done.append((sorted(poses), width))
         return swept(graph)
 
     monkeypatch.setattr(second_adjustment, "pose_all_frames", pose_all_frames)
     monkeypatch.setattr(second_adjustment, "sweep_keyframes", sweep)
     adjust_again(tracker, SimpleNamespace())
-    assert tracker.tracked == ["followed"]
+    assert tracker.tracked == [followed[0], lost, *followed[2:]]
     assert done == [([0], COARSE_WIDTH), ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end
