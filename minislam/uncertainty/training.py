@@ -23,9 +23,9 @@ from minislam.uncertainty.mlp import UncertaintyMLP
 class RenderingError:
     """Difference between a keyframe and its rendering on the feature grid, without gradient."""
 
-    ssim: Tensor  # (h', w') L'_SSIM after the median filter
-    depth: Tensor  # (h', w') L_depth in depth units, capped
-    opacity: Tensor  # (h', w') in [0, 1]
+    ssim: Tensor  # (h', w') L'_SSIM after the median filter, or (n, h', w') of n keyframes
+    depth: Tensor  # the same shape, L_depth in depth units, capped
+    opacity: Tensor  # the same shape, in [0, 1]
 
 
 @torch.no_grad()
@@ -52,7 +52,7 @@ def rendering_error(
 
 
 def uncertainty_loss(
-    beta_raw: Tensor,  # (h', w') of the view, with gradient to the MLP
+    beta_raw: Tensor,  # (h', w') of the view or (n, h', w'), with gradient to the MLP
     error: RenderingError,
     sample_beta_raw: Tensor,  # (n,) of cells drawn from the view and its neighbours
     sample_features: Tensor,  # (n, C) of the same cells
@@ -107,16 +107,17 @@ class UncertaintyTrainer(Stateful):
 
     def step(
         self,
-        features: Tensor,  # (h', w', C) of the sampled keyframe
+        features: Tensor,  # (h', w', C) of the sampled keyframe, or (n, h', w', C) of several
         error: RenderingError,
-        nearby_features: Tensor,  # (n, C) cells of this keyframe and of its neighbours in time
+        nearby_features: Tensor,  # (m, C) cells of it and of its neighbours in time
     ) -> float:
-        """Take one Adam step on L_uncer and return its value before the step."""
+        """Take one Adam step on the mean L_uncer, sqrt(n) times as long, and return its value."""
+        rate = self.config.learning_rate * features.shape[:-3].numel() ** 0.5
+        self.optimizer.param_groups[0]["lr"] = rate
         drawn = torch.randperm(len(nearby_features), generator=self.generator)
         sample = nearby_features[drawn[: self.config.variance_samples].to(nearby_features.device)]
-        beta_raw = self.mlp(features, self.generator)
-        sample_beta_raw = self.mlp(sample, self.generator)
-        loss = uncertainty_loss(beta_raw, error, sample_beta_raw, sample, self.config)
+        beta, of_sample = self.mlp(features, self.generator), self.mlp(sample, self.generator)
+        loss = uncertainty_loss(beta, error, of_sample, sample, self.config)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()

@@ -30,6 +30,19 @@ def test_the_mlp_learns_which_features_the_map_cannot_explain():
     assert beta[:, :4].mean() < 0.4 and beta[:, 4:].mean() > 1.41
 
 
+def test_a_step_on_two_equal_keyframes_is_one_on_either_but_longer():
+    features, error = two_object_error()
+    config = UncertaintyConfig(dropout=0.0, lambda_variance=0.0)
+    steps = []
+    for count in (1, 2):
+        trainer = UncertaintyTrainer(4, config, seed=3)
+        before = trainer.mlp.weights[0].detach().clone()
+        both = RenderingError(*(torch.stack([e] * count) for e in vars(error).values()))
+        trainer.step(torch.stack([features] * count), both, features.reshape(-1, 4))
+        steps.append(trainer.mlp.weights[0].detach() - before)
+    torch.testing.assert_close(steps[1], 2**0.5 * steps[0], rtol=1e-3, atol=1e-7)
+
+
 def test_two_runs_with_one_seed_are_equal_to_the_bit():
     features, error = two_object_error()
     betas = []
