@@ -111,8 +111,8 @@ class UncertaintyTrainer(Stateful):
         error: RenderingError,
         nearby_features: Tensor,  # (m, C) cells of it and of its neighbours in time
     ) -> float:
-        """Take one Adam step on the mean L_uncer, sqrt(n) times as long, and return its value."""
-        rate = self.config.learning_rate * features.shape[:-3].numel() ** 0.5
+        """Take one Adam step on the mean L_uncer, n times as long, and return its value."""
+        rate = self.config.learning_rate * features.shape[:-3].numel()
         self.optimizer.param_groups[0]["lr"] = rate
         drawn = torch.randperm(len(nearby_features), generator=self.generator)
         sample = nearby_features[drawn[: self.config.variance_samples].to(nearby_features.device)]
