@@ -7,16 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import (
-    CAMERA,
-    Case,
-    Function,
-    Hints,
-    Verdict,
-    check_function,
-    doubles,
-    normals,
-)
+from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.disparity_prior import DepthView, depth_consistency
@@ -28,6 +19,7 @@ from minislam.tracking.reprojection import (
     reproject_with_jacobians,
     scaled_points,
 )
+from minislam.tracking.safeguards.robust import RobustKernel
 
 
 def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -> Verdict:
@@ -35,27 +27,14 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
     rays = CAMERA.rays(doubles([0.0, 0.0], [100.0, 52.0], [60.5, 10.25]))
     motion = se3_exp(doubles([0.1, -0.2, 0.3, 0.1, 0.2, -0.1]))
 
-    def reference(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
+    def reference(
+        points: Tensor, disparities: Tensor, camera: Camera, *, slide: Any = 1, turn: Any = 1
+    ) -> Tensor:
         # A camera that stands still sees each cell where its ray points: X = ray of the cell.
-        rays = points / points[:, 2:]
-        still = torch.eye(4, dtype=points.dtype)[None]
-        ratio = disparities / points[:, 2]
-        return (
-            reproject_with_jacobians(still, ratio[None], rays, camera).J_target[0].permute(2, 1, 0)
-        )
-
-    def signed(*signs: float) -> Function:
-        return lambda *arguments: doubles(*signs) * reference(*arguments)
-
-    def of_the_point(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
-        return reference(points, torch.ones_like(disparities), camera)
-
-    def rotation_first(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
-        return reference(points, disparities, camera).roll(3, -1)
-
-    def turned_with_depth(points: Tensor, disparities: Tensor, camera: Camera) -> Tensor:
-        J = reference(points, disparities, camera)
-        return torch.cat([J[..., :3], disparities[:, None, None] * J[..., 3:]], -1)
+        still, ratio = torch.eye(4, dtype=points.dtype)[None], disparities / points[:, 2]
+        seen = reproject_with_jacobians(still, ratio[None], points / points[:, 2:], camera)
+        J = seen.J_target[0].permute(2, 1, 0)
+        return torch.cat([slide * J[..., :3], turn * J[..., 3:]], -1)
 
     def case(disparities: Tensor, description: str, motion: Tensor = motion) -> Case:
         points = scaled_points(motion, disparities[None], rays)[0].T
@@ -69,49 +48,33 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
         case(doubles(1.0, 1.0, 1.0), "disparities of 1"),
         case(doubles(0.5, 0.25, 0.8), "any disparities"),
         case(doubles(0.0, 0.0, 0.0), "points at infinity"),
+        *drawn(draw),
     ]
-    hints: Hints = [
-        (of_the_point, "X is d times the point, so it moves by d rho, not by rho."),
-        (signed(1, 1, 1, -1, -1, -1), "The rotation is the wrong way round: it is -hat(X) phi."),
-        (signed(-1, -1, -1, -1, -1, -1), "This is the derivative of the residual p~ - p."),
-        (rotation_first, "The order is (rho, phi), translation first."),
-        (turned_with_depth, "A rotation moves X by phi x X, without another d."),
-        (signed(1, 1, 1, 0, 0, 0), "The rotation is missing: columns 3 to 5."),
-        (signed(0, 0, 0, 1, 1, 1), "The translation is missing: columns 0 to 2."),
+    hints = [
+        (lambda X, d, c: reference(X, d**0, c), "X is d times the point: it moves by d rho."),
+        (lambda *a: reference(*a, turn=-1), "The rotation is the wrong way round: -hat(X) phi."),
+        (lambda *a: -reference(*a), "This is the derivative of the residual p~ - p."),
+        (lambda *a: reference(*a).roll(3, -1), "The order is (rho, phi), translation first."),
+        (
+            lambda *a: reference(*a, turn=a[1][:, None, None]),
+            "A rotation moves X by phi x X: no d.",
+        ),
+        (lambda *a: reference(*a, turn=0), "The rotation is missing: columns 3 to 5."),
+        (lambda *a: reference(*a, slide=0), "The translation is missing: columns 0 to 2."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_schur_step(
-    student: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
-) -> Verdict:
+def check_schur_step(student: Callable[..., tuple[Tensor, Tensor]]) -> Verdict:
     """Check (H, E, diagonal of C, g, s) -> the steps of the poses and of the disparities."""
 
-    def solved(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        xi = torch.linalg.solve(H - E / C @ E.T, g - E @ (s / C))
-        return xi, (s - E.T @ xi) / C
-
-    def poses_alone(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        xi = torch.linalg.solve(H, g)
-        return xi, (s - E.T @ xi) / C
-
-    def not_substituted(*arguments: Tensor) -> tuple[Tensor, Tensor]:
-        return solved(*arguments)[0], arguments[4] / arguments[2]
-
-    def added(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        xi = torch.linalg.solve(H + E / C @ E.T, g - E @ (s / C))
-        return xi, (s - E.T @ xi) / C
-
-    def unscaled(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        xi = torch.linalg.solve(H - E @ E.T, g - E @ s)
-        return xi, (s - E.T @ xi) / C
-
-    def undivided(*arguments: Tensor) -> tuple[Tensor, Tensor]:
-        return solved(*arguments)[0], arguments[2] * solved(*arguments)[1]
-
-    def old_gradient(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor):
-        xi = torch.linalg.solve(H - E / C @ E.T, g)
-        return xi, (s - E.T @ xi) / C
+    def solved(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor, flaw: str = "") -> Any:
+        by = C**0 if flaw == "unscaled" else C
+        left = {"alone": 0, "added": -1}.get(flaw, 1) * (E / by @ E.T)
+        right = (flaw not in ("alone", "old")) * (E @ (s / by))
+        xi = torch.linalg.solve(H - left, g - right)
+        delta = s - (flaw != "still") * (E.T @ xi)
+        return xi, delta if flaw == "undivided" else delta / C
 
     def case(poses: int, cells: int, description: str, seed: int = 1) -> Case:
         rows = normals(seed, 4 * cells, 6 * poses + 2)
@@ -121,20 +84,21 @@ def check_schur_step(
         Jd = mine * rows[:, 1:2]
         return Case((J.T @ J, J.T @ Jd, Jd.square().sum(0), J.T @ r, Jd.T @ r), description)
 
-    def draw(seed: int) -> Case:
-        return case(2, 8 + seed % 5, f"two poses and {8 + seed % 5} cells", seed)
-
-    cases = [case(1, 5, "one pose and 5 cells"), case(3, 20, "three poses and 20 cells")]
-    hints: Hints = [
-        (poses_alone, "The disparities do not stand still: subtract E C^-1 E^T from H."),
-        (old_gradient, "The right-hand side changes too: g - E C^-1 s."),
-        (not_substituted, "The disparities must follow the poses: s - E^T xi."),
-        (added, "E C^-1 E^T is subtracted from H, not added."),
-        (unscaled, "C^-1 is missing between E and E^T, and between E and s."),
-        (undivided, "The steps of the disparities are divided by C, one by one."),
-        (lambda *a: solved(*a)[::-1], "The poses come first: xi, then delta."),
+    cases = [
+        case(1, 5, "one pose and 5 cells"),
+        case(3, 20, "three poses and 20 cells"),
+        *drawn(lambda seed: case(2, 8 + seed % 5, f"two poses and {8 + seed % 5} cells", seed)),
     ]
-    return check_function(student, solved, cases, 1e-9, hints, draw, ("xi", "delta"))
+    flaws = {
+        "alone": "The disparities do not stand still: subtract E C^-1 E^T from H.",
+        "old": "The right-hand side changes too: g - E C^-1 s.",
+        "still": "The disparities must follow the poses: s - E^T xi.",
+        "added": "E C^-1 E^T is subtracted from H, not added.",
+        "unscaled": "C^-1 is missing between E and E^T, and between E and s.",
+        "undivided": "The steps of the disparities are divided by C, one by one.",
+    }
+    hints = [(lambda *a: solved(*a)[::-1], "The poses come first: xi, then delta.")]
+    return check_function(student, solved, cases, 1e-9, hints, flaws, ("xi", "delta"))
 
 
 def check_bundle_adjustment(
@@ -145,31 +109,26 @@ def check_bundle_adjustment(
     source, target = (1 - torch.eye(3)).nonzero().T
 
     def loop(
-        sign: float = 1.0,
-        left: bool = True,
-        most: int = 99,
-        damped: bool = True,
-        changed: dict[str, Tensor] | None = None,
-    ) -> Function:
-        def run(problem: BundleProblem, state: BundleState, steps: int, damping: float) -> Any:
-            problem = replace(problem, **(changed or {}))  # type: ignore[arg-type]
-            for _ in range(min(steps, most)):
-                equations = dense_normal_equations(problem, state)
-                diagonal = (damping if damped else 1e-9) * torch.ones(len(equations.vector))
-                step = torch.linalg.solve(equations.matrix + diagonal.diag(), equations.vector)
-                after, before = moved(problem, state, sign * step), state.T_camera_world
-                poses = after.T_camera_world
-                poses = poses if left else before @ poses @ se3_inverse(before)
-                state = BundleState(poses, after.disparities)
-            return state.T_camera_world, state.disparities
-
-        return run
+        problem: BundleProblem, state: BundleState, steps: int, damping: float, flaw: str = ""
+    ) -> tuple[Tensor, Tensor]:
+        weights = problem.weights ** (flaw != "weights")
+        free = problem.free_poses | (flaw == "held")
+        problem = replace(problem, weights=weights, free_poses=free)
+        for _ in range(min(steps, 1) if flaw == "one" else steps):
+            equations = dense_normal_equations(problem, state)
+            diagonal = (1e-9 if flaw == "damping" else damping) * torch.ones(len(equations.vector))
+            step = torch.linalg.solve(equations.matrix + diagonal.diag(), equations.vector)
+            before = state.T_camera_world
+            state = moved(problem, state, -step if flaw == "uphill" else step)
+            if flaw == "right":
+                poses = before @ state.T_camera_world @ se3_inverse(before)
+                state = BundleState(poses, state.disparities)
+        return state.T_camera_world, state.disparities
 
     def answered(*arguments: Any) -> Any:
         state = student(*arguments)
-        if not isinstance(state, BundleState):
-            return state
-        return state.T_camera_world, state.disparities
+        is_state = isinstance(state, BundleState)
+        return (state.T_camera_world, state.disparities) if is_state else state
 
     def case(steps: int, held: int, weights: Tensor, description: str, seed: int = 1) -> Case:
         xi, start, noise, scatter = normals(seed, 4, 3, len(rays)).clamp(-2, 2)
@@ -194,60 +153,67 @@ def check_bundle_adjustment(
         case(1, 2, some, "one step, two poses held, weights that differ"),
         case(1, 1, hidden, "two cells that no other view sees"),
         case(3, 2, some, "three steps"),
+        *drawn(draw),
     ]
-    hints: Hints = [
-        (
-            loop(changed={"weights": ones}),
-            "Each residual counts with its weight: J^T W J and J^T W r.",
-        ),
-        (
-            loop(changed={"free_poses": ones[0, 0, :3] > 0}),
-            "A pose that is not free must not move.",
-        ),
-        (loop(sign=-1), "The step points uphill: with r = p~ - p it is added."),
-        (loop(left=False), "The step stands on the left: exp(xi) T_camera_world."),
-        (loop(damped=False), "Add the damping to the diagonals of H and of C."),
-        (loop(most=1), "Repeat the step: each one linearises at the state the last one left."),
-        (lambda *a: (loop()(*a)[0], a[1].disparities), "The disparities move as well: + delta."),
-        (lambda *a: (a[1].T_camera_world, loop()(*a)[1]), "The poses move as well: exp(xi) T."),
+    flaws = {
+        "weights": "Each residual counts with its weight: J^T W J and J^T W r.",
+        "held": "A pose that is not free must not move.",
+        "uphill": "The step points uphill: with r = p~ - p it is added.",
+        "right": "The step stands on the left: exp(xi) T_camera_world.",
+        "damping": "Add the damping to the diagonals of H and of C.",
+        "one": "Repeat the step: each one linearises at the state the last one left.",
+    }
+    hints = [
+        (lambda *a: (loop(*a)[0], a[1].disparities), "The disparities move as well: + delta."),
+        (lambda *a: (a[1].T_camera_world, loop(*a)[1]), "The poses move as well: exp(xi) T."),
     ]
-    return check_function(answered, loop(), cases, 1e-7, hints, draw, ("poses", "disparities"))
+    return check_function(answered, loop, cases, 1e-7, hints, flaws, ("poses", "disparities"))
 
 
-def check_prior_mask(
-    student: Callable[[Tensor, list[tuple[Tensor, Tensor]], Camera, int, float], Tensor],
-) -> Verdict:
+def check_robust_weight(student: Callable[[Tensor, float, float], Tensor]) -> Verdict:
+    """Check (residuals (N, 2) [px], scale c [px], power p) -> the weight of each cell (N,)."""
+
+    def reference(r: Tensor, c: float, p: float) -> Tensor:
+        return RobustKernel(c, p).weight(r.square().sum(-1))
+
+    cases = [
+        Case((doubles([0, 0], [0.3, 0.4], [3, -4]), 2.0, 1.0), "c = 2 px and p = 1"),
+        Case((2 * normals(1, 6, 2), 1.5, 2.0), "c = 1.5 px and p = 2"),
+        *drawn(lambda seed: Case((normals(seed, 5, 2), 0.5, 1.5), "c = 0.5 px and p = 1.5")),
+    ]
+    hints = [
+        (lambda r, c, p: reference(r, c, 1.0), "The power p is an argument."),
+        (lambda r, c, p: reference(r, 1.0, p), "The residual is divided by c."),
+        (lambda r, c, p: reference(r, c**0.5, p), "c is squared, like the residual."),
+        (lambda r, c, p: 1 / reference(r, c, p), "The power is -p: large residuals count little."),
+        (
+            lambda r, c, p: r.norm(dim=1) * reference(r, c, p),
+            "This is the pull, w r.",
+        ),
+        (
+            lambda r, c, p: RobustKernel(c, p).weight(r**2),
+            "A cell has one weight: sum over u, v.",
+        ),
+        (lambda r, c, p: RobustKernel(c, p).weight(r.norm(dim=1)), "r is squared, like c."),
+    ]
+    return check_function(student, reference, cases, 1e-9, hints)
+
+
+def check_prior_mask(student: Callable[..., Tensor]) -> Verdict:
     """Check (depth, [(depth, T_this_other)], camera, stride, epsilon) -> M (h, w) bool."""
     camera, stride = Camera(60.0, 60.0, 31.3, 22.6, 64, 48), 4
     grid = Grid.of(camera, stride)
 
-    def counted(depth: Tensor, others: list, error: float) -> tuple[Tensor, Tensor]:
+    def reference(depth: Tensor, others: list, *rest: Any, seen: int = 2, agree: int = 2) -> Tensor:
         same = torch.ones(1, 1, 1).double()
         this = DepthView(depth, same, torch.eye(4).double())
-        views = [DepthView(seen, same, se3_inverse(T)) for seen, T in others]
-        counts = depth_consistency(grid, this, views, error, -2.0)
-        return counts.corresponding.view(grid.shape), counts.consistent.view(grid.shape)
-
-    def reference(depth: Tensor, others: list, *rest: Any) -> Tensor:
-        corresponding, consistent = counted(depth, others, rest[-1])
-        return (~((corresponding >= 2) & (consistent < 2))).double()
-
-    def anywhere(depth: Tensor, others: list, *rest: Any) -> Tensor:
-        return (counted(depth, others, rest[-1])[1] >= 2).double()
-
-    def one_is_enough(depth: Tensor, others: list, *rest: Any) -> Tensor:
-        corresponding, consistent = counted(depth, others, rest[-1])
-        return (~((corresponding >= 2) & (consistent < 1))).double()
-
-    def opposite(*arguments: Any) -> Tensor:
-        return 1 - reference(*arguments)
+        views = [DepthView(there, same, se3_inverse(T)) for there, T in others]
+        counts = depth_consistency(grid, this, views, rest[-1], -2.0)
+        trusted = (counts.corresponding < seen) | (counts.consistent >= agree)
+        return trusted.double().view(grid.shape)
 
     def backwards(depth: Tensor, others: list, *rest: Any) -> Tensor:
-        return reference(depth, [(seen, se3_inverse(T)) for seen, T in others], *rest)
-
-    def absolute(depth: Tensor, others: list, *rest: Any) -> Tensor:
-        # Where all depths are near 3 m, an absolute error is a third of it, relatively.
-        return reference(depth, others, rest[-1] / 3)
+        return reference(depth, [(there, se3_inverse(T)) for there, T in others], *rest)
 
     def wall(T_this_other: Tensor) -> Tensor:
         """Return the depth of a wall, 3 m before this view, as another view sees it."""
@@ -262,20 +228,19 @@ def check_prior_mask(
             seen[8 * number : 8 * number + 20, 30:50] *= 0.6  # in front of the wall, for one view
         return Case((depth, others, camera, stride, 0.02), description)
 
-    def draw(seed: int) -> Case:
-        return case(3, 0.8, "three drawn views", seed)
-
     cases = [
         case(4, 0.7, "a region whose depth is 30 % too small"),
         case(4, 1.01, "a region whose depth is 1 % too large"),
         case(4, 0.0, "a region without depth"),
         case(1, 0.7, "a single other view"),
+        *drawn(lambda seed: case(3, 0.8, "three drawn views", seed)),
     ]
-    hints: Hints = [
-        (anywhere, "Where fewer than two views have a depth for the cell, M stays 1."),
-        (opposite, "M is 1 where the prior counts, 0 where the views contradict it."),
+    hints = [
+        (lambda *a: reference(*a, seen=0), "Where fewer than two views have a depth, M stays 1."),
+        (lambda *a: 1 - reference(*a), "M is 1 where the prior counts, 0 where views contradict."),
         (backwards, "T_this_other takes points of the other view to this one, not back."),
-        (one_is_enough, "Two views must agree, not one."),
-        (absolute, "The difference is relative to the depth that arrives from the other view."),
+        (lambda *a: reference(*a, agree=1), "Two views must agree, not one."),
+        # Where all depths are near 3 m, an absolute error is a third of it, relatively.
+        (lambda *a: reference(*a[:2], a[-1] / 3), "Divide the difference by the other's depth."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)

@@ -8,16 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.checks.grading import (
-    CAMERA,
-    Case,
-    Function,
-    Hints,
-    Verdict,
-    check_function,
-    doubles,
-    normals,
-)
+from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 
 
@@ -28,13 +19,10 @@ def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> V
         resized = camera.resized(width, height)
         return doubles(resized.fx, resized.fy, resized.cx, resized.cy)
 
-    def shifted(before: float, after: float) -> Function:
-        def resized(camera: Camera, width: int, height: int) -> Tensor:
-            su, sv = width / camera.width, height / camera.height
-            cx, cy = (camera.cx + before) * su + after, (camera.cy + before) * sv + after
-            return doubles(camera.fx * su, camera.fy * sv, cx, cy)
-
-        return resized
+    def shifted(before: float, after: float, camera: Camera, width: float, height: float) -> Tensor:
+        su, sv = width / camera.width, height / camera.height
+        cx, cy = (camera.cx + before) * su + after, (camera.cy + before) * sv + after
+        return doubles(camera.fx * su, camera.fy * sv, cx, cy)
 
     def draw(seed: int) -> Case:
         width, height = 20 + 37 * seed % 300, 30 + 23 * seed % 200
@@ -44,21 +32,19 @@ def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> V
         Case((CAMERA, 101, 53), "the same size"),
         Case((CAMERA, 202, 106), "twice the size"),
         Case((CAMERA, 33, 26), "33 x 26 pixels"),
+        *drawn(draw),
     ]
-    right = shifted(0.5, -0.5)
+    right = partial(shifted, 0.5, -0.5)
     hints = [
-        (shifted(0, 0), "The image starts at -0.5: scale cx + 0.5, then take 0.5 off again."),
-        (shifted(-0.5, 0.5), "The image starts at -0.5, not at 0.5: both signs are the other one."),
-        (shifted(0.5, 0), "Take 0.5 off again after scaling: the new image starts at -0.5, too."),
-        (shifted(0, -0.5), "Add 0.5 before scaling, where 0.5 is taken off after it."),
+        (lambda *a: shifted(0, 0, *a), "The image starts at -0.5: (cx + 0.5) * scale - 0.5."),
+        (lambda *a: shifted(-0.5, 0.5, *a), "The image starts at -0.5: both signs are wrong."),
+        (lambda *a: shifted(0.5, 0, *a), "Take 0.5 off after scaling: it starts at -0.5, too."),
+        (lambda *a: shifted(0, -0.5, *a), "Add 0.5 before scaling, as it is taken off later."),
         (lambda c, w, h: reference(c, w, h)[[0, 2, 1, 3]], "The order is fx, fy, cx, cy."),
-        (
-            lambda c, w, h: right(c, c.width * h / c.height, h),
-            "Width and height have a scale each.",
-        ),
+        (lambda c, _, h: right(c, c.width * h / c.height, h), "Width and height: a scale each."),
         (lambda c, w, h: right(c, c.width**2 / w, c.height**2 / h), "Scale by new over old size."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor]) -> Verdict:
@@ -69,18 +55,6 @@ def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor])
     def reference(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
         points = camera.backproject(pixels, 1 / disparities)
         return camera.project(transform_points(pose, points))
-
-    def inverted_pose(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
-        return reference(pixels, disparities, camera, se3_inverse(pose))
-
-    def disparity_as_depth(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor):
-        return reference(pixels, 1 / disparities, camera, pose)
-
-    def turned_only(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
-        return reference(pixels, 1e-12 * disparities, camera, pose)
-
-    def depth_of_one(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
-        return reference(pixels, torch.ones_like(disparities), camera, pose)
 
     def draw(seed: int) -> Case:
         pixels = doubles(50, 25) + 15 * normals(seed, 4, 2)
@@ -93,14 +67,15 @@ def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor])
         "any motion": doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1),
     }
     cases = [Case((pixels, disparities, CAMERA, se3_exp(xi)), name) for name, xi in motions.items()]
+    cases += drawn(draw)
     hints = [
-        (inverted_pose, "This is the inverse motion: T_target_source takes points to the target."),
-        (disparity_as_depth, "This takes the disparity for the depth: depth = 1 / disparity."),
-        (depth_of_one, "The disparities are not used: all points are at depth 1."),
-        (turned_only, "The translation is missing."),
+        (lambda p, d, c, T: reference(p, d, c, se3_inverse(T)), "This is the inverse motion."),
+        (lambda p, d, *a: reference(p, 1 / d, *a), "These are no depths: depth = 1 / disparity."),
+        (lambda p, d, *a: reference(p, d**0, *a), "The disparities are not used: depth is 1."),
+        (lambda p, d, *a: reference(p, 1e-12 * d, *a), "The translation is missing."),
         (lambda *a: reference(*a).flip(-1), "u and v are exchanged: a pixel is (column, row)."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_warped_photo(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor]) -> Verdict:
@@ -134,6 +109,7 @@ def check_warped_photo(student: Callable[[Tensor, Tensor, Camera, Tensor], Tenso
         "a source camera that looks back": doubles(0.1, 0, 0, 0, 3.0, 0),
     }
     cases = [Case((photo, depth, camera, se3_exp(xi)), name) for name, xi in motions.items()]
+    cases += drawn(draw)
     flaws = {
         "inverted": "This is the inverse motion: T_source_target takes points to the source.",
         "disparity": "This takes the depth for a disparity: the point is depth times the ray.",
@@ -142,5 +118,4 @@ def check_warped_photo(student: Callable[[Tensor, Tensor, Camera, Tensor], Tenso
         "rounded": "This takes the nearest pixel: mix the four around the position.",
         "turned": "The weights are exchanged: the nearer of two pixels has the larger weight.",
     }
-    hints: Hints = [(partial(warped, flaw=flaw), hint) for flaw, hint in flaws.items()]
-    return check_function(student, warped, cases, 1e-9, hints, draw)
+    return check_function(student, warped, cases, 1e-9, flaws=flaws)

@@ -4,8 +4,9 @@ import dis
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -22,7 +23,7 @@ SECONDS = 10.0  # of the student's function, all cases together
 CAMERA = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
 
 Function = Callable[..., Any]  # answers with numbers in any form, or with a tuple of such
-Hints = list[tuple[Function, str]]  # (known mistake, the sentence that explains it)
+Hints = Sequence[tuple[Any, str]]  # (known mistake, the sentence that explains it)
 
 
 @dataclass(frozen=True)
@@ -60,29 +61,36 @@ def normals(seed: int, *shape: int) -> Tensor:
     return torch.randn(shape, generator=source, dtype=torch.float64)
 
 
+def drawn(draw: Callable[[int], Case]) -> list[Case]:
+    """Return three cases, the same in every notebook, and three others where MINISLAM_SEED is set.
+
+    `minislam grade` sets it. `draw` makes a case of a seed.
+    """
+    hidden = os.environ.get("MINISLAM_SEED", "")
+    seeds = [1000 * (int(hidden) + 1) + n for n in range(DRAWN_CASES)] if hidden else []
+    return [draw(seed) for seed in [*range(DRAWN_CASES), *seeds]]
+
+
 def check_function(
     student: Function,
     reference: Function,
     cases: list[Case],
     tolerance: float = 1e-6,  # relative to the largest expected number; 1e-5 in float32
-    hints: Hints | None = None,
-    draw: Callable[[int], Case] | None = None,  # seed -> a further case
+    hints: Hints = (),
+    flaws: dict[str, str] | None = None,  # those that the reference makes where asked by `flaw=`
     returns: tuple[str, ...] = (),  # the names of the values, where there are several
 ) -> Verdict:
     """Compare a student's function with the reference on all cases, up to the first difference.
 
-    Further cases are drawn: the same ones in every notebook, and others where MINISLAM_SEED is
-    set, as `minislam grade` does. MINISLAM_STRICT=1 raises WrongAnswer where the answer has not
-    passed, so that nbmake and nbgrader see it.
+    MINISLAM_STRICT=1 raises WrongAnswer where the answer has not passed, so that nbmake and
+    nbgrader see it.
     """
-    if draw is not None:
-        hidden = os.environ.get("MINISLAM_SEED", "")
-        seeds = [1000 * (int(hidden) + 1) + n for n in range(DRAWN_CASES)] if hidden else []
-        cases = [*cases, *map(draw, [*range(DRAWN_CASES), *seeds])]
+    known = [(partial(reference, flaw=flaw), hint) for flaw, hint in (flaws or {}).items()]
+    known.extend(hints)
     verdict, seconds = None, SECONDS
     for case in cases:
         begin = time.process_time()
-        verdict = _grade_case(student, reference, case, tolerance, hints or [], returns, seconds)
+        verdict = _grade_case(student, reference, case, tolerance, known, returns, seconds)
         if verdict is not None:
             break
         seconds = max(seconds - (time.process_time() - begin), 1.0)
@@ -118,10 +126,9 @@ def _grade_case(
     if not found:
         return None
     smallest = max(smallest, largest(expected))
+    others = ((mistake(*case.arguments), hint) for mistake, hint in hints)
     known = (
-        hint
-        for mistake, hint in hints
-        if not difference(answer, mistake(*case.arguments), tolerance, (), smallest)
+        hint for other, hint in others if not difference(answer, other, tolerance, (), smallest)
     )
     hint = next(known, "") or relation(answer, expected, tolerance)
     return Verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)

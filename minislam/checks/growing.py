@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import CAMERA, Case, Hints, Verdict, check_function, doubles
+from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 from minislam.mapping.config import InsertionConfig, MappingConfig, PoseRefinementConfig
 from minislam.mapping.insertion import EXPLAINED_OPACITY, gaussians_at_pixels
@@ -58,7 +58,7 @@ def check_insertion(student: Callable[..., Tensor]) -> Verdict:
         Case((image, depth, weight, opacity, CAMERA, T, 3), "a map that covers a part"),
     ]
     corner = replace(CAMERA, cx=0.0, cy=0.0)
-    hints: Hints = [
+    hints = [
         (lambda *a: reference(*a, depth_at_least=0), "Depth 0 means unknown: insert nothing."),
         (lambda i, d, w, *a: reference(i, d, one, *a), "Weight 0 is a dynamic object: leave it."),
         (lambda *a: reference(*a[:3], zero, *a[4:]), "Parts of the map are opaque there already."),
@@ -68,7 +68,7 @@ def check_insertion(student: Callable[..., Tensor]) -> Verdict:
         (lambda *a: reference(*a[:4], corner, *a[5:]), "A ray is (u - cx) / fx, (v - cy) / fy, 1."),
         (of_one_size, "A cell at depth z is cell * z / f wide."),
     ]
-    return check_function(student, reference, cases, hints=hints)
+    return check_function(student, reference, cases, 1e-6, hints)
 
 
 def check_map_loss(student: Callable[..., Tensor]) -> Verdict:
@@ -104,7 +104,7 @@ def check_map_loss(student: Callable[..., Tensor]) -> Verdict:
         Case((color, depth, image, holes, weight, scales), "depth that is unknown in places"),
         Case((color, depth, image, holes, weight, needles), "thin Gaussians"),
     ]
-    hints: Hints = [
+    hints = [
         (lambda *a: reference(*a[:4], one, a[5]), "Each pixel has its weight."),
         (lambda *a: reference(*a[:4], a[4] / a[4].mean(), a[5]), "Divide by the number of pixels."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
@@ -113,7 +113,7 @@ def check_map_loss(student: Callable[..., Tensor]) -> Verdict:
         (of_known, "The mean is over all pixels; one of unknown depth counts 0."),
         (with_unknown, "Where the reference depth is 0 it is unknown and costs nothing."),
     ]
-    return check_function(student, reference, cases, tolerance=1e-7, hints=hints)
+    return check_function(student, reference, cases, 1e-7, hints)
 
 
 def check_followed_pose(student: Callable[..., Tensor]) -> Verdict:
@@ -137,7 +137,7 @@ def check_followed_pose(student: Callable[..., Tensor]) -> Verdict:
         image = render(gaussians, camera, true.float()).color
         if mover:  # the left half of the image moves to the right
             image[:, 3:17], weight[:, :17] = image[:, :14].clone(), 0
-        inputs = gaussians, camera, se3_exp(start) @ true, image, weight, 60
+        inputs = gaussians, camera, se3_exp(start) @ true, image, weight, 15
         return Case(inputs, description), true
 
     pairs = [
@@ -170,7 +170,7 @@ def check_followed_pose(student: Callable[..., Tensor]) -> Verdict:
         return refine_pose(gaussians, camera, pose, image, equal, black, settings)
 
     settings = PoseRefinementConfig(iterations=30, tolerance=0.0, farthest=1e9, fraction=1.0)
-    mistakes: Hints = [
+    mistakes = [
         (lambda *a: a[2], "The pose has not moved: return exp(twist) times the first pose."),
         (lambda *a: se3_inverse(true_pose(*a)), "This is T_world_camera."),
         (motion, "This is the motion alone."),
@@ -178,6 +178,6 @@ def check_followed_pose(student: Callable[..., Tensor]) -> Verdict:
         (lambda *a: se3_inverse(motion(*a)) @ a[2], "The pose moves the other way."),
         (unweighted, "The camera follows the dynamic object: each pixel has its weight."),
     ]
-    hints: Hints = [(seen_from(mistake), hint) for mistake, hint in mistakes]
+    hints = [(seen_from(mistake), hint) for mistake, hint in mistakes]
     cases = [case for case, _ in pairs]
     return check_function(seen_from(student), seen_from(true_pose), cases, 0.016, hints)

@@ -22,7 +22,7 @@ import minislam
 from minislam import checks
 from minislam.checks.calls import Stopped, call
 from minislam.checks.grading import SECONDS, WRONG
-from minislam.checks.points import EXERCISES, Exercise
+from minislam.checks.points import EXERCISES, MAY_CALL, MAY_NOT_CALL, Exercise
 from minislam.checks.submission import SUBMITTED
 
 REFUSED = "refused"
@@ -96,7 +96,8 @@ def _functions() -> dict[str, int]:
 
 def _watched(function: Any, exercise: Exercise, used: set[str]) -> Callable[..., Any]:
     """Return the function, which notes what it calls of the package and may not call."""
-    allowed, refused = exercise.may_call.split(), exercise.may_not_call.split()
+    allowed = MAY_CALL.get(exercise.key, "").split()
+    refused = MAY_NOT_CALL.get(exercise.key, "").split()
 
     def watch(frame: FrameType, event: str, _: Any) -> None:
         code = frame.f_code

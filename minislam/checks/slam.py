@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from itertools import product
+from typing import Any
 
 import numpy as np
 
-from minislam.checks.grading import Case, Hints, Verdict, check_function
+from minislam.checks.grading import Case, Verdict, check_function, drawn
 from minislam.evaluation.images import auroc
-from minislam.geometry.alignment import Similarity, umeyama
+from minislam.geometry.alignment import umeyama
 
 
 def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
@@ -20,9 +21,6 @@ def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
     def rms(errors: np.ndarray) -> float:  # (N,) or (N, 3)
         return float(np.sqrt(np.sum(errors**2) / len(errors)))
 
-    def centred(positions: np.ndarray) -> np.ndarray:
-        return positions - positions.mean(0)
-
     def reference(estimate: np.ndarray, truth: np.ndarray) -> float:
         return rms(distances(estimate, truth))
 
@@ -34,27 +32,25 @@ def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
             estimate = estimate[:, [2, 0, 1]] + np.array([3.0, -1.0, 2.0])  # z to x, x to y, y to z
         return Case((estimate, truth), description)
 
-    def draw(seed: int) -> Case:
-        return case(0.5 + seed % 3, seed % 2 == 0, "another walk", seed)
-
     cases = [
         case(1.0, False, "an estimate in the right frame"),
         case(0.25, False, "an estimate in another unit"),
         case(0.25, True, "an estimate in another unit and frame"),
+        *drawn(lambda seed: case(0.5 + seed % 3, seed % 2 == 0, "another walk", seed)),
     ]
-    hints: Hints = [
+    hints = [
         (lambda e, t: rms(e - t), "The estimate is not aligned yet."),
         (lambda e, t: rms(distances(e, t, False)), "A monocular estimate has no scale: align it."),
-        (lambda e, t: float(distances(e, t).mean()), "ATE is the root of the mean square."),
-        (lambda e, t: float(np.median(distances(e, t))), "ATE is the root of the mean square."),
+        (lambda e, t: distances(e, t).mean(), "ATE is the root of the mean square."),
+        (lambda e, t: np.median(distances(e, t)), "ATE is the root of the mean square."),
         (lambda e, t: rms(distances(t, e)), "The truth has been mapped to the estimate."),
         (lambda e, t: reference(e, t) ** 2, "The root is missing."),
         (lambda e, t: reference(e, t) / 3**0.5, "A mean over cameras, not over their 3 N numbers."),
         (lambda e, t: reference(e, t) * len(t) ** 0.5, "The mean is missing: divide by N."),
-        (lambda e, t: float(distances(e, t).max()), "ATE is no maximum."),
-        (lambda e, t: rms(centred(e) - centred(t)), "Centred, but neither turned nor scaled yet."),
+        (lambda e, t: distances(e, t).max(), "ATE is no maximum."),
+        (lambda e, t: rms(e - t - (e - t).mean(0)), "Centred, but neither turned nor scaled yet."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
@@ -64,39 +60,33 @@ def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Ve
         pairs = beta[moving][:, None] - beta[~moving]
         return float(np.mean(np.where(pairs == 0, draw, pairs > 0)))
 
-    cases = [
-        Case(
-            (np.array([0.1, 0.9, 0.4, 0.7, 0.2]), np.array([False, True, False, True, True])),
-            "three cells of a person and two of a wall",
-        ),
-        Case(
-            (np.array([0.5, 0.5, 0.8, 0.3]), np.array([True, False, True, False])),
-            "a beta that does not tell two cells apart",
-        ),
-    ]
+    def case(beta: Any, moving: Any, description: str) -> Case:
+        return Case((np.array(beta), np.array(moving) > 0), description)
 
     def draw(seed: int) -> Case:
-        source = np.random.default_rng(seed)
         moving = np.arange(12) < 3 + seed % 4
-        beta = np.round(source.uniform(0, 1, 12) + 0.3 * moving, 1)
-        return Case((beta, moving), "12 cells, some of them alike")
+        beta = np.round(np.random.default_rng(seed).uniform(0, 1, 12) + 0.3 * moving, 1)
+        return case(beta, moving, "12 cells, some of them alike")
 
     def count(beta: np.ndarray, moving: np.ndarray) -> float:
         return wins(beta, moving, 0.5) * moving.sum() * (~moving).sum()
 
-    def at_the_median(beta: np.ndarray, moving: np.ndarray) -> float:
-        return float(np.mean((beta > np.median(beta)) == moving))
+    cases = [
+        case([0.1, 0.9, 0.4, 0.7, 0.2], [0, 1, 0, 1, 1], "three cells of a person, two of a wall"),
+        case([0.5, 0.5, 0.8, 0.3], [1, 0, 1, 0], "a beta that does not tell two cells apart"),
+        *drawn(draw),
+    ]
 
-    hints: Hints = [
+    hints = [
         (lambda b, m: wins(b, ~m, 0.5), "The other way round: what moves has the larger beta."),
         (lambda b, m: wins(b, m, 0.0), "A pair with equal beta is worth one half."),
         (lambda b, m: wins(b, m, 1.0), "A pair with equal beta is worth one half."),
         (count, "The number of pairs is missing: divide by it."),
         (lambda b, m: count(b, m) / len(b) ** 2, "Only pairs of a moving and a static cell count."),
         (lambda b, m: b[m].mean() - b[~m].mean(), "This is a difference of means, no fraction."),
-        (at_the_median, "No threshold is asked for: compare all pairs."),
+        (lambda b, m: ((b > np.median(b)) == m).mean(), "No threshold: compare all pairs."),
     ]
-    return check_function(student, auroc, cases, 1e-9, hints, draw)
+    return check_function(student, auroc, cases, 1e-9, hints)
 
 
 def check_alignment(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Verdict:
@@ -108,19 +98,16 @@ def check_alignment(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> 
         A[:3, 3] = truth.mean(0) - A[:3, :3] @ estimate.mean(0)
         return A
 
-    def best(e: np.ndarray, t: np.ndarray, with_scale: bool = True) -> Similarity:
-        return umeyama(e, t, with_scale)
-
-    def reference(e: np.ndarray, t: np.ndarray) -> np.ndarray:
-        return matrix(best(e, t).scale, best(e, t).rotation, e, t)
+    def reference(e: np.ndarray, t: np.ndarray, scale: float | None = None) -> np.ndarray:
+        best = umeyama(e, t)
+        return matrix(best.scale if scale is None else scale, best.rotation, e, t)
 
     def mirrored(e: np.ndarray, t: np.ndarray) -> np.ndarray:
         u, d, v = np.linalg.svd((t - t.mean(0)).T @ (e - e.mean(0)))
         return matrix(d.sum() / ((e - e.mean(0)) ** 2).sum(), u @ v, e, t)
 
     def by_spread(e: np.ndarray, t: np.ndarray) -> np.ndarray:
-        ratio = np.linalg.norm(t - t.mean(0)) / np.linalg.norm(e - e.mean(0))
-        return matrix(float(ratio), best(e, t).rotation, e, t)
+        return reference(e, t, float(np.linalg.norm(t - t.mean(0)) / np.linalg.norm(e - e.mean(0))))
 
     def centred(e: np.ndarray, t: np.ndarray) -> np.ndarray:
         A = reference(e, t)
@@ -140,16 +127,16 @@ def check_alignment(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> 
         case(2.0, 0.1, -1.0, 20, "points that a reflection would fit better"),
         case(2.0, 0.1, 1.0, 3, "three points"),
     ]
-    hints: Hints = [
-        (lambda e, t: matrix(1.0, best(e, t).rotation, e, t), "Monocular: the scale is unknown."),
+    hints = [
+        (lambda e, t: reference(e, t, 1.0), "Monocular: the scale is unknown."),
         (mirrored, "A rotation has determinant +1: turn the last column of U if it is -1."),
         (by_spread, "With errors s is trace(D S) over the variance of the estimate."),
         (lambda e, t: np.linalg.inv(reference(e, t)), "This maps the truth to the estimate."),
         (lambda e, t: reference(t, e), "This maps the truth to the estimate."),
         (centred, "t maps the TURNED and scaled mean of the estimate to that of the truth."),
-        (lambda e, t: matrix(best(e, t).scale, best(e, t).rotation.T, e, t), "This is R^T."),
+        (lambda e, t: matrix(1.0, reference(e, t)[:3, :3].T, e, t), "This is R^T."),
     ]
-    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_sign_test(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
@@ -160,25 +147,22 @@ def check_sign_test(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdi
     """
 
     def reference(a: np.ndarray, b: np.ndarray, slack: float = 1e-12, sided: int = 2) -> float:
-        d = np.asarray(a) - np.asarray(b)
+        d = a - b
         means = np.array([np.mean(d * signs) for signs in product([1, -1], repeat=len(d))])
-        if sided == 1:
-            return float((means * np.sign(d.mean()) >= abs(d.mean()) - slack).mean())
-        return float((np.abs(means) >= abs(d.mean()) - slack).mean())
+        far = np.abs(means) if sided == 2 else means * np.sign(d.mean())
+        return float((far >= abs(d.mean()) - slack).mean())
 
-    def case(with_it: list[float], without: list[float], description: str) -> Case:
-        return Case((np.array(with_it), np.array(without)), description)
-
-    cases = [
-        case([1.0, 2.0, 3.0], [2.0, 4.0, 6.0], "three clips that all get better"),
-        case([0.4, 0.9, 0.3, 0.8], [0.5, 0.6, 0.7, 2.8], "four clips, one gets worse"),
-        case([2.0], [1.0], "a single clip"),
-        case([1.0, 2.0, 1.5], [1.0, 2.0, 1.5], "no difference at all"),
-    ]
-    hints: Hints = [
+    of_clips = {
+        "three clips that all get better": [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]],
+        "four clips, one gets worse": [[0.4, 0.9, 0.3, 0.8], [0.5, 0.6, 0.7, 2.8]],
+        "a single clip": [[2.0], [1.0]],
+        "no difference at all": [[1.0, 2.0, 1.5], [1.0, 2.0, 1.5]],
+    }
+    cases = [Case((*np.array(errors),), name) for name, errors in of_clips.items()]
+    hints = [
         (lambda a, b: reference(a, b, sided=1), "A difference the other way is as surprising."),
         (lambda a, b: reference(a, b, -1e-12), "At least as far: the measured one counts as well."),
         (lambda a, b: 1 - reference(a, b), "This is the fraction of the others."),
         (lambda a, b: reference(a, b) * 2 ** len(a), "Divide by the number of choices, 2^N."),
     ]
-    return check_function(student, reference, cases, tolerance=1e-9, hints=hints)
+    return check_function(student, reference, cases, 1e-9, hints)

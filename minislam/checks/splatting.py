@@ -1,52 +1,27 @@
 """Exercises of notebook 02."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import (
-    CAMERA,
-    Case,
-    Hints,
-    Verdict,
-    check_function,
-    doubles,
-    normals,
-)
+from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.splatting.constants import LOW_PASS_VARIANCE, NEAR_DEPTH
 from minislam.splatting.reference import composite, gaussian_alphas, project_covariances
 
 
-def check_projected_covariance(
-    student: Callable[[Tensor, Tensor, Tensor, Camera], Tensor],
-) -> Verdict:
+def check_projected_covariance(student: Callable[..., Tensor]) -> Verdict:
     """Check (covariance_world, mean_world, T_camera_world, camera) -> Sigma' (2, 2) in px^2."""
 
     def reference(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
         point = transform_points(pose, mean[None])
         return project_covariances(covariance[None], point, pose, camera)[0]
 
-    def unfiltered(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
-        low_pass = LOW_PASS_VARIANCE * torch.eye(2, dtype=covariance.dtype)
-        return reference(covariance, mean, pose, camera) - low_pass
-
-    def not_turned(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
-        rotation = pose[:3, :3]
-        return reference(rotation.T @ covariance @ rotation, mean, pose, camera)
-
-    def turned_back(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
-        twice = pose[:3, :3].T @ pose[:3, :3].T
-        return reference(twice @ covariance @ twice.T, mean, pose, camera)
-
-    def spread(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
-        return unfiltered(covariance, mean, pose, camera) + LOW_PASS_VARIANCE
-
-    def in_world(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
-        return project_covariances(covariance[None], mean[None], pose, camera)[0]
+    def turned(times: int, covariance: Tensor, mean: Tensor, pose: Tensor, *a: Camera) -> Tensor:
+        back = torch.linalg.matrix_power(pose[:3, :3].T, times)
+        return reference(back @ covariance @ back.T, mean, pose, *a)
 
     def case(x: float, turn: float, description: str, seed: int = 0) -> Case:
         factor = doubles([0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.05])
@@ -58,53 +33,38 @@ def check_projected_covariance(
         x, turn = normals(seed, 2).clamp(-2, 2).tolist()
         return case(0.3 * x, 0.15 * turn, "any camera", seed)
 
-    cases = [case(-0.1, 0.0, "a camera that is not turned"), case(0.6, 0.2, "a turned camera")]
-    hints = [
-        (unfiltered, "The low-pass filter is missing: add 0.3 I."),
-        (not_turned, "Sigma is still in the world frame: turn it by W before J."),
-        (turned_back, "This turns Sigma the wrong way: it is W Sigma W^T."),
-        (spread, "0.3 stands on the diagonal alone: 0.3 I."),
-        (lambda *a: torch.linalg.inv(reference(*a)), "This is the conic, the inverse of Sigma'."),
-        (in_world, "J is taken at the world point: move the mean into the camera frame first."),
+    cases = [
+        case(-0.1, 0.0, "a camera that is not turned"),
+        case(0.6, 0.2, "a turned camera"),
+        *drawn(draw),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    low_pass = LOW_PASS_VARIANCE * torch.eye(2).double()
+    off_diagonal = LOW_PASS_VARIANCE - low_pass
+    hints = [
+        (lambda *a: reference(*a) - low_pass, "The low-pass filter is missing: add 0.3 I."),
+        (lambda *a: turned(1, *a), "Sigma is still in the world frame: turn it by W before J."),
+        (lambda *a: turned(2, *a), "This turns Sigma the wrong way: it is W Sigma W^T."),
+        (lambda *a: reference(*a) + off_diagonal, "0.3 stands on the diagonal alone: 0.3 I."),
+        (lambda *a: torch.linalg.inv(reference(*a)), "This is the conic, the inverse of Sigma'."),
+        (
+            lambda S, x, *a: project_covariances(S[None], x[None], *a)[0],
+            "J is taken at the world point: move the mean into the camera frame first.",
+        ),
+    ]
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
     """Check (alphas, colors, background) -> color (3,) of one pixel, nearest Gaussian first."""
 
-    def blend(light: Tensor, alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        return (light[:-1] * alphas) @ colors + light[-1] * background
-
-    def transmittances(alphas: Tensor) -> Tensor:  # (K,) -> (K + 1,)
-        return torch.cat([alphas.new_ones(1), (1 - alphas).cumprod(0)])
-
-    def reference(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        return blend(transmittances(alphas), alphas, colors, background)
-
-    def without_background(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        return reference(alphas, colors, torch.zeros_like(background))
-
-    def far_first(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        return reference(alphas.flip(0), colors.flip(0), background)
-
-    def shades_itself(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        light = transmittances(alphas)
-        return blend(torch.cat([light[1:], light[-1:]]), alphas, colors, background)
-
-    def unattenuated(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        return without_background(alphas, colors, background) + background
-
-    def opaque(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        light = transmittances(alphas)
-        return light[:-1] @ colors + light[-1] * background
-
-    def additive(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        light = torch.cat([alphas.new_ones(1), 1 - alphas.cumsum(0)])
-        return blend(light, alphas, colors, background)
-
-    def unshaded(alphas: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-        return alphas @ colors + transmittances(alphas)[-1] * background
+    def blended(alphas: Tensor, colors: Tensor, background: Tensor, flaw: str = "") -> Tensor:
+        light = torch.cat([alphas.new_ones(1), (1 - alphas).cumprod(0)])  # (K + 1,)
+        end = {"unattenuated": 1, "no background": 0}.get(flaw, light[-1])
+        if flaw == "sum":
+            light = torch.cat([light[:1], 1 - alphas.cumsum(0)])
+            end = light[-1]
+        before = {"itself": light[1:], "unshaded": light[:-1] ** 0}.get(flaw, light[:-1])
+        return (before * alphas ** (flaw != "opaque")) @ colors + end * background
 
     def draw(seed: int) -> Case:
         values = normals(seed, 5, 4).sigmoid()[: 1 + seed % 5]
@@ -118,22 +78,22 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
         Case((alphas, colors, torch.zeros_like(grey)), "three Gaussians on black"),
         Case((alphas, colors, grey), "three Gaussians on grey"),
         Case((alphas[:0], colors[:0], grey), "no Gaussian at all"),
+        *drawn(draw),
     ]
-    hints = [
-        (without_background, "The background is missing: add T_end times its colour."),
-        (far_first, "This starts with the farthest: the list is sorted nearest first."),
-        (shades_itself, "T_i holds only the Gaussians in front of i, not i itself."),
-        (unattenuated, "The background shines through T_end only: multiply it."),
-        (opaque, "Each colour counts T_i times its own alpha_i."),
-        (additive, "The light that is left is a product of (1 - alpha), not 1 minus a sum."),
-        (unshaded, "T_i is missing: what stands in front takes light away."),
-    ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    flaws = {
+        "no background": "The background is missing: add T_end times its colour.",
+        "itself": "T_i holds only the Gaussians in front of i, not i itself.",
+        "unattenuated": "The background shines through T_end only: multiply it.",
+        "opaque": "Each colour counts T_i times its own alpha_i.",
+        "sum": "The light that is left is a product of (1 - alpha), not 1 minus a sum.",
+        "unshaded": "T_i is missing: what stands in front takes light away.",
+    }
+    farthest = "This starts with the farthest: the list is sorted nearest first."
+    hints = [(lambda a, c, b: blended(a.flip(0), c.flip(0), b), farthest)]
+    return check_function(student, blended, cases, 1e-9, hints, flaws)
 
 
-def check_rendered_image(
-    student: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Camera], Tensor],
-) -> Verdict:
+def check_rendered_image(student: Callable[..., Tensor]) -> Verdict:
     """Check (means, covariances, opacities, colors, T_camera_world, camera) -> image (H, W, 3)."""
     factors, colors = normals(1, 2, 5, 3, 3)
     means = doubles([0.1, 0, 3], [0, 0.1, 2], [-0.2, -0.1, 4], [0.3, 0, -2], [-0.3, 0.2, 2.5])
@@ -163,6 +123,7 @@ def check_rendered_image(
         Case((*(x[:1] for x in values), se3_exp(doubles(*[0] * 6)), camera), "one Gaussian"),
         Case((*(x[:3] for x in values), turned, camera), "three Gaussians in any order"),
         Case((*values, turned, camera), "five Gaussians, one behind the camera"),
+        *drawn(draw),
     ]
     flaws = {
         "unsorted": "Sort by the depth in the camera frame: the list has no order.",
@@ -172,5 +133,4 @@ def check_rendered_image(
         "whole": "The exponent is -1/2 of the squared distance.",
         "added": "Light is used up on its way: multiply T by 1 - alpha after each Gaussian.",
     }
-    hints: Hints = [(partial(rendered, flaw=flaw), hint) for flaw, hint in flaws.items()]
-    return check_function(student, rendered, cases, 1e-6, hints, draw)
+    return check_function(student, rendered, cases, 1e-6, flaws=flaws)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Hints, Verdict, check_function, normals
+from minislam.checks.grading import Case, Verdict, check_function, doubles, drawn, normals
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.stereo.sweep import plane_homographies
 
@@ -20,42 +20,34 @@ def check_plane_homography(student: Callable[[Tensor, Tensor, float], Tensor]) -
         camera = Camera(fx, fy, cx, cy, 320, 240)
         return torch.from_numpy(plane_homographies(camera, T.numpy(), np.array([q]))[0])
 
-    def with_depth(K: Tensor, T: Tensor, q: float) -> Tensor:
-        return reference(K, T, 1 / q) if q else reference(K, T, q)
-
-    def without_intrinsics(K: Tensor, T: Tensor, q: float) -> Tensor:
-        return torch.linalg.solve(K, reference(K, T, q) @ K)
-
     def other_axis(K: Tensor, T: Tensor, q: float) -> Tensor:
         motion = T[:3, :3].clone()
         motion[2] += q * T[:3, 3]
         return K @ motion @ torch.linalg.inv(K)
 
-    def turned_only(K: Tensor, T: Tensor, q: float) -> Tensor:
-        return reference(K, T, 0.0)
-
     def draw(seed: int) -> Case:
         q = round(0.2 + abs(normals(seed, 1).item()), 2)
         return Case((K, se3_exp(0.2 * normals(seed, 6)), q), f"q = {q}")
 
-    K = torch.tensor([[60.0, 0, 33], [0, 66, 19], [0, 0, 1]], dtype=torch.float64)
-    T = se3_exp(torch.tensor([0.3, -0.1, 0.2, 0.1, -0.2, 0.05], dtype=torch.float64))
+    K = doubles([60, 0, 33], [0, 66, 19], [0, 0, 1])
+    T = se3_exp(doubles(0.3, -0.1, 0.2, 0.1, -0.2, 0.05))
     cases = [
         Case((K, T, 0.0), "a plane at infinity"),
         Case((K, T, 0.5), "a plane two units away"),
         Case((K, se3_inverse(T), 0.8), "a camera that moves the other way"),
+        *drawn(draw),
     ]
     hints = [
         (lambda K, T, q: reference(K, se3_inverse(T), q), "This is the way back."),
-        (with_depth, "q is an inverse depth: the translation is multiplied by it."),
-        (without_intrinsics, "H maps pixels to pixels: it needs K on both sides."),
+        (lambda K, T, q: reference(K, T, q and 1 / q), "q is an inverse depth: t times q."),
+        (lambda K, *a: K.inverse() @ reference(K, *a) @ K, "H needs K on both sides: for pixels."),
         (lambda K, T, q: reference(K, T, -q), "The sign of the translation is the other one."),
-        (turned_only, "The translation is missing."),
+        (lambda K, T, q: reference(K, T, 0.0), "The translation is missing."),
         (other_axis, "t stands in the last column, t n^T, not in the last row."),
         (lambda K, T, q: torch.linalg.inv(reference(K, T, q)), "This maps the other image to us."),
         (lambda K, T, q: reference(K, T, q) @ K @ K, "The last factor is K^-1, not K."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_plane_cost(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Verdict:
@@ -65,27 +57,18 @@ def check_plane_cost(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) ->
     better half of the views that see the pixel; 1 where none does.
     """
 
-    def reference(
-        gray: np.ndarray,
-        warped: np.ndarray,
-        window: int = 5,
-        every: bool = False,
-        worse: bool = False,
-        up: int = 1,
-        unseen: float = 1.0,
-    ) -> np.ndarray:
-        seen = warped >= 0
-        difference = np.where(seen, np.abs(warped - gray), 0)
-        blurred = [cv2.blur(picture, (window, window)) for picture in difference]
-        ordered = np.sort(np.where(seen, blurred, np.inf), 0)[:: -1 if worse else 1]
+    def reference(gray: np.ndarray, warped: np.ndarray, flaw: str = "") -> np.ndarray:
+        seen = (warped >= 0) | (flaw == "outside")
+        difference = np.where(seen, np.abs(warped.clip(0) - gray), 0)
+        window = (1, 1) if flaw == "pixel" else (5, 5)
+        blurred = [cv2.blur(picture, window) for picture in difference]
+        ordered = np.sort(np.where(seen, blurred, np.inf), 0)[:: -1 if flaw == "worse" else 1]
         number = seen.sum(0)
-        taken = np.maximum(number if every else (number + up) // 2, 1)
+        half = (number + (flaw != "down")) // 2
+        taken = np.maximum(number if flaw == "every" else half, 1)
         inside = (np.arange(len(warped))[:, None, None] < taken) & np.isfinite(ordered)
         total = np.where(inside, ordered, 0).sum(0)
-        return np.where(number > 0, total / taken, unseen)
-
-    def unmasked(gray: np.ndarray, warped: np.ndarray) -> np.ndarray:
-        return reference(gray, np.abs(np.where(warped < 0, 0, warped)))
+        return np.where(number > 0, total / taken, float(flaw != "unseen"))
 
     source = np.random.default_rng(0)
     gray, warped = source.random((12, 15)), source.random((4, 12, 15))
@@ -96,15 +79,12 @@ def check_plane_cost(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) ->
         Case((gray, warped[:3]), "three views, of which two are the better half"),
         Case((gray, partly), "views that do not see every pixel"),
     ]
-    hints: Hints = [
-        (
-            lambda g, w: reference(g, w, every=True),
-            "Only the better half of the views is averaged.",
-        ),
-        (lambda g, w: reference(g, w, worse=True), "This is the worse half."),
-        (lambda g, w: reference(g, w, window=1), "Average over the 5x5 px around the pixel."),
-        (lambda g, w: reference(g, w, up=0), "Of three views two are the half: round up."),
-        (lambda g, w: reference(g, w, unseen=0.0), "A pixel that no view sees costs 1."),
-        (unmasked, "A negative value is outside of the image: that view does not count there."),
-    ]
-    return check_function(student, reference, cases, tolerance=1e-6, hints=hints)
+    flaws = {
+        "every": "Only the better half of the views is averaged.",
+        "worse": "This is the worse half.",
+        "pixel": "Average over the 5x5 px around the pixel.",
+        "down": "Of three views two are the half: round up.",
+        "unseen": "A pixel that no view sees costs 1.",
+        "outside": "A negative value is outside of the image: that view does not count there.",
+    }
+    return check_function(student, reference, cases, 1e-6, flaws=flaws)

@@ -1,6 +1,8 @@
 """Exercises of notebooks 06 and 06b."""
 
 from collections.abc import Callable
+from functools import partial
+from itertools import combinations
 from typing import Any
 
 import cv2
@@ -8,17 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import (
-    CAMERA,
-    Case,
-    Function,
-    Hints,
-    Verdict,
-    check_function,
-    doubles,
-    normals,
-)
-from minislam.geometry import Camera, se3_exp
+from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
+from minislam.geometry import se3_exp
 from minislam.priors.dense_flow import composed_flow, reverse_flow
 from minislam.priors.grid_flow import grid_matches
 from minislam.priors.interfaces import FlowMatches
@@ -27,11 +20,10 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_selection import KEYFRAME_MATCHED_RATIO
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.safeguards import motion_memory
+from minislam.tracking.safeguards.robust import RobustKernel
 
 
-def check_flow_distance(
-    student: Callable[[Tensor, Tensor, Tensor, Tensor, Camera, float], Tensor],
-) -> Verdict:
+def check_flow_distance(student: Callable[..., Tensor]) -> Verdict:
     """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, beta) -> distance [px]."""
     pixels = CAMERA.pixel_grid(10, torch.float64).flatten(0, 1)
     disparities = 0.2 + 0.3 * normals(0, 2, len(pixels)).sigmoid()
@@ -39,27 +31,24 @@ def check_flow_distance(
     def reference(*arguments: Any) -> Tensor:
         return flow_distances(*arguments)[0, 1]
 
-    def with_beta(change: Callable[[float], float]) -> Function:
+    def with_beta(change: Callable[[float], float]) -> Callable:
         return lambda *arguments: reference(*arguments[:-1], change(arguments[-1]))
 
-    def changed(length: Function, without_translation: bool = False) -> Function:
+    def changed(length: Callable, turned: bool = False) -> Callable:
         """Return the distance with another mean of the flows (2, 2, N), both directions."""
 
         def distance(poses: Tensor, d: Tensor, rays: Tensor, pixels: Tensor, *rest: Any) -> Tensor:
-            camera, beta = rest
             whole = relative_transforms(poses, [0, 1], [1, 0])
             part = torch.eye(4, dtype=poses.dtype).repeat(2, 1, 1)
-            part[:, :3, 3] = whole[:, :3, 3]
-            if without_translation:
-                part = whole * (1 - part) + torch.eye(4, dtype=poses.dtype) * part
-            flows = [reproject(T, d, rays, camera)[0] - pixels.T for T in (whole, part)]
-            return beta * length(flows[0]) + (1 - beta) * length(flows[1])
+            kept = (slice(None), slice(3), slice(3) if turned else 3)
+            part[kept] = whole[kept]
+            flows = [reproject(T, d, rays, rest[0])[0] - pixels.T for T in (whole, part)]
+            return rest[1] * length(flows[0]) + (1 - rest[1]) * length(flows[1])
 
         return distance
 
     def case(twist: list[float], beta: float, description: str) -> Case:
-        poses = se3_exp(doubles([0.0] * 6, twist))
-        rays = CAMERA.rays(pixels)
+        poses, rays = se3_exp(doubles([0.0] * 6, twist)), CAMERA.rays(pixels)
         return Case((poses, disparities, rays, pixels, CAMERA, beta), description)
 
     def draw(seed: int) -> Case:
@@ -70,8 +59,9 @@ def check_flow_distance(
         case([0.3, -0.1, 0.0, 0.0, 0.0, 0.0], 0.75, "a camera that slides"),
         case([0.0, 0.0, 0.0, 0.02, 0.1, 0.0], 0.75, "a camera that turns"),
         case([0.3, 0.1, 0.2, 0.02, -0.05, 0.03], 0.75, "a camera that does both"),
+        *drawn(draw),
     ]
-    hints: Hints = [
+    hints = [
         (with_beta(lambda beta: 1.0), "The flow without rotation has the weight 1 - beta."),
         (with_beta(lambda beta: 0.0), "This is the flow without rotation alone."),
         (with_beta(lambda beta: 1 - beta), "beta and 1 - beta are exchanged."),
@@ -83,12 +73,9 @@ def check_flow_distance(
         (changed(lambda f: f.norm(dim=1).median()), "The mean is asked for, not the median."),
         (changed(lambda f: f.abs().sum(1).mean()), "A length is the root of u^2 + v^2."),
         (changed(lambda f: f.square().sum(1).mean()), "A length is the root of u^2 + v^2."),
-        (
-            changed(lambda f: f.norm(dim=1).mean(), True),
-            "Leave out the rotation, not the translation.",
-        ),
+        (changed(lambda f: f.norm(dim=1).mean(), True), "Without rotation, not translation."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict:
@@ -96,38 +83,22 @@ def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict
 
     def reference(newer: int, older: int, count: int, suppression: int) -> Tensor:
         suppressed = torch.zeros(count, count)
-        for a in range(count):
-            for b in range(a):
-                # All other pairs are too far apart, so only this one can be returned.
-                distances = torch.full((count, count), 2.0)
-                distances[a, b] = 0.0
-                pairs = proximity_pairs(
-                    distances, [(newer, older)], range(count), 1.0, count, suppression
-                )
-                suppressed[a, b] = not pairs
+        for a, b in combinations(reversed(range(count)), 2):
+            # All other pairs are too far apart, so only this one can be returned.
+            distances = torch.full((count, count), 2.0)
+            distances[a, b] = 0.0
+            chosen = [(newer, older)], range(count), 1.0, count, suppression
+            suppressed[a, b] = not proximity_pairs(distances, *chosen)
         return suppressed
 
-    def within(radius: int, count: int, newer: int, older: int, order: float) -> Tensor:
-        a, b = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
-        offsets = torch.stack([a - newer, b - older]).double()
-        return ((torch.linalg.vector_norm(offsets, order, 0) <= radius) & (a > b)).double()
+    def of_radius(radius: Callable[[int, int], int], norm: float = 1) -> Callable:
+        def within(newer: int, older: int, count: int, most: int) -> Tensor:
+            a, b = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
+            offsets = torch.stack([a - newer, b - older]).double()
+            length = torch.linalg.vector_norm(offsets, norm, 0)
+            return ((length <= radius(newer - older, most)) & (a > b)).double()
 
-    def radius_of(newer: int, older: int, suppression: int) -> int:
-        return max(min(newer - older - 2, suppression), 0)
-
-    def as_square(newer: int, older: int, count: int, suppression: int) -> Tensor:
-        radius = radius_of(newer, older, suppression)
-        return within(radius, count, newer, older, torch.inf)
-
-    def unlimited(newer: int, older: int, count: int, suppression: int) -> Tensor:
-        return within(suppression, count, newer, older, 1)
-
-    def both_orders(newer: int, older: int, count: int, suppression: int) -> Tensor:
-        answer = reference(newer, older, count, suppression)
-        return answer + answer.T
-
-    def of_radius(radius: Callable[[int, int], int]) -> Function:
-        return lambda i, j, count, most: within(radius(i - j, most), count, i, j, 1)
+        return within
 
     def draw(seed: int) -> Case:
         older, apart, most = 1 + seed % 4, 2 + seed % 5, 1 + seed % 3
@@ -137,11 +108,12 @@ def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict
         Case((8, 2, 11, 2), "a pair far apart in time"),
         Case((6, 3, 11, 2), "a pair three keyframes apart"),
         Case((5, 4, 11, 2), "two neighbours"),
+        *drawn(draw),
     ]
-    hints: Hints = [
-        (as_square, "The neighbourhood is a diamond: |a| + |b|, not the larger of the two."),
-        (unlimited, "Near the diagonal the radius shrinks: it is at most |i - j| - 2."),
-        (both_orders, "Only pairs (newer, older) are wanted: a > b."),
+    hints = [
+        (of_radius(lambda n, most: max(min(n - 2, most), 0), torch.inf), "A diamond: |a| + |b|."),
+        (of_radius(lambda n, most: most), "Near the diagonal the radius shrinks: |i - j| - 2."),
+        (lambda *a: reference(*a) + reference(*a).T, "Only pairs (newer, older), a > b."),
         (of_radius(lambda n, most: min(n, most)), "At most |i - j| - 2: take 2 off."),
         (of_radius(lambda n, most: min(n - 2, most)), "A radius is at least 0: the pair itself."),
         (of_radius(lambda n, most: max(min(n - 2, most), 0) - 1), "Up to the radius: <=, not <."),
@@ -149,50 +121,44 @@ def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict
         (of_radius(lambda n, most: 0), "Only the pair itself: its neighbours are left out, too."),
         (lambda *a: (1 - reference(*a)).tril(-1), "True stands for the pairs that are left out."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_keyframes(student: Callable[[list[np.ndarray], float, int], list[int]]) -> Verdict:
     """Check (gray images, largest mean flow [px], longest interval) -> frames to keep."""
 
-    def choice(weighted: bool = True, restart: bool = True, matched: bool = True) -> Function:
-        def run(images: list[np.ndarray], max_flow: float, interval: int) -> list[int]:
-            kept = [0]
-            none = np.zeros((*images[0].shape, 2), np.float32)
-            cells = none[::8, ::8]
-            flow, start = none, images[0]
-            for n, image in enumerate(images[1:], 1):
-                flow = composed_flow(start, image, flow)
-                back = reverse_flow(start, image, flow)
-                _, sure = grid_matches(flow, cells, back, cells[..., 0] + 1, 8)
-                weight = sure if weighted else np.ones_like(sure)
-                length = np.linalg.norm(flow[::8, ::8], axis=-1)
-                mean = (weight * length).sum() / max(weight.sum(), 1e-9)
-                unmatched = matched and sure.mean() < KEYFRAME_MATCHED_RATIO
-                if mean > max_flow or unmatched or n - kept[-1] >= interval:
-                    kept.append(n)
-                    start, flow = (image, none) if restart else (start, flow)
-            return kept
-
-        return run
+    def choice(
+        images: list[np.ndarray], max_flow: float, interval: int, flaw: str = ""
+    ) -> list[int]:
+        kept, none = [0], np.zeros((*images[0].shape, 2), np.float32)
+        cells, flow, start = none[::8, ::8], none, images[0]
+        for n, image in enumerate(images[1:], 1):
+            flow = composed_flow(start, image, flow)
+            back = reverse_flow(start, image, flow)
+            _, sure = grid_matches(flow, cells, back, cells[..., 0] + 1, 8)
+            weight = np.ones_like(sure) if flaw == "equal" else sure
+            length = np.linalg.norm(flow[::8, ::8], axis=-1)
+            mean = (weight * length).sum() / max(weight.sum(), 1e-9)
+            unmatched = flaw != "unmatched" and sure.mean() < KEYFRAME_MATCHED_RATIO
+            if mean > max_flow or unmatched or n - kept[-1] >= interval:
+                kept.append(n)
+                start, flow = (start, flow) if flaw == "no restart" else (image, none)
+        return kept
 
     noise = np.random.default_rng(0).integers(0, 256, (2, 30, 60), np.uint8)
     wide = [cv2.resize(part, (480, 240), interpolation=cv2.INTER_CUBIC) for part in noise]
 
     def shown(columns: list[float], blinking: bool = False) -> list[np.ndarray]:
-        views = []
-        for number, column in enumerate(columns):
-            shift = np.array([[1, 0, -column], [0, 1, -60]])
-            view = cv2.warpAffine(wide[0], shift, (160, 120))
-            if blinking:  # a screen that shows another picture in each frame
-                view[20:100, 30:110] = wide[1][20:100, 80 * (number % 4) :][:, :80]
-            views.append(view)
+        shifts = [np.array([[1, 0, -column], [0, 1, -60]]) for column in columns]
+        views = [cv2.warpAffine(wide[0], shift, (160, 120)) for shift in shifts]
+        for number, view in enumerate(views if blinking else []):  # a screen, each time another
+            view[20:100, 30:110] = wide[1][20:100, 80 * (number % 4) :][:, :80]
         return views
 
     def draw(seed: int) -> Case:
         speed = 1.5 + 0.25 * (seed % 5)
-        columns = [20.0 + speed * n for n in range(5)]
-        return Case((shown(columns), 2.5 * speed, 20), f"{speed} px a frame")
+        moving = shown([20.0 + speed * n for n in range(5)])
+        return Case((moving, 2.5 * speed, 20), f"{speed} px a frame")
 
     slide = [2.0 * n for n in range(9)]
     leap = shown(slide[:3] + [column + 150 for column in slide[3:5]])
@@ -201,44 +167,61 @@ def check_keyframes(student: Callable[[list[np.ndarray], float, int], list[int]]
         Case((shown([0.2 * n for n in range(6)]), 20.0, 3), "a camera that hardly moves"),
         Case((leap, 500.0, 20), "a camera that leaps to another place"),
         Case((shown(slide[:6], blinking=True), 6.9, 20), "a screen that blinks"),
+        *drawn(draw),
     ]
-    hints: Hints = [
-        (choice(weighted=False), "The mean is weighted by the confidence of each cell."),
-        (choice(matched=False), "A frame of which too little is matched is kept as well."),
-        (
-            lambda a, b, c: choice()(a, b, 99),
-            "A frame is kept at the latest `interval` frames after the last.",
-        ),
-        (choice(restart=False), "The flow starts anew, from the frame that was kept last."),
-        (lambda *a: choice()(*a)[1:], "Frame 0 is the first that is kept."),
+    flaws = {
+        "equal": "The mean is weighted by the confidence of each cell.",
+        "unmatched": "A frame of which too little is matched is kept as well.",
+        "no restart": "The flow starts anew, from the frame that was kept last.",
+    }
+    hints = [
+        (lambda a, b, _: choice(a, b, 99), "At the latest `interval` frames after the last one."),
+        (lambda *a: choice(*a)[1:], "Frame 0 is the first that is kept."),
     ]
-    return check_function(student, choice(), cases, 1e-9, hints, draw)
+    return check_function(student, choice, cases, 1e-9, hints, flaws)
 
 
-def check_motion_memory(
-    student: Callable[[Grid, FlowMatches, Tensor, Tensor, Tensor, float], Tensor],
-) -> Verdict:
+def check_bounded_loss(student: Callable[[Tensor, float, int], Tensor]) -> Verdict:
+    """Check (lengths r of residuals (N,) [px], scale c [px], p = 1 or 2) -> L_p (N,) [px^2]."""
+
+    def reference(r: Tensor, c: float, p: int) -> Tensor:
+        return RobustKernel(c, p).loss(r**2)
+
+    cases = [
+        Case((doubles(0, 0.5, 3, 40), 2.0, 1), "p = 1 and c = 2 px"),
+        Case((doubles(0, 0.5, 3, 40), 2.0, 2), "p = 2 and c = 2 px"),
+        *drawn(lambda seed: Case((normals(seed, 5).abs(), 0.5, 1 + seed % 2), "c = 0.5 px")),
+    ]
+    hints = [
+        (lambda r, c, p: reference(r, c, 1), "With p = 2 the loss is bounded: L_2."),
+        (lambda r, c, p: reference(r, c, 2), "With p = 1 the loss is a logarithm: L_1."),
+        (lambda r, c, p: reference(r, c, p) / c**2, "The factor c^2 in front is missing."),
+        (lambda r, c, p: r**2, "This is least squares: not yet robust."),
+        (lambda r, c, p: RobustKernel(c, p).weight(r**2), "This is the weight, the loss's slope."),
+        (lambda r, c, p: RobustKernel(c, p).loss(r * c), "r / c is squared."),
+        (lambda r, c, p: reference(r, c, p) / 2, "This is half of the loss."),
+    ]
+    return check_function(student, reference, cases, 1e-9, hints)
+
+
+def check_motion_memory(student: Callable[..., Tensor]) -> Verdict:
     """Check (grid, matches, disparities, motion, weights, scale) -> weights of the next cells."""
     grid = Grid.of(CAMERA, 8)
     grid.rays = grid.rays.to(torch.get_default_dtype())
 
-    def reference(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
-        weight = motion_memory.update_motion_weight(grid, matches, *rest)
-        return motion_memory.inherit_motion_weight(grid, matches, weight)
+    def reference(
+        grid: Grid, matches: FlowMatches, *rest: Any, constants: dict[str, float] | None = None
+    ) -> Tensor:
+        known = {name: getattr(motion_memory, name) for name in constants or {}}
+        try:
+            vars(motion_memory).update(constants or {})
+            weight = motion_memory.update_motion_weight(grid, matches, *rest)
+            return motion_memory.inherit_motion_weight(grid, matches, weight)
+        finally:
+            vars(motion_memory).update(known)
 
-    def changed(constants: dict[str, float]) -> Function:
-        def run(*arguments: Any) -> Tensor:
-            known = {name: getattr(motion_memory, name) for name in constants}
-            try:
-                vars(motion_memory).update(constants)
-                return reference(*arguments)
-            finally:
-                vars(motion_memory).update(known)
-
-        return run
-
-    def stays(*arguments: Any) -> Tensor:
-        return motion_memory.update_motion_weight(*arguments)
+    def change(constants: dict[str, float]) -> Callable:
+        return partial(reference, constants=constants)
 
     def zeros_left(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
         columns, rows = (matches.targets[0] / grid.stride).round().long()
@@ -249,13 +232,13 @@ def check_motion_memory(
         return reference(grid, matches, *rest) * (1 - empty.flatten())
 
     def case(twist: list[float], aside: float, sure: float, what: str, seed: int = 3) -> Case:
-        drawn = normals(seed, 4, len(grid.rays)).erf().abs().to(grid.rays)  # in [0, 1)
-        disparities, motion = 0.2 + 0.3 * drawn[0], se3_exp(torch.tensor(twist))
+        random = normals(seed, 4, len(grid.rays)).erf().abs().to(grid.rays)  # in [0, 1)
+        disparities, motion = 0.2 + 0.3 * random[0], se3_exp(torch.tensor(twist))
         flow, _ = reproject(motion[None], disparities[None], grid.rays, CAMERA)
-        flow = flow + aside * (drawn[1] < 0.4) * torch.tensor([[1.0], [-0.5]])
-        confidences = (drawn[2] < sure).to(flow).expand(1, 2, -1)
+        flow = flow + aside * (random[1] < 0.4) * torch.tensor([[1.0], [-0.5]])
+        confidences = (random[2] < sure).to(flow).expand(1, 2, -1)
         matches = FlowMatches(flow, confidences, torch.ones(1))
-        return Case((grid, matches, disparities, motion, drawn[3], 2.0), what)
+        return Case((grid, matches, disparities, motion, random[3], 2.0), what)
 
     def draw(seed: int) -> Case:
         slide, turn = (0.1 * normals(seed, 2, 3).clamp(-2, 2)).tolist()
@@ -265,13 +248,17 @@ def check_motion_memory(
         case([0.0] * 6, 3.0, 1.0, "a camera that stands still"),
         case([0.5, 0.1, 0.0, 0.0, 0.02, 0.0], 5.0, 1.0, "a camera that moves"),
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
+        *drawn(draw),
     ]
-    hints: Hints = [
-        (changed({"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9}), "It falls fast and recovers slowly."),
-        (changed({"RECOVERY_RATE": 0.9}), "The rate is 0.9 only where the weight falls."),
-        (changed({"DEPTH_ERROR": 0.0}), "c_m^2 also holds a hundredth of the squared parallax."),
-        (changed({"MIN_CONFIDENCE": -1.0}), "Cells with a confidence of at most 0.1 say nothing."),
-        (stays, "These are the weights of the source cells: hand them on along the flow."),
+    hints = [
+        (change({"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9}), "It falls fast and recovers slowly."),
+        (change({"RECOVERY_RATE": 0.9}), "The rate is 0.9 only where the weight falls."),
+        (change({"DEPTH_ERROR": 0.0}), "c_m^2 also holds a hundredth of the squared parallax."),
+        (change({"MIN_CONFIDENCE": -1.0}), "Cells with a confidence of at most 0.1 say nothing."),
+        (
+            motion_memory.update_motion_weight,
+            "These are the weights of the source cells: hand them on along the flow.",
+        ),
         (zeros_left, "A cell to which nothing flows takes the weight of the nearest one."),
     ]
-    return check_function(student, reference, cases, 1e-4, hints, draw)
+    return check_function(student, reference, cases, 1e-4, hints)

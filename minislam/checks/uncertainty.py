@@ -2,14 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.checks.grading import Case, Function, Verdict, check_function, doubles, normals
+from minislam.checks.grading import Case, Verdict, check_function, doubles, drawn, normals
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import variance_regulariser
 from minislam.uncertainty.mlp import UncertaintyMLP
@@ -27,7 +26,11 @@ def check_best_beta(student: Callable[[Tensor, float], Tensor]) -> Verdict:
         return Case((normals(seed, 4).square(), lambda_log), f"lambda_3 = {lambda_log}")
 
     error = doubles(0.0, 0.01, 0.5, 2.0, 6.0)
-    cases = [Case((error, 2.0), "lambda_3 = 2"), Case((error, 0.5), "lambda_3 = 0.5")]
+    cases = [
+        Case((error, 2.0), "lambda_3 = 2"),
+        Case((error, 0.5), "lambda_3 = 0.5"),
+        *drawn(draw),
+    ]
     hints = [
         (lambda L, _: L.sqrt(), "lambda_3 is not in it: set the derivative to zero and solve."),
         (lambda L, x: (L / x).sqrt(), "A factor 2 is missing: d(L beta^-2) = -2 L beta^-3."),
@@ -36,7 +39,7 @@ def check_best_beta(student: Callable[[Tensor, float], Tensor]) -> Verdict:
         (lambda L, x: (2 * L * x).sqrt(), "lambda_3 belongs below the line: it makes beta small."),
         (lambda L, x: reference(L, x).clamp_min(0.1), "No floor is asked for: 0 stays 0."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_feature_variance(student: Callable[[Tensor, Tensor], Tensor]) -> Verdict:
@@ -46,56 +49,42 @@ def check_feature_variance(student: Callable[[Tensor, Tensor], Tensor]) -> Verdi
     def reference(beta: Tensor, features: Tensor) -> Tensor:
         return variance_regulariser(beta, features, config)
 
-    def masked(similar: Tensor, beta: Tensor) -> Tensor:
-        mean = similar @ beta / similar.sum(1)
+    def masked(beta: Tensor, near: Tensor, lost: int = 0) -> Tensor:
+        mean, count = near @ beta / near.sum(1), near.sum(1)
         squares = (beta[None] - mean[:, None]) ** 2
-        return (similar * squares).sum(1) / similar.sum(1)
-
-    def all_cells(beta: Tensor, features: Tensor) -> Tensor:
-        return masked(torch.ones(len(beta), len(beta), dtype=beta.dtype), beta).mean()
-
-    def not_normalised(beta: Tensor, features: Tensor) -> Tensor:
-        return masked((features @ features.T > config.similarity).to(beta), beta).mean()
-
-    def deviation(beta: Tensor, features: Tensor) -> Tensor:
-        return masked(similar(features), beta).sqrt().mean()
+        return (near * squares).sum(1) / (count - lost).clamp_min(lost)
 
     def similar(features: Tensor) -> Tensor:
         unit = functional.normalize(features, dim=-1)
         return (unit @ unit.T > config.similarity).to(features)
 
-    def without_itself(beta: Tensor, features: Tensor) -> Tensor:
-        others = similar(features).fill_diagonal_(0)
-        return masked(others, beta).nan_to_num().mean()
+    def not_normalised(beta: Tensor, features: Tensor) -> Tensor:
+        return masked(beta, (features @ features.T > config.similarity).to(beta)).mean()
 
-    def unbiased(beta: Tensor, features: Tensor) -> Tensor:
-        count = similar(features).sum(1)
-        variance = masked(similar(features), beta) * count / (count - 1).clamp_min(1)
-        return variance.mean()
+    def without_itself(beta: Tensor, features: Tensor) -> Tensor:
+        return masked(beta, similar(features).fill_diagonal_(0)).nan_to_num().mean()
 
     def around_all(beta: Tensor, features: Tensor) -> Tensor:
         near = similar(features)
         return (near @ (beta - beta.mean()) ** 2 / near.sum(1)).mean()
-
-    def draw(seed: int) -> Case:
-        return Case((normals(seed, 7).abs(), normals(seed, 7, 2)), "seven cells")
 
     beta = doubles(0.2, 1.4, 0.5, 2.0, 0.9)
     features = doubles([3.0, 0.0], [2.0, 1.0], [0.0, 0.5], [0.1, 0.5], [1.0, -1.0])
     cases = [
         Case((beta[:2], torch.eye(2, dtype=torch.float64)), "two cells that are not similar"),
         Case((beta, features), "five cells in three groups"),
+        *drawn(lambda seed: Case((normals(seed, 7).abs(), normals(seed, 7, 2)), "seven cells")),
     ]
     hints = [
-        (all_cells, "Every cell is compared with every other: only similar ones count."),
+        (lambda b, f: masked(b, f.new_ones(len(b), len(b))).mean(), "Compare only similar cells."),
         (not_normalised, "Divide each feature by its length: the cosine has no unit."),
-        (deviation, "This is the standard deviation; the variance is its square."),
+        (lambda b, f: masked(b, similar(f)).sqrt().mean(), "The variance is the square of this."),
         (without_itself, "A cell is one of its own neighbours."),
-        (unbiased, "Divide by the number of neighbours, not by the number minus one."),
+        (lambda b, f: masked(b, similar(f), 1).mean(), "Divide by the number, not by one less."),
         (around_all, "The mean is that of the similar cells, not that of all."),
-        (lambda b, f: masked(similar(f), b).sum(), "The mean over the cells is asked for."),
+        (lambda b, f: masked(b, similar(f)).sum(), "The mean over the cells is asked for."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints, draw)
+    return check_function(student, reference, cases, 1e-9, hints)
 
 
 def check_training(student: Callable[..., Tensor]) -> Verdict:
@@ -123,12 +112,13 @@ def check_training(student: Callable[..., Tensor]) -> Verdict:
                 optimizer.step()
         return torch.stack(losses).detach()
 
-    def with_mlp(train: Function) -> Function:
-        def outcome(features: Tensor, *errors_and_steps: Any) -> Tensor | None:
+    def with_mlp(train: Callable) -> Callable:
+        def outcome(features: Tensor, *rest: Any, flaw: str = "") -> Tensor | None:
             mlp = UncertaintyMLP(5, torch.Generator().manual_seed(1)).to(features)
             # Plain descent: Adam would hide a loss that is twice too large.
             descent = torch.optim.SGD(mlp.parameters(), lr=0.02)
-            losses = train(mlp, descent, features, *errors_and_steps)
+            asked = {"flaw": flaw} if flaw else {}
+            losses = train(mlp, descent, features, *rest, **asked)
             if losses is None:
                 return None
             return torch.cat([torch.as_tensor(losses), mlp(features).flatten()]).detach()
@@ -142,6 +132,7 @@ def check_training(student: Callable[..., Tensor]) -> Verdict:
         Case((features, ssim, depth, torch.ones_like(opacity), 1), "one step"),
         Case((features, ssim, depth, opacity, 1), "one step, with holes in the map"),
         Case((features, ssim, depth, opacity, 4), "four steps on two views"),
+        *drawn(draw),
     ]
     flaws = {
         "lambda_depth": "L_depth is missing in the error.",
@@ -152,5 +143,4 @@ def check_training(student: Callable[..., Tensor]) -> Verdict:
         "gathered": "Gradients add up: call zero_grad before backward.",
         "still": "The MLP did not change: call optimizer.step().",
     }
-    hints = [(with_mlp(partial(trained, flaw=flaw)), hint) for flaw, hint in flaws.items()]
-    return check_function(with_mlp(student), with_mlp(trained), cases, 1e-6, hints, draw)
+    return check_function(with_mlp(student), with_mlp(trained), cases, 1e-6, flaws=flaws)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.checks import check_bundle_adjustment, check_prior_mask
+from minislam.checks import check_bundle_adjustment, check_prior_mask, check_robust_weight
 from minislam.geometry import se3_adjoint, se3_exp, se3_inverse, transform_points
 from minislam.tracking.bundle_adjustment import BundleState
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
@@ -118,7 +118,7 @@ def in_numpy(depth, others, camera, stride, error):
     return voted(depth, others, camera, stride, error).numpy().astype(np.float32)
 
 
-@pytest.mark.ex05b_1
+@pytest.mark.ex05b_2
 def test_prior_mask():
     right = {"loop": voted, "numpy": in_numpy}
     wrong = {
@@ -131,3 +131,26 @@ def test_prior_mask():
         "always": lambda *a: voted(*a) | True,
     }
     assert_variants(check_prior_mask, right, wrong, named=0.7)
+
+
+def robust(r, c, p):
+    return (1 + (r**2).sum(1) / c**2) ** -p
+
+
+def robust_in_a_loop(r, c, p):
+    return [1 / (1 + (float(u) ** 2 + float(v) ** 2) / c**2) ** p for u, v in r]
+
+
+@pytest.mark.ex05b_1
+def test_robust_weight():
+    wrong = {
+        "always Cauchy": lambda r, c, p: robust(r, c, 1),
+        "no c": lambda r, c, p: robust(r, 1, p),
+        "c not squared": lambda r, c, p: robust(r, c**0.5, p),
+        "other sign": lambda r, c, p: robust(r, c, -p),
+        "pull": lambda r, c, p: robust(r, c, p) * r.norm(dim=1),
+        "one for u, one for v": lambda r, c, p: (1 + r**2 / c**2) ** -p,
+        "r not squared": lambda r, c, p: (1 + r.norm(dim=1) / c**2) ** -p,
+        "no 1": lambda r, c, p: ((r**2).sum(1) / c**2) ** -p,
+    }
+    assert_variants(check_robust_weight, {"torch": robust, "loop": robust_in_a_loop}, wrong)

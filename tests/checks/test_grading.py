@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from minislam.checks import PASSED, WRONG, Case, check_function, is_written
-from minislam.checks.grading import WrongAnswer, normals
+from minislam.checks.grading import WrongAnswer, drawn, normals
 from tests.helpers import unfinished
 
 
@@ -50,20 +50,23 @@ def double(x):
     return 2 * x
 
 
-def drawn(seed: int) -> Case:
+def random_case(seed: int) -> Case:
     return Case((normals(seed, 3),), f"seed {seed}")
 
 
 def test_cases_are_drawn_and_others_under_a_seed(monkeypatch):
-    cases, seen = [Case((torch.ones(3),), "three ones")], []
+    ones, seen = Case((torch.ones(3),), "three ones"), []
 
     def student(x):
         seen.append(x.double().sum().item())
         return 2 * x
 
-    assert "4 of 4 cases" in check_function(student, double, cases, draw=drawn).sentence
+    def verdict():
+        return check_function(student, double, [ones, *drawn(random_case)])
+
+    assert "4 of 4 cases" in verdict().sentence
     monkeypatch.setenv("MINISLAM_SEED", "5")
-    assert "7 of 7 cases" in check_function(student, double, cases, draw=drawn).sentence
+    assert "7 of 7 cases" in verdict().sentence
     assert seen[:4] == seen[4:8] and len(set(seen)) == 7
 
 

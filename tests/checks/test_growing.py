@@ -7,6 +7,7 @@ import torch
 
 from minislam.checks import check_followed_pose, check_insertion, check_map_loss
 from minislam.geometry import se3_exp, se3_inverse, transform_points
+from minislam.mapping.pose_refinement import curvature
 from minislam.splatting import render
 from tests.helpers import assert_variants
 
@@ -95,10 +96,10 @@ def test_map_loss():
 
 
 def followed(gaussians, camera, T, image, weight, steps, rate=0.006, shrink=0.96, **how):
-    """Descend with Adam; `sign`, `result` and `fold` say how it goes wrong, or another way."""
+    """Descend with Adam, 60 steps; `sign`, `result`, `fold`: how it goes wrong, or another way."""
     twist, pose = torch.zeros(6, requires_grad=True), T
     optimizer = torch.optim.Adam([twist], lr=rate)
-    for _ in range(steps):
+    for _ in range(60):
         view = render(gaussians, camera, pose, twist=twist)
         error = (view.color - image).abs().mean(-1) * view.opacity.detach()
         loss = how.get("sign", 1) * (error * (1 if how.get("equal") else weight)).mean()
@@ -121,10 +122,23 @@ def followed(gaussians, camera, T, image, weight, steps, rate=0.006, shrink=0.96
     return results[how.get("result", "left")]
 
 
+def newton(gaussians, camera, T, image, weight, steps):
+    """Divide the gradient by the curvature."""
+    for _ in range(steps):
+        twist = torch.zeros(6, requires_grad=True)
+        view = render(gaussians, camera, T, twist=twist)
+        error = (view.color - image).abs().mean(-1)
+        (weight * view.opacity.detach() * error).mean().backward()
+        H = curvature(view, image, weight, camera)
+        step = torch.linalg.solve(H + 0.1 * H.diagonal().diag(), twist.grad.double())
+        T = se3_exp(-step) @ T
+    return T
+
+
 @pytest.mark.slow
 @pytest.mark.ex07_5
 def test_followed_pose():
-    right = {"one twist": followed, "folded": lambda *a: followed(*a, fold=True)}
+    right = {"Newton": newton, "Adam": followed, "folded": lambda *a: followed(*a, fold=True)}
     ways = ("right", "inverse", "motion", "world", "start")
     wrong = {way: (lambda *a, way=way: followed(*a, result=way)) for way in ways}
     wrong["uphill"] = lambda *a: followed(*a, sign=-1)

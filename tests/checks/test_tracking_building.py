@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.checks import check_keyframes, check_motion_memory
+from minislam.checks import check_bounded_loss, check_keyframes, check_motion_memory
 from minislam.priors import dense_flow
 from minislam.tracking.pose_from_flow import filled_from_nearest
 from minislam.tracking.reprojection import reproject
@@ -97,7 +97,7 @@ def in_one_piece(grid, matches, disparities, motion, weight, scale):
     return filled_from_nearest(inherited, inherited.isinf()).numpy()
 
 
-@pytest.mark.ex06b_1
+@pytest.mark.ex06b_2
 def test_motion_memory():
     right = {"loop": remembered, "scatter, numpy": in_one_piece}
     wrong = {
@@ -111,3 +111,24 @@ def test_motion_memory():
         "falls only": lambda *a: remembered(*a, rise=0.0),
     }
     assert_variants(check_motion_memory, right, wrong)
+
+
+def bounded(r, c, p, factor=None):
+    factor = c**2 if factor is None else factor
+    return factor * (torch.log(1 + (r / c) ** 2) if p == 1 else r**2 / (r**2 + c**2))
+
+
+@pytest.mark.ex06b_1
+def test_bounded_loss():
+    right = {"torch": bounded, "a list": lambda r, c, p: [float(bounded(x, c, p)) for x in r]}
+    wrong = {
+        "always Cauchy": lambda r, c, p: bounded(r, c, 1),
+        "always Geman-McClure": lambda r, c, p: bounded(r, c, 2),
+        "no c^2": lambda r, c, p: bounded(r, c, p, 1),
+        "c once": lambda r, c, p: bounded(r, c, p, c),
+        "least squares": lambda r, c, p: r**2,
+        "weight": lambda r, c, p: (1 + r**2 / c**2) ** -p,
+        "not squared": lambda r, c, p: bounded(r.sqrt(), c**0.5, p, c**2),
+        "half": lambda r, c, p: bounded(r, c, p) / 2,
+    }
+    assert_variants(check_bounded_loss, right, wrong)
