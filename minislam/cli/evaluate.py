@@ -102,10 +102,10 @@ def _relative_errors(
 
     from minislam.evaluation.trajectory import relative_pose_error, statistics
 
-    step = args.delta
-    if args.delta_unit == "s":
+    step, is_possible = args.delta, 0 < args.delta < 1e9  # not NaN either
+    if args.delta_unit == "s" and is_possible:
         step = max(1, round(step / float(np.median(np.diff(result.truth.timestamps)))))
-    if not (args.delta > 0 and step == int(step)):
+    if not (is_possible and step == int(step)):
         raise InputError(
             f"expected a --delta of seconds or of whole frames, found {args.delta:g} "
             f"{args.delta_unit}; give a positive one"

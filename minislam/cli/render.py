@@ -40,10 +40,13 @@ def add_render_parser(commands: argparse._SubParsersAction[argparse.ArgumentPars
 
 def _render(args: argparse.Namespace) -> int:
     from minislam.data.animation import write_animation
+    from minislam.data.options import MINIMUM_SIDE
+    from minislam.parameters import require_bounds
     from minislam.runs import flythrough
     from minislam.runs.loaded import Run
 
     run = Run(args.folder)
+    require_bounds("--size", args.size, MINIMUM_SIDE, 16384)
     camera = run.camera.resized(*args.size) if args.size else run.camera
     rate, count = flythrough.frame_rate(run), len(run.poses)
     if args.path == ORBIT:

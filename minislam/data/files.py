@@ -50,9 +50,9 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
 def require_free(folder: Path | str, overwrite: bool, also: str = "") -> None:
     """Refuse an output folder that holds files, unless it may be overwritten."""
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
+    if os.path.exists(folder) and not os.path.isdir(folder):  # names of any length
         raise InputError(f"expected an output folder, but {folder} is a file; choose another name")
-    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
+    if os.path.isdir(folder) and any(folder.iterdir()) and not overwrite:
         raise InputError(
             f"expected a new or empty output folder, but {folder} holds files; choose another name "
             f"or add --overwrite{also}"

@@ -1,5 +1,6 @@
 """Input options: which frames to read, at which size, with which camera. They need no torch."""
 
+import os
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -66,10 +67,12 @@ def require_source(source: str) -> None:
                 f"expected synth:NAME or synth:NAME:SEED with NAME one of "
                 f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"
             )
-    elif not Path(source).expanduser().exists():
+        return
+    path = Path(source).expanduser()
+    if not (os.path.isfile(path) or os.path.isdir(path)):  # these know names of any length
         raise InputError(
             f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
-            f"{source} does not exist; check the path"
+            f"{source[:300]} does not exist or is a device; check the path"
         )
 
 

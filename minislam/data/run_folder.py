@@ -52,7 +52,7 @@ def locked(path: Path | str) -> Iterator[None]:
     """Make a folder, and keep other runs out of it while it is used (not on Windows)."""
     with ExitStack() as stack:
         # RunFolder says what is wrong with a folder that cannot be made or opened.
-        with suppress(OSError, ImportError):
+        with suppress(OSError, ValueError, ImportError):
             import fcntl
 
             Path(path).mkdir(parents=True, exist_ok=True)
@@ -73,7 +73,7 @@ class RunFolder:
     def __init__(self, path: Path | str) -> None:
         """Refer to an existing run folder."""
         self.path = Path(path)
-        if not self.path.is_dir():
+        if not os.path.isdir(path):
             raise InputError(
                 f"expected a run folder, but {self.path} does not exist or is no folder; give the "
                 "--output of an earlier run"
@@ -89,10 +89,17 @@ class RunFolder:
         """Make a new run folder; with `overwrite`, remove what an earlier run wrote, only that."""
         path = Path(path)
         require_free(path, overwrite)
-        for file in _files_of_a_run(path, inputs) if path.is_dir() else ():
+        for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():
             file.unlink()
-        for folder in (KEYFRAMES, PLOTS):
-            (path / folder).mkdir(parents=True, exist_ok=True)
+        try:
+            for folder in (KEYFRAMES, PLOTS):
+                (path / folder).mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(
+                f"expected to make the output folder {str(path)[:300]}, but the system says: "
+                f"{reason}; choose another --output"
+            ) from error
         return cls(path)
 
     def write_config(self, config: dict[str, Any]) -> None:
@@ -215,7 +222,14 @@ class RunFolder:
 
     def read_mlp(self) -> dict[str, Tensor]:
         """Return the weights of the uncertainty MLP."""
-        return torch.load(io.BytesIO(read_bytes(self.path / MLP)), weights_only=True)
+        content = io.BytesIO(read_bytes(self.path / MLP))
+        try:
+            return torch.load(content, weights_only=True)
+        except Exception as error:  # damaged bytes fail inside torch in many ways
+            raise InputError(
+                f"expected the weights of the MLP in {self.path / MLP}, found damaged or other "
+                "content; repeat the run with --overwrite"
+            ) from error
 
 
 def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:

@@ -1,5 +1,6 @@
 """TUM RGB-D folders, and the ground truth that synthetic sequences add to them."""
 
+import os
 import re
 from pathlib import Path
 
@@ -89,7 +90,7 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
         return (stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
     stamps, names = parse_image_list(read_text(list_path), str(list_path))
     paths = [folder / name for name in names]
-    missing = next((path for path in paths if not path.is_file()), None)
+    missing = next((path for path in paths if not os.path.isfile(path)), None)
     if missing is not None:
         raise InputError(
             f"expected all images of {list_path}, but {missing} does not exist; complete the "

@@ -38,7 +38,7 @@ def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any |
     try:
         make = found[0].load()
         prior = make(device) if weights is None else make(device, weights)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(
             f"expected --{kind} {name} to name a function that makes a prior of a device, found "
             f"{type(error).__name__}: {str(error).partition(chr(10))[0]}; write it like "

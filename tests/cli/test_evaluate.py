@@ -140,7 +140,11 @@ def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path: P
 # Errors
 
 
-@pytest.mark.parametrize("flags", [["--delta", "0"], ["--delta", "1.5", "--delta_unit", "f"]])
+@pytest.mark.parametrize(
+    "flags",
+    [["--delta", "0"], ["--delta", "nan"], ["--delta", "inf"],
+     ["--delta", "1.5", "--delta_unit", "f"]],
+)  # fmt: skip
 def test_a_motion_of_no_length_or_of_half_a_frame_is_refused(files, flags: list[str]):
     with pytest.raises(InputError, match="a --delta of seconds or of whole frames"):
         run_eval(parse(*files, "--rpe", *flags))

@@ -114,6 +114,7 @@ def truth_with_nan(folder: Path) -> Path:
 
 INPUTS: list[tuple[Callable[[Path], Path], str]] = [
     (lambda path: path / "nowhere", "nowhere does not exist"),
+    (lambda path: Path("/dev/null"), "/dev/null does not exist or is a device"),
     (empty_folder, "found none; give a folder that holds images"),
     (text_named_png, r"00\.png \(14 bytes\) is damaged"),
     (truncated_image, r"02\.png \(\d+ bytes\) is damaged"),

@@ -173,6 +173,24 @@ def test_an_empty_folder_is_accepted(tmp_path: Path):
 # Errors
 
 
+@pytest.mark.parametrize("content", [b"", b"a text", b"PK\3\4" + bytes(40)])
+def test_damaged_weights_are_one_sentence(content: bytes, tmp_path: Path):
+    (tmp_path / "uncertainty_mlp.pt").write_bytes(content)
+    with pytest.raises(InputError, match=r"expected the weights of the MLP in .*mlp\.pt"):
+        RunFolder(tmp_path).read_mlp()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("mine/a", "Not a dir"), ("a" * 300, "too long"), ("a\0", "null byte")]
+)
+def test_a_folder_that_cannot_be_made_is_one_sentence(name: str, words: str, tmp_path: Path):
+    (tmp_path / "mine").write_text("mine")
+    make = f"make the output folder (?s:.*)says: .*{words}.*; choose"
+    with pytest.raises(InputError, match=make), locked(tmp_path / name):
+        RunFolder.create(tmp_path / name)
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
 def test_a_file_or_a_missing_folder_is_no_run(tmp_path: Path):
     path = save(tmp_path / "out.png", picture(0))
     with pytest.raises(InputError, match="is a file"):

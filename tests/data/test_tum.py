@@ -95,6 +95,12 @@ def test_a_missing_image_is_named(tmp_path: Path):
         read_tum_folder(folder)
 
 
+def test_a_name_that_is_too_long_is_a_missing_image(tmp_path: Path):
+    (tmp_path / "rgb.txt").write_text("1 " + "a" * 5000)
+    with pytest.raises(InputError, match="aaa does not exist"):
+        read_tum_folder(tmp_path)
+
+
 def test_an_empty_list_is_refused(tmp_path: Path):
     (tmp_path / "rgb.txt").write_text("# nothing\n")
     with pytest.raises(InputError, match="found none"):

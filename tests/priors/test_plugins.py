@@ -21,6 +21,9 @@ class Plane:
 def broken(device):
     raise OSError("no such file\\nsecond line")
 
+def ends(device):
+    raise SystemExit(5)
+
 def wrong(device):
     return lambda frame, camera: frame.image
 
@@ -78,6 +81,7 @@ def test_what_this_package_holds_can_be_named_like_a_plugin():
         ("python:", "expected --depth python: to name a function"),
         ("python:my_priors:number", "found TypeError: 'int' object is not callable"),
         ("python:my_priors:broken", "found OSError: no such file; write"),
+        ("python:my_priors:ends", "found SystemExit: 5; write"),
         ("python:my_priors:wrong", "expected --depth python:my_priors:wrong to return a finite te"),
     ],
 )
