@@ -231,7 +231,8 @@ def test_the_same_command_gives_the_same_bytes_in_another_process(root: Path):
     for name in ("trajectory.txt", "keyframe_trajectory.txt", "map.ply", "config.json"):
         first, second = ((root / run / name).read_bytes() for run in ("here", "again"))
         assert first == second, name
-    assert RunFolder(root / "again").read_metrics()["peak_memory_mb"] < 1000  # torch: 300
+    # Without `resource` (Windows) the peak is unknown; torch alone takes 300 MB.
+    assert (RunFolder(root / "again").read_metrics()["peak_memory_mb"] or 0) < 1000
 
 
 def test_ctrl_c_leaves_what_was_done_so_far(with_depth, root: Path):
