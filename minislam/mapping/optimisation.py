@@ -22,6 +22,7 @@ from minislam.uncertainty import (
     UncertaintyTrainer,
     mapping_weight,
 )
+from minislam.uncertainty.weights import BETA_CUT
 from minislam.workers import Workers
 
 CONFIRMED_BETA = 0.4  # fraction of beta that is taken away where other views confirm [-]
@@ -99,7 +100,10 @@ class JointOptimisation(Stateful):
         if keyframe.given_beta is not None:
             return keyframe.given_beta
         beta, confirmation = self.predict_beta(keyframe.features), keyframe.confirmation
-        return beta if confirmation is None else beta * (1 - CONFIRMED_BETA * confirmation)
+        if confirmation is None:
+            return beta
+        # What the MLP clearly says to move may have stood still for a while: it stays excluded.
+        return torch.where(beta > BETA_CUT, beta, beta * (1 - CONFIRMED_BETA * confirmation))
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
         """Return the static weight (H, W) for a raw beta; 1 with uncertainty switched off."""

@@ -14,7 +14,7 @@ from minislam.images import resample
 from minislam.records import Keyframe, Progress, Sequence
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
-from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm
+from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, keep_what_stays
 from minislam.workers import Workers
 
 DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
@@ -73,11 +73,11 @@ def dense_depths(
         if progress:
             progress(len(swept), len(frames))
     depths = []
-    for keyframe in keyframes:
-        at = frames.index(keyframe)
+    for at, view in enumerate(swept):
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
-        depths.append(full_size(confirm(planner.camera, swept[at], others), camera))
-    return depths
+        depths.append(confirm(planner.camera, view, others))
+    depths = keep_what_stays(planner.camera, swept, depths)
+    return [full_size(depths[frames.index(keyframe)], camera) for keyframe in keyframes]
 
 
 def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:

@@ -3,6 +3,9 @@
 The point of a pixel is projected into another swept view. If the depth found there is the depth of
 the point, the view agrees. If the view has a good match behind the point, it looks through it, and
 the point is refuted. A moving object is swept to a depth with which no other view agrees.
+
+What stands still for a while is agreed upon by the views of that while. Views of all times refute
+it, because before it came or after it left they look through it.
 """
 
 from dataclasses import dataclass
@@ -19,6 +22,7 @@ MAX_REFUTED = 0.5  # refuting views per agreeing view [-]
 SUPPORT_WINDOW = 7  # px, side of the window that supports a pixel
 MIN_SUPPORT = 0.4  # of the window that must be known, too [-]
 CONFIRMING_COST = 0.6  # a pixel with a larger matching cost confirms nothing [-]
+JUDGES = 24  # views, spread evenly over the clip, that tell what stays
 
 
 @dataclass(frozen=True)
@@ -41,19 +45,61 @@ class ConfirmedDepth:
 
 def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> ConfirmedDepth:
     """Keep the depths of a view on which enough other views agree."""
+    agreeing, refuting = count_votes(camera, view, others)
+    needed = min(MIN_AGREEING, len(others))
+    known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)
+    known &= _window_share(known) >= MIN_SUPPORT
+    static = known & (view.cost < CONFIRMING_COST)
+    known &= static.any()  # if nothing matches well, aggregation has only spread a guess
+    return ConfirmedDepth(np.where(known, view.inverse_depth, 0), _window_share(static))
+
+
+def keep_what_stays(
+    camera: Camera,
+    views: list[SweptView],  # in the order of time
+    depths: list[ConfirmedDepth],  # of the views
+) -> list[ConfirmedDepth]:
+    """Drop what views of other times look through, though the views near in time confirm it.
+
+    Only confirmed depths vote here. Around a dropped pixel the confirmation fades too.
+    """
+    known_only = [
+        SweptView(
+            np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
+            1 - depth.confirmation,
+            view.plane_step,
+            view.T_camera_world,
+        )
+        for view, depth in zip(views, depths, strict=True)
+    ]
+    judges = np.linspace(0, len(views) - 1, JUDGES).round().astype(int)
+    kept = []
+    for index, (view, depth) in enumerate(zip(known_only, depths, strict=True)):
+        others = [known_only[k] for k in np.unique(judges[judges != index])]
+        agreeing, refuting = count_votes(camera, view, others)
+        left = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
+        known = (depth.inverse_depth > 0) & ~left
+        known &= _window_share(known) >= MIN_SUPPORT
+        confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(left), 0)
+        kept.append(ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation))
+    return kept
+
+
+def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
+    """Return the share of the window around each pixel in which the mask is true."""
+    return cv2.blur(mask.astype(np.float32), (SUPPORT_WINDOW, SUPPORT_WINDOW))
+
+
+def count_votes(
+    camera: Camera, view: SweptView, others: list[SweptView]
+) -> tuple[np.ndarray, np.ndarray]:  # 2 x (h, w)
+    """Return how many views agree with each depth of a view, and how many refute it."""
     agreeing, refuting = np.zeros_like(view.cost), np.zeros_like(view.cost)
     for other in others:
         agrees, refutes = vote(camera, view, other)
         agreeing += agrees
         refuting += refutes
-    needed = min(MIN_AGREEING, len(others))
-    known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)
-    window = (SUPPORT_WINDOW, SUPPORT_WINDOW)
-    known &= cv2.blur(known.astype(np.float32), window) >= MIN_SUPPORT
-    static = known & (view.cost < CONFIRMING_COST)
-    known &= static.any()  # if nothing matches well, aggregation has only spread a guess
-    confirmation = cv2.blur(static.astype(np.float32), window)
-    return ConfirmedDepth(np.where(known, view.inverse_depth, 0), confirmation)
+    return agreeing, refuting
 
 
 def vote(camera: Camera, view: SweptView, other: SweptView) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,7 @@ TRACKING_CAP = 1.0  # beta may lower the weight that the flow confidence gives, 
 BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: the largest that L_uncer gives
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
+BETA_CUT = 1.41  # the beta_raw of that weight
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
 
 

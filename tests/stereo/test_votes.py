@@ -3,7 +3,7 @@
 import numpy as np
 
 from minislam.geometry import Camera
-from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, vote
+from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, keep_what_stays, vote
 
 CAMERA = Camera(fx=60.0, fy=66.0, cx=19.5, cy=14.5, width=40, height=30)
 WALL = 0.5  # inverse depth
@@ -103,3 +103,58 @@ def test_where_the_sweep_found_nothing_there_is_no_vote():
     assert (result.inverse_depth[10:20, 10:20] == 0).all()
     agrees, refutes = vote(CAMERA, view(), lost)
     assert not agrees[12:18, 12:18].any() and not refutes[12:18, 12:18].any()
+
+
+# What stands still for a while
+
+
+def of_time(time: int, stands: bool) -> tuple[SweptView, ConfirmedDepth]:
+    """Return a view of the wall, and its confirmed depth. A box may stand before the wall.
+
+    The camera hardly moves, so that the box stays at its pixels.
+    """
+    swept = with_square(view(0.001 * time), 0.8) if stands else view(0.001 * time)
+    return swept, ConfirmedDepth(swept.inverse_depth.copy(), np.ones_like(swept.cost))
+
+
+def kept(stands: list[bool]) -> list[ConfirmedDepth]:
+    views, depths = zip(*(of_time(*at) for at in enumerate(stands)), strict=True)
+    return keep_what_stays(CAMERA, list(views), list(depths))
+
+
+def test_a_box_that_leaves_is_dropped_though_the_views_before_confirm_it():
+    depths = kept([True] * 6 + [False] * 4)
+    for depth in depths[:6]:
+        assert (depth.inverse_depth[12:18, 12:18] == 0).all()
+        assert depth.confirmation[13:17, 13:17].max() == 0
+        assert (depth.inverse_depth[22:, :] == np.float32(WALL)).all()
+        np.testing.assert_allclose(depth.confirmation[24:], 1, atol=1e-6)
+
+
+def test_the_wall_behind_a_box_that_leaves_is_kept():
+    for depth in kept([True] * 6 + [False] * 4)[6:]:
+        assert (depth.inverse_depth == np.float32(WALL)).all()
+        np.testing.assert_allclose(depth.confirmation, 1, atol=1e-6)
+
+
+def test_a_box_that_stays_is_kept_although_one_or_two_views_miss_it():
+    for stands in ([True] * 10, [True] * 8 + [False] * 2):
+        depth = kept(stands)[0]
+        assert (depth.inverse_depth[10:20, 10:20] == np.float32(0.8)).all()
+        assert depth.confirmation.min() > 1 - 1e-6
+
+
+def test_depths_that_nothing_confirms_do_not_judge():
+    views, depths = zip(*(of_time(k, k < 3) for k in range(9)), strict=True)
+    doubtful = [
+        depth if k < 3 else ConfirmedDepth(depth.inverse_depth, 0 * depth.confirmation)
+        for k, depth in enumerate(depths)
+    ]
+    first = keep_what_stays(CAMERA, list(views), doubtful)[0]
+    assert (first.inverse_depth[10:20, 10:20] == np.float32(0.8)).all()
+
+
+def test_views_that_know_nothing_are_kept_as_they_are():
+    empty = ConfirmedDepth(np.zeros_like(view().cost), np.zeros_like(view().cost))
+    for depth in keep_what_stays(CAMERA, others(), [empty] * 4):
+        assert depth.inverse_depth.max() == 0 and depth.confirmation.max() == 0
