@@ -62,8 +62,7 @@ def draw_pixels(
 ) -> Tensor:  # (M, 2) int64, column and row
     """Draw one random known pixel in each cell x cell square of the image that has any.
 
-    The paper draws a random subset of the whole image. One pixel per square leaves no clumps and
-    no holes, and it draws no fewer pixels where the depth is sparse.
+    The paper's random subset of the image leaves clumps, holes and less where depth is sparse.
     """
     height, width = known.shape
     priority = torch.rand(height, width, generator=generator).to(known.device)
@@ -86,8 +85,7 @@ def gaussians_at_pixels(
 ) -> GaussianMap:
     """Back-project pixels to round Gaussians that just cover their cells.
 
-    The first scale is `config.footprint` times the side of a cell at the depth of the pixel. No
-    search for neighbours in space is needed, because neighbours are about one cell apart.
+    The first scale is `config.footprint` times the side of a cell at the depth of the pixel.
     """
     column, row = pixels.unbind(-1)
     z = depth[row, column]
@@ -96,11 +94,10 @@ def gaussians_at_pixels(
     focal = math.sqrt(camera.fx * camera.fy)
     scales = (config.footprint * config.cell * z / focal).clamp_min(_SMALLEST_SCALE)
     count = len(z)
-    identity = z.new_tensor([1.0, 0.0, 0.0, 0.0])
     logit = math.log(config.opacity / (1 - config.opacity))
     return GaussianMap(
         means,
-        identity.expand(count, 4).clone(),
+        z.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         scales.log()[:, None].expand(count, 3).clone(),
         torch.full_like(z, logit),
         image[row, column].to(z),
@@ -116,8 +113,7 @@ def is_on_dynamic_object(
 ) -> Tensor:  # (N,) bool
     """Tell which Gaussians project to pixels of static weight 0 in their own keyframe.
 
-    They were inserted before the MLP had learnt that the object there moves. With the present
-    static weight `insertable_pixels` would exclude their pixels.
+    They were inserted before the MLP had learnt that the object there moves.
     """
     points = transform_points(T_camera_world, means.double())
     in_front = points[:, 2] > 0

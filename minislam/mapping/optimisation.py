@@ -25,7 +25,8 @@ from minislam.uncertainty import (
 from minislam.uncertainty.weights import BETA_CUT
 from minislam.workers import Workers
 
-CONFIRMED_BETA = 0.4  # fraction of beta that is taken away where other views confirm [-]
+# Fraction of beta that is taken away where other views confirm; but what the MLP would exclude may
+CONFIRMED_BETA = 0.4  # have stood still for a while, so a beta above the cut is kept [-]
 
 
 class JointOptimisation(Stateful):
@@ -102,7 +103,6 @@ class JointOptimisation(Stateful):
         beta, confirmation = self.predict_beta(keyframe.features), keyframe.confirmation
         if confirmation is None:
             return beta
-        # What the MLP clearly says to move may have stood still for a while: it stays excluded.
         return torch.where(beta > BETA_CUT, beta, beta * (1 - CONFIRMED_BETA * confirmation))
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:

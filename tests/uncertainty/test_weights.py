@@ -3,6 +3,7 @@ import torch
 
 from minislam.geometry import Camera
 from minislam.uncertainty.weights import (
+    BETA_CUT,
     DATA_RATE,
     adjusted_beta,
     beta_of_mask,
@@ -58,6 +59,7 @@ def test_thresholds_of_the_weights_one_and_zero():
     assert float(tracking_weight(grid(0.475), CAMERA, 8).max()) < 1
     assert float(mapping_weight(grid(1.4079), CAMERA).min()) > 0
     assert float(mapping_weight(grid(1.4083), CAMERA).max()) == 0
+    assert pytest.approx(1.408, abs=5e-3) == BETA_CUT
 
 
 def test_a_given_mask_gives_the_full_weight_or_almost_none():
