@@ -23,6 +23,8 @@ from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
+PAIRS_AT_ONCE = 16  # of keyframes: a dense flow has 600 kB at 320x240, and there may be thousands
+
 
 @dataclass(frozen=True)
 class MeasuredEdge:
@@ -106,20 +108,28 @@ class ClassicalFlow(Stateful):
 
     def _measure(self, starts: dict[Edge, np.ndarray]) -> None:
         pool = _threads(self.config.workers)
-        flows = pool.map(self._edge_flow, starts, starts.values())
-        flow_of = dict(zip(starts, flows, strict=True))
+        pairs = list(dict.fromkeys((min(edge), max(edge)) for edge in starts))
+        for first in range(0, len(pairs), PAIRS_AT_ONCE):
+            both = [e for i, j in pairs[first : first + PAIRS_AT_ONCE] for e in ((i, j), (j, i))]
+            edges = [edge for edge in both if edge in starts]
+            flows = pool.map(self._edge_flow, edges, [starts[edge] for edge in edges])
+            flow_of = dict(zip(edges, flows, strict=True))
+            measured = [
+                pool.submit(self._measured_edge, edge, starts[edge], flow, flow_of.get(edge[::-1]))
+                for edge, flow in flow_of.items()
+            ]
+            self._measured.update(zip(edges, (m.result() for m in measured), strict=True))
 
-        def measure(edge: Edge) -> MeasuredEdge:
-            source, target = edge
-            forward, backward = flow_of[edge], flow_of.get((target, source))
-            if backward is None:
-                backward = reverse_flow(self._images[source], self._images[target], forward)
-            images, texture = (self._images[source], self._images[target]), self._textures[source]
-            on_grid = measure_on_grid(*images, forward, backward, texture, self.stride)
-            # A copy: a view would keep the starts of all edges of this call.
-            return MeasuredEdge(source, target, starts[edge].copy(), *on_grid)
-
-        self._measured.update(zip(starts, pool.map(measure, starts), strict=True))
+    def _measured_edge(
+        self, edge: Edge, start: np.ndarray, forward: np.ndarray, backward: np.ndarray | None
+    ) -> MeasuredEdge:
+        source, target = (self._images[end] for end in edge)
+        if backward is None:
+            backward = reverse_flow(source, target, forward)
+        texture = self._textures[edge[0]]
+        on_grid = measure_on_grid(source, target, forward, backward, texture, self.stride)
+        # A copy: a view would keep the starts of all edges of this call.
+        return MeasuredEdge(*edge, start.copy(), *on_grid)
 
     def _edge_flow(self, edge: Edge, start: np.ndarray) -> np.ndarray:
         source, target = self._images[edge[0]], self._images[edge[1]]

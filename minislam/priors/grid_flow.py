@@ -177,4 +177,4 @@ def as_matches(
     )
     matched, possible = matched.flatten(1, 2).mT.contiguous(), texture.sum((1, 2))
     ratios = confidence.sum((1, 2)) / possible.clamp_min(1e-6)
-    return FlowMatches(matched, confidence.flatten(1)[:, None].repeat(1, 2, 1), ratios)
+    return FlowMatches(matched, confidence.flatten(1)[:, None].expand(-1, 2, -1), ratios)

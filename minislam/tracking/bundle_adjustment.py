@@ -11,6 +11,7 @@ Disparities are marginalised (Schur complement), which leaves 6 unknowns per fre
     [ E^T C ] [ dd ] = [ s ]   =>   dd = C^-1 (s - E^T xi)
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,7 +20,8 @@ from torch import Tensor
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
 from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal
-from minislam.tracking.safeguards.robust import RobustKernel
+from minislam.tracking.safeguards.parts import in_parts, joined
+from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
@@ -69,7 +71,9 @@ class BundleState:
 
 @dataclass(frozen=True)
 class _Linearised:
-    cost: float  # px^2
+    edges: Tensor  # (E,) positions in the whole problem
+    problem: BundleProblem  # of these edges
+    costs: Tensor  # (E,) float64 px^2
     residual: Tensor  # (E, 2, N) px
     weight: Tensor  # (E, 2, N), the robust one included
     reprojection: Linearisation  # J_target is (E, 6 + G, 2, N); G = 1 if the focal length is free
@@ -97,19 +101,18 @@ def bundle_adjust(
     A step that fails or raises the cost is discarded and tried again with ten times the damping.
     If no step helps, the state is returned unchanged, with the reason. Eq. (5).
     """
-    current = _linearised(problem, state)
-    cost_before = current.cost
-    equations = None
+    cost, current = _cost(problem, state)
+    cost_before, equations = cost, None
     accepted, level = 0, damping
     converged, reason = True, "all iterations used"
     while accepted < iterations:
         if equations is None:
             equations = _normal_equations(problem, state, current)
         candidate = _damped_step(problem, state, equations, level, absolute_damping)
-        trial = None if candidate is None else _linearised(problem, candidate)
-        if candidate is not None and trial is not None and trial.cost <= current.cost:
-            settled = current.cost - trial.cost <= 1e-9 * current.cost
-            state, current, equations = candidate, trial, None
+        trial, there = (float("inf"), []) if candidate is None else _cost(problem, candidate)
+        if candidate is not None and trial <= cost:
+            settled = cost - trial <= 1e-9 * cost
+            state, cost, current, equations = candidate, trial, there, None
             accepted += 1
             level = max(level / 10, damping)
             if settled:
@@ -122,7 +125,7 @@ def bundle_adjust(
                 converged = candidate is not None
                 reason = "no step lowers the cost" if converged else "normal equations are singular"
                 break
-    return state, BundleReport(converged, cost_before, current.cost, accepted, level, reason)
+    return state, BundleReport(converged, cost_before, cost, accepted, level, reason)
 
 
 def motion_only_adjust(
@@ -135,69 +138,66 @@ def motion_only_adjust(
 
 def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
     """Return the residuals p~ - p (E, 2, N) [px] and the weights (E, 2, N), robust one included."""
-    linearised = _linearised(problem, state)
-    return linearised.residual, linearised.weight
+    residual, weight = joined((a.edges, a.residual, a.weight) for a in _linearised(problem, state))
+    return residual, weight
 
 
-def _linearised(problem: BundleProblem, state: BundleState) -> _Linearised:
-    source, dtype = problem.edges_source, problem.targets.dtype
-    transforms = relative_transforms(state.T_camera_world, source, problem.edges_target)
-    view = problem.rays, problem.camera, state.log_focal, problem.free_focal
-    reprojection = reproject_with_focal(transforms.to(dtype), state.disparities[source], *view)
-    residual = problem.targets - reprojection.positions
-    weight = problem.weights * reprojection.valid[:, None]
-    if problem.robust is not None:
-        weight = weight * problem.robust.weight(residual.square().sum(1, keepdim=True))
-    cost = _cost(problem, state, residual, reprojection.valid)
-    return _Linearised(cost, residual, weight, reprojection, transforms)
+def _linearised(problem: BundleProblem, state: BundleState) -> Iterator[_Linearised]:
+    """Linearise the edges, part by part."""
+    for edges, part in in_parts(problem):
+        source, dtype = part.edges_source, part.targets.dtype
+        transforms = relative_transforms(state.T_camera_world, source, part.edges_target)
+        view = part.rays, part.camera, state.log_focal, part.free_focal
+        reprojection = reproject_with_focal(transforms.to(dtype), state.disparities[source], *view)
+        residual = part.targets - reprojection.positions
+        weight = part.weights * reprojection.valid[:, None]
+        if part.robust is not None:
+            weight = weight * part.robust.weight(residual.square().sum(1, keepdim=True))
+        # A point behind the target counts as a residual of the image's width. Were it left out, the
+        # cheapest camera would be one that looks away from all points.
+        far = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
+        costs = edge_losses(part.weights, far, part.robust)
+        yield _Linearised(edges, part, costs, residual, weight, reprojection, transforms)
 
 
 def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) float64 px^2
     """Return the reprojection cost of each edge, the robust loss included."""
-    at = _linearised(problem, state)
-    return _edge_costs(problem, at.residual, at.reprojection.valid)
+    return joined((at.edges, at.costs) for at in _linearised(problem, state))[0]
 
 
-def _edge_costs(problem: BundleProblem, residual: Tensor, valid: Tensor) -> Tensor:
-    # A point behind the target counts as a residual of the image's width. Were it left out, the
-    # cheapest camera would be one that looks away from all points.
-    residual = torch.where(valid[:, None], residual, float(problem.camera.width))
-    if problem.robust is None:
-        return (problem.weights * residual.square()).sum((1, 2), dtype=torch.float64)
-    loss = problem.robust.loss(residual.square().sum(1))
-    return (problem.weights.mean(1) * loss).sum(1, dtype=torch.float64)
-
-
-def _cost(problem: BundleProblem, state: BundleState, residual: Tensor, valid: Tensor) -> float:
-    """Return the whole cost in px^2, with the robust loss if there is one. Eq. (5)."""
+def _cost(problem: BundleProblem, state: BundleState) -> tuple[float, list[_Linearised]]:
+    """Return the whole cost in px^2, Eq. (5), and the linearised edges if they are one part."""
     difference = state.disparities - problem.prior_disparities
     prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
-    return float(_edge_costs(problem, residual, valid).sum() + prior_cost)
+    costs = [(at := found).costs for found in _linearised(problem, state)]
+    return float(torch.cat(costs).sum() + prior_cost), [at] if len(costs) == 1 else []
 
 
 def _normal_equations(
-    problem: BundleProblem, state: BundleState, at: _Linearised
+    problem: BundleProblem, state: BundleState, known: list[_Linearised]
 ) -> _NormalEquations:
-    residual, weight, J = at.residual, at.weight, at.reprojection.J_target
-    weighted_J = (J * weight[:, None]).flatten(2)
-    A = (weighted_J @ J.flatten(2).mT).double()  # (E, 6 + G, 6 + G)
-    b = (weighted_J @ residual.flatten(1)[..., None]).squeeze(-1).double()  # (E, 6 + G)
-
-    adjoint = se3_adjoint(at.transforms)
-    H, g = _assemble_poses(problem, A, b, adjoint)
-
     C = problem.prior_weights * problem.free_disparities[:, None]
     s = C * (problem.prior_disparities - state.disparities)
-    if not problem.free_disparities.any():
-        return _NormalEquations(H, g, C, s, [])
-    free = problem.free_disparities[problem.edges_source].to(J.dtype)
-    J_disparity = at.reprojection.J_disparity * free[:, None, None]
-    weighted_Jd = weight * J_disparity
-    E_target = J[:, :, 0] * weighted_Jd[:, None, 0] + J[:, :, 1] * weighted_Jd[:, None, 1]
-    E_source = -adjoint.mT.to(J.dtype) @ E_target[:, :6]
-    C.index_add_(0, problem.edges_source, (weighted_Jd * J_disparity).sum(1))
-    s.index_add_(0, problem.edges_source, (weighted_Jd * residual).sum(1))
-    return _NormalEquations(H, g, C, s, _source_blocks(problem, E_target, E_source))
+    rows, blocks = [], []
+    for at in known or _linearised(problem, state):
+        residual, weight, J = at.residual, at.weight, at.reprojection.J_target
+        weighted_J = (J * weight[:, None]).flatten(2)
+        A = (weighted_J @ J.flatten(2).mT).double()  # (E, 6 + G, 6 + G)
+        b = (weighted_J @ residual.flatten(1)[..., None]).squeeze(-1).double()  # (E, 6 + G)
+        rows.append((at.edges, A, b, adjoint := se3_adjoint(at.transforms)))
+        source = at.problem.edges_source
+        free = problem.free_disparities[source].to(J.dtype)
+        if not free.any():
+            continue
+        J_disparity = at.reprojection.J_disparity * free[:, None, None]
+        weighted_Jd = weight * J_disparity
+        E_target = J[:, :, 0] * weighted_Jd[:, None, 0] + J[:, :, 1] * weighted_Jd[:, None, 1]
+        E_source = -adjoint.mT.to(J.dtype) @ E_target[:, :6]
+        C.index_add_(0, source, (weighted_Jd * J_disparity).sum(1))
+        s.index_add_(0, source, (weighted_Jd * residual).sum(1))
+        blocks += _source_blocks(at.problem, E_target, E_source)
+    H, g = _assemble_poses(problem, *joined(rows))
+    return _NormalEquations(H, g, C, s, blocks)
 
 
 def _pose_slots(problem: BundleProblem) -> Tensor:

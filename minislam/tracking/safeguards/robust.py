@@ -35,3 +35,15 @@ class RobustKernel:
     def widened(self, factor: float) -> "RobustKernel":
         """Return the same kernel with `factor` times its scale."""
         return replace(self, scale=factor * self.scale)
+
+
+def edge_losses(
+    weights: Tensor,  # (E, 2, N) without the robust weight
+    residual: Tensor,  # (E, 2, N) px
+    robust: RobustKernel | None,
+) -> Tensor:  # (E,) float64 px^2
+    """Return the cost of each edge in Eq. (5): the sum of weighted squares, or of their losses."""
+    if robust is None:
+        return (weights * residual.square()).sum((1, 2), dtype=torch.float64)
+    loss = robust.loss(residual.square().sum(1))
+    return (weights.mean(1) * loss).sum(1, dtype=torch.float64)
