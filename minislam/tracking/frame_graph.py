@@ -13,6 +13,8 @@ from minislam.tracking.reprojection import lengths, relative_transforms, reproje
 # Fraction of cells that must stay in view, else a pair has no meaningful distance. DROID-SLAM: 0.75
 MIN_VISIBLE_FRACTION = 0.5
 FAR = 1000.0  # px, the distance of a pair below this fraction
+# Most pairs are far apart: one cell in so many tells it, to a factor.
+COARSE, COARSE_MARGIN = 16, 2.0
 # New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8
 
@@ -108,12 +110,8 @@ def proximity_pairs(
     free = torch.ones_like(distances, dtype=torch.bool)
     for i, j in existing:
         _suppress(free, max(i, j), min(i, j), suppression)
-    order = sorted(
-        (float(distances[i, j]), i, j)
-        for i in candidates
-        for j in range(i)
-        if float(distances[i, j]) <= max_distance
-    )
+    rows = ((i, distances[i, :i].tolist()) for i in candidates)
+    order = sorted((d, i, j) for i, row in rows for j, d in enumerate(row) if d <= max_distance)
     chosen: list[tuple[int, int]] = []
     used = dict.fromkeys(candidates, 0)
     for _, i, j in order:
@@ -140,23 +138,29 @@ def flow_distances(
     camera: Camera,
     rotation_weight: float,  # beta
     rows: range | None = None,  # keyframes to compare with all others; None: all
+    limit: float | None = None,  # px: more counts as FAR, by a look at a few cells
 ) -> Tensor:  # (K, K) px, FAR outside the rows and their columns
     """Return the distances between keyframes, as the mean flow that their geometry predicts.
 
     D = beta |flow| + (1 - beta) |flow without rotation|, averaged over the visible cells and
     both directions. Rotation counts less than translation, because it brings no parallax.
     """
-    count = len(T_camera_world)
+    count, view = len(T_camera_world), (camera, rotation_weight)
+    rows = range(count) if rows is None else rows
+    near = torch.ones(count, count, dtype=torch.bool, device=disparities.device)
+    if limit is not None:
+        few = disparities[:, ::COARSE], rays[::COARSE], pixels[::COARSE]
+        near = flow_distances(T_camera_world, *few, *view, rows) < COARSE_MARGIN * limit
     distances = disparities.new_full((count, count), FAR)
-    all_keyframes = torch.arange(count, device=disparities.device)
-    for row in range(count) if rows is None else rows:
-        this = torch.full_like(all_keyframes, row)
+    for row in rows:
+        near[row, rows.start : row] = False  # known already
+        others = near[row].nonzero()[:, 0]
+        this = torch.full_like(others, row)
         both = []
-        for source, target in ((this, all_keyframes), (all_keyframes, this)):
+        for source, target in ((this, others), (others, this)):
             motion = relative_transforms(T_camera_world, source, target).to(disparities.dtype)
-            view = rays, pixels, camera, rotation_weight
-            both.append(_directed_distances(motion, disparities[source], *view))
-        distances[row] = distances[:, row] = 0.5 * (both[0] + both[1])
+            both.append(_directed_distances(motion, disparities[source], rays, pixels, *view))
+        distances[row, others] = distances[others, row] = 0.5 * (both[0] + both[1])
     return distances
 
 

@@ -264,7 +264,7 @@ class KeyframeGraph(Stateful):
     ) -> list[Edge]:
         """Return pairs of covisible keyframes, by increasing flow distance."""
         shifted = range(newer.start - start, newer.stop - start)
-        distances = self.distances(start, shifted)
+        distances = self.distances(start, shifted, limit)
         existing = self.links.edges() + planned
         taken = [(i - start, j - start) for i, j in existing if min(i, j) >= start]
         pairs = proximity_pairs(distances, taken, shifted, limit, links)
@@ -272,10 +272,12 @@ class KeyframeGraph(Stateful):
 
     # How far apart keyframes are ----------------------------------------------------------------
 
-    def distances(self, start: int = 0, rows: range | None = None) -> Tensor:  # (K', K') px
+    def distances(
+        self, start: int = 0, rows: range | None = None, limit: float | None = None
+    ) -> Tensor:  # (K', K') px
         """Return the flow distances between the keyframes from `start` on, of some rows or all."""
         poses, disparities = self.keyframes.T_camera_world, self.keyframes.disparities
-        return self._flow_distances(poses[start:], disparities[start:], rows)
+        return self._flow_distances(poses[start:], disparities[start:], rows, limit)
 
     def distance_to_newest(self, T_camera_world: Tensor) -> float:  # px
         """Return the flow distance of a pose (4, 4) from the newest keyframe."""
@@ -284,11 +286,15 @@ class KeyframeGraph(Stateful):
         return float(self._flow_distances(pair, disparities)[0, 1])
 
     def _flow_distances(
-        self, poses: Tensor, disparities: Tensor, rows: range | None = None
+        self,
+        poses: Tensor,
+        disparities: Tensor,
+        rows: range | None = None,
+        limit: float | None = None,  # px
     ) -> Tensor:
         view = self.grid.rays, self.grid.pixels, self.grid.camera
         # On the CPU, because pairs are chosen by one number after the other.
-        return flow_distances(poses, disparities, *view, ROTATION_WEIGHT, rows).cpu()
+        return flow_distances(poses, disparities, *view, ROTATION_WEIGHT, rows, limit).cpu()
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""

@@ -31,7 +31,8 @@ def loop_pairs(
     index = torch.arange(len(distances), device=distances.device)
     near_in_time = (index[:, None] - index).abs() < min_gap
     candidates = distances.masked_fill(near_in_time, FAR)
-    far_edges = [edge for edge in edges if abs(edge[0] - edge[1]) >= min_gap]
+    near_newest = [edge for edge in edges if max(edge) >= newest - suppression]
+    far_edges = [edge for edge in near_newest if abs(edge[0] - edge[1]) >= min_gap]
     newer = range(newest, newest + 1)
     return proximity_pairs(candidates, far_edges, newer, max_distance, limit, suppression)
 
@@ -44,8 +45,8 @@ def close_loops(graph: KeyframeGraph) -> bool:
     config, newest = graph.config, len(graph.keyframes) - 1
     if newest < config.loop_min_gap:
         return False
-    distances = graph.distances(rows=range(newest, newest + 1))
     limits = config.loop_distance * graph.pixel_scale, config.loop_min_gap, config.loop_edges
+    distances = graph.distances(rows=range(newest, newest + 1), limit=limits[0])
     pairs = loop_pairs(distances, graph.links.edges(), newest, *limits, LOOP_SUPPRESSION)
     edges = graph.filter_confirmed(both_directions(pairs))
     if not edges:

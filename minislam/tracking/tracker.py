@@ -35,6 +35,9 @@ from minislam.tracking.safeguards.settling import Settling, certainty
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 MAX_CULLED_IN_A_ROW = 2  # keyframes, official code
 LONGEST_TAIL = 2  # frames after the last keyframe
+# All keyframes are adjusted online only once a fifth has been added, so that the adjustments of
+# all cost the same per keyframe however long the sequence is.
+LEAST_GROWTH = 5
 
 
 class Mode(Enum):
@@ -220,7 +223,8 @@ class Tracker(Stateful):
         """Close loops; every `global_interval` keyframes run online global BA."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
-        is_due = 0 < config.global_interval <= count - self._last_global
+        interval = max(config.global_interval, count // LEAST_GROWTH)
+        is_due = 0 < config.global_interval and interval <= count - self._last_global
         if is_due and not closed:
             online_global_ba(self.graph)
         if is_due or closed:

@@ -12,14 +12,18 @@ than with the present focal length.
 import math
 from dataclasses import dataclass, replace
 
+import torch
+
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.safeguards.parts import of_rows
 
 STEP = math.log(1.05)  # to either side, where the cost must have risen
 ITERATIONS = 10  # Gauss-Newton steps of each adjustment
 # Of the robust weight: a focal length far off has large residuals. [-]
 WIDENINGS: tuple[float, ...] = (4.0, 1.0)
+MOST_KEYFRAMES = 100  # from the first on, that a check adjusts, dozens of times
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
 # Smallest mean rise of the cost. In six pieces of real video, two seconds each, the cost rose by
@@ -52,7 +56,11 @@ def check_focal_length(graph: KeyframeGraph) -> FocalLengthFit | None:
     """Fit a given focal length to all links, after the final global BA; nothing is changed."""
     if graph.seeks_focal:
         return None  # it was not given
-    return fit_focal_length(_problem(graph), graph.state)[0]
+    edges = enumerate(graph.links.edges())
+    positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
+    problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
+    rows = torch.arange(min(MOST_KEYFRAMES, len(graph.keyframes)), device=problem.rays.device)
+    return fit_focal_length(*of_rows(problem, graph.state, rows))[0]
 
 
 def seek_focal_length(graph: KeyframeGraph) -> None:
@@ -62,7 +70,8 @@ def seek_focal_length(graph: KeyframeGraph) -> None:
     """
     if not graph.seeks_focal:
         return
-    fit, state = fit_focal_length(_problem(graph), graph.state)
+    problem = bundle_problem(graph, range(len(graph.links)), 0, lambda_prior=0.0)
+    fit, state = fit_focal_length(problem, graph.state)
     if fit.factor is not None:
         graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
         graph.grid.zoom(state.log_focal)
@@ -103,7 +112,3 @@ def _adjust(
         robust = problem.robust and problem.robust.widened(widening)
         state, report = bundle_adjust(replace(problem, robust=robust), state, ITERATIONS)
     return state, report.cost_after
-
-
-def _problem(graph: KeyframeGraph) -> BundleProblem:
-    return bundle_problem(graph, range(len(graph.links)), 0, lambda_prior=0.0)
