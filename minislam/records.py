@@ -14,23 +14,34 @@ from minislam.geometry import Camera
 Progress = Callable[[int, int], None]  # called with the steps done and their number
 
 
+class Pictured:
+    """What has an image. Bytes are kept, because numbers take four times the memory."""
+
+    pixels: Tensor  # (H, W, 3) uint8 RGB; an image in [0, 1] is taken as it is
+
+    @property
+    def image(self) -> Tensor:
+        """Return the image (H, W, 3) float32 RGB in [0, 1]."""
+        return self.pixels if self.pixels.is_floating_point() else self.pixels / 255
+
+
 @dataclass(frozen=True)
-class Frame:
+class Frame(Pictured):
     """One input image."""
 
     frame_index: int  # position in the sequence as it is processed: 0, 1, 2, ...
     timestamp: float  # second, as the source gives it
-    image: Tensor  # (H, W, 3) float32 RGB in [0, 1], undistorted, at the working size
+    pixels: Tensor  # (H, W, 3) uint8 RGB, undistorted, at the working size
 
 
 @dataclass(frozen=True)
-class Keyframe:
+class Keyframe(Pictured):
     """A frame that the tracker kept, as the mapper receives it."""
 
     keyframe_index: int  # position among the keyframes: 0, 1, 2, ...
     frame_index: int  # position among the frames
     timestamp: float  # second
-    image: Tensor  # (H, W, 3) float32 RGB in [0, 1]
+    pixels: Tensor  # (H, W, 3) uint8 RGB
     features: Tensor  # (h', w', C) float32, one vector per patch of the feature grid
     depth: Tensor  # (H, W) float32 world units, 0 where unknown: the mapper's reference D~
     T_camera_world: Tensor  # (4, 4) float64

@@ -111,9 +111,9 @@ class Slam(Stateful):
         return Mapper(camera, *parts, dimension, config.seed, self.device, self.workers)
 
     def frame(self, frame_index: int) -> Frame:
-        """Read a frame; its image moves to the device of the run."""
+        """Read a frame; it moves to the device of the run."""
         frame = self.sequence.frame(frame_index)
-        return replace(frame, image=frame.image.to(self.device))
+        return replace(frame, pixels=frame.pixels.to(self.device))
 
     def _frames_left(self) -> Iterator[Frame]:
         """Yield the frames to come. If one cannot be read, the state before it is saved."""
@@ -239,7 +239,7 @@ class Slam(Stateful):
             frame, depth = store.frames[index], store.metric_depths[index]
             record = Keyframe(
                 keyframe_index=index, frame_index=frame.frame_index, timestamp=frame.timestamp,
-                image=frame.image, features=store.features[index],
+                pixels=frame.pixels, features=store.features[index],
                 depth=unknown if depth is None else depth,
                 T_camera_world=store.T_camera_world[index],
                 moving_mask=self._given_mask(frame.frame_index),

@@ -62,17 +62,21 @@ class ImagePreparation:
             "crop": self._crop,  # left, top
         }
 
-    def color(
+    def color(self, raw: np.ndarray, label: str = "an image") -> np.ndarray:  # (H', W', 3) float32
+        """Prepare a colour image: values in [0, 1]."""
+        return self.pixels(raw, label).astype(np.float32) / np.float32(255)
+
+    def pixels(
         self,
         raw: np.ndarray,  # (H, W, 3) uint8
         label: str = "an image",  # how to call it in an error
-    ) -> np.ndarray:  # (H', W', 3) float32
-        """Prepare a colour image: values in [0, 1]."""
+    ) -> np.ndarray:  # (H', W', 3) uint8
+        """Prepare a colour image."""
         self._require_size(raw, label)
         image = self._undistorted(raw, cv2.INTER_LINEAR)
         if (image.shape[1], image.shape[0]) != self._resized:
             image = cv2.resize(image, self._resized, interpolation=cv2.INTER_AREA)
-        return self._cropped(image).astype(np.float32) / np.float32(255)
+        return np.ascontiguousarray(self._cropped(image))
 
     def full_color(self, raw: np.ndarray, label: str = "an image") -> np.ndarray:  # (H, W, 3) uint8
         """Undistort a colour image and cut unseen borders, at the size of the source."""

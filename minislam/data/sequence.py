@@ -117,9 +117,9 @@ class RecordedSequence:
         index = self.source_index(frame_index)
         raw = self._recording.images.read(index)
         self.checksums[frame_index] = crc32(raw.tobytes())
-        image = self._prepare.color(raw, self._recording.images.label(index))
+        pixels = self._prepare.pixels(raw, self._recording.images.label(index))
         timestamp = float(self._recording.timestamps[index])
-        return Frame(frame_index, timestamp, torch.from_numpy(image))
+        return Frame(frame_index, timestamp, torch.from_numpy(pixels))
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
         """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""

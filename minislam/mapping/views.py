@@ -8,7 +8,7 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.images import shrink_depth, shrink_image
-from minislam.records import Keyframe
+from minislam.records import Keyframe, Pictured
 from minislam.splatting import Rendering
 from minislam.state.stateful import FrameOf, Tree
 from minislam.uncertainty import RenderingError, UncertaintyConfig, beta_of_mask, rendering_error
@@ -26,13 +26,13 @@ class View:
 
 
 @dataclass
-class MappedKeyframe:
+class MappedKeyframe(Pictured):
     """A keyframe in the map. Bundle adjustment changes its pose."""
 
     keyframe_index: int
     frame_index: int
     features: Tensor  # (h', w', C)
-    image: Tensor  # (H, W, 3)
+    pixels: Tensor  # (H, W, 3) as of a `Keyframe`
     depth: Tensor  # (H, W) world units, 0 where unknown
     T_camera_world: Tensor  # (4, 4) float64
     given_beta: Tensor | None = None  # (h, w) instead of the MLP's
@@ -46,7 +46,7 @@ class MappedKeyframe:
             keyframe.keyframe_index,
             keyframe.frame_index,
             keyframe.features,
-            keyframe.image,
+            keyframe.pixels,
             keyframe.depth,
             keyframe.T_camera_world.double(),
             None if keyframe.moving_mask is None else beta_of_mask(keyframe.moving_mask),
@@ -55,17 +55,19 @@ class MappedKeyframe:
 
     def saved_state(self) -> Tree:
         """Return all attributes but the image, which is read again, and its copies."""
-        images = ("image", "_views")
+        images = ("pixels", "_views")
         return {name: value for name, value in vars(self).items() if name not in images}
 
     @classmethod
     def from_state(cls, state: Tree, frame_of: FrameOf) -> "MappedKeyframe":
         """Return the keyframe of a saved state; its image is read again."""
-        return cls(**state, image=frame_of(state["frame_index"]).image)
+        return cls(**state, pixels=frame_of(state["frame_index"]).pixels)
 
     def view(self, camera: Camera) -> View:
-        """Return the keyframe at the size of `camera`; it is computed once and stored."""
+        """Return the keyframe at the size of `camera`; a smaller one is computed once."""
         size = (camera.height, camera.width)
+        if size == self.depth.shape:
+            return View(self.image, self.depth)
         if size not in self._views:
             image = shrink_image(self.image, *size)
             self._views[size] = View(image, shrink_depth(self.depth, *size))

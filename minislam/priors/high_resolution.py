@@ -50,7 +50,7 @@ class HighResolutionFeatures:
         height, width = frame.image.shape[:2]
         rows, columns = height // self.extractor.stride, width // self.extractor.stride
         image = shift_image(frame.image, x * width / columns, y * height / rows)
-        return self.extractor(replace(frame, image=image))
+        return self.extractor(replace(frame, pixels=image))
 
 
 def shift_image(

@@ -25,13 +25,14 @@ def pose_all_frames(
     fits = {f.frame_index: PoseFit(T, 1.0) for f, T in zip(frames, poses, strict=True)}
     followed = [t for t in tracker.tracked if t.status.is_followed]
     others = {t.frame_index: t for t in followed if t.frame_index not in fits}
-    shown = ShownImages({frame.frame_index: frame.image for frame in frames})
+    shown = ShownImages(frames)
 
     def fit_from(index: int, start: Tensor) -> PoseFit:
-        image = sequence.frame(index).image.to(poses.device)
-        if shown.repeats(index, image) and index - 1 in fits:
+        frame = sequence.frame(index)
+        frame = replace(frame, pixels=frame.pixels.to(poses.device))
+        if shown.repeats(frame) and index - 1 in fits:
             return fits[index - 1]
-        return PoseFit(*graph.fit_pose(image, _around(graph, others[index]), start))
+        return PoseFit(*graph.fit_pose(frame.image, _around(graph, others[index]), start))
 
     for done, (index, tracked) in enumerate(others.items()):
         fits[index] = fit_from(index, _interpolate(graph, tracked))

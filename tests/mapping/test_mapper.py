@@ -154,7 +154,7 @@ def test_sparse_depth_and_arbitrary_units_are_enough():
 def test_a_black_keyframe_without_depth_changes_nothing_for_the_worse():
     mapper = make_mapper()
     mapper.initialise([wall_keyframe(0)])
-    black = replace(wall_keyframe(1), image=torch.zeros(24, 32, 3), depth=torch.zeros(24, 32))
+    black = replace(wall_keyframe(1), pixels=torch.zeros(24, 32, 3), depth=torch.zeros(24, 32))
     mapper.integrate(black)
     assert torch.isfinite(mapper.gaussians.means).all()
     first = wall_keyframe(0)

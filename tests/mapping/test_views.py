@@ -1,5 +1,7 @@
 """Keyframes at several sizes, and the depths that are compared with theirs."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -29,10 +31,18 @@ def test_shrinking_depth_averages_known_pixels_only():
 # Identities
 
 
-def test_the_full_size_is_the_keyframe_itself():
+def test_the_full_size_is_the_keyframe_itself_and_is_kept_as_bytes_only():
+    record = wall_keyframe(0)
+    record = replace(record, pixels=(255 * record.image).round().byte())
+    keyframe = MappedKeyframe.from_record(record)
+    assert torch.equal(keyframe.view(CAMERA).image, record.pixels.float() / 255)
+    assert keyframe.view(CAMERA).depth is keyframe.depth
+    assert keyframe.pixels is record.pixels and not keyframe._views
+
+
+def test_a_smaller_size_is_computed_once():
     keyframe = MappedKeyframe.from_record(wall_keyframe(0))
-    assert keyframe.view(CAMERA).image is keyframe.image
-    assert keyframe.view(CAMERA) is keyframe.view(CAMERA)
+    assert keyframe.view(HALF) is keyframe.view(HALF)
 
 
 # Errors

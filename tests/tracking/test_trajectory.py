@@ -90,7 +90,7 @@ def test_a_frame_that_repeats_the_one_before_it_has_its_pose_however_often():
 
     def frozen(number: int) -> Frame:
         like, noise = wall_frame(shown.get(number, number)), 0.0005 * (number % 2)
-        return replace(like, frame_index=number, image=like.image + noise)
+        return replace(like, frame_index=number, pixels=like.image + noise)
 
     poses = posed(frame=frozen)
     assert torch.equal(poses[1], poses[0]) and torch.equal(poses[2], poses[0])

@@ -93,7 +93,7 @@ class DroidFlow(Stateful):
                 f"expected images of more than {STRIDE * (_SMALLEST_GRID - 1)} px per side for "
                 f"DROID, found {image.shape[1]}x{image.shape[0]}; give a larger working size"
             )
-        if self._newest is None or self._newest.image is not image:
+        if self._newest is None or not torch.equal(self._newest.image, image):
             self._newest = EncodedFrame(self.weights, image)
         return self._newest
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from minislam.priors.interfaces import FlowMatches
+from minislam.records import Frame
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
@@ -56,16 +57,15 @@ def retry_doubtful(
 class ShownImages:
     """Finds images that repeat the one before, as of a recorder that froze."""
 
-    def __init__(self, images: dict[int, Tensor]) -> None:
-        """Start with the images (H, W, 3) of some frames, by frame index."""
-        self._images = images
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = {frame.frame_index: frame for frame in frames}
 
-    def repeats(self, index: int, image: Tensor) -> bool:
+    def repeats(self, frame: Frame) -> bool:
         """Tell whether an image repeats the one before it. Sensor noise differs by more."""
-        self._images[index] = image
-        self._images.pop(index - 2, None)
-        before = self._images.get(index - 1)
-        return before is not None and float((image - before).abs().mean()) < REPEATED
+        self._frames[frame.frame_index] = frame
+        self._frames.pop(frame.frame_index - 2, None)
+        before = self._frames.get(frame.frame_index - 1)
+        return before is not None and float((frame.image - before.image).abs().mean()) < REPEATED
 
 
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
