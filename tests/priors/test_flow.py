@@ -95,6 +95,18 @@ def test_the_number_of_workers_changes_nothing(other: int):
     assert torch.equal(one.matched_ratios, many.matched_ratios)
 
 
+def test_edges_in_parts_are_measured_as_all_at_once(monkeypatch: pytest.MonkeyPatch):
+    images = [shifted(3 * d, -d, SIZE) for d in range(4)]
+    sources, targets = [0, 1, 1, 2, 3, 0], [1, 2, 0, 3, 2, 3]
+    whole = flow_of(images).match(sources, targets, still(6))
+    monkeypatch.setattr(flow_module, "PAIRS_AT_ONCE", 1)
+    split = flow_of(images).match(sources, targets, still(6))
+    assert torch.equal(split.targets, whole.targets)
+    assert torch.equal(split.confidences, whole.confidences)
+    # One confidence counts for u and v, and is stored once.
+    assert whole.confidences.untyped_storage().nbytes() == 4 * whole.confidences[:, 0].numel()
+
+
 def test_matches_follow_the_order_of_the_edges():
     flow = flow_of([shifted(3 * d, 0, SIZE) for d in range(3)])
     matches = flow.match([0, 2, 0], [1, 1, 2], still(3))

@@ -154,6 +154,19 @@ def test_a_pure_rotation_counts_by_its_share():
     torch.testing.assert_close(some, 0.75 * whole)
 
 
+def test_distances_within_a_limit_are_those_without_one():
+    poses = poses_on_an_arc(6, 3)
+    disparities = 0.2 + 0.3 * uniform(4, 6, len(RAYS))
+    view = poses, disparities, RAYS, PIXELS, CAMERA, 0.75
+    whole = flow_distances(*view)
+    limit = float(whole[0, 2])
+    limited = flow_distances(*view, limit=limit)
+    assert torch.equal(limited[whole <= limit], whole[whole <= limit])
+    assert int((limited == FAR).sum()) > int((whole == FAR).sum())
+    row = flow_distances(*view, rows=range(3, 4))
+    assert torch.equal(row[3], whole[3]) and torch.equal(row[:, 3], whole[:, 3])
+
+
 def test_distances_are_symmetric_and_zero_to_oneself():
     poses, disparities = poses_on_an_arc(4, 0), 0.2 + 0.3 * uniform(0, 4, len(RAYS))
     distance = flow_distances(poses, disparities, RAYS, PIXELS, CAMERA, 0.75)

@@ -74,6 +74,16 @@ def test_closing_a_loop_takes_the_drift_away():
     assert end_error(graph) < 0.2 * before
 
 
+def test_a_loop_that_fits_already_is_linked_and_moves_nothing():
+    graph = drifted(TrueFlow())
+    graph.keyframes.set_geometry(
+        torch.stack([true_poses()[n] for n in ROUND]), graph.state.disparities
+    )
+    before = graph.state
+    assert not close_loops(graph)
+    assert (8, 0) in graph.links and torch.equal(graph.state.T_camera_world, before.T_camera_world)
+
+
 def test_a_loop_that_does_not_fit_leaves_everything_as_it_was():
     graph = drifted(FlowThatNeverFits())
     state, edges = graph.state, graph.links.edges()
