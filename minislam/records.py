@@ -1,12 +1,13 @@
 """The data that one stage gives to another (frozen), and the protocols of the input."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
@@ -32,6 +33,10 @@ class Frame(Pictured):
     frame_index: int  # position in the sequence as it is processed: 0, 1, 2, ...
     timestamp: float  # second, as the source gives it
     pixels: Tensor  # (H, W, 3) uint8 RGB, undistorted, at the working size
+
+    def to(self, device: torch.device | str) -> "Frame":
+        """Return the frame with its image on a device."""
+        return replace(self, pixels=self.pixels.to(device))
 
 
 @dataclass(frozen=True)

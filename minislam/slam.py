@@ -10,7 +10,7 @@ beta into the weight of each cell. `_move_map` deforms the map when an adjustmen
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -112,8 +112,7 @@ class Slam(Stateful):
 
     def frame(self, frame_index: int) -> Frame:
         """Read a frame; it moves to the device of the run."""
-        frame = self.sequence.frame(frame_index)
-        return replace(frame, pixels=frame.pixels.to(self.device))
+        return self.sequence.frame(frame_index).to(self.device)
 
     def _frames_left(self) -> Iterator[Frame]:
         """Yield the frames to come. If one cannot be read, the state before it is saved."""

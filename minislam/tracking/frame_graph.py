@@ -13,8 +13,7 @@ from minislam.tracking.reprojection import lengths, relative_transforms, reproje
 # Fraction of cells that must stay in view, else a pair has no meaningful distance. DROID-SLAM: 0.75
 MIN_VISIBLE_FRACTION = 0.5
 FAR = 1000.0  # px, the distance of a pair below this fraction
-# Most pairs are far apart: one cell in so many tells it, to a factor.
-COARSE, COARSE_MARGIN = 16, 2.0
+COARSE, COARSE_MARGIN = 16, 2.0  # one cell in so many tells, to a factor, which pairs are far
 # New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8
 
@@ -138,7 +137,7 @@ def flow_distances(
     camera: Camera,
     rotation_weight: float,  # beta
     rows: range | None = None,  # keyframes to compare with all others; None: all
-    limit: float | None = None,  # px: more counts as FAR, by a look at a few cells
+    limit: float = FAR,  # px: more counts as FAR, by a look at a few cells
 ) -> Tensor:  # (K, K) px, FAR outside the rows and their columns
     """Return the distances between keyframes, as the mean flow that their geometry predicts.
 
@@ -148,7 +147,7 @@ def flow_distances(
     count, view = len(T_camera_world), (camera, rotation_weight)
     rows = range(count) if rows is None else rows
     near = torch.ones(count, count, dtype=torch.bool, device=disparities.device)
-    if limit is not None:
+    if limit < FAR:
         few = disparities[:, ::COARSE], rays[::COARSE], pixels[::COARSE]
         near = flow_distances(T_camera_world, *few, *view, rows) < COARSE_MARGIN * limit
     distances = disparities.new_full((count, count), FAR)

@@ -21,6 +21,7 @@ from minislam.tracking.bundle_adjustment import (
 )
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import (
+    FAR,
     FrameGraph,
     both_directions,
     flow_distances,
@@ -272,10 +273,8 @@ class KeyframeGraph(Stateful):
 
     # How far apart keyframes are ----------------------------------------------------------------
 
-    def distances(
-        self, start: int = 0, rows: range | None = None, limit: float | None = None
-    ) -> Tensor:  # (K', K') px
-        """Return the flow distances between the keyframes from `start` on, of some rows or all."""
+    def distances(self, start: int = 0, rows: range | None = None, limit: float = FAR) -> Tensor:
+        """Return the flow distances (K', K') [px] of the keyframes from `start` on."""
         poses, disparities = self.keyframes.T_camera_world, self.keyframes.disparities
         return self._flow_distances(poses[start:], disparities[start:], rows, limit)
 
@@ -286,11 +285,7 @@ class KeyframeGraph(Stateful):
         return float(self._flow_distances(pair, disparities)[0, 1])
 
     def _flow_distances(
-        self,
-        poses: Tensor,
-        disparities: Tensor,
-        rows: range | None = None,
-        limit: float | None = None,  # px
+        self, poses: Tensor, disparities: Tensor, rows: range | None = None, limit: float = FAR
     ) -> Tensor:
         view = self.grid.rays, self.grid.pixels, self.grid.camera
         # On the CPU, because pairs are chosen by one number after the other.

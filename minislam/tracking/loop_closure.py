@@ -15,9 +15,7 @@ from minislam.tracking.optimisation import FIRST_WIDENING, adjust, bundle_proble
 from minislam.tracking.reprojection import lengths
 
 LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code
-# px at 320x240: a loop that fits so well needs no adjustment. On synth:loop:4711 the first one has
-# 2.5 px, and those after it .1 to .4; almost every keyframe of a second round ends one.
-FITTING_LOOP_RESIDUAL = 0.5
+FITTING_LOOP_RESIDUAL = 0.5  # px at 320x240: nothing has drifted; .1 to .4 in a second round
 MAX_LOOP_RESIDUAL = 3.0  # px at 320x240: a loop that stays worse than this is undone
 
 
@@ -34,8 +32,7 @@ def loop_pairs(
     index = torch.arange(len(distances), device=distances.device)
     near_in_time = (index[:, None] - index).abs() < min_gap
     candidates = distances.masked_fill(near_in_time, FAR)
-    near_newest = [edge for edge in edges if max(edge) >= newest - suppression]
-    far_edges = [edge for edge in near_newest if abs(edge[0] - edge[1]) >= min_gap]
+    far_edges = [e for e in edges if abs(e[0] - e[1]) >= min_gap and max(e) >= newest - suppression]
     newer = range(newest, newest + 1)
     return proximity_pairs(candidates, far_edges, newer, max_distance, limit, suppression)
 

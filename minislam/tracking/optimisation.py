@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from minislam.records import Progress
-from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
+from minislam.tracking.bundle_adjustment import BundleProblem
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
-from minislam.tracking.safeguards.parts import of_rows, put_back, touched_rows
+from minislam.tracking.safeguards.touched import adjust_touched
 
 # A new keyframe may have so large an error that the robust weight takes its cells for outliers and
 # the error stays. So the weight is wide at first. [-]
@@ -88,9 +88,7 @@ def adjust(
         # disparities, and they keep the scale until the camera moves again.
         known = problem.free_disparities & _has_parallax(graph, problem)
         problem = replace(problem, free_disparities=known)
-    rows = touched_rows(problem)
-    found, report = bundle_adjust(*of_rows(problem, graph.state, rows), iterations)
-    state = put_back(graph.state, rows, found)
+    state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.grid.zoom(state.log_focal)
     graph.count_adjustment(report)

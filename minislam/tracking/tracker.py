@@ -35,9 +35,7 @@ from minislam.tracking.safeguards.settling import Settling, certainty
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 MAX_CULLED_IN_A_ROW = 2  # keyframes, official code
 LONGEST_TAIL = 2  # frames after the last keyframe
-# All keyframes are adjusted online only once a fifth has been added, so that the adjustments of
-# all cost the same per keyframe however long the sequence is.
-LEAST_GROWTH = 5
+LEAST_GROWTH = 5  # online all keyframes are adjusted again once a fifth of them is new
 
 
 class Mode(Enum):
@@ -89,13 +87,12 @@ class Tracker(Stateful):
         self.config = config = self.graph.config  # for this kind of flow
         self.keyframes = self.graph.keyframes
         self.grid = self.graph.grid
-        self.tracked, self.watch = [], Watch(self.graph)
+        self.tracked, self.watch, self._settling = [], Watch(self.graph), Settling(self.graph)
         self._features = features
         self._depth_prior = lambda frame: depth_prior(frame, camera)  # as given: one unit of length
         self._predict_static_weight = predict_static_weight
         memory_scale = config.motion_memory * self.graph.pixel_scale
         self._motion = MotionMemory(self.grid, self.keyframes, memory_scale)
-        self._settling = Settling(self.graph)
         self._relocaliser = Relocaliser(self.grid, self.keyframes, self.graph.pixel_scale)
         # From the newest keyframe to the newest frame that could be matched with it.
         self._chain: FlowChain | None = None
@@ -223,8 +220,7 @@ class Tracker(Stateful):
         """Close loops; every `global_interval` keyframes run online global BA."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
-        interval = max(config.global_interval, count // LEAST_GROWTH)
-        is_due = 0 < config.global_interval and interval <= count - self._last_global
+        is_due = 0 < config.global_interval <= count - self._last_global >= count // LEAST_GROWTH
         if is_due and not closed:
             online_global_ba(self.graph)
         if is_due or closed:

@@ -28,8 +28,7 @@ def pose_all_frames(
     shown = ShownImages(frames)
 
     def fit_from(index: int, start: Tensor) -> PoseFit:
-        frame = sequence.frame(index)
-        frame = replace(frame, pixels=frame.pixels.to(poses.device))
+        frame = sequence.frame(index).to(poses.device)
         if shown.repeats(frame) and index - 1 in fits:
             return fits[index - 1]
         return PoseFit(*graph.fit_pose(frame.image, _around(graph, others[index]), start))

@@ -17,7 +17,7 @@ import torch
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.safeguards.parts import of_rows
+from minislam.tracking.safeguards.touched import of_rows
 
 STEP = math.log(1.05)  # to either side, where the cost must have risen
 ITERATIONS = 10  # Gauss-Newton steps of each adjustment

@@ -1,13 +1,11 @@
-"""Edges in parts and rows that count: the same numbers as with everything at once."""
-
-from dataclasses import replace
+"""Edges in parts: the same numbers as with all at once."""
 
 import pytest
 import torch
 
 from minislam.tracking.bundle_adjustment import bundle_adjust, edge_costs, residuals
 from minislam.tracking.safeguards import parts
-from minislam.tracking.safeguards.parts import in_parts, of_rows, put_back, touched_rows
+from minislam.tracking.safeguards.parts import in_parts
 from tests.tracking.scene import CELLS, known_problem, noisy, perturbed
 
 
@@ -42,31 +40,3 @@ def test_an_adjustment_in_parts_is_that_of_all_edges(monkeypatch: pytest.MonkeyP
     assert again.cost_after == pytest.approx(report.cost_after, rel=1e-12)
     assert torch.equal(edge_costs(problem, start), costs)
     assert all(torch.equal(a, b) for a, b in zip(residuals(problem, start), rest, strict=True))
-
-
-def test_rows_that_nothing_touches_stay_and_the_others_move_as_in_the_whole(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    known = known_problem(5)
-    problem, start = noisy(known, 1.0), perturbed(known, 0.02)
-    chosen = ((problem.edges_source != 1) & (problem.edges_target != 1)).nonzero()[:, 0]
-    ends = problem.edges_source[chosen], problem.edges_target[chosen]
-    free = problem.free_disparities & (torch.arange(5) != 1)
-    problem = replace(
-        problem,
-        edges_source=ends[0],
-        edges_target=ends[1],
-        targets=problem.targets[chosen],
-        weights=problem.weights[chosen],
-        free_poses=problem.free_poses & free,
-        free_disparities=free,
-    )
-    assert touched_rows(problem).tolist() == [0, 1, 2, 3, 4]  # so few are not selected
-    monkeypatch.setattr(parts, "FEW_KEYFRAMES", 4)
-    rows = touched_rows(problem)
-    assert rows.tolist() == [0, 2, 3, 4]
-    found, _ = bundle_adjust(*of_rows(problem, start, rows), 3)
-    state, (whole, _) = put_back(start, rows, found), bundle_adjust(problem, start, 3)
-    torch.testing.assert_close(state.T_camera_world, whole.T_camera_world, rtol=0, atol=1e-12)
-    torch.testing.assert_close(state.disparities, whole.disparities, rtol=0, atol=1e-12)
-    assert torch.equal(state.disparities[1], start.disparities[1])
