@@ -42,10 +42,10 @@ class MappedKeyframe(Pictured):
     @classmethod
     def from_record(cls, keyframe: Keyframe) -> "MappedKeyframe":
         """Return the keyframe for a record of the tracker."""
-        mask, pose = keyframe.moving_mask, keyframe.T_camera_world.double()
+        mask, depth, pose = keyframe.moving_mask, keyframe.depth, keyframe.T_camera_world.double()
         return cls(
             keyframe.keyframe_index, keyframe.frame_index, keyframe.features, keyframe.pixels,
-            keyframe.depth, pose, None if mask is None else beta_of_mask(mask), keyframe.confirmation
+            depth, pose, None if mask is None else beta_of_mask(mask), keyframe.confirmation
         )  # fmt: skip
 
     def saved_state(self) -> Tree:

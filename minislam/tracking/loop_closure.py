@@ -38,10 +38,7 @@ def loop_pairs(
 
 
 def close_loops(graph: KeyframeGraph) -> bool:
-    """Link the loops that end at the newest keyframe; return whether all keyframes were adjusted.
-
-    They are, unless the loops fit already. Stored flow is used again.
-    """
+    """Link the loops that end at the newest keyframe; adjust all unless they fit, and tell it."""
     config, newest = graph.config, len(graph.keyframes) - 1
     if newest < config.loop_min_gap:
         return False
