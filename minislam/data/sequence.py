@@ -11,6 +11,7 @@ import torch
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.folder import read_image_folder, read_video
 from minislam.data.images import read_depth, read_mask
+from minislam.data.kept_images import KeptImages
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
 from minislam.data.preparation import ImagePreparation
 from minislam.data.recording import RecordedTruth, Recording, mask_files, path_of
@@ -69,6 +70,7 @@ class RecordedSequence:
             )
         self.lost = [row for row in recording.lost if stamps[0] < row[0] < stamps[-1]]
         self.checksums: dict[int, int] = {}
+        self._kept = KeptImages()
         self.files = recording.images.paths  # of all images
         self._masks = recording.mask_paths
         if options.masks is not None:
@@ -115,11 +117,14 @@ class RecordedSequence:
     def frame(self, frame_index: int) -> Frame:
         """Return one frame; timestamps are those of the source, whatever the stride."""
         index = self.source_index(frame_index)
-        raw = self._recording.images.read(index)
-        self.checksums[frame_index] = crc32(raw.tobytes())
-        pixels = self._prepare.pixels(raw, self._recording.images.label(index))
-        timestamp = float(self._recording.timestamps[index])
-        return Frame(frame_index, timestamp, torch.from_numpy(pixels))
+
+        def prepare() -> np.ndarray:
+            raw = self._recording.images.read(index)
+            self.checksums[frame_index] = crc32(raw.tobytes())
+            return self._prepare.pixels(raw, self._recording.images.label(index))
+
+        pixels = torch.from_numpy(self._kept.get(frame_index, prepare))
+        return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
         """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""
