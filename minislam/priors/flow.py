@@ -111,7 +111,7 @@ class ClassicalFlow(Stateful):
         pairs = list(dict.fromkeys((min(edge), max(edge)) for edge in starts))
         for first in range(0, len(pairs), PAIRS_AT_ONCE):
             both = [e for i, j in pairs[first : first + PAIRS_AT_ONCE] for e in ((i, j), (j, i))]
-            edges = [edge for edge in both if edge in starts]
+            edges = [edge for edge in dict.fromkeys(both) if edge in starts]
             flows = pool.map(self._edge_flow, edges, [starts[edge] for edge in edges])
             flow_of = dict(zip(edges, flows, strict=True))
             measured = [

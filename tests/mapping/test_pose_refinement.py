@@ -107,7 +107,7 @@ def test_a_mover_of_weight_zero_does_not_pull_and_with_weight_one_it_does():
 
 
 def test_a_frame_between_two_keyframes_is_refined_by_the_mapper():
-    config = MappingConfig(image_scale=1.0, init_iterations=80, pose_refinement=CONFIG)
+    config = MappingConfig(image_scale=1.0, init_iterations=120, pose_refinement=CONFIG)
     mapper = Mapper(CAMERA, config, UncertaintyConfig(), feature_dimension=3, seed=0)
     mapper.initialise([wall_keyframe(0), wall_keyframe(2)])
     between = wall_keyframe(1)

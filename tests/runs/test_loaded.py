@@ -24,7 +24,7 @@ def run(root: Path) -> minislam.Run:
     try:
         done = minislam.run(
             "synth:person", root / "run", preset="test", stride=3, max_frames=10, size=(96, 72),
-            settings={"seed": 3, "mapping.init_iterations": 30}, quiet=True,
+            settings={"seed": 3, "mapping.init_iterations": 60}, quiet=True,
         )  # fmt: skip
         assert torch.get_num_threads() == 2  # of the caller
     finally:
