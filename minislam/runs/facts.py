@@ -3,6 +3,7 @@
 import platform
 import sys
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -165,8 +166,14 @@ def peak_memory_mb() -> float | None:
         import resource
     except ImportError:
         return None
+    # What Linux returns counts the process that started this one, too; its status does not.
+    status = Path("/proc/self/status")
+    if sys.platform == "linux" and status.exists():
+        _, _, rest = status.read_text(encoding="ascii", errors="replace").partition("VmHWM:")
+        if rest:
+            return int(rest.split()[0]) / 1024  # kB
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes, Linux: kB
+    return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes
 
 
 def _warnings(slam: Slam) -> list[str]:

@@ -99,6 +99,17 @@ def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.slow
+def test_the_memory_of_the_process_that_starts_a_run_is_not_counted():
+    child = "from minislam.runs.facts import peak_memory_mb; print(peak_memory_mb() or 0)"
+    parent = (
+        "import subprocess, sys\nlarge = bytearray(b'1') * 900_000_000\n"
+        f"subprocess.run([sys.executable, '-c', {child!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True)
+    assert float(done.stdout) < 800, done.stderr
+
+
+@pytest.mark.slow
 def test_without_the_counter_of_unix_the_package_still_imports():
     program = (
         "import sys; sys.modules['resource'] = None\n"
