@@ -84,7 +84,7 @@ class Workers:
         """Return function(*call) for every call, in their order; what it raises is raised here.
 
         It must be a function of a module of this package, with annotated arguments and result:
-        tensors, plain values, and dataclasses, lists or dictionaries of them.
+        tensors, arrays, plain values, and dataclasses, lists or dictionaries of them.
         """
         *kinds, kind = _kinds(function)
         # Tensors are contiguous, as a helper gets them: the layout can change the last bits.

@@ -25,8 +25,9 @@ from minislam.uncertainty import (
 from minislam.uncertainty.weights import BETA_CUT
 from minislam.workers import Workers
 
-# Fraction of beta that is taken away where other views confirm; but what the MLP would exclude may
-CONFIRMED_BETA = 0.4  # have stood still for a while, so a beta above the cut is kept [-]
+# Fraction of beta that is taken away where other views confirm. A beta above the cut is kept: what
+# it excludes may have stood still for a while. [-]
+CONFIRMED_BETA = 0.4
 
 
 class JointOptimisation(Stateful):

@@ -38,7 +38,7 @@ def adjust_again(
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
     followed = [frame.frame_index for frame in tracked if frame.status.is_followed]
-    # The other frames would take two thirds of the time and gain nothing (RESULTS.md).
+    # The other frames took 40 to 80 % of the time and gained nothing (RESULTS.md).
     wanted = {*swept_frames(keyframes, followed)}
     tracker.tracked = [frame for frame in tracked if frame.frame_index in wanted]
     poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))

@@ -1,5 +1,6 @@
 """Steps of the bundle adjustment that must not be taken, and degenerate problems."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -34,6 +35,22 @@ def scaled_disparities(state: BundleState, factor: float) -> BundleState:
     return replace(state, disparities=factor * state.disparities)
 
 
+def spoil_steps(
+    monkeypatch: pytest.MonkeyPatch, is_bad: Callable[[list[float]], bool]
+) -> list[float]:
+    """Replace steps by bad ones; return the list that will hold the dampings tried so far."""
+    solve, dampings = bundle_adjustment._damped_step, []
+
+    def step(problem, state, equations, damping, absolute_damping):
+        dampings.append(damping)
+        if is_bad(dampings):
+            return scaled_disparities(state, 3.0)
+        return solve(problem, state, equations, damping, absolute_damping)
+
+    monkeypatch.setattr(bundle_adjustment, "_damped_step", step)
+    return dampings
+
+
 @pytest.mark.parametrize("robust", [None, RobustKernel(1.0, 1), RobustKernel(3.0)])
 def test_cost_never_rises_over_accepted_steps(robust):
     known = known_problem()
@@ -47,14 +64,8 @@ def test_cost_never_rises_over_accepted_steps(robust):
 
 def test_a_step_that_raises_the_cost_is_tried_again_with_more_damping(monkeypatch):
     known = known_problem()
-    start, solve, dampings = perturbed(known, 0.02), bundle_adjustment._damped_step, []
-
-    def bad_below_a_tenth(problem, state, equations, damping, absolute_damping):
-        dampings.append(damping)
-        step = solve(problem, state, equations, damping, absolute_damping)
-        return step if damping > 0.05 else scaled_disparities(state, 3.0)
-
-    monkeypatch.setattr(bundle_adjustment, "_damped_step", bad_below_a_tenth)
+    start = perturbed(known, 0.02)
+    dampings = spoil_steps(monkeypatch, lambda tried: tried[-1] < 0.05)
     end, report = bundle_adjust(known.problem, start, iterations=1)
     assert dampings == pytest.approx([1e-4, 1e-3, 1e-2, 1e-1])
     assert report.iterations == 1 and report.cost_after < report.cost_before
@@ -63,14 +74,8 @@ def test_a_step_that_raises_the_cost_is_tried_again_with_more_damping(monkeypatc
 
 def test_damping_falls_by_ten_after_each_good_step_and_no_lower_than_given(monkeypatch):
     known = known_problem()
-    start, solve, dampings = perturbed(known, 0.02), bundle_adjustment._damped_step, []
-
-    def bad_at_first(problem, state, equations, damping, absolute_damping):
-        dampings.append(damping)
-        step = solve(problem, state, equations, damping, absolute_damping)
-        return step if len(dampings) > 3 else scaled_disparities(state, 3.0)
-
-    monkeypatch.setattr(bundle_adjustment, "_damped_step", bad_at_first)
+    start = perturbed(known, 0.02)
+    dampings = spoil_steps(monkeypatch, lambda tried: len(tried) <= 3)
     _, report = bundle_adjust(known.problem, start, iterations=4, damping=1e-3)
     assert dampings == pytest.approx([1e-3, 1e-2, 1e-1, 1.0, 1e-1, 1e-2, 1e-3])
     assert report.iterations == 4 and report.damping == pytest.approx(1e-3)
