@@ -182,42 +182,15 @@ def _rotation_and_left_jacobian(phi: Tensor) -> tuple[Tensor, Tensor]:
 def se3_left_jacobian(xi: Tensor) -> Tensor:
     """Return J (..., 6, 6), with exp(xi + d) = exp(J d) exp(xi) to first order in d.
 
-    J = [[V, Q], [0, V]] for xi = (rho, phi); Q collects the coupling of rho and phi (Barfoot,
-    State Estimation for Robotics, (7.86)). Near zero angle the series sum ad^n / (n+1)! is used.
+    For xi = (rho, phi), ad = [[hat(phi), hat(rho)], [0, hat(phi)]] and J = sum ad^n / (n+1)!, which
+    is the upper right block of the matrix exponential of [[ad, I], [0, 0]].
     """
-    rho, phi = xi[..., :3], xi[..., 3:]
-    angle = _safe_norm(phi)[..., None, None]
-    small = angle < 0.3  # here the closed form divides differences by t^5
-    t = torch.where(small, torch.ones_like(angle), angle)
-    p, r = hat(phi), hat(rho)
-    c1 = (t - t.sin()) / t**3
-    c2 = (t**2 + 2 * t.cos() - 2) / (2 * t**4)
-    c3 = (2 * t - 3 * t.sin() + t * t.cos()) / (2 * t**5)
-    coupling = (
-        0.5 * r
-        + c1 * (p @ r + r @ p + p @ r @ p)
-        + c2 * (p @ p @ r + r @ p @ p - 3 * p @ r @ p)
-        + c3 * (p @ r @ p @ p + p @ p @ r @ p)
-    )
-    jacobian = xi.new_zeros(*xi.shape[:-1], 6, 6)
-    rotation_part = so3_left_jacobian(phi)
-    jacobian[..., :3, :3] = rotation_part
-    jacobian[..., 3:, 3:] = rotation_part
-    jacobian[..., :3, 3:] = torch.where(small, _coupling_series(p, r), coupling)
-    return jacobian
-
-
-def _coupling_series(p: Tensor, r: Tensor) -> Tensor:
-    """Return the upper right block of sum_n ad(xi)^n / (n+1)!, exact for small angles."""
-    power, coupling = torch.eye(3, dtype=p.dtype, device=p.device).expand_as(p), torch.zeros_like(p)
-    total, factorial = torch.zeros_like(p), 1.0
-    for n in range(1, 14):
-        # [[P, R], [0, P]]^n has the upper right block C_n = P C_(n-1) + R P^(n-1).
-        coupling = p @ coupling + r @ power
-        power = p @ power
-        factorial *= n + 1
-        total = total + coupling / factorial
-    return total
+    rho, phi = hat(xi[..., :3]), hat(xi[..., 3:])
+    generator = xi.new_zeros(*xi.shape[:-1], 12, 12)
+    generator[..., :3, :3] = generator[..., 3:6, 3:6] = phi
+    generator[..., :3, 3:6] = rho
+    generator[..., :6, 6:] = torch.eye(6, dtype=xi.dtype, device=xi.device)
+    return torch.linalg.matrix_exp(generator)[..., :6, 6:]
 
 
 def make_transform(rotation: Tensor, translation: Tensor) -> Tensor:

@@ -23,13 +23,3 @@ from minislam.mapping.config import (
 )
 from minislam.mapping.mapper import Mapper
 from minislam.records import MappingHistory
-
-__all__ = [
-    "DensityConfig",
-    "InsertionConfig",
-    "Mapper",
-    "MappingConfig",
-    "MappingHistory",
-    "PoseRefinementConfig",
-    "paper_mapping",
-]

@@ -23,12 +23,3 @@ from minislam.splatting.constants import Rendering
 from minislam.splatting.gaussians import GaussianMap, LearningRates, MapOptimizer
 from minislam.splatting.reference import render_reference
 from minislam.splatting.renderer import render
-
-__all__ = [
-    "GaussianMap",
-    "LearningRates",
-    "MapOptimizer",
-    "Rendering",
-    "render",
-    "render_reference",
-]

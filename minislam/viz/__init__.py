@@ -9,7 +9,7 @@ from minislam.viz.figures import (
     overview,
     trajectory_plot,
 )
-from minislam.viz.flipbook import FlipBook, figure_picture, flipbook
+from minislam.viz.flipbook import figure_picture, flipbook
 from minislam.viz.notebook import Page, summary_html
 from minislam.viz.report import Report, build_report
 from minislam.viz.style import (
@@ -25,34 +25,4 @@ from minislam.viz.style import (
     show_image,
     show_map,
 )
-from minislam.viz.viewer import build_viewer, picture_url
-
-__all__ = [
-    "Figure",
-    "FlipBook",
-    "Page",
-    "Report",
-    "ate_over_time",
-    "beta_limits",
-    "beta_to_rgb",
-    "build_report",
-    "build_viewer",
-    "colour_bar",
-    "depth_limits",
-    "depth_to_rgb",
-    "figure_picture",
-    "figure_png",
-    "flipbook",
-    "keyframe_health",
-    "loss_curves",
-    "map_growth",
-    "new_figure",
-    "overview",
-    "picture_url",
-    "set_notebook_style",
-    "show_figure",
-    "show_image",
-    "show_map",
-    "summary_html",
-    "trajectory_plot",
-]
+from minislam.viz.viewer import build_viewer
