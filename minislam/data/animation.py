@@ -14,15 +14,11 @@ _WEBP_QUALITY = 75  # of 100
 
 
 def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float) -> None:
-    """Write images (H, W, 3) RGB in [0, 1], `rate` per second, as .webm or .webp."""
-    atomic_write(path, encode_animation(images, rate, Path(path).suffix.lower()))
-
-
-def encode_animation(images: Iterable[np.ndarray], rate: float, kind: str) -> bytes:
-    """Return the bytes of an animation of images (H, W, 3) RGB in [0, 1], kind .webm or .webp.
+    """Write images (H, W, 3) RGB in [0, 1], `rate` per second, as .webm or .webp.
 
     The images may come one by one: a video holds only one of them in memory.
     """
+    kind = Path(path).suffix.lower()
     encoders = {".webm": _write_webm, ".webp": _write_webp}
     if kind not in encoders:
         raise InputError(f"expected a file that ends in .webm or .webp, found {kind or 'neither'}")
@@ -35,7 +31,7 @@ def encode_animation(images: Iterable[np.ndarray], rate: float, kind: str) -> by
                 f"expected this OpenCV ({cv2.__version__}) to write {kind}, but it does not; "
                 "choose the other kind, .webm or .webp, or install a newer one"
             )
-    return content
+    atomic_write(path, content)
 
 
 def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:

@@ -1,4 +1,4 @@
-"""The folder of one run: names and formats of its files. Each file is written atomically."""
+"""The folder of one run: the names of its files, what may be overwritten, how to read it back."""
 
 import io
 import os
@@ -13,18 +13,9 @@ import torch
 from torch import Tensor
 
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
-from minislam.data.files import (
-    atomic_write,
-    read_bytes,
-    read_json,
-    read_text,
-    require_free,
-    write_json,
-    write_text,
-)
+from minislam.data.files import atomic_write, read_bytes, read_json, require_free, write_text
 from minislam.data.images import encode_png
-from minislam.data.ply import GaussianArrays, read_ply, write_ply
-from minislam.data.trajectory import read_trajectory, write_trajectory
+from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
 
@@ -102,38 +93,10 @@ class RunFolder:
             ) from error
         return cls(path)
 
-    def write_config(self, config: dict[str, Any]) -> None:
-        """Write sequence, input, priors and settings."""
-        write_json(self.path / CONFIG, config)
-
-    def write_run(self, facts: dict[str, Any]) -> None:
-        """Write version, seed, command, timings and exit state."""
-        write_json(self.path / RUN, facts)
-
-    def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Write the errors against the ground truth."""
-        write_json(self.path / METRICS, metrics)
-
-    def write_camera(self, scene: dict[str, Any]) -> None:
-        """Write camera, unit, background and frames: what `minislam.load` stands on."""
-        write_json(self.path / CAMERA, scene)
-
-    def write_trajectory(self, trajectory: Trajectory) -> None:
-        """Write the poses of all tracked frames."""
-        write_trajectory(self.path / TRAJECTORY, trajectory)
-
-    def write_keyframe_trajectory(self, trajectory: Trajectory) -> None:
-        """Write the poses of the keyframes."""
-        write_trajectory(self.path / KEYFRAME_TRAJECTORY, trajectory)
-
     def write_lost_frames(self, lost: list[tuple[int, float, str]]) -> None:
         """Write (frame_index, timestamp [s], reason); the index is -1 if there is no image."""
         rows = [f"{index} {stamp:.6f} {reason}\n" for index, stamp, reason in lost]
         write_text(self.path / LOST_FRAMES, "# frame_index timestamp reason\n" + "".join(rows))
-
-    def write_map(self, gaussians: GaussianArrays) -> None:
-        """Write the Gaussian map for 3D viewers."""
-        write_ply(self.path / MAP, gaussians)
 
     def write_mlp(self, state: dict[str, Tensor]) -> None:
         """Write the weights of the uncertainty MLP."""
@@ -151,18 +114,6 @@ class RunFolder:
         """Write the PNG bytes of a figure to plots/NAME.png."""
         assert name in PLOT_NAMES, name
         atomic_write(self.path / PLOTS / f"{name}.png", png)
-
-    def write_clip(self, webp: bytes) -> None:
-        """Write the animation of the whole clip: input, beta and static map side by side."""
-        atomic_write(self.path / CLIP, webp)
-
-    def write_viewer(self, html: str) -> None:
-        """Write the page in which the map can be turned."""
-        write_text(self.path / VIEWER, html)
-
-    def write_report(self, html: str) -> None:
-        """Write the report to open in a browser."""
-        write_text(self.path / REPORT, html)
 
     def write_checkpoint(self, tree: dict[str, Any]) -> None:
         """Write the state from which an interrupted run can continue."""
@@ -188,14 +139,6 @@ class RunFolder:
         """Return sequence, input, priors and settings."""
         return read_json(self.path / CONFIG)
 
-    def has_camera(self) -> bool:
-        """Tell whether a run came as far as a map here."""
-        return (self.path / CAMERA).is_file()
-
-    def read_camera(self) -> dict[str, Any]:
-        """Return camera, unit, background and frames."""
-        return read_json(self.path / CAMERA)
-
     def read_run(self) -> dict[str, Any]:
         """Return version, seed, command, timings and exit state."""
         return read_json(self.path / RUN)
@@ -204,21 +147,9 @@ class RunFolder:
         """Return the errors against the ground truth."""
         return read_json(self.path / METRICS)
 
-    def read_plot(self, name: str) -> bytes:
-        """Return the PNG bytes of plots/NAME.png."""
-        return read_bytes(self.path / PLOTS / f"{name}.png")
-
-    def read_viewer(self) -> str:
-        """Return the page in which the map can be turned."""
-        return read_text(self.path / VIEWER)
-
     def read_trajectory(self) -> Trajectory:
         """Return the poses of all tracked frames."""
         return read_trajectory(self.path / TRAJECTORY)
-
-    def read_map(self) -> GaussianArrays:
-        """Return the Gaussian map."""
-        return read_ply(self.path / MAP)
 
     def read_mlp(self) -> dict[str, Tensor]:
         """Return the weights of the uncertainty MLP."""

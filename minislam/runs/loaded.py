@@ -10,7 +10,10 @@ import torch
 from torch import Tensor
 
 from minislam.config import SlamConfig, from_json
-from minislam.data import GaussianArrays, InputOptions, RecordedSequence, RunFolder, open_sequence
+from minislam.data import InputOptions, RecordedSequence, RunFolder, open_sequence
+from minislam.data.files import read_bytes, read_json, read_text
+from minislam.data.ply import GaussianArrays, read_ply
+from minislam.data.run_folder import CAMERA, MAP, PLOTS, VIEWER
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_inverse
 from minislam.images import resample
@@ -63,12 +66,13 @@ class Run:
     def __init__(self, folder: Path | str) -> None:
         """Read the folder of a run that has a map."""
         self.folder = RunFolder(folder)
-        if not self.folder.has_camera():
+        path = self.folder.path / CAMERA
+        if not path.is_file():
             raise InputError(
                 f"expected a run with a map in {folder}, found no camera.json; give the --output "
                 f"of a finished run, or repeat it: minislam run --config {folder}/config.json"
             )
-        scene = self.folder.read_camera()
+        scene = read_json(path)
         try:
             self.name: str = scene["sequence"]["name"]
             self.camera = Camera(**scene["camera"])
@@ -82,7 +86,7 @@ class Run:
             ) from error
         self._betas: dict[int, Tensor] = {}  # raw beta (h', w') of frames asked for so far
         self.trajectory: Trajectory = self.folder.read_trajectory()
-        self.gaussians: GaussianArrays = self.folder.read_map()
+        self.gaussians: GaussianArrays = read_ply(self.folder.path / MAP)
 
     @cached_property
     def config(self) -> SlamConfig:
@@ -140,7 +144,7 @@ class Run:
 
     def view(self, height: int = 620) -> Page:  # px
         """Return the map to turn with the mouse, as the output of a notebook's cell."""
-        return Page(self.folder.read_viewer(), height)
+        return Page(read_text(self.folder.path / VIEWER), height)
 
     def summary(self) -> list[Line]:
         """Return what is known of the run in words, with units and verdicts."""
@@ -156,7 +160,8 @@ class Run:
         """Return what a notebook shows of the run: summary, warnings, one picture."""
         lines = {line.what: (line.value, line.verdict) for line in self.summary()}
         warnings = self.folder.read_run()["warnings"]
-        return summary_html(self.name, lines, warnings, self.folder.read_plot("overview"))
+        png = read_bytes(self.folder.path / PLOTS / "overview.png")
+        return summary_html(self.name, lines, warnings, png)
 
     @cached_property
     def sequence(self) -> RecordedSequence:

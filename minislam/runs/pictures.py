@@ -12,7 +12,9 @@ import numpy as np
 
 from minislam.config import PRESETS, SlamConfig, preset, settings_of
 from minislam.data import RunFolder
+from minislam.data.files import write_text
 from minislam.data.images import encode_jpeg
+from minislam.data.run_folder import REPORT, VIEWER
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.runs.facts import surface_depth
@@ -79,7 +81,7 @@ class Preview:
             strip = [keyframe.image.cpu().numpy(), beta_to_rgb(slam.beta_image(newest)), color]
             jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
             page = replace(_known(self._folder, slam, {}, facts), overview=jpeg)
-            self._folder.write_report(build_report(page))
+            write_text(self._folder.path / REPORT, build_report(page))
 
 
 def write_pictures(
@@ -114,7 +116,7 @@ def write_pictures(
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
-    folder.write_viewer(build_viewer(f"minislam: {run.name}", *scene))
+    write_text(folder.path / VIEWER, build_viewer(f"minislam: {run.name}", *scene))
     page = replace(
         _known(folder, slam, metrics, facts),
         overview=png,
@@ -124,7 +126,7 @@ def write_pictures(
         unit=facts["unit"],
         figures=list(plots.values()),
     )
-    folder.write_report(build_report(page))
+    write_text(folder.path / REPORT, build_report(page))
 
 
 def _known(

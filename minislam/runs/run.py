@@ -10,8 +10,11 @@ import torch
 
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
-from minislam.data.animation import encode_animation
-from minislam.data.run_folder import locked
+from minislam.data import run_folder as names
+from minislam.data.animation import write_animation
+from minislam.data.files import write_json
+from minislam.data.ply import write_ply
+from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
@@ -92,7 +95,7 @@ def run_in_folder(
     threads = torch.get_num_threads()
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
     warn = (observer or SilentObserver()).warn
-    with locked(output), Workers(count, config.threads, warn) as helpers:
+    with names.locked(output), Workers(count, config.threads, warn) as helpers:
         folder = (
             RunFolder(output) if resume else RunFolder.create(output, overwrite, sequence.files)
         )
@@ -134,8 +137,9 @@ def run_sequence(
     preview.watch(slam, lambda: run_facts(slam, choice, checkpoints, "running", None))
     if resume:
         checkpoints.restore(slam)
-    folder.write_config({**sequence.opened_as, "priors": asdict(choice), **as_json(config)})
-    folder.write_run(run_facts(slam, choice, checkpoints, "running", None))
+    settings = {**sequence.opened_as, "priors": asdict(choice), **as_json(config)}
+    write_json(folder.path / names.CONFIG, settings)
+    write_json(folder.path / names.RUN, run_facts(slam, choice, checkpoints, "running", None))
     interrupted = False
     try:
         try:
@@ -148,18 +152,18 @@ def run_sequence(
         facts = run_facts(slam, choice, checkpoints, state, exit_code)
         _write_estimates(folder, slam)
         metrics = measure(slam, facts["seconds"]["total"], lpips)
-        folder.write_metrics(metrics)
+        write_json(folder.path / names.METRICS, metrics)
         with suppress(InputError):  # an OpenCV that writes no WebP
-            folder.write_clip(encode_animation(*clip(Run(folder.path)), ".webp"))
+            write_animation(folder.path / names.CLIP, *clip(Run(folder.path)))
         write_pictures(folder, slam, metrics, facts)
-        folder.write_run(facts)
+        write_json(folder.path / names.RUN, facts)
     except (Exception, KeyboardInterrupt) as error:
         state, exit_code = f"failed: {str(error) or repr(error)}", FAILED_EXIT
         if isinstance(error, KeyboardInterrupt):
             state, exit_code = "interrupted", INTERRUPTED_EXIT
         with suppress(Exception):  # a full disk: the first error is the one to hear of
             facts = run_facts(slam, choice, checkpoints, state, exit_code)
-            folder.write_run(facts)
+            write_json(folder.path / names.RUN, facts)
             _write_trajectories(folder, slam)
             preview.write(slam, facts)
         raise
@@ -185,8 +189,8 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
 def _write_trajectories(folder: RunFolder, slam: Slam) -> None:
     """Write the poses, as far as there are any; a run that ends without a map keeps them."""
     if slam.tracker.initialised:
-        folder.write_trajectory(slam.trajectory())
-        folder.write_keyframe_trajectory(slam.keyframe_trajectory())
+        write_trajectory(folder.path / names.TRAJECTORY, slam.trajectory())
+        write_trajectory(folder.path / names.KEYFRAME_TRAJECTORY, slam.keyframe_trajectory())
         undecoded = [(-1, stamp, reason) for stamp, reason in slam.sequence.lost]
         folder.write_lost_frames(sorted([*slam.lost_frames(), *undecoded], key=itemgetter(1)))
 
@@ -195,6 +199,6 @@ def _write_estimates(folder: RunFolder, slam: Slam) -> None:
     _write_trajectories(folder, slam)
     arrays = slam.mapper.gaussians.to_arrays()
     arrays.pop("anchor_keyframe")
-    folder.write_map(GaussianArrays(**arrays))
+    write_ply(folder.path / names.MAP, GaussianArrays(**arrays))
     folder.write_mlp(slam.mapper.mlp.state_dict())
-    folder.write_camera(scene_of(slam))
+    write_json(folder.path / names.CAMERA, scene_of(slam))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from minislam.data.animation import encode_animation, write_animation
+from minislam.data.animation import write_animation
 from minislam.errors import InputError
 
 REDS = np.linspace(0.1, 0.9, 8)
@@ -41,5 +41,5 @@ def test_another_kind_and_nothing_to_show_are_said(tmp_path: Path):
         write_animation(tmp_path / "a.mp4", images(), 10.0)
     for kind in (".webm", ".webp"):
         with pytest.raises(InputError, match="expected this OpenCV"):
-            encode_animation([], 10.0, kind)
+            write_animation(tmp_path / f"a{kind}", [], 10.0)
     assert not list(tmp_path.iterdir())

@@ -1,5 +1,6 @@
 """A run folder: what is written, what is refused, what is left alone."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -9,30 +10,41 @@ import torch
 
 from minislam.data import read_ply, read_trajectory
 from minislam.data.images import read_color
-from minislam.data.ply import GaussianArrays
+from minislam.data.ply import GaussianArrays, write_ply
 from minislam.data.run_folder import RunFolder, locked
+from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
 from tests.recordings import picture, save
 
-CONFIG = {"sequence": "desk", "input": {}, "priors": {}, "tracking": {"window": 8}, "mapping": {}}
+JSON = {
+    "config.json": {
+        "sequence": "desk",
+        "input": {},
+        "priors": {},
+        "tracking": {"window": 8},
+        "mapping": {},
+    },
+    "run.json": {"seed": 0, "state": "ok"},
+    "metrics.json": {"ate_rmse_world_units": 0.01},
+}
 
 
 def fill(run: RunFolder) -> None:
     trajectory = Trajectory(np.arange(3.0), random_transforms(3, "normal", 0).numpy())
     ones = np.ones((2, 3), np.float32)
-    run.write_config(CONFIG)
-    run.write_run({"seed": 0, "state": "ok"})
-    run.write_metrics({"ate_rmse_world_units": 0.01})
-    run.write_trajectory(trajectory)
-    run.write_keyframe_trajectory(trajectory)
     run.write_lost_frames([(7, 0.233333, "too few matches")])
-    run.write_map(GaussianArrays(ones, ones, np.ones((2, 4), np.float32), np.zeros(2), ones))
     run.write_mlp({"0.weight": torch.arange(6.0).reshape(2, 3)})
     run.write_keyframe_image(123, "input", picture(1) / 255)
     run.write_plot("trajectory", b"png")
-    run.write_report("<html></html>")
+    for name in ("trajectory.txt", "keyframe_trajectory.txt"):
+        write_trajectory(run.path / name, trajectory)
+    gaussians = GaussianArrays(ones, ones, np.ones((2, 4), np.float32), np.zeros(2), ones)
+    write_ply(run.path / "map.ply", gaussians)
+    for name, text in JSON.items():
+        (run.path / name).write_text(json.dumps(text))
+    (run.path / "report.html").write_text("<html></html>")
 
 
 # Known answers
@@ -54,7 +66,7 @@ def test_the_files_of_a_run(tmp_path: Path):
 def test_everything_can_be_read_back(tmp_path: Path):
     fill(RunFolder.create(tmp_path / "out"))
     run = RunFolder(tmp_path / "out")
-    assert run.read_config() == CONFIG
+    assert run.read_config() == JSON["config.json"]
     assert run.read_run()["state"] == "ok"
     assert run.read_metrics() == {"ate_rmse_world_units": 0.01}
     assert (

@@ -10,7 +10,8 @@ import torch
 
 import minislam
 from minislam import api
-from minislam.data import RunFolder, open_sequence
+from minislam.data import open_sequence
+from minislam.data.files import write_json
 from minislam.errors import InputError
 from minislam.geometry import Camera
 
@@ -84,7 +85,7 @@ def test_what_a_notebook_shows(run: minislam.Run):
 def test_a_damaged_or_missing_camera_is_said(run: minislam.Run, tmp_path: Path):
     with pytest.raises(InputError, match="expected a run with a map"):
         minislam.load(tmp_path)
-    RunFolder(tmp_path).write_camera({"camera": 3})
+    write_json(tmp_path / "camera.json", {"camera": 3})
     with pytest.raises(InputError, match=r"expected camera\.json of a run"):
         minislam.load(tmp_path)
 
@@ -94,7 +95,7 @@ def test_a_source_with_fewer_frames_is_said(run: minislam.Run, root: Path, tmp_p
         (tmp_path / name).write_bytes((run.folder.path / name).read_bytes())
     config = json.loads((tmp_path / "config.json").read_text())
     config["input"]["max_frames"] = 8
-    RunFolder(tmp_path).write_config(config)
+    write_json(tmp_path / "config.json", config)
     with pytest.raises(InputError, match="expected the 10 frames of the run"):
         _ = minislam.load(tmp_path).sequence
 

@@ -26,13 +26,13 @@ def test_config_json_alone_gives_the_same_bytes_again(root: Path, monkeypatch):
     reports: list[str] = []
     # The second run writes a report after every step: not a byte of its results may change.
     monkeypatch.setattr(pictures, "PREVIEW_FRACTION", float("inf"))
-    monkeypatch.setattr(pictures.RunFolder, "write_report", lambda _, html: reports.append(html))
+    monkeypatch.setattr(pictures, "write_text", lambda path, html: reports.append(html))
     assert main(["run", "--config", config, "-o", str(root / "again")]) == 0
     for name in SAME:
         first, again = (root / run / name for run in ("first", "again"))
         assert first.read_bytes() == again.read_bytes(), name
     running = [html for html in reports if '<main class="running">' in html]
-    assert len(running) > 5 and len(reports) == len(running) + 1
+    assert len(running) > 5 and len(reports) == len(running) + 2  # at the end: viewer and report
     assert "data:image/jpeg" in running[0] and "location.reload" in running[0]
     facts = RunFolder(root / "again").read_run()
     assert facts["failed_adjustments"] == 0 < facts["adjustments"]
