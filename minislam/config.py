@@ -121,6 +121,8 @@ def with_settings(config: SlamConfig, settings: dict[str, Any]) -> SlamConfig:
     settings = settings | {n: v for n, v in also.items() if n in known and n not in settings}
     metadata = metadata_of(config)
     for name, value in settings.items():
+        if value == {} and any(other.startswith(f"{name}.") for other in known):
+            continue  # a part of which nothing is given
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
             raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
@@ -183,7 +185,7 @@ def flattened(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         )
     flat: dict[str, Any] = {}
     for name, value in tree.items():
-        if isinstance(value, dict):
+        if isinstance(value, dict) and value:
             flat |= flattened(value, f"{prefix}{name}.")
         else:
             flat[prefix + name] = value

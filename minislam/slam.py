@@ -28,6 +28,7 @@ from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
 from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
+from minislam.tracking.safeguards.first_frame import FirstFrame
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
     check_focal_length,
@@ -56,6 +57,7 @@ class Slam(Stateful):
     tracker: Tracker
     mapper: Mapper
     steps: Steps
+    first_frame: FirstFrame
     focal_length: FocalLengthFit | None = None  # where it was not refined, the best one at the end
     _poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
@@ -78,7 +80,7 @@ class Slam(Stateful):
         self.tracker.graph.seeks_focal = sequence.refines_focal
         self.mapper = self._new_mapper()
         self._stride = priors.flow.stride
-        self._poses = {}
+        self._poses, self.first_frame = {}, FirstFrame()
 
     def run(self) -> None:
         """Process the sequence to the final map, from its start or from a restored state."""
@@ -116,7 +118,7 @@ class Slam(Stateful):
 
     def _frames_left(self) -> Iterator[Frame]:
         """Yield the frames to come. If one cannot be read, the state before it is saved."""
-        for index in range(self.steps.done("tracking and mapping"), len(self.sequence)):
+        while (index := self.first_frame.next_frame(self.tracker, len(self.sequence))) is not None:
             try:
                 frame = self.frame(index)
             except MinislamError:

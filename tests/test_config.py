@@ -136,6 +136,21 @@ def test_an_unknown_name_is_answered_with_the_nearest():
         from_json({"mapping": {"insertion": {"cel": 3}}})
 
 
+@pytest.mark.parametrize("tree", [{"mapping": {"a": {}}}, {"mapping": {"a": {"b": {}}}}, {"a": {}}])
+def test_an_unknown_name_with_nothing_in_it_is_refused_too(tree: dict):
+    with pytest.raises(InputError, match=r"a known setting, found '(mapping\.a(\.b)?|a)'"):
+        from_json(tree)
+
+
+def test_a_part_with_nothing_in_it_keeps_its_defaults():
+    assert from_json({"mapping": {}, "tracking": {"learned": {}}, "input": {}}) == SlamConfig()
+
+
+def test_a_setting_is_no_part():
+    with pytest.raises(InputError, match=r"expected tracking\.window to be of type int"):
+        from_json({"tracking": {"window": {}}})
+
+
 def test_an_unknown_preset_is_answered_with_all():
     with pytest.raises(InputError, match="laptop, paper, paper-fast, test, found 'desktop'"):
         preset("desktop")

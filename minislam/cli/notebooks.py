@@ -26,7 +26,7 @@ def add_notebooks_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run_notebooks(args: argparse.Namespace) -> int:
     """Copy all notebooks and what they name, never over a file; return the exit code."""
-    from minislam.data.files import atomic_write, read_bytes  # needs torch
+    from minislam.data.files import atomic_write, read_bytes, require_no_file  # needs torch
 
     # A wheel holds the notebooks inside the package, the repository beside it.
     folder, package = Path(args.folder).expanduser(), Path(minislam.__file__).parent
@@ -45,6 +45,7 @@ def run_notebooks(args: argparse.Namespace) -> int:
     for path in (source / "SYLLABUS.md", source / "LICENSE", source.parent / "LICENSE"):
         if path.is_file():
             copies[path.name] = read_bytes(path)
+    require_no_file(folder)
     there = [name for name in copies if (folder / name).exists()]
     if there:
         raise InputError(

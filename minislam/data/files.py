@@ -50,13 +50,21 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
 def require_free(folder: Path | str, overwrite: bool, also: str = "") -> None:
     """Refuse an output folder that holds files, unless it may be overwritten."""
     folder = Path(folder)
-    if os.path.exists(folder) and not os.path.isdir(folder):  # names of any length
-        raise InputError(f"expected an output folder, but {folder} is a file; choose another name")
+    require_no_file(folder)
     if os.path.isdir(folder) and any(folder.iterdir()) and not overwrite:
         raise InputError(
             f"expected a new or empty output folder, but {folder} holds files; choose another name "
             f"or add --overwrite{also}"
         )
+
+
+def require_no_file(folder: Path) -> None:
+    """Refuse an output folder that is a file, or that would lie below one."""
+    for path in (folder, *folder.parents):
+        if os.path.exists(path) and not os.path.isdir(path):  # names of any length
+            raise InputError(
+                f"expected an output folder, but {path} is a file; choose another name"
+            )
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -16,7 +16,7 @@ class Alarms:
     def check(self, slam: Slam) -> None:
         """Look at the newest frame and at the newest keyframe."""
         tracked, diagnostics = slam.tracker.tracked, slam.tracker.watch.diagnostics
-        lost = bool(tracked) and not tracked[-1].status.is_followed
+        lost = slam.tracker.initialised and not tracked[-1].status.is_followed
         if lost and not self._lost:
             self._observer.warn(
                 f"frame {tracked[-1].frame_index}: the camera is lost; it is looked for among the "

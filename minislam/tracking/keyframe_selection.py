@@ -18,6 +18,13 @@ def keyframe_flow(graph: KeyframeGraph) -> float:
     return flow * graph.pixel_scale
 
 
+def mean_flow(graph: KeyframeGraph, matches: FlowMatches) -> float:
+    """Return the mean flow of matches (E = 1), weighted by their confidences [px]."""
+    length = lengths(matches.targets - graph.grid.pixels.T)[0]
+    confidence = matches.confidences[0, 0]
+    return float((confidence * length).sum() / confidence.sum())
+
+
 def needs_keyframe(
     graph: KeyframeGraph,
     frame: Frame,
@@ -29,16 +36,12 @@ def needs_keyframe(
     It should if the mean flow is large, if few cells are matched, or if the last keyframe was
     `keyframe_interval` frames ago.
     """
-    length = lengths(matches.targets - graph.grid.pixels.T)[0]
-    confidence = matches.confidences[0, 0]
-    mean_flow = float((confidence * length).sum() / confidence.sum())
-    if mean_flow > keyframe_flow(graph):
+    if mean_flow(graph, matches) > keyframe_flow(graph):
         return True
     if float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
     # Without a depth prior the first keyframes need parallax, so none is forced.
-    may_force = is_initialised or graph.keyframes.has_prior
-    return may_force and _is_due(graph, frame)
+    return (is_initialised or graph.keyframes.has_prior) and _is_due(graph, frame)
 
 
 def is_redundant(graph: KeyframeGraph, frame: Frame, T_camera_world: Tensor) -> bool:
@@ -48,9 +51,8 @@ def is_redundant(graph: KeyframeGraph, frame: Frame, T_camera_world: Tensor) -> 
     """
     if _is_due(graph, frame):
         return False
-    return graph.distance_to_newest(T_camera_world) < graph.config.cull_fraction * keyframe_flow(
-        graph
-    )
+    enough = graph.config.cull_fraction * keyframe_flow(graph)
+    return graph.distance_to_newest(T_camera_world) < enough
 
 
 def _is_due(graph: KeyframeGraph, frame: Frame) -> bool:

@@ -26,7 +26,6 @@ from minislam.tracking.keyframe_selection import is_redundant, needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards.diagnostics import Watch
-from minislam.tracking.safeguards.first_frame import forget_start
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
@@ -55,7 +54,7 @@ class Tracker(Stateful):
                                                                   +---- old view or ---+
                                                                        known place
 
-    A frame of the warm-up that cannot be matched is lost, too; with many, the warm-up begins anew.
+    A frame of the warm-up that cannot be matched is lost, too; with many, `FirstFrame` begins anew.
     """
 
     graph: KeyframeGraph
@@ -63,7 +62,7 @@ class Tracker(Stateful):
     watch: Watch
     _settling: Settling
     mode: Mode = Mode.WAITING
-    _last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
+    last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
     _lost_in_a_row: int = 0  # frames
     _culled_in_a_row: int = 0  # keyframes
     _last_global: int = 0  # keyframes at the last online global BA
@@ -127,10 +126,10 @@ class Tracker(Stateful):
 
     def end(self) -> None:
         """Make the last frame a keyframe, so that the frames before it lie between two."""
-        if self._last_non_keyframe is not None:
-            last = self._last_non_keyframe[0].frame_index
+        if self.last_non_keyframe is not None:
+            last = self.last_non_keyframe[0].frame_index
             if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:
-                self._insert(*self._last_non_keyframe, may_cull=False)
+                self._insert(*self.last_non_keyframe, may_cull=False)
 
     def _begin(self, frame: Frame) -> None:
         """Make the first frame the first keyframe; its camera frame is the world frame."""
@@ -145,10 +144,10 @@ class Tracker(Stateful):
         """Match a frame with the newest keyframe; make it a keyframe if it should be one."""
         chain, matches = self._advance(frame)
         ratio = float(matches.matched_ratios)
-        if ratio < MIN_MATCHED_RATIO and self._last_non_keyframe is not None:
+        if ratio < MIN_MATCHED_RATIO and self.last_non_keyframe is not None:
             # Too far from the last keyframe, but perhaps not from the last frame: make the last
             # frame a keyframe and match with it.
-            self._insert(*self._last_non_keyframe, may_cull=False)
+            self._insert(*self.last_non_keyframe, may_cull=False)
             chain, matches = self._advance(frame)
             ratio = float(matches.matched_ratios)
         if ratio < MIN_MATCHED_RATIO:
@@ -156,7 +155,7 @@ class Tracker(Stateful):
             return
         self._chain = chain
         self._log_followed(frame, ratio)
-        self._last_non_keyframe = (frame, matches)
+        self.last_non_keyframe = (frame, matches)
         if needs_keyframe(self.graph, frame, matches, self.initialised):
             self._insert(frame, matches)
 
@@ -192,7 +191,7 @@ class Tracker(Stateful):
             self._motion.remember(matches, pose)
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()
-        self._last_non_keyframe = None
+        self.last_non_keyframe = None
         self.graph.flow_to_next.append(matches)
         self._add_keyframe(frame, self._features(frame), pose, disparities)
         if self.initialised:
@@ -240,9 +239,6 @@ class Tracker(Stateful):
             place = self._relocaliser.find(frame.image, features)
             if place is not None and self._resume(frame, place, features):
                 return
-        elif forget_start(self.graph, self.tracked, self._lost_in_a_row):
-            self._begin(frame)
-            return
         recently = self._lost_in_a_row <= self.config.recently_lost_frames
         status = TrackingStatus.RECENTLY_LOST if recently else TrackingStatus.LOST
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
@@ -257,7 +253,7 @@ class Tracker(Stateful):
             return False
         self.watch.judge_newest()
         self._chain = self.graph.flow.start_chain(frame.image)
-        self._last_non_keyframe = None
+        self.last_non_keyframe = None
         self._log_followed(frame, 1.0)
         return True
 
@@ -265,8 +261,8 @@ class Tracker(Stateful):
 
     def initialise(self) -> None:
         """Estimate the warm-up keyframes together, beta unknown (first of the two stages)."""
-        if len(self.keyframes) == 1 and self._last_non_keyframe is not None:
-            self._insert(*self._last_non_keyframe)
+        if len(self.keyframes) == 1 and self.last_non_keyframe is not None:
+            self._insert(*self.last_non_keyframe)
         if len(self.keyframes) < 2:
             raise TrackingLost(
                 "expected at least two frames that show the same scene, found none among "

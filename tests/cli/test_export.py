@@ -49,6 +49,7 @@ def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
         (["--points", "mine.ply"], "expected a new file, but mine.ply exists"),
         (["--depth", "mine"], "expected a new or empty output folder, but mine holds files"),
         (["--masks", "mine.ply", "--overwrite"], "but mine.ply is a file"),
+        (["--nerfstudio", "mine.ply/a/b"], "but mine.ply is a file; choose another name"),
     ],
 )
 def test_files_of_the_user_stay(arguments, words, folder: Path, tmp_path, monkeypatch, capsys):

@@ -69,6 +69,18 @@ def test_nobodys_work_is_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert [path.read_text() for path in tmp_path.iterdir()] == ["my solution"]
 
 
+@pytest.mark.parametrize("name", ["mine", "mine/a"])
+def test_a_file_is_no_folder(tmp_path: Path, monkeypatch, capsys, name: str):
+    monkeypatch.chdir(tmp_path)
+    Path("mine").write_text("mine")
+    assert main(["notebooks", name]) == 1
+    said = capsys.readouterr().err
+    assert said == (
+        "minislam: expected an output folder, but mine is a file; choose another name\n"
+    )
+    assert Path("mine").read_text() == "mine"
+
+
 def test_a_package_without_notebooks_says_so(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr(minislam, "__file__", str(tmp_path / "minislam/__init__.py"))
     assert main(["notebooks", str(tmp_path / "course")]) == 1

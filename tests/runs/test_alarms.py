@@ -27,12 +27,13 @@ def said(statuses: list[TrackingStatus], explained: dict[int, float | None]) -> 
     """Return the warnings of a run; `explained` is that of the keyframes, by frame."""
     tracked, diagnostics = [], []
     watch = SimpleNamespace(diagnostics=diagnostics)
-    slam = SimpleNamespace(tracker=SimpleNamespace(tracked=tracked, watch=watch))
+    slam = SimpleNamespace(tracker=SimpleNamespace(tracked=tracked, watch=watch, initialised=False))
     observer = Said()
     alarms = Alarms(observer)
     alarms.check(slam)
     for index, status in enumerate(statuses):
         tracked.append(TrackedFrame(index, index / 30, status, 0.5))
+        slam.tracker.initialised |= status is TrackingStatus.OK
         if index in explained:
             diagnostics.append(KeyframeDiagnostics(index, 0.5, 9.0, explained[index], 0.01))
         alarms.check(slam)
@@ -50,6 +51,10 @@ def test_a_good_run_is_quiet():
 def test_a_loss_is_said_once_each_time():
     texts = said([OK, RECENTLY, LOST, OK, RECENTLY], {})
     assert [text.split(":")[0] for text in texts] == ["frame 1", "frame 4"]
+
+
+def test_nothing_is_looked_for_before_there_is_a_map():
+    assert said([TrackingStatus.INITIALISING, RECENTLY, LOST, OK], {}) == []
 
 
 def test_a_keyframe_that_contradicts_its_flow_is_said_once():

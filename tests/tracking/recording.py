@@ -12,6 +12,7 @@ from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame, Trajectory
 from minislam.tracking.config import TrackingConfig
+from minislam.tracking.safeguards.first_frame import FirstFrame
 from minislam.tracking.tracker import Tracker
 
 SIZE = (160, 120)
@@ -46,8 +47,9 @@ def new_tracker(with_depth: bool, shown: Sequence[int] = range(FRAMES)) -> Track
 
 
 def run(tracker: Tracker, images: list[Frame]) -> None:
-    for frame in images:
-        tracker.track(frame)
+    first_frame = FirstFrame()
+    while (index := first_frame.next_frame(tracker, len(images))) is not None:
+        tracker.track(images[index])
         if not tracker.initialised and len(tracker.keyframes) == CONFIG.warmup_keyframes:
             tracker.initialise()
             tracker.refine_initialisation()

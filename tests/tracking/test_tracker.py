@@ -1,5 +1,7 @@
 """The tracker from the first frame to the last adjustment, on a small synthetic sequence."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,6 +13,7 @@ from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error,
 from minislam.records import Frame, TrackingStatus, Trajectory
 from minislam.tracking.tracker import LONGEST_TAIL, Mode, Tracker
 from tests.tracking.recording import (
+    CONFIG,
     SIZE,
     WHERE_LOST,
     frames,
@@ -120,11 +123,39 @@ def test_a_spoilt_frame_is_lost_and_the_next_is_found_again(kind: str):
     assert error.statistics["rmse"] < 5e-3 * path_length(truth)
 
 
+def global_adjustments(monkeypatch, keyframes: int, interval: int, loops: Sequence[int] = ()):
+    """Return at how many keyframes all of them are adjusted; `loops` are where one is closed."""
+    tracker, adjusted = new_tracker(with_depth=False), []
+    tracker.config = replace(CONFIG, global_interval=interval)
+    monkeypatch.setattr(
+        "minislam.tracking.tracker.online_global_ba",
+        lambda graph: adjusted.append(len(graph.keyframes)),
+    )
+    monkeypatch.setattr(
+        "minislam.tracking.tracker.close_loops", lambda graph: len(graph.keyframes) in loops
+    )
+    for _ in range(keyframes):
+        tracker.keyframes.frames.append(frames()[0])
+        tracker._adjust_all_if_due()
+    return adjusted
+
+
+def test_all_keyframes_are_adjusted_online_every_interval_and_later_once_a_fifth_is_new(
+    monkeypatch,
+):
+    assert global_adjustments(monkeypatch, 200, interval=20) == [20, 40, 60, 80, 100, 124, 154, 192]
+    assert global_adjustments(monkeypatch, 200, interval=0) == []
+    assert global_adjustments(monkeypatch, 1000, interval=150) == [150, 300, 450, 600, 750, 937]
+
+
+def test_a_closed_loop_counts_as_an_adjustment_of_all(monkeypatch):
+    found = global_adjustments(monkeypatch, 160, interval=20, loops=[15, 35, 120])
+    assert found == [55, 75, 95, 118, 149]
+
+
 def test_blank_images_are_an_error_of_one_sentence():
     tracker = new_tracker(with_depth=False)
     blank = torch.full((SIZE[1], SIZE[0], 3), 0.5)
-    for index in range(3):
-        tracker.track(Frame(index, 0.1 * index, blank))
-    assert lost_frames(tracker) == [0, 1]  # each time the next one may be the first
     with pytest.raises(TrackingLost, match="found none among 3 frames"):
-        tracker.initialise()
+        run(tracker, [Frame(index, 0.1 * index, blank) for index in range(3)])
+    assert lost_frames(tracker) == [0, 1]  # each time the next one may be the first

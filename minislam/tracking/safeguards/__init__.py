@@ -7,7 +7,7 @@ inverse_flow     flow back from a new keyframe that does not start from its own 
 two_views        a pose from a depth prior that has errors
 relocalisation   finds a lost camera among the keyframes
 pose_support     tries other starts for poses between keyframes that little of the flow supports
-first_frame      begins anew where nothing can be matched with the first frames
+first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
 first_depth      depth of the first keyframe from matches alone, where there is no depth prior
 structure        which disparities several keyframes agree on
 diagnostics      how well each keyframe is tied to the others

@@ -1,22 +1,60 @@
-"""A start that nothing after it can be matched with: a black first frame, a fade-in, a slate."""
+"""Which frame the warm-up begins with: a black first frame, a slate or a jump cut must not end it.
+
+During the warm-up a lost camera cannot be found again. So the warm-up begins anew with the first
+lost frame, once as many frames were lost as were followed before. If the sequence ends before any
+start has made enough keyframes, the best of all starts is repeated.
+"""
 
 from dataclasses import replace
 
-from minislam.records import TrackedFrame, TrackingStatus
-from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.records import TrackingStatus
+from minislam.state.stateful import Stateful
+from minislam.tracking.keyframe_selection import mean_flow
+from minislam.tracking.tracker import Mode, Tracker
+
+Worth = tuple[bool, int]  # whether a start has moved enough for depth; frames that it followed
 
 
-def forget_start(graph: KeyframeGraph, tracked: list[TrackedFrame], lost_in_a_row: int) -> bool:
-    """Forget all keyframes if as many frames were just lost as were followed before.
+class FirstFrame(Stateful):
+    """Chooses the first frame of the warm-up, and by that the frame that is tracked next."""
 
-    Then the frames so far are logged as lost, and the next one can be the first. Only during the
-    warm-up, while no keyframe has links.
-    """
-    if lost_in_a_row < sum(frame.status.is_followed for frame in tracked):
-        return False
-    while len(graph.keyframes) > 1:
-        graph.remove_newest()
-    graph.keyframes.remove_newest()
-    graph.flow.remove_frame(0)
-    tracked[:] = [replace(frame, status=TrackingStatus.LOST) for frame in tracked]
-    return True
+    best: int = 0  # first frame of the best start that was given up
+    worth: Worth = (False, 0)  # of that start
+    is_repeated: bool = False  # all starts were tried, the best is the last
+
+    def next_frame(self, tracker: Tracker, count: int) -> int | None:
+        """Return which of `count` frames the tracker shall see next, None after the last."""
+        tracked = tracker.tracked
+        if tracked and not tracker.initialised and not self.is_repeated:
+            worth, is_over = worth_of_start(tracker), len(tracked) == count
+            last = max(t.frame_index for t in tracked if t.status.is_followed)
+            lost = len(tracked) - 1 - last
+            if lost and (lost >= worth[1] or (is_over and (True, lost) > worth)):
+                if worth > self.worth:
+                    self.best, self.worth = tracker.keyframes.frames[0].frame_index, worth
+                begin_anew(tracker, last + 1)
+            elif is_over and worth < self.worth:
+                self.is_repeated = True
+                begin_anew(tracker, self.best)
+        return len(tracked) if len(tracked) < count else None
+
+
+def worth_of_start(tracker: Tracker) -> Worth:
+    """Return what a warm-up is worth; without a depth prior it must move to measure depth."""
+    graph = tracker.graph
+    seen = [*graph.flow_to_next, *(tracker.last_non_keyframe or ())[1:]]
+    least = graph.config.min_parallax * graph.pixel_scale
+    has_moved = any(mean_flow(graph, matches) >= least for matches in seen)
+    followed = sum(frame.status.is_followed for frame in tracker.tracked)
+    return has_moved or graph.keyframes.has_prior, followed
+
+
+def begin_anew(tracker: Tracker, first: int) -> None:
+    """Forget all keyframes of the warm-up: the frames before `first` are lost, it comes next."""
+    while len(tracker.keyframes) > 1:
+        tracker.graph.remove_newest()
+    tracker.keyframes.remove_newest()
+    tracker.graph.flow.remove_frame(0)
+    tracker.mode, tracker.last_non_keyframe = Mode.WAITING, None
+    before = tracker.tracked[:first]
+    tracker.tracked[:] = [replace(frame, status=TrackingStatus.LOST) for frame in before]

@@ -12,6 +12,7 @@ from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import warm_up_ba
 from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.safeguards import focal_length
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
     check_focal_length,
@@ -111,6 +112,33 @@ def test_the_check_changes_nothing():
     check_focal_length(graph)
     assert torch.equal(graph.state.T_camera_world, poses)
     assert torch.equal(graph.state.disparities, disparities)
+
+
+def test_a_check_adjusts_the_first_keyframes_alone(monkeypatch: pytest.MonkeyPatch):
+    # A pose far off, behind the limit, and its links cannot disturb the check.
+    expected = check_focal_length(turned_graph(1.2))
+    graph = true_graph([0, 2, 4, 6, 8, 10, 11, 9])
+    graph.match(neighbourhood_edges(0, 6, 5))
+    graph.match(neighbourhood_edges(6, 8, 5))
+    graph.grid.zoom(math.log(1.2))
+    graph.keyframes.T_camera_world[6:, :3, 3] += 1.0
+    monkeypatch.setattr(focal_length, "MOST_KEYFRAMES", 6)
+    assert check_focal_length(graph) == expected
+    assert expected.factor == pytest.approx(1 / 1.2, rel=FOUND)
+
+
+@pytest.mark.parametrize("keyframes", [99, 100, 101, 130])
+def test_a_check_costs_no_more_above_a_hundred_keyframes(monkeypatch, keyframes: int):
+    asked = []
+    monkeypatch.setattr(focal_length, "fit_focal_length", lambda *parts: asked.append(parts) or [0])
+    graph = true_graph([number % 12 for number in range(keyframes)])
+    graph.match(neighbourhood_edges(1, keyframes, 1))
+    check_focal_length(graph)
+    ((problem, state),) = asked
+    used = min(keyframes, 100)
+    assert len(state.T_camera_world) == len(state.disparities) == len(problem.free_poses) == used
+    assert len(problem.edges_source) == len(problem.targets) == 2 * (used - 1)
+    assert int(torch.maximum(problem.edges_source, problem.edges_target).max()) == used - 1
 
 
 @pytest.mark.parametrize(
