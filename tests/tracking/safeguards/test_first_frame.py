@@ -1,11 +1,13 @@
 """A start that nothing can be matched with is lost; the frames after it are not."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
+from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.errors import TrackingLost
 from minislam.priors.depth import NoDepth
 from minislam.priors.interfaces import FlowMatches
@@ -156,3 +158,11 @@ def test_a_camera_that_stands_is_kept_where_nothing_better_comes():
 def test_an_old_view_that_returns_is_followed_again():
     images = shot(1, 9)
     assert followed_in(images + shot(BLACK, 3) + images[6:])[0] == [*range(9), 12, 13, 14]
+
+
+def test_an_interrupted_choice_goes_on(tmp_path: Path):
+    given, restored = FirstFrame(), FirstFrame()
+    given.best, given.worth, given.is_repeated = 7, (True, 9), True
+    write_checkpoint(tmp_path / "a.npz", given.saved_state())
+    restored.restore_state(read_checkpoint(tmp_path / "a.npz"), lambda index: None)
+    assert vars(restored) == vars(given)
