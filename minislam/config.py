@@ -11,7 +11,6 @@ from minislam.errors import InputError
 from minislam.mapping.config import MappingConfig, paper_mapping
 from minislam.parameters import parameter, require_bounds
 from minislam.priors.depth import SimulatedDepthConfig
-from minislam.priors.features import ClassicalFeaturesConfig
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.networks.droid import DroidFlowConfig
 from minislam.priors.networks.table import NetworksConfig
@@ -34,7 +33,6 @@ class SlamConfig:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
     flow: ClassicalFlowConfig = field(default_factory=ClassicalFlowConfig)
-    features: ClassicalFeaturesConfig = field(default_factory=ClassicalFeaturesConfig)
     simulated_depth: SimulatedDepthConfig = field(default_factory=SimulatedDepthConfig)
     networks: NetworksConfig = field(default_factory=NetworksConfig)
 

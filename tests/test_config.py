@@ -25,7 +25,7 @@ CHANGED = {
     "mapping.insertion.cell": 5,
     "mapping.image_scale": 0.25,
     "uncertainty.enabled": False,
-    "features.windows": (1, 7),
+    "networks.metric3d.size": (28, 84),
 }
 
 
@@ -76,8 +76,8 @@ def test_every_setting_says_what_it_means():
         ("uncertainty.enabled", "off", False),
         ("uncertainty.enabled", "True", True),
         ("tracking.final_prior", "1", True),
-        ("features.windows", "1,5,9", (1, 5, 9)),
-        ("features.windows", [1, 5], (1, 5)),
+        ("networks.metric3d.size", "28,56", (28, 56)),
+        ("networks.metric3d.size", [56, 28], (56, 28)),
     ],
 )
 def test_text_and_json_values_take_the_type_of_the_setting(name: str, text: object, value: object):
@@ -167,8 +167,8 @@ def test_an_unknown_preset_is_answered_with_all():
         ("tracking.keyframe_flow", "nan"),
         ("tracking.keyframe_flow", "1,5"),
         ("uncertainty.enabled", "maybe"),
-        ("features.windows", "one,two"),
-        ("features.windows", 3),
+        ("networks.metric3d.size", "one,two"),
+        ("networks.metric3d.size", 3),
     ],
 )
 def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):
@@ -182,8 +182,8 @@ def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):
         ("seed", -1), ("seed", 10**22), ("threads", 0), ("threads", 100_000),
         ("checkpoint_fraction", -1), ("tracking.window", 0), ("tracking.window", -3),
         ("tracking.window", 10**22), ("tracking.learned.window", 0),
-        ("mapping.init_iterations", -1), ("mapping.color_weight", 1.1), ("features.windows", "1,0"),
-        ("flow.workers", 0),
+        ("mapping.init_iterations", -1), ("mapping.color_weight", 1.1), ("flow.stride", 0),
+        ("networks.metric3d.size", "28,0"),
         ("uncertainty.dropout", 1), ("uncertainty.grid_factor", 0),
     ],
 )  # fmt: skip

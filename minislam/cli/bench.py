@@ -4,8 +4,6 @@ Each sequence is a `minislam run` in a process of its own: the memory or the cra
 touch the next.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import io

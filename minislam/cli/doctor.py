@@ -1,7 +1,5 @@
 """The sub-command `minislam doctor`: checks the installation."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

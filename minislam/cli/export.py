@@ -1,7 +1,5 @@
 """The sub-command `minislam export`: a finished run for COLMAP, nerfstudio and other programs."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What `-h` and `--help` show, and the hint after an option that does not exist."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """log.txt of a run folder: what a command printed, and when."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import sys

@@ -1,7 +1,5 @@
 """The command line, `minislam COMMAND`; `main` first."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal

@@ -1,7 +1,5 @@
 """The sub-command `minislam notebooks`: copies of the course, with or without solutions."""
 
-from __future__ import annotations
-
 import argparse
 import copy
 import json

@@ -86,11 +86,11 @@ def _kinds(
 
     # Everything the result depends on, so that files of another command are not taken for these.
     tree = as_json(config)
-    constants = {name: tree[name] for name in ("seed", FEATURES, "simulated_depth", "networks")}
+    constants = {name: tree[name] for name in ("seed", "simulated_depth", "networks")}
     conditions = f"{sequence.description}; {sequence.camera}; {constants}"
     kinds: dict[str, tuple[str, Callable[[Frame], Tensor | None]]] = {}
     if with_features:
-        features = choose_features(choice, sequence.camera, config.features, config.networks)
+        features = choose_features(choice, sequence.camera, config.networks)
         factor = config.uncertainty.grid_factor
         origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
         kinds[FEATURES] = (origin, with_finer_grid(features, factor))

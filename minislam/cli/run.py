@@ -1,7 +1,5 @@
 """The sub-commands `minislam demo` and `minislam run`."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from functools import partial

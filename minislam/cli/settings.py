@@ -1,7 +1,5 @@
 """The sub-command `minislam settings`: every constant, with its default, bounds and meaning."""
 
-from __future__ import annotations
-
 import argparse
 import fnmatch
 import shutil

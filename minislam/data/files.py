@@ -77,8 +77,8 @@ def write_text(path: Path | str, text: str) -> None:
 
 def write_json(path: Path | str, content: Any) -> None:
     """Write JSON atomically; NaN and infinity, which JSON does not know, become null."""
-    text = json.dumps(_without_nonfinite(content), indent=2, allow_nan=False, ensure_ascii=False)
-    write_text(path, text + "\n")
+    finite = json.loads(json.dumps(content), parse_constant=lambda name: None)
+    write_text(path, json.dumps(finite, indent=2, ensure_ascii=False) + "\n")
 
 
 def read_bytes(path: Path | str) -> bytes:
@@ -129,14 +129,3 @@ def finite_numbers(fields: list[str], where: str) -> list[float]:
         shown = " ".join(fields)[:80]
         raise InputError(f"expected finite numbers in {where}, found '{shown}'; correct this line")
     return numbers
-
-
-def _without_nonfinite(content: Any) -> Any:
-    """Return a copy of nested lists and dictionaries with NaN and infinity replaced by None."""
-    if isinstance(content, dict):
-        return {str(key): _without_nonfinite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_without_nonfinite(value) for value in content]
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -14,24 +13,6 @@ from minislam.errors import InputError
 ASSUMED_FRAME_RATE = 30.0  # frames per second
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
-
-
-class ImageSource(Protocol):
-    """Raw images in order, each of which can be read again."""
-
-    paths: list[Path]  # the files that hold them
-
-    def __len__(self) -> int:
-        """Return the number of images."""
-
-    def read(self, index: int) -> np.ndarray:
-        """Return a raw image (H, W, 3) uint8 RGB."""
-
-    def label(self, index: int) -> str:
-        """Return how to call this image in a message."""
-
-    def name(self, index: int) -> str:
-        """Return a short name of this image, without its folder."""
 
 
 @dataclass
@@ -65,7 +46,7 @@ class VideoImages:
     """
 
     def __init__(self, path: Path, limit: int | None = None) -> None:
-        self.path, self.paths = path, [path]
+        self.path, self.paths = path, [path]  # the files that hold the images
         self._capture = _open_capture(path)
         self._grabbed = 0  # calls of grab() since the start
         self._calls: list[int] = []  # of grab(), after which a frame can be had
@@ -119,6 +100,9 @@ class VideoImages:
         self._capture.release()
         self._capture = _open_capture(self.path)
         self._grabbed = 0
+
+
+ImageSource = FileImages | VideoImages
 
 
 def _open_capture(path: Path) -> cv2.VideoCapture:

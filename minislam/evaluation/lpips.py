@@ -27,39 +27,27 @@ _SMALLEST_LENGTH = 1e-10  # added to the length of a feature vector: where nothi
 
 
 @dataclass(frozen=True)
-class _Stage:
-    """Some convolutions, each followed by a ReLU; the output of the last one is compared."""
-
-    convs: tuple[int, ...]  # number in the names: features.{number}.weight
-    channels: int  # of the output
-    pool: int = 0  # size of a maximum filter of stride 2 before the first convolution, 0: none
-
-
-@dataclass(frozen=True)
 class _Trunk:
-    """The convolutions of one classifier, up to the last that is compared."""
+    """The convolutions of one classifier, up to the last that is compared, in five stages.
+
+    Each convolution is followed by a ReLU; the output of the last one of a stage is compared.
+    """
 
     name: str
+    convs: tuple[tuple[int, ...], ...]  # numbers in the names: features.{number}.weight
+    channels: tuple[int, ...]  # of the output of each stage
+    pooled: int  # stages, the first ones behind the first, that begin with a maximum filter ...
+    pool: int  # ... of this size and stride 2
     first_kernel: int  # px, of features.0
     first_stride: int  # px
     smallest_side: int  # px of an image whose coarsest map has one cell
-    stages: tuple[_Stage, ...]
 
 
 _ALEXNET = _Trunk(
-    "AlexNet", 11, 4, 31,
-    (
-        _Stage((0,), 64), _Stage((3,), 192, pool=3), _Stage((6,), 384, pool=3),
-        _Stage((8,), 256), _Stage((10,), 256),
-    ),
-)  # fmt: skip
-_VGG16 = _Trunk(
-    "VGG-16", 3, 1, 16,
-    (
-        _Stage((0, 2), 64), _Stage((5, 7), 128, pool=2), _Stage((10, 12, 14), 256, pool=2),
-        _Stage((17, 19, 21), 512, pool=2), _Stage((24, 26, 28), 512, pool=2),
-    ),
-)  # fmt: skip
+    "AlexNet", ((0,), (3,), (6,), (8,), (10,)), (64, 192, 384, 256, 256), 2, 3, 11, 4, 31
+)
+_VGG_CONVS = (0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)
+_VGG16 = _Trunk("VGG-16", _VGG_CONVS, (64, 128, 256, 512, 512), 4, 2, 3, 1, 16)
 
 
 class Lpips:
@@ -87,8 +75,19 @@ class Lpips:
     ) -> float:
         """Return the distance of two images, 0 for equal ones."""
         both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
+        shapes = [tuple(x.shape) for x in both]
+        if shapes[0] != shapes[1] or len(shapes[0]) != 3 or shapes[0][2] != 3:
+            raise InputError(
+                f"expected two RGB images of one size, found {shapes[0]} and {shapes[1]}; render "
+                "at the size of the reference"
+            )
+        self.require_size(shapes[0][1], shapes[0][0])
+        total = 0.0
         with torch.no_grad():
-            return float(self.distance(*both))
+            for level, (a, b) in enumerate(zip(*map(self._features, both), strict=True)):
+                weight = self._heads[f"lin{level}.model.1.weight"].reshape(-1, 1, 1)
+                total += float((weight * (a - b) ** 2).sum(0).mean())
+        return total
 
     def require_size(self, width: int, height: int) -> None:
         """Refuse images that are too small to compare [px]."""
@@ -99,37 +98,20 @@ class Lpips:
                 f"{width}x{height}; give a larger working size"
             )
 
-    def distance(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Return the distance of two images (H, W, 3), differentiable."""
-        if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3:
-            raise InputError(
-                f"expected two RGB images of one size, found {tuple(image.shape)} and "
-                f"{tuple(reference.shape)}; render at the size of the reference"
-            )
-        self.require_size(image.shape[1], image.shape[0])
-        total = image.new_zeros(())
-        pairs = zip(self._features(image), self._features(reference), strict=True)
-        for level, (a, b) in enumerate(pairs):
-            weight = self._heads[f"lin{level}.model.1.weight"].to(image).reshape(-1, 1, 1)
-            total = total + (weight * (a - b) ** 2).sum(0).mean()
-        return total
-
     def _features(self, image: Tensor) -> list[Tensor]:  # five of (C, h, w), of unit length
         scaled = (2 * image - 1 - image.new_tensor(_SHIFT)) / image.new_tensor(_SCALE)
         x, levels = scaled.permute(2, 0, 1)[None], []
-        for stage in self._layout.stages:
-            if stage.pool:
-                x = functional.max_pool2d(x, stage.pool, stride=2)
-            for number in stage.convs:
+        for stage, convs in enumerate(self._layout.convs):
+            if 0 < stage <= self._layout.pooled:
+                x = functional.max_pool2d(x, self._layout.pool, stride=2)
+            for number in convs:
                 x = self._conv(x, number).relu()
             length = x.square().sum(1, keepdim=True).sqrt()
             levels.append((x / (length + _SMALLEST_LENGTH))[0])
         return levels
 
     def _conv(self, x: Tensor, number: int) -> Tensor:
-        weight, bias = (
-            self._trunk[f"features.{number}.{part}"].to(x) for part in ("weight", "bias")
-        )
+        weight, bias = (self._trunk[f"features.{number}.{part}"] for part in ("weight", "bias"))
         stride = self._layout.first_stride if number == 0 else 1
         # AlexNet's first kernel of 11 px has a border of 2 px, all others keep the size.
         padding = 2 if weight.shape[-1] == _ALEXNET.first_kernel else weight.shape[-1] // 2
@@ -159,21 +141,21 @@ def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:
 def _expected_channels(layout: _Trunk) -> dict[str, tuple[int, ...]]:
     """Return the channels (out, in) of every weight and (out,) of every bias of a trunk."""
     expected: dict[str, tuple[int, ...]] = {}
-    channels = 3
-    for stage in layout.stages:
-        for number in stage.convs:
-            expected[f"features.{number}.weight"] = (stage.channels, channels)
-            expected[f"features.{number}.bias"] = (stage.channels,)
-            channels = stage.channels
+    before = 3
+    for channels, convs in zip(layout.channels, layout.convs, strict=True):
+        for number in convs:
+            expected[f"features.{number}.weight"] = (channels, before)
+            expected[f"features.{number}.bias"] = (channels,)
+            before = channels
     return expected
 
 
 def recognise_heads(heads: Mapping[str, Tensor]) -> str:
     """Return the name of the trunk that heads belong to, by their channels."""
-    names = [f"lin{level}.model.1.weight" for level in range(len(_ALEXNET.stages))]
+    names = [f"lin{level}.model.1.weight" for level in range(len(_ALEXNET.convs))]
     found = [tuple(heads[name].shape) if name in heads else None for name in names]
     for layout in (_ALEXNET, _VGG16):
-        if found == [(1, stage.channels, 1, 1) for stage in layout.stages]:
+        if found == [(1, channels, 1, 1) for channels in layout.channels]:
             return layout.name
     raise InputError(
         f"expected five LPIPS heads lin0 to lin4 for AlexNet or VGG-16, found shapes {found}; give "

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minislam.errors import InputError
-from minislam.geometry.alignment import Similarity, identity_similarity, umeyama
+from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 
 # Two poses whose timestamps differ by more do not belong together (evo's default).
@@ -138,7 +138,7 @@ def associate(
 def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Similarity:
     """Return the similarity that maps the paired estimate to the truth."""
     if alignment is Alignment.NONE:
-        return identity_similarity()
+        return Similarity(1.0, np.eye(3), np.zeros(3))
     with_scale = alignment is not Alignment.SE3
     fitted = umeyama(centres(estimate), centres(truth), with_scale)
     if alignment is Alignment.SCALE:

@@ -30,11 +30,6 @@ class Similarity:
         return moved
 
 
-def identity_similarity() -> Similarity:
-    """Return the similarity that changes nothing."""
-    return Similarity(1.0, np.eye(3), np.zeros(3))
-
-
 def umeyama(
     source: np.ndarray,  # (N, 3) points to be mapped
     target: np.ndarray,  # (N, 3) where they should be mapped to

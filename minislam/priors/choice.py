@@ -15,7 +15,7 @@ from minislam.priors.depth import (
     SimulatedDepth,
     SimulatedDepthConfig,
 )
-from minislam.priors.features import ClassicalFeatures, ClassicalFeaturesConfig
+from minislam.priors.features import ClassicalFeatures
 from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
@@ -36,12 +36,11 @@ def choose_flow(
 def choose_features(
     choice: PriorChoice,
     camera: Camera,
-    classical: ClassicalFeaturesConfig,
     networks: NetworksConfig,
 ) -> FeatureExtractor:
     """Return the features: classical, a network, a plugin, or files:FOLDER."""
     makers: dict[str, Callable[[], Any]] = {
-        "classical": lambda: ClassicalFeatures(classical),
+        "classical": ClassicalFeatures,
         FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera),
     }
     return _choose("features", choice, networks, makers)

@@ -5,15 +5,12 @@ are enough for many scenes, but not for a grey person before a grey wall: there 
 network is needed.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.errors import InputError
-from minislam.parameters import parameter
 from minislam.records import Frame
 
 # Centre and spread of each raw feature, rounded from statistics of everyday video (indoor and
@@ -29,28 +26,17 @@ _EDGE_CENTRE, _EDGE_SPREAD = 1.7, 0.7  # of log(1 + mean gradient / unit)
 _ORIENTATION_SPREAD = 0.1  # of the fraction of edges in one orientation bin around 1 / bins
 
 STRIDE = 7  # px, size of a cell: half the patch of DINOv2, since the windows span several cells
+WINDOWS = 1, 3, 5  # cells, sides of the square windows whose statistics are taken
 ORIENTATION_BINS = 8  # of the edge direction over 180 degrees
 # Of contrast and edges relative to colour: colour changes less when the view changes.
 TEXTURE_WEIGHT = np.float32(0.5)
-
-
-@dataclass(frozen=True)
-class ClassicalFeaturesConfig:
-    """Settings of the classical features."""
-
-    windows: tuple[int, ...] = parameter(
-        (1, 3, 5), "sides of the square windows whose statistics are taken [cells]", 1, 999
-    )
 
 
 class ClassicalFeatures:
     """Colour, contrast and edge orientation on a grid of cells: a `FeatureExtractor`."""
 
     stride = STRIDE
-
-    def __init__(self, config: ClassicalFeaturesConfig | None = None) -> None:
-        self.config = config or ClassicalFeaturesConfig()
-        self.dimension = len(self.config.windows) * (3 + 3 + ORIENTATION_BINS + 1)
+    dimension = len(WINDOWS) * (3 + 3 + ORIENTATION_BINS + 1)
 
     def __call__(
         self,
@@ -63,7 +49,7 @@ class ClassicalFeatures:
         mean = _cell_mean(lab, width, height)
         mean_square = _cell_mean(lab * lab, width, height)
         edges = _cell_mean(oriented_edges(lab[..., 0], ORIENTATION_BINS), width, height)
-        groups = [_describe(mean, mean_square, edges, side) for side in self.config.windows]
+        groups = [_describe(mean, mean_square, edges, side) for side in WINDOWS]
         features = torch.from_numpy(np.concatenate(groups, -1).reshape(height, width, -1))
         # Unit length on average per channel: what an MLP with standard initialisation expects.
         length = features.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # never 0/0

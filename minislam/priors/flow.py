@@ -23,6 +23,7 @@ from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
+THREADS = 2  # that compute flows side by side, without effect on the result
 PAIRS_AT_ONCE = 16  # of keyframes: a dense flow has 600 kB at 320x240, and there may be thousands
 
 
@@ -107,7 +108,7 @@ class ClassicalFlow(Stateful):
         return bool(distance >= self.config.start_tolerance)
 
     def _measure(self, starts: dict[Edge, np.ndarray]) -> None:
-        pool = _threads(self.config.workers)
+        pool = _threads()
         pairs = list(dict.fromkeys((min(edge), max(edge)) for edge in starts))
         for first in range(0, len(pairs), PAIRS_AT_ONCE):
             both = [e for i, j in pairs[first : first + PAIRS_AT_ONCE] for e in ((i, j), (j, i))]
@@ -190,7 +191,7 @@ class FlowChain(Stateful):
         # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
         # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
         starts = (self._flow, self._flow + self._increment)
-        measured = _threads(self._config.workers).map(follow, starts)
+        measured = _threads().map(follow, starts)
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
         return chain, as_matches([targets], [confidence], [texture], image)
@@ -202,5 +203,5 @@ class FlowChain(Stateful):
 
 
 @cache
-def _threads(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(THREADS)

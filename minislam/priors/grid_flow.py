@@ -31,9 +31,6 @@ class ClassicalFlowConfig:
     start_tolerance: float = parameter(
         0.25, "an edge is measured again if its start has moved by this (median) [px]; 0: always"
     )
-    workers: int = parameter(
-        2, "threads that compute flows side by side; no effect on the result", 1, 256
-    )
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import platform
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ def run_facts(
     slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int | None
 ) -> dict[str, Any]:
     """Return the content of run.json: the command, how long the run took, and how it ended."""
-    failed, adjustments = failed_adjustments(slam)
+    adjustments = slam.tracker.graph.adjustments
     return {
         "version": minislam.__version__,
         "command": sys.argv,
@@ -48,14 +49,14 @@ def run_facts(
         "seed": slam.config.seed,
         "state": state,
         "exit_code": exit_code,
-        "warnings": _warnings(slam) + ([checkpoints.problem] if checkpoints.problem else []),
+        "warnings": [*_warnings(slam), *filter(None, [checkpoints.problem])],
         "seconds": {"total": checkpoints.run_seconds, **slam.steps.seconds},
         "checkpoint_seconds": checkpoints.seconds,
         "frames": len(slam.tracker.tracked),
         "keyframes": len(slam.tracker.keyframes),
         "lost_frames": len(slam.lost_frames()),
-        "adjustments": adjustments,
-        "failed_adjustments": failed,
+        "adjustments": adjustments.count,
+        "failed_adjustments": adjustments.failed,
         "gaussians": len(slam.mapper.gaussians),
         "unit": unit_of(slam),
         "camera": asdict(slam.tracker.grid.camera),
@@ -71,12 +72,6 @@ def run_facts(
 def unit_of(slam: Slam) -> str:
     """Return the unit of length of trajectory and map."""
     return "m" if slam.tracker.keyframes.has_prior else "world units"
-
-
-def failed_adjustments(slam: Slam) -> tuple[int, int]:
-    """Return how many bundle adjustments failed, and how many there were."""
-    adjustments = slam.tracker.graph.adjustments
-    return adjustments.failed, adjustments.count
 
 
 def focal_length_note(slam: Slam) -> str:
@@ -176,75 +171,61 @@ def peak_memory_mb() -> float | None:
     return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes
 
 
-def _warnings(slam: Slam) -> list[str]:
-    warnings = list(slam.sequence.warnings)
-    lost = len(slam.lost_frames())
+def _warnings(slam: Slam) -> Iterator[str]:
+    """Yield what the user must know of a run."""
+    watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
+    diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
+    yield from slam.sequence.warnings
     if lost:
-        warnings.append(
+        yield (
             f"{lost} of {len(slam.tracker.tracked)} frames could not be tracked and have no "
             "pose; lost_frames.txt lists them"
         )
-    warnings += _break_warnings(slam)
-    failed, adjustments = failed_adjustments(slam)
-    if failed:
-        warnings.append(
-            f"{failed} of {adjustments} bundle adjustments failed and changed nothing: poses and "
-            "depths there are those of the start"
+    if watch.breaks:
+        where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
+        pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
+        yield (
+            f"the trajectory is broken at frames {where}: motion or depth contradicts the images. "
+            f"Before and after, scale and direction do not belong together; each piece (frames "
+            f"{pieces or 'none'}) stands for itself"
         )
-    warnings += _focal_length_warnings(slam) + _parallax_warnings(slam) + _overlay_warnings(slam)
-    if not slam.tracker.keyframes.has_prior:
-        warnings.append("without a depth prior the unit of length is arbitrary")
-    return warnings
+    if graph.adjustments.failed:
+        yield (
+            f"{graph.adjustments.failed} of {graph.adjustments.count} bundle adjustments failed "
+            "and changed nothing: poses and depths there are those of the start"
+        )
+    yield from _focal_length_warnings(slam)
+    least = slam.config.tracking.min_parallax * graph.pixel_scale
+    without = sum(keyframe.parallax < least for keyframe in diagnostics)
+    if without and 2 * without >= len(diagnostics):
+        yield (
+            f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera "
+            "turned or stood still, so the distances it moved are not determined"
+        )
+    if keyframes.overlay is not None:
+        yield (
+            f"{float((keyframes.overlay == 0).float().mean()):.0%} of the image stand still while "
+            "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map does "
+            "not; crop the images"
+        )
+    if not keyframes.has_prior:
+        yield "without a depth prior the unit of length is arbitrary"
 
 
-def _break_warnings(slam: Slam) -> list[str]:
-    breaks = slam.tracker.watch.breaks
-    if not breaks:
-        return []
-    where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in breaks)
-    pieces = ", ".join(f"{first} to {last}" for first, last in slam.tracker.watch.segments)
-    return [
-        f"the trajectory is broken at frames {where}: motion or depth contradicts the images. "
-        f"Before and after, scale and direction do not belong together; each piece (frames "
-        f"{pieces or 'none'}) stands for itself"
-    ]
-
-
-def _focal_length_warnings(slam: Slam) -> list[str]:
+def _focal_length_warnings(slam: Slam) -> Iterator[str]:
     fit, graph = slam.focal_length, slam.tracker.graph
     if graph.seeks_focal and graph.adjustments.count and not graph.focal_is_free:
-        return [
+        yield (
             "the focal length is unknown and the motion does not tell it: trajectory and map may "
             "be bent; give --fx or a calibration file"
-        ]
-    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or failed_adjustments(slam)[0]
-    if fit is None or not fit.is_doubtful or is_broken:
-        return []  # the flow of a broken run fits whatever focal length
-    factor = f"{fit.factor:.2f}"
-    return [
-        f"the flow fits {factor} times the present focal length better, with {fit.saved:.0%} less "
-        f"cost: check the calibration, or give {factor} times the present --fx and --fy. If the "
-        "lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
-    ]
-
-
-def _parallax_warnings(slam: Slam) -> list[str]:
-    diagnostics = slam.tracker.watch.diagnostics
-    least = slam.config.tracking.min_parallax * slam.tracker.graph.pixel_scale
-    without = sum(keyframe.parallax < least for keyframe in diagnostics)
-    if not without or 2 * without < len(diagnostics):
-        return []
-    return [
-        f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera turned or "
-        "stood still, so the distances it moved are not determined"
-    ]
-
-
-def _overlay_warnings(slam: Slam) -> list[str]:
-    overlay = slam.tracker.keyframes.overlay
-    if overlay is None:
-        return []
-    return [
-        f"{float((overlay == 0).float().mean()):.0%} of the image stand still while the rest moves "
-        "(a logo, a dashboard, bars?): tracking leaves them out, the map does not; crop the images"
-    ]
+        )
+        return
+    # The flow of a broken run fits whatever focal length.
+    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.adjustments.failed
+    if fit is not None and fit.is_doubtful and not is_broken:
+        yield (
+            f"the flow fits {fit.factor:.2f} times the present focal length better, with "
+            f"{fit.saved:.0%} less cost: check the calibration, or give {fit.factor:.2f} times the "
+            "present --fx and --fy. If the lens zoomed while it filmed, no focal length is right, "
+            "and the trajectory is bent"
+        )

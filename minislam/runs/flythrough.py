@@ -37,7 +37,7 @@ def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
 
     The circle is small, since the map holds only what the camera saw.
     """
-    start = run.poses[_middle(run)]
+    start = run.poses[run.keyframes[len(run.keyframes) // 2]]
     depth = run.render_depth(start)
     if not (depth > 0).any():
         raise InputError("expected a map in front of the middle keyframe, found none to fly around")
@@ -87,7 +87,3 @@ def _labelled(row: np.ndarray, width: int) -> np.ndarray:
             font = cv2.FONT_HERSHEY_SIMPLEX
             cv2.putText(row, label, place, font, 0.45, color, thickness, cv2.LINE_AA)
     return row / 255
-
-
-def _middle(run: Run) -> int:
-    return run.keyframes[len(run.keyframes) // 2]

@@ -166,8 +166,9 @@ class Run:
     @cached_property
     def sequence(self) -> RecordedSequence:
         """Return the source of the run, opened again."""
-        source = self.folder.read_config()["sequence"]
-        sequence = open_sequence(source, self.sequence_options())
+        source, options = (self.folder.read_config()[part] for part in ("sequence", "input"))
+        options["size"] = options["size"] and tuple(options["size"])
+        sequence = open_sequence(source, InputOptions(**options))
         if len(sequence) < len(self.frames):
             raise InputError(
                 f"expected the {len(self.frames)} frames of the run in {source}, found "
@@ -175,18 +176,12 @@ class Run:
             )
         return sequence
 
-    def sequence_options(self) -> InputOptions:
-        """Return the options with which the source was opened."""
-        options: dict[str, Any] = dict(self.folder.read_config()["input"])
-        return InputOptions(**options | {"size": options["size"] and tuple(options["size"])})
-
     @cached_property
     def _features(self) -> FeatureExtractor:
         on_cpu = {"device": "cpu", "precision": "fp32"}
         choice = PriorChoice(**self.folder.read_config()["priors"] | on_cpu)
-        config = self.config
-        features = choose_features(choice, self.sequence.camera, config.features, config.networks)
-        return with_finer_grid(features, config.uncertainty.grid_factor)
+        features = choose_features(choice, self.sequence.camera, self.config.networks)
+        return with_finer_grid(features, self.config.uncertainty.grid_factor)
 
     @cached_property
     def _mlp(self) -> UncertaintyMLP:

@@ -23,7 +23,7 @@ from minislam.priors.networks.checkpoints import load_checkpoint
 from minislam.priors.networks.published import find_weights
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms
-from minislam.runs.facts import failed_adjustments, measure, run_facts
+from minislam.runs.facts import measure, run_facts
 from minislam.runs.flythrough import clip
 from minislam.runs.loaded import Run, scene_of
 from minislam.runs.pictures import Preview, write_pictures
@@ -57,7 +57,7 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
         )
     return Priors(
         choose_flow(choice, config.flow, networks),
-        choose_features(choice, sequence.camera, config.features, networks),
+        choose_features(choice, sequence.camera, networks),
         choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
 
@@ -176,8 +176,8 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     """Return the state of run.json and the exit code."""
     if interrupted:
         return "interrupted", INTERRUPTED_EXIT
-    failed, adjustments = failed_adjustments(slam)
-    if 2 * failed > adjustments:
+    adjustments = slam.tracker.graph.adjustments
+    if 2 * adjustments.failed > adjustments.count:
         return "finished, most bundle adjustments failed", LOST_EXIT
     if slam.tracker.watch.is_broken:
         return "finished, broken", LOST_EXIT

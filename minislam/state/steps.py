@@ -9,30 +9,23 @@ from minislam.state.stateful import Stateful
 
 
 class Observer(Protocol):
-    """Shows the progress of a run, and may end the run between two steps."""
+    """Shows the progress of a run, and may end the run between two steps; the default: neither."""
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Show that `done` of the `total` steps of a stage are finished."""
+        return None
 
     def warn(self, text: str) -> None:
         """Tell the user of something at once."""
+        return None
 
     def should_stop(self) -> bool:
         """Tell whether the run should end after the present step."""
-
-
-class SilentObserver:
-    """Shows nothing and never ends a run."""
-
-    def show(self, stage: str, done: int, total: int) -> None:
-        """Show nothing."""
-
-    def warn(self, text: str) -> None:
-        """Say nothing."""
-
-    def should_stop(self) -> bool:
-        """Return False."""
         return False
+
+
+class SilentObserver(Observer):
+    """Shows nothing and never ends a run."""
 
 
 class Steps(Stateful):

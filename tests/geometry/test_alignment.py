@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from minislam.errors import InputError
-from minislam.geometry.alignment import Similarity, identity_similarity, umeyama
+from minislam.geometry.alignment import Similarity, umeyama
 from tests.helpers import random_transforms
 
 
@@ -92,7 +92,9 @@ def test_poses_move_with_their_centres():
     # A point one unit ahead of the camera is `scale` units ahead afterwards.
     ahead = similarity.transform_points(poses[:, :3, 3] + poses[:, :3, 2])
     np.testing.assert_allclose(ahead - centres, 3.0 * moved[:, :3, 2], atol=1e-11)
-    np.testing.assert_array_equal(identity_similarity().transform_poses(poses), poses)
+    np.testing.assert_array_equal(
+        Similarity(1.0, np.eye(3), np.zeros(3)).transform_poses(poses), poses
+    )
 
 
 # Degenerate input and errors

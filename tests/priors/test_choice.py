@@ -8,7 +8,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepthConfig
-from minislam.priors.features import ClassicalFeatures, ClassicalFeaturesConfig
+from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.networks.table import NetworksConfig
@@ -35,7 +35,7 @@ def flow(**flags: str):
 
 
 def features(**flags: str):
-    return choose_features(PriorChoice(**flags), CAMERA, ClassicalFeaturesConfig(), NETWORKS)
+    return choose_features(PriorChoice(**flags), CAMERA, NETWORKS)
 
 
 def depth(**flags: str):

@@ -85,8 +85,8 @@ class Weights:
         return torch.autocast(self.device.type, self.precision) if is_mixed else nullcontext()
 
     def linear(self, name: str, x: Tensor, bias: bool = True) -> Tensor:
-        """Apply a linear layer."""
-        return functional.linear(x, self[f"{name}.weight"], self._bias(name, bias))
+        """Apply a linear layer; a missing bias is noticed, because `bias` says it must be there."""
+        return functional.linear(x, self[f"{name}.weight"], self[f"{name}.bias"] if bias else None)
 
     def conv(
         self,
@@ -106,7 +106,7 @@ class Weights:
                 "version of the network"
             )
         padding = weight.shape[-1] // 2 if padding is None else padding
-        return functional.conv2d(x, weight, self._bias(name, bias), stride, padding)
+        return functional.conv2d(x, weight, self[f"{name}.bias"] if bias else None, stride, padding)
 
     def upconv(self, name: str, x: Tensor) -> Tensor:
         """Apply a transposed convolution whose stride is its kernel's size."""
@@ -130,10 +130,6 @@ class Weights:
         r = torch.sigmoid(self.conv("convr", both) + offsets[1])
         q = torch.tanh(self.conv("convq", torch.cat([r * hidden, inputs], 1)) + offsets[2])
         return (1 - z) * hidden + z * q
-
-    def _bias(self, name: str, wanted: bool) -> Tensor | None:
-        # Not "the bias if there is one": an incomplete file would go unnoticed.
-        return self[f"{name}.bias"] if wanted else None
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Weights:

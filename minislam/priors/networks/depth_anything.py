@@ -18,7 +18,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
+from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
 from minislam.records import Frame
 
 SHORTER_SIDE = 518  # px the network sees, as in its training
@@ -41,7 +41,7 @@ class DepthAnythingHead:
     """The convolutions behind the transformer: tokens in, one number per pixel out."""
 
     def __init__(self, weights: Weights) -> None:
-        transformer = VisionTransformer(weights.below("pretrained."), PositionResize.OFFSET)
+        transformer = VisionTransformer(weights.below("pretrained."))
         self.transformer, self.weights = transformer, weights.below("depth_head.")
         self.taps = _TAPS[transformer.depth]
 

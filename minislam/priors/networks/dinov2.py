@@ -12,7 +12,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 from minislam.priors.features import grid_size
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
+from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
 from minislam.records import Frame
 
 
@@ -23,7 +23,7 @@ class DinoFeatures:
 
     def __init__(self, weights: Weights) -> None:
         self.device = weights.device
-        self._transformer = VisionTransformer(weights, position_resize_of(weights))
+        self._transformer = VisionTransformer(weights, is_antialiased(weights))
         self.dimension = self._transformer.width
 
     def __call__(
@@ -40,8 +40,8 @@ class DinoFeatures:
         return patches.permute(1, 2, 0).to(image.device)
 
 
-def position_resize_of(weights: Weights) -> PositionResize:
-    """Return how a features checkpoint was trained to resize its positions.
+def is_antialiased(weights: Weights) -> bool:
+    """Tell whether a features checkpoint was trained with antialiased positions.
 
     The file does not state it, but the three published kinds differ in what they contain: FiT3D
     alone lacks the mask token of the training, and DINOv2 has registers or not. A file that has
@@ -54,7 +54,7 @@ def position_resize_of(weights: Weights) -> PositionResize:
     if lacks_mask or ("_reg" in name and not has_registers):
         lost = "mask_token" if lacks_mask else "register tokens"
         raise InputError(f"expected {lost} in {weights.file}, found none; the file is not complete")
-    return PositionResize.ANTIALIAS if is_fit3d or has_registers else PositionResize.OFFSET
+    return is_fit3d or has_registers
 
 
 def build_dino_features(weights: Weights) -> DinoFeatures:

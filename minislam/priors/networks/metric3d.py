@@ -18,8 +18,8 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.metric3d_refinement import Metric3DOutput, refine
-from minislam.priors.networks.vit import PATCH, PositionResize, VisionTransformer, normalise
+from minislam.priors.networks.metric3d_refinement import refine
+from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
 from minislam.records import Frame
 
 CANONICAL_FOCAL = 1000.0  # px, of the camera that all training images were turned into
@@ -52,12 +52,12 @@ class Pyramid:
 
 
 class Metric3D:
-    """The network: a normalised image in, depth for the canonical camera and normals out."""
+    """The network: a normalised image in, depth for the canonical camera out."""
 
     def __init__(self, weights: Weights) -> None:
         encoder = weights.below("depth_model.encoder.")
         # It has registers, yet resizes its positions like the networks without.
-        self.transformer = VisionTransformer(encoder, PositionResize.OFFSET)
+        self.transformer = VisionTransformer(encoder)
         self.weights = weights.below("depth_model.decoder.")
         width = self.transformer.width
         if width not in _ROUNDS:
@@ -70,8 +70,8 @@ class Metric3D:
     def __call__(
         self,
         image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 28
-    ) -> Metric3DOutput:
-        """Return canonical depth, its confidence, and normals."""
+    ) -> Tensor:  # (B, H, W) metre
+        """Return the depth for the canonical camera."""
         pyramid = self.pyramid(image)
         features = _fuse(self.weights.below("decoder_mono."), pyramid)
         # The fusion of the official code rectifies its inputs in place, so its refinement sees
@@ -173,7 +173,7 @@ class Metric3DDepth:
         """Return the depth of a 1000 px camera at the network's scale, and that scale."""
         with torch.no_grad():
             fitted = fit(image, self.network_size, self.device)
-            depth = self.network(fitted.image).depth[0, fitted.rows, fitted.cols]
+            depth = self.network(fitted.image)[0, fitted.rows, fitted.cols]
         return depth, fitted.scale
 
 

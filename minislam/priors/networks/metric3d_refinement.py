@@ -6,7 +6,6 @@ normal (3), normal confidence.
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -25,23 +24,13 @@ _CONTEXT_NAMES = ("outputs04", "outputs08", "outputs16")
 _GRU_NAMES = ("gru08", "gru16", "gru32")
 
 
-@dataclass(frozen=True)
-class Metric3DOutput:
-    """The output of Metric3D for an image."""
-
-    depth: Tensor  # (B, H, W) metre, for the canonical camera
-    confidence: Tensor  # (B, H, W) of the depth
-    normals: Tensor  # (B, 3, H, W) unit vectors
-    normal_confidence: Tensor  # (B, H, W) > 0
-
-
 def refine(
     weights: Weights,  # of the decoder
     features: Tensor,  # (B, c0 + 2, h, w), the last two channels are confidences
     context: list[Tensor],  # three maps (B, c, h_l, w_l), from fine to coarse
     rounds: int,
-) -> Metric3DOutput:
-    """Return the refined and upsampled estimate."""
+) -> Tensor:  # (B, H, W) metre
+    """Return the refined and upsampled depth for the canonical camera."""
     state = first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
     hidden, gates = _start(weights, context)
     update = weights.below("update_block.")
@@ -49,14 +38,8 @@ def refine(
         hidden = _recurrent_round(update, hidden, gates, state)
         state = state + _proposed_change(update.below("flow_head."), hidden[0])
     mask = update.conv("mask.2", update.conv("mask.0", hidden[0]).relu())
-    fine = convex_upsample(state, _MASK_SCALE * mask, _UPSAMPLING)
-    normals = normalised(fine[:, 2:])
-    return Metric3DOutput(
-        depth=(_STATE_UNIT * fine[:, 0] + FARTHEST).clamp(NEAREST, FARTHEST),
-        confidence=fine[:, 1],
-        normals=normals[:, :3],
-        normal_confidence=normals[:, 3],
-    )
+    fine = convex_upsample(state[:, :1], _MASK_SCALE * mask, _UPSAMPLING)[:, 0]
+    return (_STATE_UNIT * fine + FARTHEST).clamp(NEAREST, FARTHEST)
 
 
 def first_estimate(
@@ -68,8 +51,9 @@ def first_estimate(
     depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
     depth = depth.clamp(NEAREST, FARTHEST)
     normal = _head(weights.below("normal_predictor."), features, layers=4, channels=3)
-    oriented = normalised(torch.cat([normal, normal_confidence], 1))
-    return torch.cat([(depth - FARTHEST) / _STATE_UNIT, depth_confidence, oriented], 1)
+    unit = normal / (normal.norm(dim=1, keepdim=True) + 1e-10)
+    positive = functional.elu(normal_confidence) + 1.01
+    return torch.cat([(depth - FARTHEST) / _STATE_UNIT, depth_confidence, unit, positive], 1)
 
 
 def _head(weights: Weights, x: Tensor, layers: int, channels: int) -> Tensor:
@@ -77,13 +61,6 @@ def _head(weights: Weights, x: Tensor, layers: int, channels: int) -> Tensor:
     for k in range(layers - 1):
         x = weights.conv(f"{2 * k}", x).relu()
     return weights.conv(f"{2 * layers - 2}", x, channels=(channels,))
-
-
-def normalised(oriented: Tensor) -> Tensor:
-    """Return (B, 4, ...) with the first three channels of unit length and the last positive."""
-    normal, confidence = oriented[:, :3], oriented[:, 3:]
-    unit = normal / (normal.norm(dim=1, keepdim=True) + 1e-10)
-    return torch.cat([unit, functional.elu(confidence) + 1.01], 1)
 
 
 def _start(weights: Weights, context: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:

@@ -41,9 +41,7 @@ class Network:
     build: Callable[[Weights, NetworksConfig], Any]  # makes it and runs it on a tiny image
     unneeded: tuple[str, ...] = ()  # parts of names that are stored in its files but not used
     transformer: str | None = None  # prefix of the names of its vision transformer, if it has one
-    is_strict: bool = (
-        True  # its official loader refuses further tensors, and so do we; else we warn
-    )
+    is_strict: bool = True  # its official loader refuses further tensors, as we do; else we warn
 
 
 # The first row whose marks are all in a file tells what the file is.

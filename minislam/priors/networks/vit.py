@@ -10,7 +10,6 @@ output of an MLP on the token itself:
 
 import math
 from dataclasses import dataclass
-from enum import Enum
 
 import torch
 from torch import Tensor
@@ -24,20 +23,12 @@ _BLOCKS = {384: 12, 768: 12, 1024: 24}  # by the width of ViT-S, -B and -L
 _HEAD_WIDTH = 64  # channels per attention head, at every size of the network
 _EPSILON = 1e-6  # of every layer norm of the transformer; torch's default is another
 _TRAINED_GRID = 37  # patches per side of the 518 px images of the training
-_OFFSET = 0.1  # patches added to the size before the scale is computed, see PositionResize
+# The table of positions is resized to other images as in the training, which no checkpoint states:
+# with antialiasing (registers, FiT3D), or by (n + _OFFSET) / 37 (DINOv2, the depth networks).
+_OFFSET = 0.1  # patches
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # RGB, of the images all these networks were trained on
 IMAGENET_STD = (0.229, 0.224, 0.225)
-
-
-class PositionResize(Enum):
-    """How the table of positions is resized to another image size.
-
-    Each network was trained with one of them, and its checkpoint does not state which.
-    """
-
-    OFFSET = "offset"  # bicubic with the factor (n + 0.1) / 37: DINOv2 and the depth networks
-    ANTIALIAS = "antialias"  # bicubic, smoothed when shrinking: registers, and timm (FiT3D)
 
 
 @dataclass(frozen=True)
@@ -51,9 +42,9 @@ class Tokens:
 class VisionTransformer:
     """A ViT-S, -B or -L with patches of 14 px, in the layout of DINOv2 or of timm."""
 
-    def __init__(self, weights: Weights, position_resize: PositionResize) -> None:
+    def __init__(self, weights: Weights, is_antialiased: bool = False) -> None:
         self.weights = weights
-        self.position_resize = position_resize
+        self.is_antialiased = is_antialiased
         # Metric3D stores all blocks in one chunk.
         self._block = "blocks.0.{}." if "blocks.0.0.norm1.weight" in weights else "blocks.{}."
         self.width = weights["patch_embed.proj.weight"].shape[0]
@@ -115,7 +106,7 @@ class VisionTransformer:
         table = self._positions
         if rows == cols == _TRAINED_GRID:
             return table
-        if self.position_resize is PositionResize.ANTIALIAS:
+        if self.is_antialiased:
             return functional.interpolate(table, (rows, cols), mode="bicubic", antialias=True)
         factors = tuple((n + _OFFSET) / _TRAINED_GRID for n in (rows, cols))
         return functional.interpolate(table, scale_factor=factors, mode="bicubic")

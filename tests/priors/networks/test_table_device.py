@@ -9,7 +9,7 @@ import torch
 
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.depth_anything import DepthAnythingHead
-from minislam.priors.networks.dinov2 import position_resize_of
+from minislam.priors.networks.dinov2 import is_antialiased
 from minislam.priors.networks.droid import DroidFlow
 from minislam.priors.networks.droid_network import cell_grid
 from minislam.priors.networks.metric3d import Metric3D, fit
@@ -30,7 +30,7 @@ def meta_weights(network: str) -> Weights:
 def test_vision_transformers():
     for network in ("dinov2_vits14", "dinov2_vits14_reg", "fit3d_small", "fit3d_reg_small"):
         weights = meta_weights(network)
-        transformer = VisionTransformer(weights, position_resize_of(weights))
+        transformer = VisionTransformer(weights, is_antialiased(weights))
         tokens = transformer(normalise(IMAGE, META))[0]
         assert tokens.patches.shape == (1, 384, 4, 6) and tokens.patches.device == META
 
@@ -41,8 +41,7 @@ def test_depth_networks_of_both_sizes():
         assert head(normalise(IMAGE, META)).shape == (1, 56, 84)
     for network in ("metric3d_vit_small", "metric3d_vit_large"):
         found = Metric3D(meta_weights(network))(fit(IMAGE, (112, 168), META).image)
-        assert found.depth.shape == found.confidence.shape == (1, 112, 168)
-        assert found.normals.shape == (1, 3, 112, 168) and found.normals.device == META
+        assert found.shape == (1, 112, 168) and found.device == META
 
 
 def test_droid():

@@ -7,7 +7,7 @@ import torch
 
 from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.vit import PositionResize, Tokens, VisionTransformer, normalise
+from minislam.priors.networks.vit import Tokens, VisionTransformer, normalise
 from tests.priors.networks import rebuilt
 
 pytestmark = pytest.mark.slow
@@ -15,9 +15,9 @@ pytestmark = pytest.mark.slow
 TOLERANCE = 2e-5  # the official code differs from its own float64 run by 3e-6
 CPU = torch.device("cpu")
 NETWORKS = {  # name: (position resize, names of the stored outputs)
-    "dinov2_vits14": (PositionResize.OFFSET, "x_norm_patchtokens"),
-    "dinov2_vits14_reg": (PositionResize.ANTIALIAS, "x_norm_patchtokens"),
-    "fit3d_reg_small": (PositionResize.ANTIALIAS, "norm_patch"),
+    "dinov2_vits14": (False, "x_norm_patchtokens"),
+    "dinov2_vits14_reg": (True, "x_norm_patchtokens"),
+    "fit3d_reg_small": (True, "norm_patch"),
 }
 
 
@@ -64,7 +64,7 @@ def test_the_trained_size_needs_no_resize_of_the_positions():
 
 
 def test_the_other_position_resize_would_be_noticed():
-    transformer = VisionTransformer(weights("dinov2_vits14"), PositionResize.ANTIALIAS)
+    transformer = VisionTransformer(weights("dinov2_vits14"), True)
     patches = transformer(normalise(rebuilt.image(56, 84), CPU))[0].patches[0].flatten(1).T
     expected = rebuilt.golden("dinov2_vits14")["56x84/x_norm_patchtokens"]
     assert (patches - expected).abs().max() > 0.1
@@ -76,4 +76,4 @@ def test_the_other_position_resize_would_be_noticed():
 def test_a_giant_is_refused_in_words():
     tensors = {"patch_embed.proj.weight": torch.zeros(1536, 1, 1, 1)}
     with pytest.raises(InputError, match=r"384, 768, 1024 \(S, B, L\) in g\.pth, .* width 1536"):
-        VisionTransformer(Weights(tensors, "g.pth"), PositionResize.OFFSET)
+        VisionTransformer(Weights(tensors, "g.pth"), False)
