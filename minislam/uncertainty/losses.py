@@ -100,8 +100,8 @@ def variance_regulariser(
     similar = cosine > config.similarity
     crowded = similar.sum(-1) > config.neighbours
     if crowded.any():
-        most_similar = cosine[crowded].topk(config.neighbours, dim=-1).values
-        similar[crowded] &= cosine[crowded] >= most_similar[:, -1:]
+        most_similar = cosine[crowded].topk(config.neighbours, dim=-1, sorted=False).values
+        similar[crowded] &= cosine[crowded] >= most_similar.amin(-1, keepdim=True)
     similar = similar.to(beta_raw)
     number = similar.sum(-1)
     mean = similar @ beta_raw / number

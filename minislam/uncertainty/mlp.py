@@ -49,7 +49,10 @@ class UncertaintyMLP(nn.Module):
 
     def _dropout_mask(self, hidden: Tensor, generator: torch.Generator) -> Tensor:
         """Return 0 for dropped units and 1 / (1 - p) for the others, so that the mean stays."""
+        # A byte for each unit, because bytes are drawn five times as fast as floats: p is n / 256.
+        dropped, eights = round(256 * self.dropout), (-(-hidden.numel() // 8),)
         # Drawn on the generator's device, so that every device drops the same units.
-        draw = torch.rand(hidden.shape, generator=generator, device=generator.device)
-        kept = (draw >= self.dropout).to(hidden)
-        return kept / (1 - self.dropout)
+        place, ends = generator.device, (-(2**63), 2**63 - 1)
+        draw = torch.randint(*ends, eights, generator=generator, device=place).view(torch.uint8)
+        kept = (draw[: hidden.numel()].reshape(hidden.shape) >= dropped).to(hidden)
+        return kept * (256 / (256 - dropped))

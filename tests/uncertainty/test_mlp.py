@@ -45,8 +45,11 @@ def test_inference_has_no_dropout_and_training_keeps_the_mean():
     assert torch.equal(mlp(features), mlp(features))
     random = generator(4)
     assert not torch.equal(mlp(features, random), mlp(features, random))
-    hidden = torch.ones(20000)
-    assert abs(float(mlp._dropout_mask(hidden, random).mean()) - 1) < 0.01
+    mask = mlp._dropout_mask(torch.ones(199, 101), random)
+    assert abs(float(mask.mean()) - 1) < 0.01
+    assert abs(float((mask == 0).float().mean()) - 0.2) < 0.01
+    neighbours = (mask[:, 1:] == 0) & (mask[:, :-1] == 0)  # each unit for itself
+    assert abs(float(neighbours.float().mean()) - 0.04) < 0.005
 
 
 # Gradients

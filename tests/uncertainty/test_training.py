@@ -43,6 +43,23 @@ def test_a_step_on_two_equal_keyframes_is_one_on_either_but_longer():
     torch.testing.assert_close(steps[1], 2 * steps[0], rtol=1e-3, atol=1e-7)
 
 
+def test_the_steps_are_those_of_adam():
+    features, error = two_object_error()
+    config = UncertaintyConfig(dropout=0.0, lambda_variance=0.0)
+    trainer, other = (UncertaintyTrainer(4, config, seed=3) for _ in range(2))
+    weights = list(other.mlp.parameters())
+    decay = config.weight_decay
+    adam = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=decay)
+    for _ in range(5):
+        trainer.step(features, error, features.reshape(-1, 4))
+        adam.zero_grad()
+        beta = other.mlp(features)
+        uncertainty_loss(beta, error, beta.reshape(-1), features.reshape(-1, 4), config).backward()
+        adam.step()
+    for ours, theirs in zip(trainer.mlp.parameters(), weights, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+
+
 def test_two_runs_with_one_seed_are_equal_to_the_bit():
     features, error = two_object_error()
     betas = []
