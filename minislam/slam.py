@@ -179,7 +179,7 @@ class Slam(Stateful):
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
-        self.focal_length = check_focal_length(self.tracker.graph)  # the last adjustment is done
+        self.focal_length = check_focal_length(self.tracker.graph, self.workers)
         progress = self.steps.on_progress("posing all frames")
         self._poses = pose_all_frames(self.tracker, self.sequence, progress)
 

@@ -26,6 +26,7 @@ from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
 MIN_RAISED_DAMPING = 1e-6  # relative; an undamped solve that fails is tried again with this
+SETTLED = 1e-6  # of the cost: a step that saves less is the last; 1e-9 moved no pose (measured)
 MAX_DAMPING = 1e6  # relative; a step damped more than this would not move anything
 
 
@@ -111,11 +112,10 @@ def bundle_adjust(
         candidate = _damped_step(problem, state, equations, level, absolute_damping)
         trial, there = (float("inf"), []) if candidate is None else _cost(problem, candidate)
         if candidate is not None and trial <= cost:
-            settled = cost - trial <= 1e-9 * cost
+            saved = cost - trial
             state, cost, current, equations = candidate, trial, there, None
-            accepted += 1
-            level = max(level / 10, damping)
-            if settled:
+            accepted, level = accepted + 1, max(level / 10, damping)
+            if saved <= SETTLED * cost:
                 reason = "cost settled"
                 break
         else:

@@ -18,6 +18,7 @@ from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bund
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.safeguards.touched import of_rows
+from minislam.workers import Workers
 
 STEP = math.log(1.05)  # to either side, where the cost must have risen
 ITERATIONS = 10  # Gauss-Newton steps of each adjustment
@@ -52,7 +53,9 @@ class FocalLengthFit:
         return abs(math.log(self.factor)) > WORTH_SAYING and self.saved > WORTH_SAVING
 
 
-def check_focal_length(graph: KeyframeGraph) -> FocalLengthFit | None:
+def check_focal_length(
+    graph: KeyframeGraph, workers: Workers | None = None
+) -> FocalLengthFit | None:
     """Fit a given focal length to all links, after the final global BA; nothing is changed."""
     if graph.seeks_focal:
         return None  # it was not given
@@ -60,7 +63,7 @@ def check_focal_length(graph: KeyframeGraph) -> FocalLengthFit | None:
     positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     rows = torch.arange(min(MOST_KEYFRAMES, len(graph.keyframes)), device=problem.rays.device)
-    return fit_focal_length(*of_rows(problem, graph.state, rows))[0]
+    return fit_focal_length(*of_rows(problem, graph.state, rows), workers)[0]
 
 
 def seek_focal_length(graph: KeyframeGraph) -> None:
@@ -79,22 +82,22 @@ def seek_focal_length(graph: KeyframeGraph) -> None:
 
 
 def fit_focal_length(
-    problem: BundleProblem, state: BundleState
+    problem: BundleProblem,
+    state: BundleState,
+    workers: Workers | None = None,  # adjust side by side
 ) -> tuple[FocalLengthFit, BundleState]:
     """Return the focal length at which the adjusted cost is lowest, and the state there."""
-    _, present = _adjust(problem, state, WIDENINGS)
-    found, widenings = state, WIDENINGS
+    workers, free = workers or Workers(), replace(problem, free_focal=True)
+    starts = [(p, state, list(WIDENINGS)) for p in (problem, free)]
+    (_, present), (found, lowest) = workers.map(adjust_narrowing, starts)
     for _ in range(MAX_TRIES):
-        found, lowest = _adjust(replace(problem, free_focal=True), found, widenings)
-        beside = [
-            bundle_adjust(problem, replace(found, log_focal=found.log_focal + step), ITERATIONS)
-            for step in (-STEP, STEP)
-        ]
-        rises = [report.cost_after - lowest for _, report in beside]
+        ends = [replace(found, log_focal=found.log_focal + step) for step in (-STEP, STEP)]
+        beside = workers.map(adjust_narrowing, [(problem, end, [1.0]) for end in ends])
+        rises = [cost - lowest for _, cost in beside]
         if min(rises) > 0:
             break
         # Not yet in the valley: go on from there. A wide weight might lead back.
-        found, widenings = beside[rises.index(min(rises))][0], WIDENINGS[-1:]
+        found, lowest = adjust_narrowing(free, beside[rises.index(min(rises))][0], [1.0])
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
     saved = (present - lowest) / max(present, floor)
     rises_enough = sum(rises) / 2 >= MIN_RISE * max(lowest, floor) or saved >= WORTH_SAVING
@@ -104,8 +107,8 @@ def fit_focal_length(
     return FocalLengthFit(fx, math.exp(change), saved), found
 
 
-def _adjust(
-    problem: BundleProblem, state: BundleState, widenings: tuple[float, ...]
+def adjust_narrowing(
+    problem: BundleProblem, state: BundleState, widenings: list[float]
 ) -> tuple[BundleState, float]:
     """Return the adjusted state and its cost [px^2], under one robust weight after the other."""
     for widening in widenings:

@@ -19,6 +19,7 @@ from minislam.tracking.safeguards.focal_length import (
     fit_focal_length,
     seek_focal_length,
 )
+from minislam.workers import Workers
 from tests.tracking.scene import CAMERA, RAYS, known_problem, noisy, normal, poses_on_an_arc
 from tests.tracking.wall import true_graph
 
@@ -55,6 +56,15 @@ def test_the_true_focal_length_is_found(factor: float):
     assert fit.factor * factor == pytest.approx(1, rel=FOUND)
     assert fit.factor == pytest.approx(math.exp(state.log_focal))
     assert fit.is_doubtful == (factor != 1)
+
+
+def test_two_processes_find_the_same():
+    known = known_problem()
+    problem = seen_through(noisy(known, NOISE), 1.1)
+    with Workers(2) as workers:
+        shared, there = fit_focal_length(problem, known.truth, workers)
+    alone, here = fit_focal_length(problem, known.truth)
+    assert shared == alone and torch.equal(there.disparities, here.disparities)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
@@ -134,7 +144,7 @@ def test_a_check_costs_no_more_above_a_hundred_keyframes(monkeypatch, keyframes:
     graph = true_graph([number % 12 for number in range(keyframes)])
     graph.match(neighbourhood_edges(1, keyframes, 1))
     check_focal_length(graph)
-    ((problem, state),) = asked
+    ((problem, state, _),) = asked
     used = min(keyframes, 100)
     assert len(state.T_camera_world) == len(state.disparities) == len(problem.free_poses) == used
     assert len(problem.edges_source) == len(problem.targets) == 2 * (used - 1)
