@@ -12,7 +12,7 @@ from minislam.state.stateful import Stateful
 from minislam.tracking.keyframe_selection import mean_flow
 from minislam.tracking.tracker import Mode, Tracker
 
-Worth = tuple[bool, int]  # whether a start has moved enough for depth; frames that it followed
+Worth = tuple[bool, int]  # whether a start can tell depth; the frames that it followed
 
 
 class FirstFrame(Stateful):
@@ -26,35 +26,34 @@ class FirstFrame(Stateful):
         """Return which of `count` frames the tracker shall see next, None after the last."""
         tracked = tracker.tracked
         if tracked and not tracker.initialised and not self.is_repeated:
-            worth, is_over = worth_of_start(tracker), len(tracked) == count
-            last = max(t.frame_index for t in tracked if t.status.is_followed)
-            lost = len(tracked) - 1 - last
-            if lost and (lost >= worth[1] or (is_over and (True, lost) > worth)):
+            start, is_over = tracker.keyframes.frames[0].frame_index, len(tracked) == count
+            followed = [t.frame_index for t in tracked[start:] if t.status.is_followed]
+            worth, lost = (can_tell_depth(tracker), len(followed)), len(tracked) - 1 - followed[-1]
+            if lost and (lost >= len(followed) or (is_over and (True, lost) > worth)):
                 if worth > self.worth:
-                    self.best, self.worth = tracker.keyframes.frames[0].frame_index, worth
-                begin_anew(tracker, last + 1)
+                    self.best, self.worth = start, worth
+                begin_anew(tracker, followed[-1] + 1)
             elif is_over and worth < self.worth:
                 self.is_repeated = True
                 begin_anew(tracker, self.best)
         return len(tracked) if len(tracked) < count else None
 
 
-def worth_of_start(tracker: Tracker) -> Worth:
-    """Return what a warm-up is worth; without a depth prior it must move to measure depth."""
+def can_tell_depth(tracker: Tracker) -> bool:
+    """Tell whether the warm-up knows depth: by a prior, or because enough of it moves."""
     graph = tracker.graph
     seen = [*graph.flow_to_next, *(tracker.last_non_keyframe or ())[1:]]
     least = graph.config.min_parallax * graph.pixel_scale
-    has_moved = any(mean_flow(graph, matches) >= least for matches in seen)
-    followed = sum(frame.status.is_followed for frame in tracker.tracked)
-    return has_moved or graph.keyframes.has_prior, followed
+    return graph.keyframes.has_prior or any(mean_flow(graph, flow) >= least for flow in seen)
 
 
 def begin_anew(tracker: Tracker, first: int) -> None:
     """Forget all keyframes of the warm-up: the frames before `first` are lost, it comes next."""
+    tracked, start = tracker.tracked, tracker.keyframes.frames[0].frame_index
     while len(tracker.keyframes) > 1:
         tracker.graph.remove_newest()
     tracker.keyframes.remove_newest()
     tracker.graph.flow.remove_frame(0)
     tracker.mode, tracker.last_non_keyframe = Mode.WAITING, None
-    before = tracker.tracked[:first]
-    tracker.tracked[:] = [replace(frame, status=TrackingStatus.LOST) for frame in before]
+    del tracked[first:]
+    tracked[start:] = [replace(frame, status=TrackingStatus.LOST) for frame in tracked[start:]]
