@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -125,6 +125,28 @@ class Workers:
         self._helpers = alive
         return results
 
+    def start(self, function: Callable[..., Any], *call: Any) -> Callable[[], Any]:
+        """Begin function(*call) in a helper, as for `map`; return what waits for the result.
+
+        Without a helper, or if that ends or fails, it is computed here when it is asked for.
+        """
+        *kinds, kind = _kinds(function)
+        tidy = [_tidy(k, a) for k, a in zip(kinds, call, strict=True)]
+        results: list[Any] = []
+
+        def ask() -> None:
+            for helper in self._helpers[-1:]:
+                with suppress(EOFError, OSError, ValueError):
+                    results.append(_of_tree(kind, helper.answer(function, tidy)))
+
+        def result() -> Any:
+            thread.join()
+            return results[0] if results else function(*tidy)
+
+        thread = Thread(target=ask, daemon=True)
+        thread.start()
+        return result
+
 
 class _Helper:
     """A process that computes calls, one at a time."""
@@ -136,12 +158,14 @@ class _Helper:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )
         self.runs = True
+        self._lock = Lock()  # while it computes a call
 
     def answer(self, function: Callable[..., Any], arguments: list[Any]) -> Tree:
         """Return function(*arguments) as a tree."""
         try:
-            _send(self._process.stdin, [function.__module__, function.__name__, arguments])
-            return _receive(self._process.stdout)
+            with self._lock:
+                _send(self._process.stdin, [function.__module__, function.__name__, arguments])
+                return _receive(self._process.stdout)
         except (EOFError, OSError, ValueError):
             self.end()
             raise

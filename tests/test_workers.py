@@ -40,6 +40,17 @@ def test_calls_are_shared_and_answered_in_their_order(two):
     assert two.map(prints, []) == []
 
 
+def test_a_call_runs_beside_others_and_is_computed_here_if_it_must(two):
+    begun = time.perf_counter()
+    result = two.start(process_of, 0.3)
+    assert time.perf_counter() - begun < 0.2
+    assert sorted(two.map(prints, [(1,), (2,)])) == [1, 2]  # a busy helper is waited for
+    assert result() != os.getpid()
+    assert Workers().start(process_of, 0.0)() == os.getpid()
+    with Workers(2) as workers, pytest.raises(ZeroDivisionError, match="number 3"):
+        workers.start(fails, 3)()
+
+
 def test_tensors_and_records_come_through_unchanged(two):
     transposed = torch.arange(6.0, dtype=torch.float64).reshape(2, 3).T
     pairs = [

@@ -2,11 +2,14 @@
 
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from minislam.data.animation import write_animation
+from minislam.data.run_folder import CLIP
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.runs.loaded import Run
@@ -71,6 +74,15 @@ def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:
     """Return the images of a short clip beside the input, and how many per second."""
     every = -(-len(run.poses) // CLIP_IMAGES)
     return side_by_side(run, shrunk(run.camera, CLIP_WIDTH), every), frame_rate(run) / every
+
+
+def write_clip(folder: str) -> bool:
+    """Write the clip of a run into its folder; tell whether this OpenCV can."""
+    try:
+        write_animation(Path(folder) / CLIP, *clip(Run(folder)))
+    except InputError:
+        return False
+    return True
 
 
 def shrunk(camera: Camera, width: int) -> Camera:

@@ -11,7 +11,6 @@ import torch
 from minislam.config import SlamConfig, as_json
 from minislam.data import GaussianArrays, RunFolder
 from minislam.data import run_folder as names
-from minislam.data.animation import write_animation
 from minislam.data.files import write_json
 from minislam.data.ply import write_ply
 from minislam.data.trajectory import write_trajectory
@@ -24,8 +23,8 @@ from minislam.priors.networks.published import find_weights
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms
 from minislam.runs.facts import measure, run_facts
-from minislam.runs.flythrough import clip
-from minislam.runs.loaded import Run, scene_of
+from minislam.runs.flythrough import write_clip
+from minislam.runs.loaded import scene_of
 from minislam.runs.pictures import Preview, write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.runs.summary import Line, summarise
@@ -151,11 +150,11 @@ def run_sequence(
         state, exit_code = _ending(slam, interrupted)
         facts = run_facts(slam, choice, checkpoints, state, exit_code)
         _write_estimates(folder, slam)
+        clip_is_written = slam.workers.start(write_clip, str(folder.path))
         metrics = measure(slam, facts["seconds"]["total"], lpips)
         write_json(folder.path / names.METRICS, metrics)
-        with suppress(InputError):  # an OpenCV that writes no WebP
-            write_animation(folder.path / names.CLIP, *clip(Run(folder.path)))
         write_pictures(folder, slam, metrics, facts)
+        clip_is_written()
         write_json(folder.path / names.RUN, facts)
     except (Exception, KeyboardInterrupt) as error:
         state, exit_code = f"failed: {str(error) or repr(error)}", FAILED_EXIT
