@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 from minislam.cli.progress import ending_signals, say
+from minislam.data.files import read_json, write_json, write_text
 from minislam.errors import InputError
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
@@ -40,8 +41,6 @@ def add_bench_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run_bench(args: argparse.Namespace) -> int:
     """Run what is not finished, print and write the tables; return the exit code."""
-    from minislam.data.files import read_json, write_json
-
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
     own.add_argument("-o", "--output", default="output/bench", type=Path)
     given, options = own.parse_known_args(args.options)
@@ -93,8 +92,6 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
 
 def _run(path: Path, folder: Path, options: list[str]) -> tuple[int, str]:
     """Run a sequence, or the rest of it, if it is not finished; return exit code and ATE."""
-    from minislam.data.files import read_json
-
     facts, code = folder / "run.json", 0
     if facts.exists() and str(read_json(facts)["state"]).startswith("finished"):
         code = read_json(facts)["exit_code"]
@@ -126,7 +123,6 @@ def _wait_for(arguments: list[str]) -> int:
 
 def _write_tables(output: Path, ours: dict[str, str]) -> str:
     """Write bench.csv and bench.md; return the latter."""
-    from minislam.data.files import write_text
     from minislam.evaluation.published import compare
 
     text, file = "", io.StringIO()

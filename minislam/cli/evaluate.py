@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from minislam.data.files import atomic_write, write_json
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
@@ -147,8 +148,6 @@ def _save_results(
     alignment: Alignment,
     tables: dict[str, dict[str, float]],
 ) -> None:
-    from minislam.data.files import write_json
-
     write_json(
         args.save_results,
         {
@@ -168,7 +167,6 @@ def _save_results(
 
 
 def _plot(args: argparse.Namespace, result: TrajectoryError) -> None:
-    from minislam.data.files import atomic_write
     from minislam.viz import figure_png, show_figure, trajectory_plot
 
     figure = trajectory_plot(result.estimate, result.truth, unit="m")

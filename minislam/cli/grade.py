@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import minislam
+from minislam.data.files import read_json, write_json, write_text
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,8 +48,6 @@ def add_grade_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run_grade(args: argparse.Namespace) -> int:
     """Grade all notebooks, print and write the points; return the exit code."""
-    from minislam.data.files import write_json, write_text  # needs torch
-
     if args.seed is not None and args.seed < 0:
         raise InputError(f"expected --seed N with N at least 0, found {args.seed}; give another")
     graded = []
@@ -89,7 +88,6 @@ def _show(graded: dict[str, Any]) -> None:
 def _graded(path: Path, seed: int | None, without_package: bool) -> dict[str, Any]:
     """Return the points of one notebook; InputError if it is none of the course."""
     from minislam.checks.submission import exercises_of, parts_of
-    from minislam.data.files import read_json
 
     notebook = read_json(path)
     exercises = exercises_of(notebook, path.name)

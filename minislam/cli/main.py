@@ -107,7 +107,3 @@ def _parser() -> argparse.ArgumentParser:
         command.set_defaults(parser=command)
     parser.set_defaults(commands=commands.choices)
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import minislam
+from minislam.data.files import atomic_write, read_bytes, require_no_file
 from minislam.errors import InputError
 
 SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
@@ -24,8 +25,6 @@ def add_notebooks_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run_notebooks(args: argparse.Namespace) -> int:
     """Copy all notebooks and what they name, never over a file; return the exit code."""
-    from minislam.data.files import atomic_write, read_bytes, require_no_file  # needs torch
-
     # A wheel holds the notebooks inside the package, the repository beside it.
     folder, package = Path(args.folder).expanduser(), Path(minislam.__file__).parent
     sources = [package / "notebooks", package.parent / "notebooks"]

@@ -10,6 +10,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from minislam.cli.help import unknown_option
+from minislam.data.files import read_json
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,14 +73,10 @@ def add_priors(
 
 
 def add_talk(parser: argparse.ArgumentParser) -> None:
-    """Add how much is said."""
+    """Add how much is said, and how many processes share the work."""
     how_much = parser.add_mutually_exclusive_group()
     how_much.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
     how_much.add_argument("-v", "--verbose", action="store_true", help="a line for every step")
-
-
-def add_workers(parser: argparse.ArgumentParser) -> None:
-    """Add how many processes share the work."""
     parser.add_argument(
         "--workers",
         type=int,
@@ -87,13 +84,6 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
         help="processes that share the work, without effect on the result; default: one per idle"
         " core, at most 4; on a GPU 1",
     )
-
-
-def add_lpips(parser: argparse.ArgumentParser) -> None:
-    """Add the files of LPIPS, a measure for which nothing comes with the package."""
-    group = parser.add_argument_group("LPIPS", "measured if both files are given")
-    group.add_argument("--lpips-trunk", metavar="FILE", help="torchvision's AlexNet or VGG-16")
-    group.add_argument("--lpips-heads", metavar="FILE", help="the authors' alex.pth or vgg.pth")
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -136,7 +126,6 @@ def size_of(text: str) -> tuple[int, int]:
 
 def config_file(args: argparse.Namespace) -> dict[str, Any]:
     """Return the file given with --config, or config.json of the run that --resume goes on with."""
-    from minislam.data.files import read_json
 
     if args.config:
         tree = read_json(args.config)
@@ -250,7 +239,6 @@ def resumed_settings(args: argparse.Namespace) -> SlamConfig:
 
 def _with_given(args: argparse.Namespace, base: SlamConfig) -> SlamConfig:
     from minislam.config import settings_in, settings_of, with_settings
-    from minislam.data.files import read_json
 
     if args.config:
         base = with_settings(base, settings_in(read_json(args.config)))

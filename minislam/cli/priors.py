@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from minislam.cli import options
 from minislam.cli.help import add_command
 from minislam.cli.progress import ProgressLine
+from minislam.data.files import atomic_write, read_text, write_text
 from minislam.data.options import require_source
 from minislam.errors import InputError
 from minislam.priors.names import require_priors
@@ -111,7 +112,6 @@ def write_kind(
     """Write one .npy file per frame. Files of an interrupted call are kept and not made again."""
     import numpy as np
 
-    from minislam.data.files import atomic_write
     from minislam.priors.files import index_text
 
     stamps = [(frame.frame_index, frame.timestamp) for frame in sequence]
@@ -128,7 +128,6 @@ def write_kind(
 
 def _claim(folder: Path, index: str) -> None:
     """Make a folder and write its index, unless it holds something else."""
-    from minislam.data.files import read_text, write_text
     from minislam.priors.files import INDEX
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -23,7 +23,6 @@ def add_demo_parser(subparsers: argparse._SubParsersAction) -> None:
     demo = add_command(subparsers, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
     demo.add_argument("-o", "--output", metavar="DIR", help="run folder, output/demo")
     options.add_talk(demo)
-    options.add_workers(demo)
     options.add_settings(demo)
     demo.set_defaults(run=_run, overwrite=True, resume=False, **DEMO)
 
@@ -39,11 +38,12 @@ def add_run_parser(subparsers: argparse._SubParsersAction) -> None:
         "--resume", action="store_true", help="go on with the interrupted run in OUTPUT"
     )
     options.add_talk(run)
-    options.add_workers(run)
     options.add_settings(run)
     options.add_input(run)
     options.add_priors(run, default_depth="simulated for synth:, else none", with_flow=True)
-    options.add_lpips(run)
+    lpips = run.add_argument_group("LPIPS", "measured if both files are given")
+    lpips.add_argument("--lpips-trunk", metavar="FILE", help="torchvision's AlexNet or VGG-16")
+    lpips.add_argument("--lpips-heads", metavar="FILE", help="the authors' alex.pth or vgg.pth")
     run.set_defaults(run=_run)
 
 

@@ -34,9 +34,7 @@ def choose_flow(
 
 
 def choose_features(
-    choice: PriorChoice,
-    camera: Camera,
-    networks: NetworksConfig,
+    choice: PriorChoice, camera: Camera, networks: NetworksConfig
 ) -> FeatureExtractor:
     """Return the features: classical, a network, a plugin, or files:FOLDER."""
     makers: dict[str, Callable[[], Any]] = {

@@ -38,11 +38,8 @@ def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: in
     """Return the dense flow (H, W, 2) that interpolates grid target positions (h, w, 2) [px]."""
     cells = np.mgrid[: grid_targets.shape[0], : grid_targets.shape[1]].astype(np.float32)
     grid_flow = grid_targets - stride * np.stack([cells[1], cells[0]], -1)
-    column, row = np.meshgrid(
-        np.arange(shape[1], dtype=np.float32) / stride,
-        np.arange(shape[0], dtype=np.float32) / stride,
-    )
-    return sample(grid_flow, column, row)
+    column, row = pixel_maps(shape)
+    return sample(grid_flow, column / stride, row / stride)
 
 
 def residual_flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:

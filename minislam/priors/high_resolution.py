@@ -33,10 +33,7 @@ class HighResolutionFeatures:
         self.dimension = extractor.dimension
         self.stride = max(1, round(extractor.stride / factor))
 
-    def __call__(
-        self,
-        frame: Frame,
-    ) -> Tensor:  # (factor * h', factor * w', C)
+    def __call__(self, frame: Frame) -> Tensor:  # (factor * h', factor * w', C)
         """Return the features of a frame on the finer grid."""
         # A patch is cut into factor x factor parts; the shifts [patches] lead to their centres.
         shifts = [(part + 0.5) / self.factor - 0.5 for part in range(self.factor)]

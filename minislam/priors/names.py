@@ -34,11 +34,14 @@ class PriorChoice:
         """Refuse a device that is not there, and a precision that it has not."""
         if self.device not in ("cpu", "cuda"):
             raise InputError(f"expected --device cpu or cuda, found {self.device!r}; choose one")
-        if self.device == "cuda" and not _has_gpu():
-            raise InputError(
-                "expected a GPU that this torch can use for --device cuda, found none; say "
-                "--device cpu, or make the priors elsewhere with minislam priors"
-            )
+        if self.device == "cuda":
+            import torch  # only where a GPU is asked for
+
+            if not torch.cuda.is_available():
+                raise InputError(
+                    "expected a GPU that this torch can use for --device cuda, found none; say "
+                    "--device cpu, or make the priors elsewhere with minislam priors"
+                )
         usable = [name for name in PRECISIONS if (self.device, name) != ("cpu", "fp16")]
         if self.precision not in usable:
             raise InputError(
@@ -98,9 +101,3 @@ def require_priors(choice: PriorChoice) -> None:
     """Refuse a choice with a name that is unknown or with weights that are missing."""
     for kind in BUILT_IN:
         require_prior(kind, getattr(choice, kind), getattr(choice, f"{kind}_weights"))
-
-
-def _has_gpu() -> bool:
-    import torch  # only where a GPU is asked for
-
-    return torch.cuda.is_available()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from minislam import viz
 from minislam.config import PRESETS, SlamConfig, preset, settings_of
 from minislam.data import RunFolder
 from minislam.data.files import write_text
@@ -23,22 +24,6 @@ from minislam.runs.summary import summarise
 from minislam.slam import Slam
 from minislam.state.steps import Observer
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
-from minislam.viz import (
-    Report,
-    ate_over_time,
-    beta_limits,
-    beta_to_rgb,
-    build_report,
-    build_viewer,
-    depth_limits,
-    depth_to_rgb,
-    figure_png,
-    keyframe_health,
-    loss_curves,
-    map_growth,
-    overview,
-    trajectory_plot,
-)
 
 MAX_SHOWN = 150  # keyframes in report and viewer, evenly spread: 40 kB each
 LONGEST_SIDE = 320  # px of their pictures there
@@ -78,10 +63,10 @@ class Preview:
             newest = len(slam.mapper.keyframes) - 1
             keyframe = slam.mapper.keyframes[newest]
             color = slam.mapper.render(keyframe.T_camera_world).color.cpu().numpy()
-            strip = [keyframe.image.cpu().numpy(), beta_to_rgb(slam.beta_image(newest)), color]
+            strip = [keyframe.image.cpu().numpy(), viz.beta_to_rgb(slam.beta_image(newest)), color]
             jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
             page = replace(_known(self._folder, slam, {}, facts), overview=jpeg)
-            write_text(self._folder.path / REPORT, build_report(page))
+            write_text(self._folder.path / REPORT, viz.build_report(page))
 
 
 def write_pictures(
@@ -95,28 +80,28 @@ def write_pictures(
     if metrics["ate_all_cm"] is not None and truth is not None and truth.trajectory is not None:
         error = absolute_trajectory_error(estimate, truth.trajectory, max_difference=MAX_DIFFERENCE)
         estimate, true_path, unit = error.estimate, error.truth, "m"
-        over_time = figure_png(ate_over_time(estimate.timestamps, error.errors, unit))
+        over_time = viz.figure_png(viz.ate_over_time(estimate.timestamps, error.errors, unit))
         plots["ate_over_time"] = "Error of the camera's position over time", over_time
-    path = figure_png(trajectory_plot(estimate, true_path, unit))
+    path = viz.figure_png(viz.trajectory_plot(estimate, true_path, unit))
     plots["trajectory"] = "Path of the camera, from above and from behind", path
     history = slam.mapper.history
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
-    plots["losses"] = "Losses while the map was optimised", figure_png(loss_curves(curves))
-    plots["gaussians"] = "Size of the map", figure_png(map_growth(history.gaussians))
+    plots["losses"] = "Losses while the map was optimised", viz.figure_png(viz.loss_curves(curves))
+    plots["gaussians"] = "Size of the map", viz.figure_png(viz.map_growth(history.gaussians))
 
     of_depth, of_beta = _colour_limits(slam)
     jpegs = _write_keyframes(folder, slam, of_depth, of_beta)
     middle = len(slam.mapper.keyframes) // 2
     keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
     color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).cpu().numpy()
-    picture = overview(keyframe.image.cpu().numpy(), beta, color, estimate, true_path, unit)
-    folder.write_plot("overview", png := figure_png(picture))
+    picture = viz.overview(keyframe.image.cpu().numpy(), beta, color, estimate, true_path, unit)
+    folder.write_plot("overview", png := viz.figure_png(picture))
     for name, (_, plot) in plots.items():
         folder.write_plot(name, plot)
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
-    write_text(folder.path / VIEWER, build_viewer(f"minislam: {run.name}", *scene))
+    write_text(folder.path / VIEWER, viz.build_viewer(f"minislam: {run.name}", *scene))
     page = replace(
         _known(folder, slam, metrics, facts),
         overview=png,
@@ -126,16 +111,16 @@ def write_pictures(
         unit=facts["unit"],
         figures=list(plots.values()),
     )
-    write_text(folder.path / REPORT, build_report(page))
+    write_text(folder.path / REPORT, viz.build_report(page))
 
 
 def _known(
     folder: RunFolder, slam: Slam, metrics: dict[str, float | None], facts: dict[str, Any]
-) -> Report:
+) -> viz.Report:
     """Return a report without pictures."""
     program, *arguments = facts["command"]
     by_hand = Path(program).stem in ("minislam", "__main__")  # or else by a program of the user
-    return Report(
+    return viz.Report(
         title=f"minislam: {slam.sequence.name}",
         folder=shlex.quote(str(folder.path)),
         state=facts["state"],
@@ -162,14 +147,14 @@ def named_settings(config: SlamConfig) -> str:
 
 def _health(slam: Slam) -> bytes:
     diagnostics = slam.tracker.watch.diagnostics
-    figure = keyframe_health(
+    figure = viz.keyframe_health(
         [keyframe.frame_index for keyframe in diagnostics],
         [keyframe.explained for keyframe in diagnostics],
         MIN_EXPLAINED_LONG,
         [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
         [index for index, _, _ in slam.lost_frames()],
     )
-    return figure_png(figure)
+    return viz.figure_png(figure)
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -184,7 +169,7 @@ def _colour_limits(slam: Slam) -> tuple[tuple[float, float], tuple[float, float]
         rendering = slam.mapper.render(slam.mapper.keyframes[index].T_camera_world)
         depths.append(surface_depth(rendering).cpu().numpy())
         betas.append(slam.beta_image(index))
-    return depth_limits(np.array(depths)), beta_limits(np.array(betas))
+    return viz.depth_limits(np.array(depths)), viz.beta_limits(np.array(betas))
 
 
 def _write_keyframes(
@@ -200,8 +185,8 @@ def _write_keyframes(
         rendering = slam.mapper.render(keyframe.T_camera_world)
         pictures = {
             "input": keyframe.image.cpu().numpy(),
-            "depth": depth_to_rgb(surface_depth(rendering).cpu().numpy(), of_depth),
-            "beta": beta_to_rgb(slam.beta_image(index), of_beta),
+            "depth": viz.depth_to_rgb(surface_depth(rendering).cpu().numpy(), of_depth),
+            "beta": viz.beta_to_rgb(slam.beta_image(index), of_beta),
             "render": rendering.color.clamp(0, 1).cpu().numpy(),
         }
         for kind, picture in pictures.items():

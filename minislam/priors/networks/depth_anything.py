@@ -97,11 +97,6 @@ class DepthAnything:
         depth_limit: float,  # metre, of the training data: INDOOR_LIMIT or OUTDOOR_LIMIT
         shorter_side: int = SHORTER_SIDE,
     ) -> None:
-        if not depth_limit > 0:
-            raise InputError(
-                f"expected the largest depth of the training in metres, found {depth_limit}; "
-                f"give {INDOOR_LIMIT} for a Hypersim and {OUTDOOR_LIMIT} for a KITTI checkpoint"
-            )
         self.depth_limit = depth_limit
         self.shorter_side = shorter_side
         self.device = weights.device

@@ -26,10 +26,7 @@ class DinoFeatures:
         self._transformer = VisionTransformer(weights, is_antialiased(weights))
         self.dimension = self._transformer.width
 
-    def __call__(
-        self,
-        frame: Frame,
-    ) -> Tensor:  # (H // 14, W // 14, C) float32
+    def __call__(self, frame: Frame) -> Tensor:  # (H // 14, W // 14, C) float32
         """Return one feature per patch of 14 px; the image is stretched to whole patches."""
         image = frame.image
         rows, cols = grid_size(image, PATCH)

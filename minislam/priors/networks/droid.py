@@ -13,27 +13,17 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.parameters import parameter
 from minislam.priors.interfaces import FlowMatches
+from minislam.priors.networks import droid_network as net
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.droid_network import (
-    LEVELS,
-    STRIDE,
-    cell_grid,
-    correlation_pyramid,
-    damping,
-    encode_context,
-    encode_features,
-    look_up,
-    update,
-)
 from minislam.priors.networks.vit import normalise
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 
-_SMALLEST_GRID = 2 ** (LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
+_SMALLEST_GRID = 2 ** (net.LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
 # Least confidence of a matched cell, relative to the mean of its edge: the network learned to weigh
 # cells against each other in a bundle adjustment, so their ratios have a meaning. [-]
 _MATCHED = 0.1
 # The official code adds 0.2 eta to squared cells times 0.001 of the confidence; here it is px^2.
-_DAMPING = 0.2 * STRIDE**2 / 0.001
+_DAMPING = 0.2 * net.STRIDE**2 / 0.001
 
 
 @dataclass(frozen=True)
@@ -41,9 +31,7 @@ class DroidFlowConfig:
     """How much work the network is given."""
 
     chain_updates: int = parameter(
-        3,
-        "updates per frame, from the last frame's flow; 1: from the identity, official code",
-        1,
+        3, "updates per frame, from the last frame's flow; 1: from the identity, official code", 1
     )
     kept_edges: int = parameter(75, "edges, those used last, that keep their hidden states", 1)
     edges_per_batch: int = parameter(8, "edges in one pass, bounds the memory of correlations", 1)
@@ -62,19 +50,19 @@ class EncodedFrame:
         self.image = image  # (H, W, 3)
         self._weights, self._normalised = weights, normalise(image, weights.device)
         with weights.autocast():
-            self.features = encode_features(weights, self._normalised)  # (1, 128, h, w)
+            self.features = net.encode_features(weights, self._normalised)  # (1, 128, h, w)
 
     @cached_property
     def context(self) -> tuple[Tensor, Tensor]:  # (1, 128, h, w) twice
         """Return the first hidden state and the context of all updates."""
         with self._weights.autocast():
-            return encode_context(self._weights, self._normalised)
+            return net.encode_context(self._weights, self._normalised)
 
 
 class DroidFlow(Stateful):
     """Learned flow between registered keyframes, refined around a predicted reprojection."""
 
-    stride = STRIDE
+    stride = net.STRIDE
     learned_confidence = True
 
     def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
@@ -88,9 +76,9 @@ class DroidFlow(Stateful):
     @torch.no_grad()
     def encode(self, image: Tensor) -> EncodedFrame:
         """Return an image (H, W, 3) encoded; chain and keyframe share the newest one."""
-        if min(image.shape[:2]) <= STRIDE * (_SMALLEST_GRID - 1):
+        if min(image.shape[:2]) <= net.STRIDE * (_SMALLEST_GRID - 1):
             raise InputError(
-                f"expected images of more than {STRIDE * (_SMALLEST_GRID - 1)} px per side for "
+                f"expected images of more than {net.STRIDE * (_SMALLEST_GRID - 1)} px per side for "
                 f"DROID, found {image.shape[1]}x{image.shape[0]}; give a larger working size"
             )
         if self._newest is None or not torch.equal(self._newest.image, image):
@@ -127,7 +115,7 @@ class DroidFlow(Stateful):
         """Update the flow of these edges once; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
         height, width = self._frames[edges_source[0]].features.shape[2:]
-        expected = predicted_targets.to(self.weights.device, torch.float32) / STRIDE
+        expected = predicted_targets.to(self.weights.device, torch.float32) / net.STRIDE
         expected = expected.mT.reshape(-1, height, width, 2)
         states: dict[tuple[int, int], _EdgeState] = {}
         confidences = []
@@ -181,8 +169,6 @@ class DroidFlow(Stateful):
         reference, newest = (self.encode(image) for image in state["_images"])
         return DroidChain(self, reference, newest, state["_target"])
 
-    # The network --------------------------------------------------------------------------------
-
     def update(
         self,
         source: Tensor,  # (E, 128, h, w) features
@@ -194,14 +180,14 @@ class DroidFlow(Stateful):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Update edges once; return hidden states, targets [cells] and confidences."""
         with self.weights.autocast():
-            correlation = look_up(correlation_pyramid(source, target), expected)
-            answer = update(self.weights, hidden, context, correlation, expected, last_target)
+            correlation = net.look_up(net.correlation_pyramid(source, target), expected)
+            answer = net.update(self.weights, hidden, context, correlation, expected, last_target)
         return answer.hidden.float(), expected + answer.revision, answer.confidence.float()
 
     def damping(self, hidden: Tensor) -> Tensor:  # (E, 128, h, w) of one source -> (h, w)
         """Return how much the network would damp the disparities of a source."""
         with self.weights.autocast():
-            return damping(self.weights, hidden).float()
+            return net.damping(self.weights, hidden).float()
 
 
 class DroidChain(Stateful):
@@ -211,11 +197,7 @@ class DroidChain(Stateful):
     _target: Tensor | None  # (1, h, w, 2) cells, None: nothing has moved yet
 
     def __init__(
-        self,
-        flow: DroidFlow,
-        reference: EncodedFrame,
-        newest: EncodedFrame,
-        target: Tensor | None,
+        self, flow: DroidFlow, reference: EncodedFrame, newest: EncodedFrame, target: Tensor | None
     ) -> None:
         self._flow, self._reference, self._newest = flow, reference, newest
         self._images = [reference.image, newest.image]
@@ -228,7 +210,7 @@ class DroidChain(Stateful):
         hidden, context = reference.context
         target, updates = self._target, flow.config.chain_updates
         if target is None or updates == 1:
-            target = cell_grid(hidden.new_zeros(1, *hidden.shape[2:], 2))[None]
+            target = net.cell_grid(hidden.new_zeros(1, *hidden.shape[2:], 2))[None]
         for _ in range(updates):
             # Without geometry, the last answer is the best guess.
             hidden, target, confidence = flow.update(
@@ -249,13 +231,13 @@ def as_matches(targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatche
     matched = inside & (of_cells >= _MATCHED * of_cells.mean((1, 2), keepdim=True))
     ratios = matched.float().mean((1, 2))
     targets, confidences = (x.flatten(1, 2).mT.contiguous() for x in (targets, confidences))
-    return FlowMatches(*(x.to(like) for x in (STRIDE * targets, confidences, ratios)))
+    return FlowMatches(*(x.to(like) for x in (net.STRIDE * targets, confidences, ratios)))
 
 
 def build_droid(weights: Weights, config: DroidFlowConfig) -> DroidFlow:
     """Return the flow after one run on a tiny image, which asks for every tensor it needs."""
     flow = DroidFlow(weights, config)
-    tiny = torch.zeros(STRIDE * _SMALLEST_GRID, STRIDE * _SMALLEST_GRID, 3)
+    tiny = torch.zeros(net.STRIDE * _SMALLEST_GRID, net.STRIDE * _SMALLEST_GRID, 3)
     flow.add_frame(0, tiny)
     flow.match([0], [0], torch.zeros(1, 2, _SMALLEST_GRID**2))
     return DroidFlow(weights, config)
