@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from minislam.cli.help import unknown_option
@@ -200,7 +201,7 @@ def _converted(value: Any, kind: type) -> Any:
 
 
 def lpips_of(args: argparse.Namespace) -> Lpips | None:
-    """Return the measure whose files were given."""
+    """Return the measure whose files were given, as paths or by their names in the list."""
     trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
     if trunk is None and heads is None:
         return None
@@ -209,9 +210,12 @@ def lpips_of(args: argparse.Namespace) -> Lpips | None:
         raise InputError(
             f"expected --lpips-{missing} FILE with --lpips-{given}, found none; give both or none"
         )
-    from minislam.runs.run import load_lpips
+    from minislam.evaluation.lpips import Lpips
+    from minislam.priors.networks.checkpoints import load_checkpoint
+    from minislam.priors.networks.published import find_weights
 
-    return load_lpips(trunk, heads)
+    files = find_weights("--lpips-trunk", trunk), find_weights("--lpips-heads", heads)
+    return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in files))
 
 
 def settings(args: argparse.Namespace) -> SlamConfig:

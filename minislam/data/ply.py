@@ -57,6 +57,7 @@ def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
     coefficients above are zeros.
     """
     _validate(gaussians, "the map")
+    quats = gaussians.quats_wxyz.astype(np.float64)
     zeros = np.zeros((len(gaussians), 3 * ((sh_degree + 1) ** 2 - 1)))
     before, after = PROPERTIES[:9], PROPERTIES[9:]
     names = [*before, *(f"f_rest_{index}" for index in range(zeros.shape[1])), *after]
@@ -68,7 +69,7 @@ def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
         zeros,
         gaussians.opacity_logits[:, None],
         gaussians.log_scales,
-        _normalised(gaussians.quats_wxyz),
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
     ]
     table = np.concatenate([column.astype("<f4") for column in columns], axis=1)
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
@@ -160,8 +161,3 @@ def _validate(gaussians: GaussianArrays, name: str) -> None:
         raise InputError(
             f"expected quaternions other than zero in {name}, found a zero one; it is no rotation"
         )
-
-
-def _normalised(quats_wxyz: np.ndarray) -> np.ndarray:
-    quats_wxyz = quats_wxyz.astype(np.float64)
-    return quats_wxyz / np.linalg.norm(quats_wxyz, axis=1, keepdims=True)

@@ -75,10 +75,7 @@ def relative_pose_error(
         for poses in (truth.T_world_camera, estimate.T_world_camera)
     )
     error = np.linalg.inv(true_motion) @ motion
-    # Half the norm of vee(R - R^T) is sin(angle): with the trace it keeps small angles exact.
-    skew = error[:, [2, 0, 1], [1, 2, 0]] - error[:, [1, 2, 0], [2, 0, 1]]
-    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    angles = np.arctan2(np.linalg.norm(skew, axis=1) / 2, cosine)
+    angles = Rotation.from_matrix(error[:, :3, :3]).magnitude()
     return np.linalg.norm(error[:, :3, 3], axis=1), angles
 
 

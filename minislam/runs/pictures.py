@@ -24,6 +24,7 @@ from minislam.runs.summary import summarise
 from minislam.slam import Slam
 from minislam.state.steps import Observer
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
+from minislam.viz import figure_png
 
 MAX_SHOWN = 150  # keyframes in report and viewer, evenly spread: 40 kB each
 LONGEST_SIDE = 320  # px of their pictures there
@@ -80,14 +81,14 @@ def write_pictures(
     if metrics["ate_all_cm"] is not None and truth is not None and truth.trajectory is not None:
         error = absolute_trajectory_error(estimate, truth.trajectory, max_difference=MAX_DIFFERENCE)
         estimate, true_path, unit = error.estimate, error.truth, "m"
-        over_time = viz.figure_png(viz.ate_over_time(estimate.timestamps, error.errors, unit))
+        over_time = figure_png(viz.ate_over_time(estimate.timestamps, error.errors, unit))
         plots["ate_over_time"] = "Error of the camera's position over time", over_time
-    path = viz.figure_png(viz.trajectory_plot(estimate, true_path, unit))
+    path = figure_png(viz.trajectory_plot(estimate, true_path, unit))
     plots["trajectory"] = "Path of the camera, from above and from behind", path
     history = slam.mapper.history
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
-    plots["losses"] = "Losses while the map was optimised", viz.figure_png(viz.loss_curves(curves))
-    plots["gaussians"] = "Size of the map", viz.figure_png(viz.map_growth(history.gaussians))
+    plots["losses"] = "Losses while the map was optimised", figure_png(viz.loss_curves(curves))
+    plots["gaussians"] = "Size of the map", figure_png(viz.map_growth(history.gaussians))
 
     of_depth, of_beta = _colour_limits(slam)
     jpegs = _write_keyframes(folder, slam, of_depth, of_beta)
@@ -95,7 +96,7 @@ def write_pictures(
     keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
     color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).cpu().numpy()
     picture = viz.overview(keyframe.image.cpu().numpy(), beta, color, estimate, true_path, unit)
-    folder.write_plot("overview", png := viz.figure_png(picture))
+    folder.write_plot("overview", png := figure_png(picture))
     for name, (_, plot) in plots.items():
         folder.write_plot(name, plot)
     run = Run(folder.path)
@@ -154,7 +155,7 @@ def _health(slam: Slam) -> bytes:
         [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
         [index for index, _, _ in slam.lost_frames()],
     )
-    return viz.figure_png(figure)
+    return figure_png(figure)
 
 
 def _spread(count: int, most: int) -> list[int]:

@@ -18,8 +18,6 @@ from minislam.errors import InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
-from minislam.priors.networks.checkpoints import load_checkpoint
-from minislam.priors.networks.published import find_weights
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms
 from minislam.runs.facts import measure, run_facts
@@ -59,12 +57,6 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
         choose_features(choice, sequence.camera, networks),
         choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
-
-
-def load_lpips(trunk: Path | str, heads: Path | str) -> Lpips:
-    """Read the two files of LPIPS, given as paths or by their names in the list of weights."""
-    found = find_weights("--lpips-trunk", str(trunk)), find_weights("--lpips-heads", str(heads))
-    return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in found))
 
 
 def default_output(sequence: Sequence) -> str:

@@ -85,8 +85,3 @@ def test_the_limit_follows_from_the_official_name():
 def test_a_relative_checkpoint_is_refused_by_its_name():
     with pytest.raises(InputError, match=r"found depth_anything_v2_vits\.pth, whose output may"):
         build_depth_anything(weights(), DepthAnythingConfig())
-
-
-def test_a_limit_that_is_not_positive_is_refused():
-    with pytest.raises(InputError, match=r"largest depth .* found 0; give 20\.0"):
-        DepthAnything(weights(), 0)

@@ -134,7 +134,7 @@ def test_an_image_is_encoded_once_and_its_context_only_as_a_source(
 
     calls: list[str] = []
     for name in ("encode_features", "encode_context"):
-        monkeypatch.setattr(droid, name, counted(name, getattr(droid, name)))
+        monkeypatch.setattr(droid.net, name, counted(name, getattr(droid.net, name)))
     flow, images = DroidFlow(weights()), [image(frame) for frame in range(3)]
     chain = flow.start_chain(images[0])
     flow.add_frame(0, images[0])
