@@ -219,31 +219,19 @@ def lpips_of(args: argparse.Namespace) -> Lpips | None:
 
 
 def settings(args: argparse.Namespace) -> SlamConfig:
-    """Return the settings: the preset, over it the file of --config, over both single flags."""
-    from minislam.config import preset
+    """Return the settings: the preset, over it the file of --config, over both single flags.
 
-    return _with_given(args, preset("laptop" if args.preset is None else args.preset))
+    With --resume, those of the interrupted run stand for the preset if none is given; a run that
+    its checkpoint does not belong to is refused by `Checkpoints.restore`.
+    """
+    from minislam.config import from_json, preset, settings_in, settings_of, with_settings
 
+    if getattr(args, "resume", False) and args.preset is None:
+        from minislam.data import RunFolder
 
-def resumed_settings(args: argparse.Namespace) -> SlamConfig:
-    """Return the settings of an interrupted run, which the options must not contradict."""
-    from minislam.config import from_json, preset, settings_of
-    from minislam.data import RunFolder
-
-    then = from_json(RunFolder(args.output).read_config())
-    now = settings_of(_with_given(args, then if args.preset is None else preset(args.preset)))
-    for name, value in settings_of(then).items():
-        if now[name] != value:
-            raise InputError(
-                f"expected {name} = {value} like the interrupted run in {args.output}, found "
-                f"{now[name]}; leave the settings out, or start anew in another folder"
-            )
-    return then
-
-
-def _with_given(args: argparse.Namespace, base: SlamConfig) -> SlamConfig:
-    from minislam.config import settings_in, settings_of, with_settings
-
+        base = from_json(RunFolder(args.output).read_config())
+    else:
+        base = preset("laptop" if args.preset is None else args.preset)
     if args.config:
         base = with_settings(base, settings_in(read_json(args.config)))
     known, given = settings_of(base), dict(args.settings)

@@ -69,8 +69,8 @@ def _run_recorded(args: argparse.Namespace, log: Log) -> int:
     from minislam.runs.run import default_output, run_in_folder
     from minislam.runs.summary import as_text
 
-    config = options.resumed_settings(args) if args.resume else options.settings(args)
-    lpips, progress = options.lpips_of(args), ProgressLine(args.quiet, args.verbose)
+    config, lpips = options.settings(args), options.lpips_of(args)
+    progress = ProgressLine(args.quiet, args.verbose)
     sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
     if lpips is not None:
         lpips.require_size(sequence.camera.width, sequence.camera.height)

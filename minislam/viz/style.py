@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from minislam.errors import InputError
 
-WIDE, STRIP = (9.0, 3.0), (9.0, 2.0)  # inch
+WIDE = 9.0, 3.0  # inch
 
 # The truth is drawn on top of the estimate.
 TRUTH_STYLE: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.2, "zorder": 3}
