@@ -200,10 +200,7 @@ REFUSALS = [
     ([*INPUT, "--fx", "99"], "expected sequence.description = .* found .*given"),
     ([*INPUT, "--focal", "refine"], "found .* to be refined"),
     ([*INPUT, "--depth", "none"], "expected priors.depth = simulated .* found none"),
-    (
-        [*INPUT, "--tracking.window", "3"],
-        "settings.tracking.window = 10 .* found 3; repeat",
-    ),
+    ([*INPUT, "--tracking.window", "3"], "settings.tracking.window = 10 .* found 3; repeat"),
     ([*INPUT, "--seed", "7"], "expected settings.seed = 0 .* found 7"),
     ([*INPUT, "--preset", "laptop"], "settings.tracking.warmup_keyframes = 6 .* found 12"),
     ([*INPUT, "--no-uncertainty"], "expected settings.uncertainty.enabled = True .* found False"),
