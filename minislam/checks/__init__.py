@@ -14,18 +14,23 @@ from minislam.checks.bundle_adjustment import (
     check_schur_step,
     check_target_jacobian,
 )
+from minislam.checks.cases import Case
 from minislam.checks.geometry import check_reproject, check_resized_intrinsics, check_warped_photo
 from minislam.checks.grading import (
     NOT_YET,
     PASSED,
     WRONG,
-    Case,
     Verdict,
     check_function,
     is_written,
 )
-from minislam.checks.growing import check_followed_pose, check_insertion, check_map_loss
-from minislam.checks.mapping import check_deformed_means, check_sampling
+from minislam.checks.mapping import (
+    check_deformed_means,
+    check_followed_pose,
+    check_insertion,
+    check_map_loss,
+    check_sampling,
+)
 from minislam.checks.real_video import check_gains, check_stride
 from minislam.checks.slam import (
     check_alignment,
@@ -34,16 +39,13 @@ from minislam.checks.slam import (
     check_sign_test,
 )
 from minislam.checks.splatting import (
+    check_conic_vjp,
+    check_picture_gradient,
     check_pixel_color,
     check_projected_covariance,
     check_rendered_image,
-)
-from minislam.checks.splatting_gradients import (
-    check_conic_vjp,
-    check_picture_gradient,
     check_twist_vjp,
 )
-from minislam.checks.start_here import check_mapping_weight
 from minislam.checks.stereo import check_plane_cost, check_plane_homography
 from minislam.checks.tracking import (
     check_bounded_loss,
@@ -52,7 +54,12 @@ from minislam.checks.tracking import (
     check_motion_memory,
     check_suppressed,
 )
-from minislam.checks.uncertainty import check_best_beta, check_feature_variance, check_training
+from minislam.checks.uncertainty import (
+    check_best_beta,
+    check_feature_variance,
+    check_mapping_weight,
+    check_training,
+)
 from minislam.priors.conformance import (
     check_depth_prior,
     check_feature_extractor,

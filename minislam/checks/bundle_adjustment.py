@@ -1,13 +1,13 @@
 """Exercises of notebooks 05 and 05b."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
+from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normals
+from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.disparity_prior import DepthView, depth_consistency
@@ -22,33 +22,27 @@ from minislam.tracking.reprojection import (
 from minislam.tracking.safeguards.robust import RobustKernel
 
 
-def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -> Verdict:
+def check_target_jacobian(student: Function) -> Verdict:
     """Check (points X (N, 3), disparities (N,), camera) -> dp / d(rho, phi) (N, 2, 6) in px."""
     rays = CAMERA.rays(doubles([0.0, 0.0], [100.0, 52.0], [60.5, 10.25]))
-    motion = se3_exp(doubles([0.1, -0.2, 0.3, 0.1, 0.2, -0.1]))
 
-    def reference(
-        points: Tensor, disparities: Tensor, camera: Camera, *, slide: Any = 1, turn: Any = 1
-    ) -> Tensor:
+    def reference(*view: Any, slide: Any = 1, turn: Any = 1) -> Tensor:
+        points, disparities, camera = view
         # A camera that stands still sees each cell where its ray points: X = ray of the cell.
         still, ratio = torch.eye(4, dtype=points.dtype)[None], disparities / points[:, 2]
         seen = reproject_with_jacobians(still, ratio[None], points / points[:, 2:], camera)
         J = seen.J_target[0].permute(2, 1, 0)
         return torch.cat([slide * J[..., :3], turn * J[..., 3:]], -1)
 
-    def case(disparities: Tensor, description: str, motion: Tensor = motion) -> Case:
-        points = scaled_points(motion, disparities[None], rays)[0].T
+    def case(disparities: Tensor, description: str, seed: int = 0) -> Case:
+        points = scaled_points(any_pose(seed)[None], disparities[None], rays)[0].T
         return Case((points, disparities, CAMERA), description)
-
-    def draw(seed: int) -> Case:
-        xi = 0.1 * normals(seed, 1, 6).clamp(-2, 2)
-        return case(normals(seed, 3).abs(), "another motion", se3_exp(xi))
 
     cases = [
         case(doubles(1.0, 1.0, 1.0), "disparities of 1"),
         case(doubles(0.5, 0.25, 0.8), "any disparities"),
         case(doubles(0.0, 0.0, 0.0), "points at infinity"),
-        *drawn(draw),
+        *drawn(lambda seed: case(normals(seed, 3).abs(), "another motion", seed)),
     ]
     hints = [
         (lambda X, d, c: reference(X, d**0, c), "X is d times the point: it moves by d rho."),
@@ -56,8 +50,8 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
         (lambda *a: -reference(*a), "This is the derivative of the residual p~ - p."),
         (lambda *a: reference(*a).roll(3, -1), "The order is (rho, phi), translation first."),
         (
-            lambda *a: reference(*a, turn=a[1][:, None, None]),
-            "A rotation moves X by phi x X: no d.",
+            lambda X, d, c: reference(X, d, c, turn=d[:, None, None]),
+            "A turn moves X by phi x X: no d.",
         ),
         (lambda *a: reference(*a, turn=0), "The rotation is missing: columns 3 to 5."),
         (lambda *a: reference(*a, slide=0), "The translation is missing: columns 0 to 2."),
@@ -65,7 +59,7 @@ def check_target_jacobian(student: Callable[[Tensor, Tensor, Camera], Tensor]) -
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_schur_step(student: Callable[..., tuple[Tensor, Tensor]]) -> Verdict:
+def check_schur_step(student: Function) -> Verdict:
     """Check (H, E, diagonal of C, g, s) -> the steps of the poses and of the disparities."""
 
     def solved(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor, flaw: str = "") -> Any:
@@ -101,16 +95,13 @@ def check_schur_step(student: Callable[..., tuple[Tensor, Tensor]]) -> Verdict:
     return check_function(student, solved, cases, 1e-9, hints, flaws, ("xi", "delta"))
 
 
-def check_bundle_adjustment(
-    student: Callable[[BundleProblem, BundleState, int, float], BundleState],
-) -> Verdict:
+def check_bundle_adjustment(student: Function) -> Verdict:
     """Check (problem, state, steps, damping) -> the state after so many Gauss-Newton steps."""
     rays = CAMERA.rays(CAMERA.pixel_grid(25, torch.float64).flatten(0, 1))
     source, target = (1 - torch.eye(3)).nonzero().T
 
-    def loop(
-        problem: BundleProblem, state: BundleState, steps: int, damping: float, flaw: str = ""
-    ) -> tuple[Tensor, Tensor]:
+    def loop(*start: Any, flaw: str = "") -> tuple[Tensor, Tensor]:
+        problem, state, steps, damping = start
         weights = problem.weights ** (flaw != "weights")
         free = problem.free_poses | (flaw == "held")
         problem = replace(problem, weights=weights, free_poses=free)
@@ -127,33 +118,32 @@ def check_bundle_adjustment(
 
     def answered(*arguments: Any) -> Any:
         state = student(*arguments)
-        is_state = isinstance(state, BundleState)
-        return (state.T_camera_world, state.disparities) if is_state else state
+        if isinstance(state, BundleState):
+            return state.T_camera_world, state.disparities
+        return state
 
     def case(steps: int, held: int, weights: Tensor, description: str, seed: int = 1) -> Case:
         xi, start, noise, scatter = normals(seed, 4, 3, len(rays)).clamp(-2, 2)
         truth = BundleState(se3_exp(0.1 * xi[:, :6]), 0.5 + 0.1 * scatter.abs())
         motion = relative_transforms(truth.T_camera_world, source, target)
         flow = reproject(motion, truth.disparities[source], rays, CAMERA)[0] + noise[:2, :]
-        none, keyframe = torch.zeros_like(scatter), torch.arange(3)
-        edges = source, target, flow, weights
-        free = keyframe >= held, keyframe >= 0
+        none, number = torch.zeros_like(scatter), torch.arange(3)
+        edges, free = (source, target, flow, weights), (number >= held, number >= 0)
         problem = BundleProblem(CAMERA, rays, *edges, none, none, *free)
         nudged = se3_exp(0.02 * start[:, :6]) @ truth.T_camera_world
         return Case((problem, BundleState(nudged, none + 0.5), steps, 10.0), description)
 
-    def draw(seed: int) -> Case:
-        return case(1 + seed % 2, 1, normals(seed, 6, 2, len(rays)).abs(), "drawn weights", seed)
+    def some(seed: int) -> Tensor:
+        return normals(seed, 6, 2, len(rays)).abs()
 
     ones = torch.ones(6, 2, len(rays)).double()
     hidden = ones * (torch.arange(len(rays)) > 1)
-    some = normals(5, 6, 2, len(rays)).abs()
     cases = [
         case(1, 1, ones, "one step and weights of 1"),
-        case(1, 2, some, "one step, two poses held, weights that differ"),
+        case(1, 2, some(5), "one step, two poses held, weights that differ"),
         case(1, 1, hidden, "two cells that no other view sees"),
-        case(3, 2, some, "three steps"),
-        *drawn(draw),
+        case(3, 2, some(5), "three steps"),
+        *drawn(lambda seed: case(1 + seed % 2, 1, some(seed), "drawn weights", seed)),
     ]
     flaws = {
         "weights": "Each residual counts with its weight: J^T W J and J^T W r.",
@@ -170,11 +160,14 @@ def check_bundle_adjustment(
     return check_function(answered, loop, cases, 1e-7, hints, flaws, ("poses", "disparities"))
 
 
-def check_robust_weight(student: Callable[[Tensor, float, float], Tensor]) -> Verdict:
+def check_robust_weight(student: Function) -> Verdict:
     """Check (residuals (N, 2) [px], scale c [px], power p) -> the weight of each cell (N,)."""
 
+    def squared(r2: Tensor, c: float, p: float) -> Tensor:
+        return RobustKernel(c, p).weight(r2)
+
     def reference(r: Tensor, c: float, p: float) -> Tensor:
-        return RobustKernel(c, p).weight(r.square().sum(-1))
+        return squared(r.square().sum(-1), c, p)
 
     cases = [
         Case((doubles([0, 0], [0.3, 0.4], [3, -4]), 2.0, 1.0), "c = 2 px and p = 1"),
@@ -186,20 +179,14 @@ def check_robust_weight(student: Callable[[Tensor, float, float], Tensor]) -> Ve
         (lambda r, c, p: reference(r, 1.0, p), "The residual is divided by c."),
         (lambda r, c, p: reference(r, c**0.5, p), "c is squared, like the residual."),
         (lambda r, c, p: 1 / reference(r, c, p), "The power is -p: large residuals count little."),
-        (
-            lambda r, c, p: r.norm(dim=1) * reference(r, c, p),
-            "This is the pull, w r.",
-        ),
-        (
-            lambda r, c, p: RobustKernel(c, p).weight(r**2),
-            "A cell has one weight: sum over u, v.",
-        ),
-        (lambda r, c, p: RobustKernel(c, p).weight(r.norm(dim=1)), "r is squared, like c."),
+        (lambda r, c, p: r.norm(dim=1) * reference(r, c, p), "This is the pull, w r."),
+        (lambda r, c, p: squared(r**2, c, p), "A cell has one weight: sum over u, v."),
+        (lambda r, c, p: squared(r.norm(dim=1), c, p), "r is squared, like c."),
     ]
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_prior_mask(student: Callable[..., Tensor]) -> Verdict:
+def check_prior_mask(student: Function) -> Verdict:
     """Check (depth, [(depth, T_this_other)], camera, stride, epsilon) -> M (h, w) bool."""
     camera, stride = Camera(60.0, 60.0, 31.3, 22.6, 64, 48), 4
     grid = Grid.of(camera, stride)

@@ -1,6 +1,5 @@
 """Exercises of notebook 01."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -8,11 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
+from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normals
+from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 
 
-def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> Verdict:
+def check_resized_intrinsics(student: Function) -> Verdict:
     """Check (camera, width, height) -> (fx, fy, cx, cy) of the resized image."""
 
     def reference(camera: Camera, width: int, height: int) -> Tensor:
@@ -24,16 +24,11 @@ def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> V
         cx, cy = (camera.cx + before) * su + after, (camera.cy + before) * sv + after
         return doubles(camera.fx * su, camera.fy * sv, cx, cy)
 
-    def draw(seed: int) -> Case:
-        width, height = 20 + 37 * seed % 300, 30 + 23 * seed % 200
-        return Case((CAMERA, width, height), f"{width} x {height} pixels")
+    def case(width: int, height: int, description: str = "") -> Case:
+        return Case((CAMERA, width, height), description or f"{width} x {height} pixels")
 
-    cases = [
-        Case((CAMERA, 101, 53), "the same size"),
-        Case((CAMERA, 202, 106), "twice the size"),
-        Case((CAMERA, 33, 26), "33 x 26 pixels"),
-        *drawn(draw),
-    ]
+    cases = [case(101, 53, "the same size"), case(202, 106, "twice the size"), case(33, 26)]
+    cases += drawn(lambda seed: case(20 + 37 * seed % 300, 30 + 23 * seed % 200))
     right = partial(shifted, 0.5, -0.5)
     hints = [
         (lambda *a: shifted(0, 0, *a), "The image starts at -0.5: (cx + 0.5) * scale - 0.5."),
@@ -47,27 +42,24 @@ def check_resized_intrinsics(student: Callable[[Camera, int, int], Tensor]) -> V
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor]) -> Verdict:
+def check_reproject(student: Function) -> Verdict:
     """Check (pixels, disparities, camera, T_target_source) -> pixels in the target view."""
-    pixels = doubles([0.0, 0.0], [100.0, 52.0], [60.5, 10.25])
-    disparities = doubles(0.5, 0.25, 1.0)
 
     def reference(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
         points = camera.backproject(pixels, 1 / disparities)
         return camera.project(transform_points(pose, points))
 
-    def draw(seed: int) -> Case:
+    def case(twist: Tensor, description: str, seed: int = 0) -> Case:
         pixels = doubles(50, 25) + 15 * normals(seed, 4, 2)
         disparities = 0.2 + 0.3 * normals(seed, 4).abs()
-        return Case((pixels, disparities, CAMERA, se3_exp(0.1 * normals(seed, 6))), "4 pixels")
+        return Case((pixels, disparities, CAMERA, se3_exp(twist)), description)
 
-    motions = {
-        "a camera that stands still": doubles(0, 0, 0, 0, 0, 0),
-        "a step of 0.2": doubles(0.2, 0, 0, 0, 0, 0),
-        "any motion": doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1),
-    }
-    cases = [Case((pixels, disparities, CAMERA, se3_exp(xi)), name) for name, xi in motions.items()]
-    cases += drawn(draw)
+    cases = [
+        case(doubles(0, 0, 0, 0, 0, 0), "a camera that stands still"),
+        case(doubles(0.2, 0, 0, 0, 0, 0), "a step of 0.2"),
+        case(doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1), "any motion"),
+        *drawn(lambda seed: case(0.1 * normals(seed, 6), "4 pixels", seed)),
+    ]
     hints = [
         (lambda p, d, c, T: reference(p, d, c, se3_inverse(T)), "This is the inverse motion."),
         (lambda p, d, *a: reference(p, 1 / d, *a), "These are no depths: depth = 1 / disparity."),
@@ -78,7 +70,7 @@ def check_reproject(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor])
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_warped_photo(student: Callable[[Tensor, Tensor, Camera, Tensor], Tensor]) -> Verdict:
+def check_warped_photo(student: Function) -> Verdict:
     """Check (photo, depth, camera, T_source_target) -> the photo as the target sees it."""
     camera = Camera(20.0, 24.0, 8.3, 5.8, 17, 13)
     photo, depth = normals(0, 13, 17, 3).abs(), 1 + normals(1, 13, 17).abs()
@@ -94,22 +86,20 @@ def check_warped_photo(student: Callable[[Tensor, Tensor, Camera, Tensor], Tenso
         seen &= (points[..., 2] > 0) | (flaw in ("behind", "unmasked"))
         pixels = 2 * pixels.floor() + 1 - pixels if flaw == "turned" else pixels
         position = (2 * (pixels.round() if flaw == "rounded" else pixels) / last - 1)[None]
-        channels = photo.permute(2, 0, 1)[None]
         sampled = functional.grid_sample(
-            channels, position.to(photo), padding_mode="border", align_corners=True
+            photo.permute(2, 0, 1)[None], position.to(photo), "bilinear", "border", True
         )
         return torch.where(seen[..., None], sampled[0].permute(1, 2, 0), 0)
 
-    def draw(seed: int) -> Case:
-        return Case((photo, depth, camera, se3_exp(0.1 * normals(seed, 6))), f"motion {seed}")
+    def case(pose: Tensor, description: str) -> Case:
+        return Case((photo, depth, camera, pose), description)
 
-    motions = {
-        "a small step": doubles(0.2, -0.07, 0.1, 0, 0, 0),
-        "any motion": doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1),
-        "a source camera that looks back": doubles(0.1, 0, 0, 0, 3.0, 0),
-    }
-    cases = [Case((photo, depth, camera, se3_exp(xi)), name) for name, xi in motions.items()]
-    cases += drawn(draw)
+    cases = [
+        case(se3_exp(doubles(0.2, -0.07, 0.1, 0, 0, 0)), "a small step"),
+        case(se3_exp(doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1)), "any motion"),
+        case(se3_exp(doubles(0.1, 0, 0, 0, 3.0, 0)), "a source camera that looks back"),
+        *drawn(lambda seed: case(any_pose(seed), f"motion {seed}")),
+    ]
     flaws = {
         "inverted": "This is the inverse motion: T_source_target takes points to the source.",
         "disparity": "This takes the depth for a disparity: the point is depth times the ray.",

@@ -9,18 +9,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from minislam.checks.answers import SMALLEST, difference, is_single, largest, relation
 from minislam.checks.calls import Stopped, call
-from minislam.geometry import Camera
+from minislam.checks.cases import Case
 
 PASSED, NOT_YET, WRONG = "passed", "not yet", "wrong"
-DRAWN_CASES = 3
 SECONDS = 10.0  # of the student's function, all cases together
-# No two of its numbers are equal, so that an exchange of axes is noticed.
-CAMERA = Camera(70.0, 90.0, 41.3, 22.8, 101, 53)
 
 Function = Callable[..., Any]  # answers with numbers in any form, or with a tuple of such
 Hints = Sequence[tuple[Any, str]]  # (known mistake, the sentence that explains it)
@@ -38,37 +32,8 @@ class Verdict:
         return f"{self.status.capitalize()}: {self.sentence}"
 
 
-@dataclass(frozen=True)
-class Case:
-    """One input of a check, and what it stands for."""
-
-    arguments: tuple[Any, ...]
-    description: str  # completes "for ..."
-
-
 class WrongAnswer(AssertionError):
     """An exercise that has not passed, where MINISLAM_STRICT is set."""
-
-
-def doubles(*values: Any) -> Tensor:
-    """Return numbers, or lists of numbers, as a float64 tensor."""
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def normals(seed: int, *shape: int) -> Tensor:
-    """Return normally distributed numbers, the same for the same seed, for a drawn case."""
-    source = torch.Generator().manual_seed(seed)
-    return torch.randn(shape, generator=source, dtype=torch.float64)
-
-
-def drawn(draw: Callable[[int], Case]) -> list[Case]:
-    """Return three cases, the same in every notebook, and three others where MINISLAM_SEED is set.
-
-    `minislam grade` sets it. `draw` makes a case of a seed.
-    """
-    hidden = os.environ.get("MINISLAM_SEED", "")
-    seeds = [1000 * (int(hidden) + 1) + n for n in range(DRAWN_CASES)] if hidden else []
-    return [draw(seed) for seed in [*range(DRAWN_CASES), *seeds]]
 
 
 def check_function(

@@ -1,23 +1,20 @@
 """Exercises of notebook 09: the light of a phone, and how far apart frames have to be."""
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import Case, Verdict, check_function, doubles, drawn, normals
+from minislam.checks.cases import Case, doubles, drawn, normals
+from minislam.checks.grading import Function, Verdict, check_function
 
 DARKEST, BRIGHTEST = 0.05, 0.95  # of a channel, between which a sensor answers in proportion
 _ROUNDS = 10
 _LEAST = 0.5  # px, below which a residual gains no more weight
+_median = partial(torch.quantile, q=0.5)
 
 
-def _median(values: Tensor) -> Tensor:
-    return values.quantile(0.5)
-
-
-def check_gains(student: Callable[[Tensor, Tensor], Tensor]) -> Verdict:
+def check_gains(student: Function) -> Verdict:
     """Check (first (N, 3), second (N, 3)): colours of points -> gain (3,) of each channel."""
 
     def reference(
@@ -49,18 +46,17 @@ def check_gains(student: Callable[[Tensor, Tensor], Tensor]) -> Verdict:
         case(2, 0.8, "a colder one"),
         *drawn(lambda seed: case(seed + 9, 1.1, "drawn colours")),
     ]
-
     return check_function(student, reference, cases, 1e-6, hints)
 
 
-def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
+def check_stride(student: Function) -> Verdict:
     """Check (rays (N, 2), flows (S, M, N, 2), strides, needed) -> parallaxes (S,), stride."""
     find, rest = parallaxes_and_stride, lengths_without_turn
 
-    def choice(choose: Callable[[int, list[int]], int]) -> Callable:
+    def choice(choose: Function) -> Function:
         return lambda *a: ((found := find(*a))[0], choose(found[1], a[2]))
 
-    flaws: dict[str, Callable] = {
+    flaws: dict[str, Function] = {
         "Weigh by 1/max(residual, 0.5) and fit anew, ten times in all.": partial(rest, rounds=1),
         "The weight is 1/residual, not 1/residual^2.": partial(rest, power=2.0),
         "The third column, a roll about the viewing axis, is missing.": partial(rest, columns=2),
@@ -82,7 +78,6 @@ def check_stride(student: Callable[..., tuple[Tensor, int]]) -> Verdict:
         *drawn(lambda seed: _walk(seed + 20, 0.7, 1.5, "a drawn walk")),
     ]
     returns = "the parallax of each stride", "the stride"
-
     return check_function(student, find, cases, 1e-4, hints, returns=returns)
 
 
@@ -110,8 +105,8 @@ def parallaxes_and_stride(
     flows: Tensor,  # (S, M, N, 2) px
     strides: list[int],
     needed: float,  # px
-    lengths: Callable = lengths_without_turn,
-    middle: Callable = _median,
+    lengths: Function = lengths_without_turn,
+    middle: Function = _median,
 ) -> tuple[Tensor, int]:
     """Return the answer to the exercise, with a length of the flow and a middle of one's own."""
     pairs = [[middle(lengths(rays, flow)) for flow in of_stride] for of_stride in flows]

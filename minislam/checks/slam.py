@@ -1,17 +1,17 @@
 """Exercises of notebooks 08 and 10."""
 
-from collections.abc import Callable
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from minislam.checks.grading import Case, Verdict, check_function, drawn
+from minislam.checks.cases import Case, drawn
+from minislam.checks.grading import Function, Verdict, check_function
 from minislam.evaluation.images import auroc
 from minislam.geometry.alignment import umeyama
 
 
-def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
+def check_ate(student: Function) -> Verdict:
     """Check (estimated (N, 3), true camera centres (N, 3)) -> ATE after the best Sim(3)."""
 
     def distances(estimate: np.ndarray, truth: np.ndarray, with_scale: bool = True) -> np.ndarray:
@@ -53,12 +53,15 @@ def check_ate(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
+def check_separability(student: Function) -> Verdict:
     """Check (beta (N,), True on dynamic objects (N,)) -> the AUROC of beta."""
 
-    def wins(beta: np.ndarray, moving: np.ndarray, draw: float) -> float:
+    def wins(beta: np.ndarray, moving: np.ndarray, tie: float) -> float:
         pairs = beta[moving][:, None] - beta[~moving]
-        return float(np.mean(np.where(pairs == 0, draw, pairs > 0)))
+        return float(np.mean(np.where(pairs == 0, tie, pairs > 0)))
+
+    def count(beta: np.ndarray, moving: np.ndarray) -> float:
+        return wins(beta, moving, 0.5) * moving.sum() * (~moving).sum()
 
     def case(beta: Any, moving: Any, description: str) -> Case:
         return Case((np.array(beta), np.array(moving) > 0), description)
@@ -68,15 +71,11 @@ def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Ve
         beta = np.round(np.random.default_rng(seed).uniform(0, 1, 12) + 0.3 * moving, 1)
         return case(beta, moving, "12 cells, some of them alike")
 
-    def count(beta: np.ndarray, moving: np.ndarray) -> float:
-        return wins(beta, moving, 0.5) * moving.sum() * (~moving).sum()
-
     cases = [
         case([0.1, 0.9, 0.4, 0.7, 0.2], [0, 1, 0, 1, 1], "three cells of a person, two of a wall"),
         case([0.5, 0.5, 0.8, 0.3], [1, 0, 1, 0], "a beta that does not tell two cells apart"),
         *drawn(draw),
     ]
-
     hints = [
         (lambda b, m: wins(b, ~m, 0.5), "The other way round: what moves has the larger beta."),
         (lambda b, m: wins(b, m, 0.0), "A pair with equal beta is worth one half."),
@@ -89,7 +88,7 @@ def check_separability(student: Callable[[np.ndarray, np.ndarray], float]) -> Ve
     return check_function(student, auroc, cases, 1e-9, hints)
 
 
-def check_alignment(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Verdict:
+def check_alignment(student: Function) -> Verdict:
     """Check (estimated (N, 3), true centres (N, 3)) -> the best Sim(3) as [s R, t; 0, 1] (4, 4)."""
 
     def matrix(scale: float, R: np.ndarray, estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -107,7 +106,7 @@ def check_alignment(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> 
         return matrix(d.sum() / ((e - e.mean(0)) ** 2).sum(), u @ v, e, t)
 
     def by_spread(e: np.ndarray, t: np.ndarray) -> np.ndarray:
-        return reference(e, t, float(np.linalg.norm(t - t.mean(0)) / np.linalg.norm(e - e.mean(0))))
+        return reference(e, t, np.sqrt(t.var(0).sum() / e.var(0).sum()))
 
     def centred(e: np.ndarray, t: np.ndarray) -> np.ndarray:
         A = reference(e, t)
@@ -139,7 +138,7 @@ def check_alignment(student: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> 
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_sign_test(student: Callable[[np.ndarray, np.ndarray], float]) -> Verdict:
+def check_sign_test(student: Function) -> Verdict:
     """Check (errors with, errors without (N,)) -> how often chance does at least as much.
 
     Of all 2^N choices of signs for the differences, the fraction whose mean is at least as far

@@ -1,18 +1,24 @@
-"""Exercises of notebook 02."""
+"""Exercises of notebooks 02 and 03."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
+from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normals
+from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.splatting.constants import LOW_PASS_VARIANCE, NEAR_DEPTH
+from minislam.splatting.projection import (
+    conics_from_factors2d,
+    conics_from_factors2d_vjp,
+    to_camera_twist_vjp,
+)
 from minislam.splatting.reference import composite, gaussian_alphas, project_covariances
 
 
-def check_projected_covariance(student: Callable[..., Tensor]) -> Verdict:
+def check_projected_covariance(student: Function) -> Verdict:
     """Check (covariance_world, mean_world, T_camera_world, camera) -> Sigma' (2, 2) in px^2."""
 
     def reference(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
@@ -29,32 +35,26 @@ def check_projected_covariance(student: Callable[..., Tensor]) -> Verdict:
         pose = se3_exp(doubles(0.1, -0.1, 0.2, turn, -turn, 0.5 * turn))
         return Case((factor @ factor.T, doubles(x, 0.1, 2.5), pose, CAMERA), description)
 
-    def draw(seed: int) -> Case:
-        x, turn = normals(seed, 2).clamp(-2, 2).tolist()
-        return case(0.3 * x, 0.15 * turn, "any camera", seed)
-
     cases = [
         case(-0.1, 0.0, "a camera that is not turned"),
         case(0.6, 0.2, "a turned camera"),
-        *drawn(draw),
+        *drawn(lambda seed: case(0.2 * seed - 0.3, 0.15, "any camera", seed)),
     ]
     low_pass = LOW_PASS_VARIANCE * torch.eye(2).double()
     off_diagonal = LOW_PASS_VARIANCE - low_pass
+    at_world = "J is taken at the world point: move the mean into the camera frame first."
     hints = [
         (lambda *a: reference(*a) - low_pass, "The low-pass filter is missing: add 0.3 I."),
         (lambda *a: turned(1, *a), "Sigma is still in the world frame: turn it by W before J."),
         (lambda *a: turned(2, *a), "This turns Sigma the wrong way: it is W Sigma W^T."),
         (lambda *a: reference(*a) + off_diagonal, "0.3 stands on the diagonal alone: 0.3 I."),
         (lambda *a: torch.linalg.inv(reference(*a)), "This is the conic, the inverse of Sigma'."),
-        (
-            lambda S, x, *a: project_covariances(S[None], x[None], *a)[0],
-            "J is taken at the world point: move the mean into the camera frame first.",
-        ),
+        (lambda S, x, *a: project_covariances(S[None], x[None], *a)[0], at_world),
     ]
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Verdict:
+def check_pixel_color(student: Function) -> Verdict:
     """Check (alphas, colors, background) -> color (3,) of one pixel, nearest Gaussian first."""
 
     def blended(alphas: Tensor, colors: Tensor, background: Tensor, flaw: str = "") -> Tensor:
@@ -66,19 +66,16 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
         before = {"itself": light[1:], "unshaded": light[:-1] ** 0}.get(flaw, light[:-1])
         return (before * alphas ** (flaw != "opaque")) @ colors + end * background
 
-    def draw(seed: int) -> Case:
-        values = normals(seed, 5, 4).sigmoid()[: 1 + seed % 5]
-        description = f"a list of {len(values)}, on blue"
-        return Case((values[:, 0], values[:, 1:], doubles(0.1, 0.2, 0.9)), description)
+    def case(count: int, description: str, background: Tensor, seed: int = 0) -> Case:
+        values = normals(seed, 5, 4).sigmoid()[:count]
+        return Case((values[:, 0], values[:, 1:], background), description)
 
-    colors = doubles([0.9, 0.1, 0.2], [0.3, 0.8, 0.4], [0.2, 0.5, 1.0])
-    alphas = doubles(0.3, 0.6, 0.5)
-    grey = doubles(0.6, 0.6, 0.6)
+    grey, blue = doubles(0.6, 0.6, 0.6), doubles(0.1, 0.2, 0.9)
     cases = [
-        Case((alphas, colors, torch.zeros_like(grey)), "three Gaussians on black"),
-        Case((alphas, colors, grey), "three Gaussians on grey"),
-        Case((alphas[:0], colors[:0], grey), "no Gaussian at all"),
-        *drawn(draw),
+        case(3, "three Gaussians on black", 0 * grey),
+        case(3, "three Gaussians on grey", grey),
+        case(0, "no Gaussian at all", grey),
+        *drawn(lambda seed: case(1 + seed % 5, f"a list of {1 + seed % 5}, on blue", blue, seed)),
     ]
     flaws = {
         "no background": "The background is missing: add T_end times its colour.",
@@ -93,7 +90,7 @@ def check_pixel_color(student: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Ve
     return check_function(student, blended, cases, 1e-9, hints, flaws)
 
 
-def check_rendered_image(student: Callable[..., Tensor]) -> Verdict:
+def check_rendered_image(student: Function) -> Verdict:
     """Check (means, covariances, opacities, colors, T_camera_world, camera) -> image (H, W, 3)."""
     factors, colors = normals(1, 2, 5, 3, 3)
     means = doubles([0.1, 0, 3], [0, 0.1, 2], [-0.2, -0.1, 4], [0.3, 0, -2], [-0.3, 0.2, 2.5])
@@ -113,17 +110,16 @@ def check_rendered_image(student: Callable[..., Tensor]) -> Verdict:
             return torch.einsum("nhw,nc->hwc", alphas, colors[kept])
         return composite(alphas, colors[kept], torch.zeros_like(colors[0]))[0]
 
-    def draw(seed: int) -> Case:
-        pose = se3_exp(0.1 * normals(seed, 6))
-        return Case((*values, pose, camera), f"five Gaussians and pose {seed}")
+    def case(count: int, pose: Tensor, description: str) -> Case:
+        return Case((*(x[:count] for x in values), pose, camera), description)
 
     camera = Camera(18.0, 22.0, 9.3, 6.8, 21, 13)
     turned = se3_exp(doubles(0.1, -0.1, 0.2, 0.1, -0.2, 0.3))
     cases = [
-        Case((*(x[:1] for x in values), se3_exp(doubles(*[0] * 6)), camera), "one Gaussian"),
-        Case((*(x[:3] for x in values), turned, camera), "three Gaussians in any order"),
-        Case((*values, turned, camera), "five Gaussians, one behind the camera"),
-        *drawn(draw),
+        case(1, torch.eye(4).double(), "one Gaussian"),
+        case(3, turned, "three Gaussians in any order"),
+        case(5, turned, "five Gaussians, one behind the camera"),
+        *drawn(lambda seed: case(5, any_pose(seed), f"five Gaussians and pose {seed}")),
     ]
     flaws = {
         "unsorted": "Sort by the depth in the camera frame: the list has no order.",
@@ -134,3 +130,118 @@ def check_rendered_image(student: Callable[..., Tensor]) -> Verdict:
         "added": "Light is used up on its way: multiply T by 1 - alpha after each Gaussian.",
     }
     return check_function(student, rendered, cases, 1e-6, flaws=flaws)
+
+
+def check_conic_vjp(student: Function) -> Verdict:
+    """Check (factors2d, conics, v_conics) -> v_factors2d (2, 3, N)."""
+    reference = conics_from_factors2d_vjp
+
+    def product(factors: str, above: float, below: float, *a: Tensor) -> Tensor:
+        """Return -2 times a product like QGQ with V, from two parts of v_b."""
+        V, conics, v = a
+        G = torch.stack([v[0], above * v[1], below * v[1], v[2]]).view(2, 2, -1)
+        matrices = {"Q": conics[[0, 1, 1, 2]].view(2, 2, -1), "G": G}
+        for name in reversed(factors):
+            V = torch.einsum("ijn,jkn->ikn", matrices[name], V)
+        return -2 * V
+
+    def case(V: Tensor, v_conics: Tensor, description: str) -> Case:
+        return Case((V, conics_from_factors2d(V)[0], v_conics), description)
+
+    def draw(seed: int) -> Case:
+        values = normals(seed, 3, 3, 1 + seed % 4)
+        return case(2 * values[:2], values[2], f"N = {1 + seed % 4}")
+
+    V = doubles([[3.0], [1.0], [0.5]], [[-1.0], [2.0], [0.0]])
+    cases = [
+        case(V, doubles([1.0], [0.0], [0.0]), "a gradient of a alone"),
+        case(V, doubles([0.7], [-1.2], [0.4]), "a gradient of a, b and c"),
+        case(normals(7, 2, 3, 3) + V, normals(8, 3, 3), "three Gaussians"),
+        *drawn(draw),
+    ]
+    hints = [
+        (lambda *a: -reference(*a), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
+        (lambda *a: reference(*a) / 2, "A factor 2 is missing: V appears twice in V V^T."),
+        (lambda *a: product("QGQ", 1, 1, *a), "b is counted twice: each place gets v_b / 2."),
+        (lambda *a: product("QGQ", 1, 0, *a), "G is symmetric: v_b / 2 above and below."),
+        (lambda *a: product("QG", 0.5, 0.5, *a), "Q stands on both sides of G: Q G Q."),
+        (lambda *a: product("GQ", 0.5, 0.5, *a), "Q stands on both sides of G: Q G Q."),
+        (lambda V, *a: 0 * V + reference(V, *a).sum(-1, True), "Do not sum over the N Gaussians."),
+        (lambda V, *a: 0 * V + reference(V, *a)[..., :1], "Each Gaussian has its own gradient."),
+    ]
+    return check_function(student, reference, cases, 1e-9, hints)
+
+
+def check_twist_vjp(student: Function) -> Verdict:
+    """Check (points, factors, v_points, v_factors) -> v_twist (6,) of (rho, phi)."""
+    right, exchanged = to_camera_twist_vjp, doubles(1, 1, 1, -1, -1, -1)
+
+    def moves_factors(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
+        return right(x, B, v_x, v_B) + torch.cat([v_B.sum((1, 2)), v_B.new_zeros(3)])
+
+    def case(count: int, description: str, seed: int = 0, factor: float = 1) -> Case:
+        x, *B, v_x, v_B0, v_B1, v_B2 = normals(seed, 8, 3, count)
+        v_B = factor * torch.stack([v_B0, v_B1, v_B2], 1)
+        return Case((x, torch.stack(B, 1), v_x, v_B), description)
+
+    cases = [
+        case(4, "means alone", factor=0),
+        case(4, "means and factors"),
+        # With N = 3, the axis of length 3 is no longer the only one.
+        *drawn(lambda seed: case(3 - seed % 3, f"N = {3 - seed % 3}", seed)),
+    ]
+    turning = "The factors turn with the camera as well: B x v_B."
+    hints = [
+        (lambda x, B, v, u: right(x, B, v, 0 * u), turning),
+        (lambda *a: exchanged * right(*a), "The wrong way round: v_phi = x cross v_x."),
+        (lambda *a: right(*a).roll(3), "The order is (rho, phi), translation first."),
+        (lambda *a: right(*a) / a[0].shape[1], "Sum over all Gaussians: no mean."),
+        (lambda x, *a: right(0 * x, *a), "The means turn with the camera as well: x cross v_x."),
+        (moves_factors, "A translation moves the means only: the factors have no place."),
+    ]
+    return check_function(student, right, cases, 1e-9, hints)
+
+
+def check_picture_gradient(student: Function) -> Verdict:
+    """Check (gaussians (K, 9), target (H, W, 3)) -> image (H, W, 3), dL/d(gaussians) (K, 9)."""
+
+    def reference(gaussians: Tensor, target: Tensor, fixed_light: bool = False) -> tuple:
+        leaf = gaussians.clone().requires_grad_()
+        mean_u, mean_v, a, b, c, log_o = leaf[:, :6, None, None].unbind(1)
+        rows, columns = torch.meshgrid(*map(torch.arange, target.shape[:2]), indexing="ij")
+        du, dv = columns - mean_u, rows - mean_v
+        alphas = torch.exp(log_o - 0.5 * (a * du**2 + 2 * b * du * dv + c * dv**2))
+        light = torch.cat([torch.ones_like(alphas[:1]), (1 - alphas).cumprod(0)])[:-1]
+        light = light.detach() if fixed_light else light
+        image = torch.einsum("khw,kc->hwc", light * alphas, leaf[:, 6:])
+        return image.detach(), torch.autograd.grad((image - target).square().sum(), leaf)[0]
+
+    def scaled(factor: float, columns: slice = slice(9)) -> Function:
+        scale = torch.ones(9, dtype=torch.float64)
+        scale[columns] = factor
+        return lambda *a: (reference(*a)[0], scale * reference(*a)[1])
+
+    def case(count: int, description: str, seed: int = 0) -> Case:
+        return Case((gaussians[:count] + 0.03 * normals(seed, count, 9), target), description)
+
+    gaussians = doubles(
+        [3.2, 2.1, 0.3, 0.1, 0.4, -0.3, 0.9, 0.2, 0.1],
+        [5.1, 3.4, 0.2, -0.1, 0.3, -0.7, 0.1, 0.8, 0.3],
+        [4.0, 3.0, 0.1, 0.02, 0.1, -0.5, 0.4, 0.3, 1.0],
+    )
+    target = normals(0, 7, 9, 3).abs()
+    cases = [
+        case(1, "one Gaussian"),
+        case(3, "three Gaussians, one over the other"),
+        *drawn(lambda seed: case(3, f"three Gaussians, {seed}", seed)),
+    ]
+    returns = "the image", "the gradient"
+    hints = [
+        (scaled(-1), "The sign is flipped: v = 2 (image - target)."),
+        (scaled(0.5), "A factor 2 is missing: L is the sum of the squares."),
+        (scaled(1 / target.numel()), "L is a sum over the pixels, not a mean."),
+        (scaled(-1, slice(2)), "The sign of v_mu' is flipped: d = x' - mu' falls as mu' grows."),
+        (scaled(0.5, slice(3, 4)), "b stands twice in the quadratic form: v_b = -sum g du dv."),
+        (partial(reference, fixed_light=True), "A Gaussian also hides what is behind it: R_{k+1}."),
+    ]
+    return check_function(student, reference, cases, 1e-7, hints, returns=returns)

@@ -1,6 +1,5 @@
 """Exercises of notebooks 06 and 06b."""
 
-from collections.abc import Callable
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -10,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.checks.grading import CAMERA, Case, Verdict, check_function, doubles, drawn, normals
+from minislam.checks.cases import CAMERA, Case, doubles, drawn, normals
+from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import se3_exp
 from minislam.priors.dense_flow import composed_flow, reverse_flow
 from minislam.priors.grid_flow import grid_matches
@@ -23,7 +23,7 @@ from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.robust import RobustKernel
 
 
-def check_flow_distance(student: Callable[..., Tensor]) -> Verdict:
+def check_flow_distance(student: Function) -> Verdict:
     """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, beta) -> distance [px]."""
     pixels = CAMERA.pixel_grid(10, torch.float64).flatten(0, 1)
     disparities = 0.2 + 0.3 * normals(0, 2, len(pixels)).sigmoid()
@@ -31,10 +31,7 @@ def check_flow_distance(student: Callable[..., Tensor]) -> Verdict:
     def reference(*arguments: Any) -> Tensor:
         return flow_distances(*arguments)[0, 1]
 
-    def with_beta(change: Callable[[float], float]) -> Callable:
-        return lambda *arguments: reference(*arguments[:-1], change(arguments[-1]))
-
-    def changed(length: Callable, turned: bool = False) -> Callable:
+    def changed(length: Function, turned: bool = False) -> Function:
         """Return the distance with another mean of the flows (2, 2, N), both directions."""
 
         def distance(poses: Tensor, d: Tensor, rays: Tensor, pixels: Tensor, *rest: Any) -> Tensor:
@@ -52,8 +49,8 @@ def check_flow_distance(student: Callable[..., Tensor]) -> Verdict:
         return Case((poses, disparities, rays, pixels, CAMERA, beta), description)
 
     def draw(seed: int) -> Case:
-        slide, turn = (0.1 * normals(seed, 2, 3).clamp(-2, 2)).tolist()
-        return case([*slide, *[0.3 * angle for angle in turn]], 0.3, "another motion, beta = 0.3")
+        twist = normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[0.03] * 3)
+        return case(twist.tolist(), 0.3, "another motion, beta = 0.3")
 
     cases = [
         case([0.3, -0.1, 0.0, 0.0, 0.0, 0.0], 0.75, "a camera that slides"),
@@ -62,10 +59,10 @@ def check_flow_distance(student: Callable[..., Tensor]) -> Verdict:
         *drawn(draw),
     ]
     hints = [
-        (with_beta(lambda beta: 1.0), "The flow without rotation has the weight 1 - beta."),
-        (with_beta(lambda beta: 0.0), "This is the flow without rotation alone."),
-        (with_beta(lambda beta: 1 - beta), "beta and 1 - beta are exchanged."),
-        (with_beta(lambda beta: 0.75), "0.75 is one beta of many: use the argument."),
+        (lambda *a: reference(*a[:-1], 1.0), "The flow without rotation has the weight 1 - beta."),
+        (lambda *a: reference(*a[:-1], 0.0), "This is the flow without rotation alone."),
+        (lambda *a: reference(*a[:-1], 1 - a[-1]), "beta and 1 - beta are exchanged."),
+        (lambda *a: reference(*a[:-1], 0.75), "0.75 is one beta of many: use the argument."),
         (changed(lambda f: f[0].norm(dim=0).mean()), "One direction only: from 1 to 0 as well."),
         (changed(lambda f: f[1].norm(dim=0).mean()), "One direction only: from 0 to 1 as well."),
         (changed(lambda f: f.norm(dim=1).sum()), "Take the mean over the pixels, not the sum."),
@@ -78,7 +75,7 @@ def check_flow_distance(student: Callable[..., Tensor]) -> Verdict:
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict:
+def check_suppressed(student: Function) -> Verdict:
     """Check (newer, older, K, suppression) -> (K, K), 1 where a pair a > b is suppressed."""
 
     def reference(newer: int, older: int, count: int, suppression: int) -> Tensor:
@@ -91,7 +88,7 @@ def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict
             suppressed[a, b] = not proximity_pairs(distances, *chosen)
         return suppressed
 
-    def of_radius(radius: Callable[[int, int], int], norm: float = 1) -> Callable:
+    def of_radius(radius: Function, norm: float = 1) -> Function:
         def within(newer: int, older: int, count: int, most: int) -> Tensor:
             a, b = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
             offsets = torch.stack([a - newer, b - older]).double()
@@ -124,12 +121,11 @@ def check_suppressed(student: Callable[[int, int, int, int], Tensor]) -> Verdict
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_keyframes(student: Callable[[list[np.ndarray], float, int], list[int]]) -> Verdict:
+def check_keyframes(student: Function) -> Verdict:
     """Check (gray images, largest mean flow [px], longest interval) -> frames to keep."""
 
-    def choice(
-        images: list[np.ndarray], max_flow: float, interval: int, flaw: str = ""
-    ) -> list[int]:
+    def choice(*clip: Any, flaw: str = "") -> list[int]:
+        images, max_flow, interval = clip
         kept, none = [0], np.zeros((*images[0].shape, 2), np.float32)
         cells, flow, start = none[::8, ::8], none, images[0]
         for n, image in enumerate(images[1:], 1):
@@ -181,7 +177,7 @@ def check_keyframes(student: Callable[[list[np.ndarray], float, int], list[int]]
     return check_function(student, choice, cases, 1e-9, hints, flaws)
 
 
-def check_bounded_loss(student: Callable[[Tensor, float, int], Tensor]) -> Verdict:
+def check_bounded_loss(student: Function) -> Verdict:
     """Check (lengths r of residuals (N,) [px], scale c [px], p = 1 or 2) -> L_p (N,) [px^2]."""
 
     def reference(r: Tensor, c: float, p: int) -> Tensor:
@@ -204,32 +200,27 @@ def check_bounded_loss(student: Callable[[Tensor, float, int], Tensor]) -> Verdi
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_motion_memory(student: Callable[..., Tensor]) -> Verdict:
+def check_motion_memory(student: Function) -> Verdict:
     """Check (grid, matches, disparities, motion, weights, scale) -> weights of the next cells."""
     grid = Grid.of(CAMERA, 8)
     grid.rays = grid.rays.to(torch.get_default_dtype())
 
-    def reference(
-        grid: Grid, matches: FlowMatches, *rest: Any, constants: dict[str, float] | None = None
-    ) -> Tensor:
-        known = {name: getattr(motion_memory, name) for name in constants or {}}
+    def reference(grid: Grid, matches: FlowMatches, *rest: Any, **constants: float) -> Tensor:
+        known = {name: getattr(motion_memory, name) for name in constants}
         try:
-            vars(motion_memory).update(constants or {})
+            vars(motion_memory).update(constants)
             weight = motion_memory.update_motion_weight(grid, matches, *rest)
             return motion_memory.inherit_motion_weight(grid, matches, weight)
         finally:
             vars(motion_memory).update(known)
 
-    def change(constants: dict[str, float]) -> Callable:
-        return partial(reference, constants=constants)
-
     def zeros_left(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
-        columns, rows = (matches.targets[0] / grid.stride).round().long()
-        empty = torch.ones(grid.shape)
-        for column, row, sure in zip(columns, rows, matches.confidences[0, 0], strict=True):
+        rows, columns = (matches.targets[0] / grid.stride).round().long().flip(0)
+        filled = torch.zeros(grid.shape)
+        for row, column, sure in zip(rows, columns, matches.confidences[0, 0], strict=True):
             if 0 <= column < grid.shape[1] and 0 <= row < grid.shape[0] and sure > 0.1:
-                empty[row, column] = 0
-        return reference(grid, matches, *rest) * (1 - empty.flatten())
+                filled[row, column] = 1
+        return reference(grid, matches, *rest) * filled.flatten()
 
     def case(twist: list[float], aside: float, sure: float, what: str, seed: int = 3) -> Case:
         random = normals(seed, 4, len(grid.rays)).erf().abs().to(grid.rays)  # in [0, 1)
@@ -241,8 +232,8 @@ def check_motion_memory(student: Callable[..., Tensor]) -> Verdict:
         return Case((grid, matches, disparities, motion, random[3], 2.0), what)
 
     def draw(seed: int) -> Case:
-        slide, turn = (0.1 * normals(seed, 2, 3).clamp(-2, 2)).tolist()
-        return case([*slide, *[angle / 4 for angle in turn]], 6.0, 0.8, "a drawn motion", seed)
+        twist = normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[0.025] * 3)
+        return case(twist.tolist(), 6.0, 0.8, "a drawn motion", seed)
 
     cases = [
         case([0.0] * 6, 3.0, 1.0, "a camera that stands still"),
@@ -250,15 +241,14 @@ def check_motion_memory(student: Callable[..., Tensor]) -> Verdict:
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
         *drawn(draw),
     ]
+    change = partial(partial, reference)
+    handed_on = "These are the weights of the source cells: hand them on along the flow."
     hints = [
-        (change({"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9}), "It falls fast and recovers slowly."),
-        (change({"RECOVERY_RATE": 0.9}), "The rate is 0.9 only where the weight falls."),
-        (change({"DEPTH_ERROR": 0.0}), "c_m^2 also holds a hundredth of the squared parallax."),
-        (change({"MIN_CONFIDENCE": -1.0}), "Cells with a confidence of at most 0.1 say nothing."),
-        (
-            motion_memory.update_motion_weight,
-            "These are the weights of the source cells: hand them on along the flow.",
-        ),
+        (change(LOSS_RATE=0.1, RECOVERY_RATE=0.9), "It falls fast and recovers slowly."),
+        (change(RECOVERY_RATE=0.9), "The rate is 0.9 only where the weight falls."),
+        (change(DEPTH_ERROR=0.0), "c_m^2 also holds a hundredth of the squared parallax."),
+        (change(MIN_CONFIDENCE=-1.0), "Cells with a confidence of at most 0.1 say nothing."),
+        (motion_memory.update_motion_weight, handed_on),
         (zeros_left, "A cell to which nothing flows takes the weight of the nearest one."),
     ]
     return check_function(student, reference, cases, 1e-4, hints)

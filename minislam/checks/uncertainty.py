@@ -1,36 +1,62 @@
-"""Exercises of notebook 04."""
+"""Exercises of notebooks 00 and 04."""
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.checks.grading import Case, Verdict, check_function, doubles, drawn, normals
+from minislam.checks.cases import Case, doubles, drawn, normals
+from minislam.checks.grading import Function, Verdict, check_function
+from minislam.geometry import Camera
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import variance_regulariser
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.training import RenderingError, uncertainty_loss
+from minislam.uncertainty.weights import MAPPING_CAP, MAPPING_CUT, adjusted_beta, mapping_weight
 
 
-def check_best_beta(student: Callable[[Tensor, float], Tensor]) -> Verdict:
+def check_mapping_weight(student: Function) -> Verdict:
+    """Check beta (h, w) -> the weight of each pixel in the map's loss (h, w)."""
+    camera = Camera(5.0, 5.0, 1.0, 0.5, 3, 2)
+
+    def uncapped(beta: Tensor) -> Tensor:
+        return 0.5 / adjusted_beta(beta, camera) ** 2
+
+    def cut(weight: Tensor, most: float = MAPPING_CAP) -> Tensor:
+        return torch.where(weight < MAPPING_CUT, 0.0, weight.clamp_max(most))
+
+    cases = [
+        Case((doubles([0.2, 0.471, 0.6], [0.7, 0.9, 1.2]),), "small beta"),
+        Case((doubles([0.5, 1.3, 1.5], [2.0, 3.0, 4.0]),), "large beta"),
+        Case((doubles([0.0, 0.05, 0.1], [0.5, 0.5, 0.5]),), "beta below the floor"),
+        *drawn(lambda seed: Case((1.2 * normals(seed, 2, 3).abs(),), "any beta")),
+    ]
+    hints = [
+        (lambda b: uncapped(b).clamp_max(5), "Weights below 0.1 must be 0: little adds up."),
+        (lambda b: cut(uncapped(b), 1e9), "No weight is above 5, that of a beta of a quarter."),
+        (lambda b: uncapped(b).clamp(0.1, 5), "Weights below 0.1 become 0, not 0.1."),
+        (lambda beta: cut(0.5 / beta**2), "This is 0.5 / beta^2: beta is adjusted first."),
+        (lambda beta: cut(0.5 / beta.clamp_min(0.1) ** 2), "beta is cut, but not adjusted yet."),
+        (lambda beta: cut(2 * uncapped(beta)), "It is a half by beta_adj^2: 0.5 is missing."),
+        (lambda beta: cut((0.5 * uncapped(beta)).sqrt()), "The adjusted beta must be squared."),
+    ]
+    return check_function(student, lambda b: mapping_weight(b, camera), cases, 1e-5, hints)
+
+
+def check_best_beta(student: Function) -> Verdict:
     """Check (L (n,), lambda_3) -> argmin of L / beta^2 + lambda_3 log beta over beta, (n,)."""
 
     def reference(error: Tensor, lambda_log: float) -> Tensor:
         return (2 * error / lambda_log).sqrt()
 
-    def draw(seed: int) -> Case:
-        lambda_log = round(0.2 + abs(normals(seed, 1).item()), 2)
-        return Case((normals(seed, 4).square(), lambda_log), f"lambda_3 = {lambda_log}")
+    def case(lambda_log: float, seed: int = 0) -> Case:
+        error = torch.cat([doubles(0.0), 2 * normals(seed, 4).square()])
+        return Case((error, lambda_log), f"lambda_3 = {lambda_log}")
 
-    error = doubles(0.0, 0.01, 0.5, 2.0, 6.0)
-    cases = [
-        Case((error, 2.0), "lambda_3 = 2"),
-        Case((error, 0.5), "lambda_3 = 0.5"),
-        *drawn(draw),
-    ]
+    cases = [case(2.0), case(0.5), *drawn(lambda seed: case(0.3 + 0.1 * (seed % 9), seed))]
     hints = [
         (lambda L, _: L.sqrt(), "lambda_3 is not in it: set the derivative to zero and solve."),
         (lambda L, x: (L / x).sqrt(), "A factor 2 is missing: d(L beta^-2) = -2 L beta^-3."),
@@ -42,31 +68,26 @@ def check_best_beta(student: Callable[[Tensor, float], Tensor]) -> Verdict:
     return check_function(student, reference, cases, 1e-9, hints)
 
 
-def check_feature_variance(student: Callable[[Tensor, Tensor], Tensor]) -> Verdict:
+def check_feature_variance(student: Function) -> Verdict:
     """Check (beta (n,), features (n, C)) -> L_reg_V () with the neighbours of cosine > 0.75."""
     config = UncertaintyConfig()
-
-    def reference(beta: Tensor, features: Tensor) -> Tensor:
-        return variance_regulariser(beta, features, config)
 
     def masked(beta: Tensor, near: Tensor, lost: int = 0) -> Tensor:
         mean, count = near @ beta / near.sum(1), near.sum(1)
         squares = (beta[None] - mean[:, None]) ** 2
         return (near * squares).sum(1) / (count - lost).clamp_min(lost)
 
-    def similar(features: Tensor) -> Tensor:
-        unit = functional.normalize(features, dim=-1)
-        return (unit @ unit.T > config.similarity).to(features)
+    def near(features: Tensor) -> Tensor:
+        return (features @ features.T > config.similarity).to(features)
 
-    def not_normalised(beta: Tensor, features: Tensor) -> Tensor:
-        return masked(beta, (features @ features.T > config.similarity).to(beta)).mean()
+    def similar(features: Tensor) -> Tensor:
+        return near(functional.normalize(features, dim=-1))
 
     def without_itself(beta: Tensor, features: Tensor) -> Tensor:
         return masked(beta, similar(features).fill_diagonal_(0)).nan_to_num().mean()
 
     def around_all(beta: Tensor, features: Tensor) -> Tensor:
-        near = similar(features)
-        return (near @ (beta - beta.mean()) ** 2 / near.sum(1)).mean()
+        return (similar(features) @ (beta - beta.mean()) ** 2 / similar(features).sum(1)).mean()
 
     beta = doubles(0.2, 1.4, 0.5, 2.0, 0.9)
     features = doubles([3.0, 0.0], [2.0, 1.0], [0.0, 0.5], [0.1, 0.5], [1.0, -1.0])
@@ -75,25 +96,27 @@ def check_feature_variance(student: Callable[[Tensor, Tensor], Tensor]) -> Verdi
         Case((beta, features), "five cells in three groups"),
         *drawn(lambda seed: Case((normals(seed, 7).abs(), normals(seed, 7, 2)), "seven cells")),
     ]
+    lengths = "Divide each feature by its length: the cosine has no unit."
     hints = [
         (lambda b, f: masked(b, f.new_ones(len(b), len(b))).mean(), "Compare only similar cells."),
-        (not_normalised, "Divide each feature by its length: the cosine has no unit."),
+        (lambda b, f: masked(b, near(f)).mean(), lengths),
         (lambda b, f: masked(b, similar(f)).sqrt().mean(), "The variance is the square of this."),
         (without_itself, "A cell is one of its own neighbours."),
         (lambda b, f: masked(b, similar(f), 1).mean(), "Divide by the number, not by one less."),
         (around_all, "The mean is that of the similar cells, not that of all."),
         (lambda b, f: masked(b, similar(f)).sum(), "The mean over the cells is asked for."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    right = partial(variance_regulariser, config=config)
+    return check_function(student, right, cases, 1e-9, hints)
 
 
-def check_training(student: Callable[..., Tensor]) -> Verdict:
+def check_training(student: Function) -> Verdict:
     """Check (mlp, optimizer, features, ssim, depth, opacity, steps) -> losses (steps,), Eq. (4).
 
     The answer is compared together with what the MLP then predicts.
     """
-    features, (ssim, depth) = 2 * normals(0, 2, 3, 4, 5), 2 * normals(1, 2, 2, 3, 4).abs()
-    opacity = torch.where(normals(2, 2, 3, 4) > -0.5, 0.95, 0.5).double()
+    errors = 2 * normals(1, 2, 2, 3, 4).abs()
+    holes = torch.where(normals(2, 2, 3, 4) > -0.5, 0.95, 0.5).double()
 
     def trained(*views: Any, flaw: str = "") -> Tensor:
         off: dict[str, Any] = {flaw: 0.0} if "lambda" in flaw else {}
@@ -112,27 +135,23 @@ def check_training(student: Callable[..., Tensor]) -> Verdict:
                 optimizer.step()
         return torch.stack(losses).detach()
 
-    def with_mlp(train: Callable) -> Callable:
-        def outcome(features: Tensor, *rest: Any, flaw: str = "") -> Tensor | None:
-            mlp = UncertaintyMLP(5, torch.Generator().manual_seed(1)).to(features)
-            # Plain descent: Adam would hide a loss that is twice too large.
-            descent = torch.optim.SGD(mlp.parameters(), lr=0.02)
-            asked = {"flaw": flaw} if flaw else {}
-            losses = train(mlp, descent, features, *rest, **asked)
-            if losses is None:
-                return None
-            return torch.cat([torch.as_tensor(losses), mlp(features).flatten()]).detach()
+    def outcome(train: Function, features: Tensor, *rest: Any, **asked: str) -> Tensor | None:
+        mlp = UncertaintyMLP(5, torch.Generator().manual_seed(1)).to(features)
+        # Plain descent: Adam would hide a loss that is twice too large.
+        descent = torch.optim.SGD(mlp.parameters(), lr=0.02)
+        losses = train(mlp, descent, features, *rest, **asked)
+        if losses is None:
+            return None
+        return torch.cat([torch.as_tensor(losses), mlp(features).flatten()]).detach()
 
-        return outcome
-
-    def draw(seed: int) -> Case:
-        return Case((normals(seed, 2, 3, 4, 5), ssim, depth, opacity, 3), f"features {seed}")
+    def case(opacity: Tensor, steps: int, description: str, seed: int = 0) -> Case:
+        return Case((2 * normals(seed, 2, 3, 4, 5), *errors, opacity, steps), description)
 
     cases = [
-        Case((features, ssim, depth, torch.ones_like(opacity), 1), "one step"),
-        Case((features, ssim, depth, opacity, 1), "one step, with holes in the map"),
-        Case((features, ssim, depth, opacity, 4), "four steps on two views"),
-        *drawn(draw),
+        case(torch.ones_like(holes), 1, "one step"),
+        case(holes, 1, "one step, with holes in the map"),
+        case(holes, 4, "four steps on two views"),
+        *drawn(lambda seed: case(holes, 3, f"features {seed}", seed)),
     ]
     flaws = {
         "lambda_depth": "L_depth is missing in the error.",
@@ -143,4 +162,5 @@ def check_training(student: Callable[..., Tensor]) -> Verdict:
         "gathered": "Gradients add up: call zero_grad before backward.",
         "still": "The MLP did not change: call optimizer.step().",
     }
-    return check_function(with_mlp(student), with_mlp(trained), cases, 1e-6, flaws=flaws)
+    answered, right = partial(outcome, student), partial(outcome, trained)
+    return check_function(answered, right, cases, 1e-6, flaws=flaws)

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from minislam.checks import PASSED, WRONG, Case, check_function, is_written
-from minislam.checks.grading import WrongAnswer, drawn, normals
+from minislam.checks.cases import drawn, normals
+from minislam.checks.grading import WrongAnswer
 from tests.helpers import unfinished
 
 
