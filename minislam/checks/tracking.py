@@ -205,14 +205,17 @@ def check_motion_memory(student: Function) -> Verdict:
     grid = Grid.of(CAMERA, 8)
     grid.rays = grid.rays.to(torch.get_default_dtype())
 
-    def reference(grid: Grid, matches: FlowMatches, *rest: Any, **constants: float) -> Tensor:
-        known = {name: getattr(motion_memory, name) for name in constants}
+    def reference(grid: Grid, matches: FlowMatches, *rest: Any, constants: Any = ()) -> Tensor:
+        known = {name: getattr(motion_memory, name) for name, _ in constants}
         try:
             vars(motion_memory).update(constants)
             weight = motion_memory.update_motion_weight(grid, matches, *rest)
             return motion_memory.inherit_motion_weight(grid, matches, weight)
         finally:
             vars(motion_memory).update(known)
+
+    def change(*constants: tuple[str, float]) -> Function:
+        return partial(reference, constants=constants)
 
     def zeros_left(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
         rows, columns = (matches.targets[0] / grid.stride).round().long().flip(0)
@@ -241,13 +244,12 @@ def check_motion_memory(student: Function) -> Verdict:
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
         *drawn(draw),
     ]
-    change = partial(partial, reference)
     handed_on = "These are the weights of the source cells: hand them on along the flow."
     hints = [
-        (change(LOSS_RATE=0.1, RECOVERY_RATE=0.9), "It falls fast and recovers slowly."),
-        (change(RECOVERY_RATE=0.9), "The rate is 0.9 only where the weight falls."),
-        (change(DEPTH_ERROR=0.0), "c_m^2 also holds a hundredth of the squared parallax."),
-        (change(MIN_CONFIDENCE=-1.0), "Cells with a confidence of at most 0.1 say nothing."),
+        (change(("LOSS_RATE", 0.1), ("RECOVERY_RATE", 0.9)), "It falls fast and recovers slowly."),
+        (change(("RECOVERY_RATE", 0.9)), "The rate is 0.9 only where the weight falls."),
+        (change(("DEPTH_ERROR", 0.0)), "c_m^2 also holds a hundredth of the squared parallax."),
+        (change(("MIN_CONFIDENCE", -1.0)), "Cells with a confidence of at most 0.1 say nothing."),
         (motion_memory.update_motion_weight, handed_on),
         (zeros_left, "A cell to which nothing flows takes the weight of the nearest one."),
     ]

@@ -135,10 +135,11 @@ def check_training(student: Function) -> Verdict:
                 optimizer.step()
         return torch.stack(losses).detach()
 
-    def outcome(train: Function, features: Tensor, *rest: Any, **asked: str) -> Tensor | None:
+    def outcome(train: Function, features: Tensor, *rest: Any, flaw: str = "") -> Tensor | None:
         mlp = UncertaintyMLP(5, torch.Generator().manual_seed(1)).to(features)
         # Plain descent: Adam would hide a loss that is twice too large.
         descent = torch.optim.SGD(mlp.parameters(), lr=0.02)
+        asked = {"flaw": flaw} if flaw else {}
         losses = train(mlp, descent, features, *rest, **asked)
         if losses is None:
             return None

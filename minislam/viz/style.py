@@ -20,6 +20,7 @@ WIDE = 9.0, 3.0  # inch
 TRUTH_STYLE: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.2, "zorder": 3}
 ESTIMATE_STYLE: dict[str, Any] = {"color": "tab:blue", "linestyle": "-", "linewidth": 1.4}
 
+_BETA_TICKS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1, 2, 3, 5, 10)
 _COLORMAPS = {"depth": "viridis", "beta": "magma", "weight": "gray", "error": "RdBu_r"}
 _DPI = 110  # dots per inch
 _UNKNOWN_RGB = (0.25, 0.25, 0.25)  # where there is no depth
@@ -113,9 +114,13 @@ def colour_bar(
     colours, label = ScalarMappable(norm, _COLORMAPS[kind]), kind if label is None else label
     if isinstance(axes, Axes):  # as tall as the picture
         beside = axes.inset_axes((1.03, 0.0, 0.05, 1.0))
-        axes.figure.colorbar(colours, cax=beside, label=label)
+        bar = axes.figure.colorbar(colours, cax=beside, label=label)
     else:
-        axes[0].figure.colorbar(colours, ax=list(axes), label=label)
+        bar = axes[0].figure.colorbar(colours, ax=list(axes), label=label)
+    if kind == "beta":  # 0.3, not 3 x 10^-1
+        ticks = [tick for tick in _BETA_TICKS if limits[0] <= tick <= limits[1]]
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        bar.minorticks_off()
 
 
 def _limits(values: np.ndarray, kind: str) -> tuple[float, float]:

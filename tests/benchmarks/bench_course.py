@@ -1,10 +1,9 @@
 """Measure what notebooks 08 and 10 show but cannot run while one reads.
 
-    nice python -m tests.benchmarks.bench_course beta|weights|row|paper|prior
+    nice python -m tests.benchmarks.bench_course beta|weights|paper|prior
 
 beta    a clip on which beta holds the camera, with beta and without; some minutes
-weights without the robust weight and the memory of motion, with beta and without; a minute
-row     row (d) of the ablation on notebook 08's clip; half a minute
+weights without the robust weight and the memory of motion, with beta and without; two minutes
 paper   rows (a) to (d) of the paper's ablation, whole runs; some minutes
 prior   rows (i) to (iv) of its supplement, tracking alone; a minute
 
@@ -31,7 +30,6 @@ ROOT = Path(__file__).parent.parent.parent
 RESULTS = ROOT / "notebooks" / "results"
 SHOWN = ("ate_all_cm", "ate_keyframes_cm", "psnr_input_db", "psnr_masked_db", "beta_auroc")
 SHORT: dict[str, Any] = {"stride": 3, "max_frames": 28, "size": (128, 96)}
-SHORTER: dict[str, Any] = {"stride": 4, "max_frames": 21, "size": (112, 84)}  # notebook 08's
 SHORT_CLIPS = ("umbrella", "stones:53")
 
 ROWS: dict[str, dict[str, dict[str, Any]]] = {
@@ -51,7 +49,6 @@ ROWS: dict[str, dict[str, dict[str, Any]]] = {
             "tracking.motion_memory": 0.0,
         },
     },
-    "row": {"(d)": {"tracking.lambda_disparity_prior": 0.0}},
     "prior": {
         "(i)": {"tracking.prior_mask": False, "tracking.final_prior": True},
         "(ii)": {"tracking.final_prior": True},
@@ -62,17 +59,10 @@ ROWS: dict[str, dict[str, dict[str, Any]]] = {
 CLIPS = {
     "beta": ("stones:53",),
     "weights": ("umbrella",),
-    "row": ("umbrella",),
     "paper": SHORT_CLIPS,
     "prior": SHORT_CLIPS,
 }
-INPUT = {
-    "beta": {"size": (160, 120)},
-    "weights": SHORTER,
-    "row": SHORTER,
-    "paper": SHORT,
-    "prior": SHORT,
-}
+INPUT = {"beta": {"size": (160, 120)}, "weights": SHORT, "paper": SHORT, "prior": SHORT}
 
 
 def whole_run(clip: str, options: dict[str, Any], settings: dict[str, Any]) -> dict[str, float]:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from minislam.checks import PASSED, WRONG, Case, check_function, is_written
-from minislam.checks.cases import drawn, normals
+from minislam.checks.cases import normals
 from minislam.checks.grading import WrongAnswer
 from tests.helpers import unfinished
 
@@ -49,26 +49,6 @@ def test_a_stub_is_not_written_and_any_body_is(capsys):
 
 def double(x):
     return 2 * x
-
-
-def random_case(seed: int) -> Case:
-    return Case((normals(seed, 3),), f"seed {seed}")
-
-
-def test_cases_are_drawn_and_others_under_a_seed(monkeypatch):
-    ones, seen = Case((torch.ones(3),), "three ones"), []
-
-    def student(x):
-        seen.append(x.double().sum().item())
-        return 2 * x
-
-    def verdict():
-        return check_function(student, double, [ones, *drawn(random_case)])
-
-    assert "4 of 4 cases" in verdict().sentence
-    monkeypatch.setenv("MINISLAM_SEED", "5")
-    assert "7 of 7 cases" in verdict().sentence
-    assert seen[:4] == seen[4:8] and len(set(seen)) == 7
 
 
 def test_strict_mode_raises(monkeypatch):
