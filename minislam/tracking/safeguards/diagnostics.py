@@ -150,18 +150,16 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
     One keyframe is a break if it explains very little of its flow or sees other depths than those
-    before it. LONG keyframes in a row, or most of very few, need to explain a little too little.
+    before it. LONG keyframes in a row need to explain less than they should by a little.
     """
     found: list[Break] = []
-    judged = sum(keyframe.explained is not None for keyframe in diagnostics)
-    long = max(2, min(LONG, judged // 2 + 1))
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little
     for index, keyframe in enumerate(diagnostics):
         explained = 1.0 if keyframe.explained is None else keyframe.explained
         weak = weak + 1 if explained < MIN_EXPLAINED_LONG else 0
         error = keyframe.depth_error or 0.0
-        if explained < MIN_EXPLAINED or weak >= long or error > MAX_DEPTH_ERROR:
-            first = diagnostics[index - long + 1 if weak >= long else index].frame_index
+        if explained < MIN_EXPLAINED or weak >= LONG or error > MAX_DEPTH_ERROR:
+            first = diagnostics[index - LONG + 1 if weak >= LONG else index].frame_index
             if found and index - last <= HEALED_AFTER:
                 first = found.pop().first_frame
             found.append(Break(first, keyframe.frame_index))

@@ -95,9 +95,6 @@ def test_the_weighted_median_splits_the_weight():
         ([HEALTHY, (None, None), HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),
-        ([(None, None), HEALTHY, WEAK, WEAK], [Break(20, 30)]),  # measured under an overlay
-        ([(None, None), WEAK, WEAK], [Break(10, 20)]),
-        ([(None, None), WEAK], []),
     ],
 )
 def test_breaks_are_runs_of_broken_keyframes(kinds: list, breaks: list[Break]):
