@@ -19,11 +19,21 @@ class Pictured:
     """What has an image. Bytes are kept, because numbers take four times the memory."""
 
     pixels: Tensor  # (H, W, 3) uint8 RGB; an image in [0, 1] is taken as it is
+    exposure: Tensor | None = None  # (3,) how many times as bright as the map, None: as bright
 
     @property
     def image(self) -> Tensor:
         """Return the image (H, W, 3) float32 RGB in [0, 1]."""
         return self.pixels if self.pixels.is_floating_point() else self.pixels / 255
+
+    @property
+    def levelled(self) -> Tensor:
+        """Return the image (H, W, 3) as bright as the map."""
+        return self.image if self.exposure is None else self.image / self.exposure
+
+    def exposed(self, color: Tensor) -> Tensor:
+        """Return colours (..., 3) of the map as bright as the image, in [0, 1]."""
+        return (color if self.exposure is None else color * self.exposure).clamp(0, 1)
 
 
 @dataclass(frozen=True)
@@ -33,6 +43,7 @@ class Frame(Pictured):
     frame_index: int  # position in the sequence as it is processed: 0, 1, 2, ...
     timestamp: float  # second, as the source gives it
     pixels: Tensor  # (H, W, 3) uint8 RGB, undistorted, at the working size
+    exposure: Tensor | None = None  # (3,) as of all that has an image
 
     def to(self, device: torch.device | str) -> "Frame":
         """Return the frame with its image on a device."""
@@ -52,6 +63,7 @@ class Keyframe(Pictured):
     T_camera_world: Tensor  # (4, 4) float64
     moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
+    exposure: Tensor | None = None  # (3,) as of all that has an image
 
 
 @dataclass(frozen=True)

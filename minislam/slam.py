@@ -27,6 +27,7 @@ from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
+from minislam.stereo.exposure import with_exposure, with_exposures
 from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
 from minislam.tracking.safeguards.first_frame import FirstFrame
 from minislam.tracking.safeguards.focal_length import (
@@ -170,7 +171,7 @@ class Slam(Stateful):
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         swept = sweep_keyframes(graph, self.sequence, self._poses, progress, self.workers)
         self.mapper = self._new_mapper()
-        keyframes = fill_depth(self._keyframes(), swept)
+        keyframes = with_exposures(fill_depth(self._keyframes(), swept), graph)
         self.mapper.initialise(keyframes, self.steps.on_progress("first map"))
 
     def _refine_map(self) -> None:
@@ -189,8 +190,10 @@ class Slam(Stateful):
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
         others = [index for index in self._poses if index not in keyframes]
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
-            frames = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
-            start, images = [self._poses[f.frame_index] for f in frames], [f.image for f in frames]
+            read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
+            frames = [with_exposure(frame, self.mapper.keyframes) for frame in read]
+            start = [self._poses[frame.frame_index] for frame in frames]
+            images = [frame.levelled for frame in frames]
             betas = [self._beta(frame, None) for frame in frames]
             poses = self.mapper.refine_poses(start, images, betas)
             self._poses |= {f.frame_index: pose for f, pose in zip(frames, poses, strict=True)}

@@ -30,7 +30,7 @@ def gaussians_of_keyframe(
     pixels = draw_pixels(keyframe.depth > 0, config.cell, generator)
     pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
     return gaussians_at_pixels(
-        pixels, keyframe.image, keyframe.depth, camera,
+        pixels, keyframe.levelled, keyframe.depth, camera,
         keyframe.T_camera_world, keyframe.keyframe_index, config,
     )  # fmt: skip
 

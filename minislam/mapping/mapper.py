@@ -31,7 +31,7 @@ class Mapper(JointOptimisation):
             raise InputError("expected at least one keyframe to start the map from, found none")
         self.median_depth = median_depth(keyframes)
         if self.config.mean_background:
-            self.background = torch.stack([k.image.mean((0, 1)) for k in keyframes]).mean(0)
+            self.background = torch.stack([k.levelled.mean((0, 1)) for k in keyframes]).mean(0)
         for keyframe in keyframes:
             self.keyframes.append(MappedKeyframe.from_record(keyframe))
             self._insert(self.keyframes[-1])

@@ -37,6 +37,7 @@ class MappedKeyframe(Pictured):
     T_camera_world: Tensor  # (4, 4) float64
     given_beta: Tensor | None = None  # (h, w) instead of the MLP's
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
+    exposure: Tensor | None = None  # (3,) of a `Keyframe`
     _views: dict[tuple[int, int], View] = field(default_factory=dict)
 
     @classmethod
@@ -45,7 +46,8 @@ class MappedKeyframe(Pictured):
         mask, depth, pose = keyframe.moving_mask, keyframe.depth, keyframe.T_camera_world.double()
         return cls(
             keyframe.keyframe_index, keyframe.frame_index, keyframe.features, keyframe.pixels,
-            depth, pose, None if mask is None else beta_of_mask(mask), keyframe.confirmation
+            depth, pose, None if mask is None else beta_of_mask(mask), keyframe.confirmation,
+            keyframe.exposure,
         )  # fmt: skip
 
     def saved_state(self) -> Tree:
@@ -59,12 +61,12 @@ class MappedKeyframe(Pictured):
         return cls(**state, pixels=frame_of(state["frame_index"]).pixels)
 
     def view(self, camera: Camera) -> View:
-        """Return the keyframe at the size of `camera`; a smaller one is computed once."""
+        """Return the levelled keyframe at the size of `camera`; a smaller one is computed once."""
         size = (camera.height, camera.width)
         if size == self.depth.shape:
-            return View(self.image, self.depth)
+            return View(self.levelled, self.depth)
         if size not in self._views:
-            image = shrink_image(self.image, *size)
+            image = shrink_image(self.levelled, *size)
             self._views[size] = View(image, shrink_depth(self.depth, *size))
         return self._views[size]
 

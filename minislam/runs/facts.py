@@ -99,7 +99,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         views.append(view)
         static = slam.mapper.static_weight(slam.mapper.beta_of(keyframe), slam.mapper.camera) > 0
         if static.any():
-            pictures = rendering.color.clamp(0, 1), keyframe.image, static
+            pictures = keyframe.exposed(rendering.color), keyframe.image, static
             likeness.append(psnr(*(picture.cpu() for picture in pictures)))
     metrics: dict[str, Any] = measure_run(
         slam.sequence.ground_truth,

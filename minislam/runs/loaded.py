@@ -37,15 +37,21 @@ class SourceFrame:
     timestamp: float  # second
     source: str  # name of its image file, or of its video with the number in it
     keyframe: bool
+    exposure: list[float] | None = None  # of a keyframe, how many times as bright as the map
 
 
 def scene_of(slam: Slam) -> dict[str, Any]:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
+    mapped = {keyframe.frame_index: keyframe.exposure for keyframe in slam.mapper.keyframes}
+    exposures = {index: e.tolist() for index, e in mapped.items() if e is not None}
     frames = [
-        SourceFrame(index, frame.timestamp, sequence.source_name(index), index in keyframes)
+        SourceFrame(
+            index, frame.timestamp, sequence.source_name(index), index in keyframes,
+            exposures.get(index),
+        )
         for index, frame in enumerate(slam.tracker.tracked)
-    ]
+    ]  # fmt: skip
     return {
         "sequence": {"name": sequence.name, "description": sequence.description},
         "camera": asdict(slam.tracker.grid.camera),
@@ -107,10 +113,14 @@ class Run:
         return [frame.index for frame in self.frames if frame.keyframe]
 
     def render(
-        self, T_world_camera: np.ndarray, camera: Camera | None = None
+        self,
+        T_world_camera: np.ndarray,
+        camera: Camera | None = None,  # None: the run's
+        exposure: list[float] | None = None,  # of one of `frames`; None: as bright as the map
     ) -> np.ndarray:  # (H, W, 3)
-        """Return the colours of the map, seen from a pose; by default with the run's camera."""
-        return self._rendering(T_world_camera, camera).color.clamp(0, 1).numpy()
+        """Return the colours of the map, seen from a pose."""
+        color = self._rendering(T_world_camera, camera).color
+        return (color * torch.tensor(exposure or 1.0)).clamp(0, 1).numpy()
 
     def render_depth(
         self, T_world_camera: np.ndarray, camera: Camera | None = None

@@ -63,7 +63,8 @@ class Preview:
         with suppress(Exception):
             newest = len(slam.mapper.keyframes) - 1
             keyframe = slam.mapper.keyframes[newest]
-            color = slam.mapper.render(keyframe.T_camera_world).color.cpu().numpy()
+            rendering = slam.mapper.render(keyframe.T_camera_world)
+            color = keyframe.exposed(rendering.color).cpu().numpy()
             strip = [keyframe.image.cpu().numpy(), viz.beta_to_rgb(slam.beta_image(newest)), color]
             jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
             page = replace(_known(self._folder, slam, {}, facts), overview=jpeg)
@@ -94,7 +95,7 @@ def write_pictures(
     jpegs = _write_keyframes(folder, slam, of_depth, of_beta)
     middle = len(slam.mapper.keyframes) // 2
     keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
-    color = slam.mapper.render(keyframe.T_camera_world).color.clamp(0, 1).cpu().numpy()
+    color = keyframe.exposed(slam.mapper.render(keyframe.T_camera_world).color).cpu().numpy()
     picture = viz.overview(keyframe.image.cpu().numpy(), beta, color, estimate, true_path, unit)
     folder.write_plot("overview", png := figure_png(picture))
     for name, (_, plot) in plots.items():
@@ -188,7 +189,7 @@ def _write_keyframes(
             "input": keyframe.image.cpu().numpy(),
             "depth": viz.depth_to_rgb(surface_depth(rendering).cpu().numpy(), of_depth),
             "beta": viz.beta_to_rgb(slam.beta_image(index), of_beta),
-            "render": rendering.color.clamp(0, 1).cpu().numpy(),
+            "render": keyframe.exposed(rendering.color).cpu().numpy(),
         }
         for kind, picture in pictures.items():
             folder.write_keyframe_image(keyframe.frame_index, kind, picture)

@@ -1,0 +1,79 @@
+"""How much brighter a keyframe is than the map: automatic exposure and white balance.
+
+A camera adapts to the light, so one wall is brighter in one image than in the next. Flow is
+measured in spite of it, so matched cells that stand still tell the factors a_k of each colour:
+
+    log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of a link.
+
+All links together are a linear least-squares problem. It leaves a common factor free; the median
+of all keyframes is 1. Not in the paper; MonoGS optimises an exposure of each keyframe.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from minislam.mapping.views import MappedKeyframe
+from minislam.records import Frame, Keyframe
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.safeguards.diagnostics import weighted_median
+
+BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the dark
+DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
+FEWEST_CELLS = 0.05  # of all: a link with less, counted by their weight, tells nothing [-]
+LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
+
+
+def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
+    """Return how bright the keyframes are (K, 3), their median being 1; None if all are alike."""
+    links, cells = graph.links, graph.keyframes.cell_weights
+    images = [_blurred(frame.image) for frame in graph.keyframes.frames]
+    ends, ratios = [], []
+    for link, (source, target) in enumerate(links.edges()):
+        matches, stride = links.targets[link], graph.grid.stride
+        here = torch.from_numpy(images[source][::stride, ::stride].reshape(-1, 3))
+        u, v = matches.cpu().numpy()
+        moved = cv2.remap(images[target], u, v, cv2.INTER_LINEAR)
+        there = torch.from_numpy(moved.reshape(-1, 3))
+        both = torch.cat([here, there], 1)
+        visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
+        static = cells[source] * graph.grid.sample(cells[target][:, None], matches.T)[:, 0]
+        weight = visible * (links.confidences[link][0] * static).cpu()
+        if weight.mean() > FEWEST_CELLS:
+            ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
+            ends.append((source, target))
+            ratios.append([weighted_median(channel, weight) for channel in ratio.T])
+    if not ends:
+        return None
+    steps = np.zeros((len(ends), len(images)))
+    steps[range(len(ends)), [j for _, j in ends]] = 1
+    steps[range(len(ends)), [i for i, _ in ends]] = -1
+    levels = np.linalg.lstsq(steps, np.array(ratios), rcond=None)[0]
+    levels -= np.median(levels, 0)
+    return None if np.abs(levels).max() < LEAST_CHANGE else torch.from_numpy(np.exp(levels)).float()
+
+
+def with_exposures(keyframes: list[Keyframe], graph: KeyframeGraph) -> list[Keyframe]:
+    """Return the keyframes of the graph with their exposures, if these differ."""
+    exposures = keyframe_exposures(graph)
+    if exposures is None:
+        return keyframes
+    pairs = zip(keyframes, exposures.to(graph.grid.rays.device), strict=True)
+    return [replace(keyframe, exposure=exposure) for keyframe, exposure in pairs]
+
+
+def with_exposure(frame: Frame, keyframes: list[MappedKeyframe]) -> Frame:
+    """Return a frame with an exposure interpolated between the keyframes before and after it."""
+    known = [keyframe.exposure for keyframe in keyframes if keyframe.exposure is not None]
+    if not known:
+        return frame
+    levels, indices = torch.stack(known).log().cpu(), [k.frame_index for k in keyframes]
+    here = [np.interp(frame.frame_index, indices, channel) for channel in levels.T.numpy()]
+    return replace(frame, exposure=torch.tensor(here).exp().to(known[0]))
+
+
+def _blurred(image: Tensor) -> np.ndarray:  # (H, W, 3)
+    return cv2.GaussianBlur(image.cpu().numpy(), (0, 0), BLUR)

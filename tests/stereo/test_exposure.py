@@ -1,0 +1,81 @@
+"""Exposure: told by matches of what stands still, taken out of images, put back into pictures."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from minislam.records import Frame
+from minislam.stereo.exposure import keyframe_exposures, with_exposure, with_exposures
+from minislam.tracking.frame_graph import neighbourhood_edges
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from tests.tracking.wall import true_graph
+
+FRAMES = [0, 3, 6, 9]
+FACTORS = torch.tensor([[1.0, 1.0, 1.0], [0.7, 0.8, 0.9], [1.3, 1.2, 1.0], [1.0, 1.0, 1.0]])
+
+
+def exposed_graph(factors: torch.Tensor) -> KeyframeGraph:
+    """Return a graph with the true flow of a grey wall, exposed by these factors."""
+    graph = true_graph(FRAMES)
+    graph.match(neighbourhood_edges(0, len(FRAMES), 5))
+    frames = graph.keyframes.frames
+    for index, (frame, factor) in enumerate(zip(frames, factors, strict=True)):
+        frames[index] = replace(frame, pixels=torch.ones_like(frame.image) * 0.5 * factor)
+    return graph
+
+
+# Known answers
+
+
+def test_the_exposures_are_found_with_their_median_at_one():
+    found = keyframe_exposures(exposed_graph(FACTORS))
+    torch.testing.assert_close(found, FACTORS, rtol=0.01, atol=0)
+
+
+def test_one_exposure_is_left_alone():
+    steady = 1 + 0.02 * torch.tensor([[0.0], [1.0], [-1.0], [0.5]]).expand(4, 3)
+    graph = exposed_graph(steady)
+    assert keyframe_exposures(graph) is None
+    keyframes = [object()]
+    assert with_exposures(keyframes, graph) is keyframes
+
+
+def test_what_moves_has_no_say():
+    graph = exposed_graph(FACTORS)
+    for index, frame in enumerate(graph.keyframes.frames):
+        dark = frame.image.clone()
+        dark[:, : dark.shape[1] // 2] *= 0.5 if index == 1 else 1
+        graph.keyframes.frames[index] = replace(frame, pixels=dark)
+        static = torch.ones(graph.grid.shape)
+        static[:, : graph.grid.shape[1] // 2 + 2] = 0
+        graph.keyframes.set_static_weight(index, static.reshape(-1))
+    torch.testing.assert_close(keyframe_exposures(graph), FACTORS, rtol=0.02, atol=0)
+
+
+def test_a_frame_between_keyframes_is_exposed_as_between_them():
+    keyframes = [
+        SimpleNamespace(frame_index=index, exposure=torch.tensor([level, 1.0, 1.0]))
+        for index, level in ((0, 1.0), (4, 4.0))
+    ]
+    frame = Frame(2, 0.1, torch.full((2, 2, 3), 0.5))
+    between = with_exposure(frame, keyframes)
+    torch.testing.assert_close(between.exposure, torch.tensor([2.0, 1.0, 1.0]))
+    torch.testing.assert_close(between.levelled[0, 0], torch.tensor([0.25, 0.5, 0.5]))
+    torch.testing.assert_close(between.exposed(between.levelled), frame.image)
+    last = with_exposure(replace(frame, frame_index=9), keyframes)
+    assert last.exposure[0] == pytest.approx(4)
+
+
+# Degenerate input
+
+
+def test_nothing_matched_or_all_black_tells_nothing():
+    graph = true_graph(FRAMES)
+    assert keyframe_exposures(graph) is None
+    black = exposed_graph(torch.full((4, 3), 0.05))
+    assert keyframe_exposures(black) is None
+    frame = Frame(2, 0.1, torch.zeros(2, 2, 3))
+    assert with_exposure(frame, [SimpleNamespace(frame_index=0, exposure=None)]) is frame
+    assert frame.levelled is frame.pixels
