@@ -191,7 +191,7 @@ class Slam(Stateful):
         others = [index for index in self._poses if index not in keyframes]
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
             read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
-            frames = [with_exposure(frame, self.mapper.keyframes) for frame in read]
+            frames = [with_exposure(frame, self.mapper.exposures) for frame in read]
             start = [self._poses[frame.frame_index] for frame in frames]
             images = [frame.levelled for frame in frames]
             betas = [self._beta(frame, None) for frame in frames]

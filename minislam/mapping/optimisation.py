@@ -83,6 +83,12 @@ class JointOptimisation(Stateful):
         return self.camera.resized(*(max(1, round(self.config.image_scale * s)) for s in sides))
 
     @property
+    def exposures(self) -> dict[int, Tensor]:
+        """Return the exposures (3,) of keyframes, by frame index; without differences, none."""
+        known = {keyframe.frame_index: keyframe.exposure for keyframe in self.keyframes}
+        return {index: exposure for index, exposure in known.items() if exposure is not None}
+
+    @property
     def mlp(self) -> UncertaintyMLP:
         """Return the uncertainty MLP."""
         return self._trainer.mlp

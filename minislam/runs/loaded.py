@@ -43,8 +43,7 @@ class SourceFrame:
 def scene_of(slam: Slam) -> dict[str, Any]:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
-    mapped = {keyframe.frame_index: keyframe.exposure for keyframe in slam.mapper.keyframes}
-    exposures = {index: e.tolist() for index, e in mapped.items() if e is not None}
+    exposures = {index: e.tolist() for index, e in slam.mapper.exposures.items()}
     frames = [
         SourceFrame(
             index, frame.timestamp, sequence.source_name(index), index in keyframes,

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.mapping.views import MappedKeyframe
 from minislam.records import Frame, Keyframe
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.diagnostics import weighted_median
@@ -65,14 +64,14 @@ def with_exposures(keyframes: list[Keyframe], graph: KeyframeGraph) -> list[Keyf
     return [replace(keyframe, exposure=exposure) for keyframe, exposure in pairs]
 
 
-def with_exposure(frame: Frame, keyframes: list[MappedKeyframe]) -> Frame:
-    """Return a frame with an exposure interpolated between the keyframes before and after it."""
-    known = [keyframe.exposure for keyframe in keyframes if keyframe.exposure is not None]
-    if not known:
+def with_exposure(frame: Frame, exposures: dict[int, Tensor]) -> Frame:
+    """Return a frame exposed as between the nearest frames whose exposures are known."""
+    if not exposures:
         return frame
-    levels, indices = torch.stack(known).log().cpu(), [k.frame_index for k in keyframes]
-    here = [np.interp(frame.frame_index, indices, channel) for channel in levels.T.numpy()]
-    return replace(frame, exposure=torch.tensor(here).exp().to(known[0]))
+    levels = torch.stack(list(exposures.values())).log()
+    channels = levels.T.cpu().numpy()
+    here = [np.interp(frame.frame_index, list(exposures), channel) for channel in channels]
+    return replace(frame, exposure=torch.tensor(here).exp().to(levels))
 
 
 def _blurred(image: Tensor) -> np.ndarray:  # (H, W, 3)

@@ -1,7 +1,6 @@
 """Exposure: told by matches of what stands still, taken out of images, put back into pictures."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -55,16 +54,13 @@ def test_what_moves_has_no_say():
 
 
 def test_a_frame_between_keyframes_is_exposed_as_between_them():
-    keyframes = [
-        SimpleNamespace(frame_index=index, exposure=torch.tensor([level, 1.0, 1.0]))
-        for index, level in ((0, 1.0), (4, 4.0))
-    ]
+    exposures = {0: torch.ones(3), 4: torch.tensor([4.0, 1.0, 1.0])}
     frame = Frame(2, 0.1, torch.full((2, 2, 3), 0.5))
-    between = with_exposure(frame, keyframes)
+    between = with_exposure(frame, exposures)
     torch.testing.assert_close(between.exposure, torch.tensor([2.0, 1.0, 1.0]))
     torch.testing.assert_close(between.levelled[0, 0], torch.tensor([0.25, 0.5, 0.5]))
     torch.testing.assert_close(between.exposed(between.levelled), frame.image)
-    last = with_exposure(replace(frame, frame_index=9), keyframes)
+    last = with_exposure(replace(frame, frame_index=9), exposures)
     assert last.exposure[0] == pytest.approx(4)
 
 
@@ -77,5 +73,5 @@ def test_nothing_matched_or_all_black_tells_nothing():
     black = exposed_graph(torch.full((4, 3), 0.05))
     assert keyframe_exposures(black) is None
     frame = Frame(2, 0.1, torch.zeros(2, 2, 3))
-    assert with_exposure(frame, [SimpleNamespace(frame_index=0, exposure=None)]) is frame
+    assert with_exposure(frame, {}) is frame
     assert frame.levelled is frame.pixels
