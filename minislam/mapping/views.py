@@ -23,6 +23,13 @@ class View:
 
     image: Tensor  # (h, w, 3) RGB in [0, 1]
     depth: Tensor  # (h, w) world units, 0 where unknown
+    exposure: Tensor | None = None  # (3,) of a `Keyframe`
+
+    def shown(self, rendering: Rendering) -> Rendering:
+        """Return a rendering as the camera would show it: exposed, and at most white."""
+        if self.exposure is None:
+            return rendering
+        return rendering._replace(color=(rendering.color * self.exposure).clamp_max(1))
 
 
 @dataclass
@@ -61,13 +68,13 @@ class MappedKeyframe(Pictured):
         return cls(**state, pixels=frame_of(state["frame_index"]).pixels)
 
     def view(self, camera: Camera) -> View:
-        """Return the levelled keyframe at the size of `camera`; a smaller one is computed once."""
+        """Return the keyframe at the size of `camera`; a smaller one is computed once."""
         size = (camera.height, camera.width)
         if size == self.depth.shape:
-            return View(self.levelled, self.depth)
+            return View(self.image, self.depth, self.exposure)
         if size not in self._views:
-            image = shrink_image(self.levelled, *size)
-            self._views[size] = View(image, shrink_depth(self.depth, *size))
+            image = shrink_image(self.image, *size)
+            self._views[size] = View(image, shrink_depth(self.depth, *size), self.exposure)
         return self._views[size]
 
 
