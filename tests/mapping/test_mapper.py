@@ -30,6 +30,18 @@ def test_a_static_wall_is_learnt_and_seen_from_between_the_keyframes():
     assert mapper.history.uncertainty[-1] < mapper.history.uncertainty[0]
 
 
+def test_a_wall_that_was_exposed_darker_has_its_colour_in_the_map():
+    exposure, errors = torch.tensor([0.5, 0.6, 0.7]), []
+    for known in (exposure, None):
+        mapper, dark = make_mapper(), wall_keyframe(1)
+        dark = replace(dark, pixels=dark.image * exposure, exposure=known)
+        mapper.initialise([wall_keyframe(0), dark])
+        shown = mapper.render(wall_keyframe(2).T_camera_world).color
+        errors.append(float((shown - wall_keyframe(2).image).square().mean()))
+        assert len(mapper.exposures) == (known is not None)
+    assert errors[0] < 0.2 * errors[1]  # measured: .11
+
+
 def test_a_mover_becomes_uncertain_and_fades_from_the_map():
     # The square is elsewhere in each keyframe: no static map can explain it.
     mapper = make_mapper(replace(CONFIG, init_iterations=250))
