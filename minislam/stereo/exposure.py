@@ -10,6 +10,7 @@ of all keyframes is 1. Not in the paper; MonoGS optimises an exposure of each ke
 """
 
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -23,19 +24,24 @@ from minislam.tracking.safeguards.diagnostics import weighted_median
 BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the dark
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
 FEWEST_CELLS = 0.05  # of all: a link with less, counted by their weight, tells nothing [-]
+KEPT = 20  # blurred images: most links are among neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
 
 
 def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
     """Return how bright the keyframes are (K, 3), their median being 1; None if all are alike."""
-    links, cells = graph.links, graph.keyframes.cell_weights
-    images = [_blurred(frame.image) for frame in graph.keyframes.frames]
+    links, cells, frames = graph.links, graph.keyframes.cell_weights, graph.keyframes.frames
     ends, ratios = [], []
+
+    @lru_cache(maxsize=KEPT)
+    def blurred(keyframe: int) -> np.ndarray:  # (H, W, 3)
+        return cv2.GaussianBlur(frames[keyframe].image.cpu().numpy(), (0, 0), BLUR)
+
     for link, (source, target) in enumerate(links.edges()):
         matches, stride = links.targets[link], graph.grid.stride
-        here = torch.from_numpy(images[source][::stride, ::stride].reshape(-1, 3))
+        here = torch.from_numpy(blurred(source)[::stride, ::stride].reshape(-1, 3))
         u, v = matches.cpu().numpy()
-        moved = cv2.remap(images[target], u, v, cv2.INTER_LINEAR)
+        moved = cv2.remap(blurred(target), u, v, cv2.INTER_LINEAR)
         there = torch.from_numpy(moved.reshape(-1, 3))
         both = torch.cat([here, there], 1)
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
@@ -47,7 +53,7 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
             ratios.append([weighted_median(channel, weight) for channel in ratio.T])
     if not ends:
         return None
-    steps = np.zeros((len(ends), len(images)))
+    steps = np.zeros((len(ends), len(frames)))
     steps[range(len(ends)), [j for _, j in ends]] = 1
     steps[range(len(ends)), [i for i, _ in ends]] = -1
     levels = np.linalg.lstsq(steps, np.array(ratios), rcond=None)[0]
@@ -72,7 +78,3 @@ def with_exposure(frame: Frame, exposures: dict[int, Tensor]) -> Frame:
     channels = levels.T.cpu().numpy()
     here = [np.interp(frame.frame_index, list(exposures), channel) for channel in channels]
     return replace(frame, exposure=torch.tensor(here).exp().to(levels))
-
-
-def _blurred(image: Tensor) -> np.ndarray:  # (H, W, 3)
-    return cv2.GaussianBlur(image.cpu().numpy(), (0, 0), BLUR)
