@@ -1,4 +1,4 @@
-"""The refinement of Metric3D: normals, and upsampling on logits that make its answer known.
+"""The refinement of Metric3D: upsampling on logits that make its answer known.
 
 That its results are those of the official code is tested with the whole network.
 """
@@ -6,14 +6,8 @@ That its results are those of the official code is tested with the whole network
 import torch
 from torch.nn import functional
 
-from minislam.priors.networks.metric3d_refinement import convex_upsample, normalised
+from minislam.priors.networks.metric3d_refinement import convex_upsample
 from tests.helpers import generator
-
-
-def test_normals_have_unit_length_and_positive_confidence():
-    found = normalised(torch.randn(2, 4, 6, 7, generator=generator(1)))
-    torch.testing.assert_close(found[:, :3].norm(dim=1), torch.ones(2, 6, 7))
-    assert (found[:, 3] > 0).all()
 
 
 def test_upsampling_with_even_weights_averages_the_neighbourhood():
