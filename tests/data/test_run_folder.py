@@ -193,12 +193,16 @@ def test_damaged_weights_are_one_sentence(content: bytes, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("mine/a", "Not a dir"), ("a" * 300, "too long"), ("a\0", "null byte")]
+    ("name", "words"),
+    [
+        ("mine/a", "mine is a file; choose"),
+        ("a" * 300, "make the output folder (?s:.*)says: .*too long.*; choose"),
+        ("a\0", "make the output folder (?s:.*)says: .*null byte.*; choose"),
+    ],
 )
 def test_a_folder_that_cannot_be_made_is_one_sentence(name: str, words: str, tmp_path: Path):
     (tmp_path / "mine").write_text("mine")
-    make = f"make the output folder (?s:.*)says: .*{words}.*; choose"
-    with pytest.raises(InputError, match=make), locked(tmp_path / name):
+    with pytest.raises(InputError, match=words), locked(tmp_path / name):
         RunFolder.create(tmp_path / name)
     assert (tmp_path / "mine").read_text() == "mine"
 

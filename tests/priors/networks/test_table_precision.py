@@ -82,7 +82,7 @@ def test_only_layers_inside_the_network_are_in_half_precision(monkeypatch: pytes
     seen = []
     correlation_pyramid = droid_network.correlation_pyramid
     monkeypatch.setattr(
-        "minislam.priors.networks.droid.correlation_pyramid",
+        "minislam.priors.networks.droid_network.correlation_pyramid",
         lambda *pair: seen.append(pair[0].dtype) or correlation_pyramid(*pair),
     )
     flow = DroidFlow(in_precision(calm_droid(), HALF))
