@@ -70,10 +70,10 @@ ROOMS_BORDERS = {
     "tracking/safeguards/overlay.py", "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py",
     "mapping/view_gradients.py", "stereo/second_adjustment.py", "stereo/dense_structure.py",
-    "slam.py", "splatting/gaussians.py",
+    "stereo/exposure.py", "slam.py", "splatting/gaussians.py",
 }  # fmt: skip
-# What stays on the CPU: random numbers, so that no draw depends on the device, and Adam's counts.
-OF_THE_CPU = ("generator", "_generator", "step")
+# What stays on the CPU: random numbers, so that no draw depends on the device.
+OF_THE_CPU = ("generator", "_generator")
 
 
 @dataclass

@@ -77,4 +77,4 @@ def with_exposure(frame: Frame, exposures: dict[int, Tensor]) -> Frame:
     levels = torch.stack(list(exposures.values())).log()
     channels = levels.T.cpu().numpy()
     here = [np.interp(frame.frame_index, list(exposures), channel) for channel in channels]
-    return replace(frame, exposure=torch.tensor(here).exp().to(levels))
+    return replace(frame, exposure=torch.tensor(here, device=levels.device).exp().to(levels))
