@@ -27,7 +27,7 @@ from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
-from minislam.stereo.exposure import with_exposure, with_exposures
+from minislam.stereo.exposure import keyframe_exposures, with_exposure, with_exposures
 from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
 from minislam.tracking.safeguards.first_frame import FirstFrame
 from minislam.tracking.safeguards.focal_length import (
@@ -177,6 +177,8 @@ class Slam(Stateful):
     def _refine_map(self) -> None:
         stage = "refining the map"
         iterations = self.config.mapping.refine_iterations
+        if not self.mapper.exposures:
+            self.mapper.expose(keyframe_exposures(self.tracker.graph))
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:

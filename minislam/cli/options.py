@@ -127,7 +127,6 @@ def size_of(text: str) -> tuple[int, int]:
 
 def config_file(args: argparse.Namespace) -> dict[str, Any]:
     """Return the file given with --config, or config.json of the run that --resume goes on with."""
-
     if args.config:
         tree = read_json(args.config)
     elif getattr(args, "resume", False):

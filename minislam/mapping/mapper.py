@@ -79,6 +79,12 @@ class Mapper(JointOptimisation):
         for keyframe, pose in zip(self.keyframes, new, strict=True):
             keyframe.T_camera_world = pose
 
+    def expose(self, exposures: Tensor | None) -> None:
+        """Take over how bright the keyframes are (K, 3), if they differ."""
+        if exposures is not None:
+            for keyframe, exposure in zip(self.keyframes, exposures, strict=True):
+                keyframe.exposure = exposure
+
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size.
 
@@ -108,22 +114,16 @@ class Mapper(JointOptimisation):
     def anchor_rows(self) -> Tensor:
         """Return (N,) the position in `keyframes` of the keyframe that inserted each Gaussian."""
         anchors = self._optimizer.gaussians.anchor_keyframe
-        return torch.searchsorted(
-            anchors.new_tensor([keyframe.keyframe_index for keyframe in self.keyframes]), anchors
-        )
+        known = anchors.new_tensor([keyframe.keyframe_index for keyframe in self.keyframes])
+        return torch.searchsorted(known, anchors)
 
     @torch.no_grad()
     def _insert(self, keyframe: MappedKeyframe) -> None:
         """Add Gaussians for what a keyframe sees and the map does not show."""
-        new = gaussians_of_keyframe(
-            keyframe,
-            self.camera,
-            self.render(keyframe.T_camera_world) if len(self.gaussians) else None,
-            self.static_weight(self.beta_of(keyframe), self.camera),
-            self.median_depth,
-            self.config.insertion,
-            self._generator,
-        )
+        rendering = self.render(keyframe.T_camera_world) if len(self.gaussians) else None
+        weight = self.static_weight(self.beta_of(keyframe), self.camera)
+        scene = self.camera, rendering, weight, self.median_depth
+        new = gaussians_of_keyframe(keyframe, *scene, self.config.insertion, self._generator)
         self._optimizer.append(new)
         self._reset_gradients()
 

@@ -85,8 +85,7 @@ class JointOptimisation(Stateful):
     @property
     def exposures(self) -> dict[int, Tensor]:
         """Return the exposures (3,) of keyframes, by frame index; without differences, none."""
-        known = {keyframe.frame_index: keyframe.exposure for keyframe in self.keyframes}
-        return {index: exposure for index, exposure in known.items() if exposure is not None}
+        return {k.frame_index: k.exposure for k in self.keyframes if k.exposure is not None}
 
     @property
     def mlp(self) -> UncertaintyMLP:

@@ -45,7 +45,7 @@ class MappedKeyframe(Pictured):
     given_beta: Tensor | None = None  # (h, w) instead of the MLP's
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
     exposure: Tensor | None = None  # (3,) of a `Keyframe`
-    _views: dict[tuple[int, int], View] = field(default_factory=dict)
+    _small: dict[tuple[int, int], tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     @classmethod
     def from_record(cls, keyframe: Keyframe) -> "MappedKeyframe":
@@ -59,7 +59,7 @@ class MappedKeyframe(Pictured):
 
     def saved_state(self) -> Tree:
         """Return all attributes but the image, which is read again, and its copies."""
-        images = ("pixels", "_views")
+        images = ("pixels", "_small")
         return {name: value for name, value in vars(self).items() if name not in images}
 
     @classmethod
@@ -72,10 +72,9 @@ class MappedKeyframe(Pictured):
         size = (camera.height, camera.width)
         if size == self.depth.shape:
             return View(self.image, self.depth, self.exposure)
-        if size not in self._views:
-            image = shrink_image(self.image, *size)
-            self._views[size] = View(image, shrink_depth(self.depth, *size), self.exposure)
-        return self._views[size]
+        if size not in self._small:
+            self._small[size] = shrink_image(self.image, *size), shrink_depth(self.depth, *size)
+        return View(*self._small[size], self.exposure)
 
 
 def median_depth(keyframes: list[Keyframe]) -> float:  # world units

@@ -5,8 +5,9 @@ measured in spite of it, so matched cells that stand still tell the factors a_k 
 
     log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of a link.
 
-All links together are a linear least-squares problem. It leaves a common factor free; the median
-of all keyframes is 1. Not in the paper; MonoGS optimises an exposure of each keyframe.
+All links together are a linear least-squares problem, in which a link counts by the weight of its
+cells. It leaves a common factor free; the median of all keyframes is 1. Not in the paper; MonoGS
+optimises an exposure of each keyframe.
 """
 
 from dataclasses import replace
@@ -23,15 +24,18 @@ from minislam.tracking.safeguards.diagnostics import weighted_median
 
 BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the dark
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
-FEWEST_CELLS = 0.05  # of all: a link with less, counted by their weight, tells nothing [-]
 KEPT = 20  # blurred images: most links are among neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
+STEADY = 1e-4  # weight of "as bright as the keyframe before", where no link tells more
 
 
 def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
     """Return how bright the keyframes are (K, 3), their median being 1; None if all are alike."""
     links, cells, frames = graph.links, graph.keyframes.cell_weights, graph.keyframes.frames
-    ends, ratios = [], []
+    keyframe_axes = np.eye(len(frames))
+    steps = list(np.diff(keyframe_axes, axis=0))
+    ratios: list[list[float | None]] = [[0.0] * 3] * len(steps)
+    weights = [STEADY] * len(steps)
 
     @lru_cache(maxsize=KEPT)
     def blurred(keyframe: int) -> np.ndarray:  # (H, W, 3)
@@ -47,18 +51,17 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
         static = cells[source] * graph.grid.sample(cells[target][:, None], matches.T)[:, 0]
         weight = visible * (links.confidences[link][0] * static).cpu()
-        if weight.mean() > FEWEST_CELLS:
+        if weight.any():
             ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
-            ends.append((source, target))
+            steps.append(keyframe_axes[target] - keyframe_axes[source])
             ratios.append([weighted_median(channel, weight) for channel in ratio.T])
-    if not ends:
-        return None
-    steps = np.zeros((len(ends), len(frames)))
-    steps[range(len(ends)), [j for _, j in ends]] = 1
-    steps[range(len(ends)), [i for i, _ in ends]] = -1
-    levels = np.linalg.lstsq(steps, np.array(ratios), rcond=None)[0]
+            weights.append(float(weight.mean()))
+    root = np.sqrt(weights)[:, None]
+    levels = np.linalg.lstsq(root * steps, root * np.array(ratios, float), rcond=None)[0]
     levels -= np.median(levels, 0)
-    return None if np.abs(levels).max() < LEAST_CHANGE else torch.from_numpy(np.exp(levels)).float()
+    if np.abs(levels).max() < LEAST_CHANGE:
+        return None
+    return torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)
 
 
 def with_exposures(keyframes: list[Keyframe], graph: KeyframeGraph) -> list[Keyframe]:
@@ -66,7 +69,7 @@ def with_exposures(keyframes: list[Keyframe], graph: KeyframeGraph) -> list[Keyf
     exposures = keyframe_exposures(graph)
     if exposures is None:
         return keyframes
-    pairs = zip(keyframes, exposures.to(graph.grid.rays.device), strict=True)
+    pairs = zip(keyframes, exposures, strict=True)
     return [replace(keyframe, exposure=exposure) for keyframe, exposure in pairs]
 
 
