@@ -14,6 +14,7 @@ from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
+from minislam.mapping.safeguards import least_weight
 from minislam.mapping.views import MappedKeyframe, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
@@ -96,7 +97,12 @@ class Mapper(JointOptimisation):
         uniform = torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
-        self._optimise(cameras, uniform, progress, self.config.refine_rate_end, done)
+        how = cameras, uniform, progress, self.config.refine_rate_end
+        half = iterations // 2 // self.config.views_per_step * self.config.views_per_step
+        if done <= half:
+            self._optimise(*how, range(done, half))
+            self._exclude_upper_mode()
+        self._optimise(*how, range(max(done, half), iterations))
 
     def refine_poses(
         self,
@@ -140,6 +146,14 @@ class Mapper(JointOptimisation):
             )
         self._optimizer.prune(keep)
         self._reset_gradients()
+
+    def _exclude_upper_mode(self) -> None:
+        """Exclude all of what the betas of this clip tell to move, now that the map is grown."""
+        betas = torch.cat([self.beta_of(keyframe).flatten() for keyframe in self.keyframes])
+        least = least_weight(betas)
+        if least > self.least_weight and self.uncertainty.enabled:
+            self.least_weight = least
+            self._replace_dynamic_gaussians()
 
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""

@@ -10,24 +10,16 @@ from minislam.geometry import Camera
 from minislam.mapping.config import MappingConfig
 from minislam.mapping.density import densify, useful_rows
 from minislam.mapping.losses import metre
+from minislam.mapping.safeguards import confirmed_beta
 from minislam.mapping.view_gradients import ViewGradients, view_gradients
 from minislam.mapping.views import Comparison, MappedKeyframe
 from minislam.records import MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.stateful import Stateful
-from minislam.uncertainty import (
-    RenderingError,
-    UncertaintyConfig,
-    UncertaintyMLP,
-    UncertaintyTrainer,
-    mapping_weight,
-)
-from minislam.uncertainty.weights import BETA_CUT
+from minislam.uncertainty import RenderingError, UncertaintyConfig, UncertaintyMLP
+from minislam.uncertainty.training import UncertaintyTrainer
+from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
 from minislam.workers import Workers
-
-# Fraction of beta that is taken away where other views confirm. A beta above the cut is kept: what
-# it excludes may have stood still for a while. [-]
-CONFIRMED_BETA = 0.4
 
 
 class JointOptimisation(Stateful):
@@ -40,6 +32,7 @@ class JointOptimisation(Stateful):
     keyframes: list[MappedKeyframe]
     window: list[int]  # positions in `keyframes`, newest first
     median_depth: float = 1.0  # world units; set by the first keyframes, then fixed
+    least_weight: float = MAPPING_CUT  # a pixel with less is excluded
     background: Tensor  # RGB of what no keyframe sees
     history: MappingHistory
     _trainer: UncertaintyTrainer
@@ -106,16 +99,13 @@ class JointOptimisation(Stateful):
         """Return the raw beta (h', w') of a keyframe: from its mask or from the MLP."""
         if keyframe.given_beta is not None:
             return keyframe.given_beta
-        beta, confirmation = self.predict_beta(keyframe.features), keyframe.confirmation
-        if confirmation is None:
-            return beta
-        return torch.where(beta > BETA_CUT, beta, beta * (1 - CONFIRMED_BETA * confirmation))
+        return confirmed_beta(self.predict_beta(keyframe.features), keyframe.confirmation)
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
         """Return the static weight (H, W) for a raw beta; 1 with uncertainty switched off."""
         if not self.uncertainty.enabled:
             return torch.ones(camera.height, camera.width, device=beta.device)
-        return mapping_weight(beta, camera)
+        return mapping_weight(beta, camera, self.least_weight)
 
     def _optimise(
         self,
@@ -123,14 +113,18 @@ class JointOptimisation(Stateful):
         probabilities: Tensor,  # (K,) of the keyframes
         progress: Progress | None = None,
         last_rate: float = 1.0,  # last step over the first one, log-linear in between
-        first: int = 0,  # iteration to begin with
+        iterations: range | None = None,  # of the cameras; None: all
     ) -> None:
         """Run the iterations. Each renders a keyframe drawn at random; a few make a step."""
         if len(self._optimizer.gaussians) == 0:
             return  # There is nothing to optimise: all was pruned, or nothing was inserted.
-        interval, total = self.config.density.interval, len(cameras)
-        for done in range(first, total, self.config.views_per_step):
-            count = min(self.config.views_per_step, total - done)
+        interval, total, views = (
+            self.config.density.interval,
+            len(cameras),
+            self.config.views_per_step,
+        )
+        for done in (range(total) if iterations is None else iterations)[::views]:
+            count = min(views, total - done)
             repeats = int((probabilities > 0).sum()) < count
             drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)
             rounds = self._iteration // interval

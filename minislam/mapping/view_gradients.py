@@ -39,8 +39,9 @@ def view_gradients(
     inputs = {name: p.detach().requires_grad_() for name, p in gaussians.parameters.items()}
     gaussians = replace(gaussians, **inputs)
     offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
-    rendered = render(gaussians, camera, T_camera_world, background, screen_offsets=offsets)
-    rendering = view.shown(rendered)
+    rendering = render(gaussians, camera, T_camera_world, background, screen_offsets=offsets)
+    if view.exposure is not None:  # as the camera shows it, at most white
+        rendering = rendering._replace(color=(rendering.color * view.exposure).clamp_max(1))
     reference = view.image, view.depth, weight, median_depth, config
     loss = render_loss(gaussians, rendering, *reference)
     *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])

@@ -1,6 +1,6 @@
 """Keyframes as the mapper stores them: one pose, and the image at several sizes."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -8,13 +8,11 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.images import shrink_depth, shrink_image
+from minislam.mapping.safeguards import doubted_error
 from minislam.records import Keyframe, Pictured
 from minislam.splatting import Rendering
 from minislam.state.stateful import FrameOf, Tree
 from minislam.uncertainty import RenderingError, UncertaintyConfig, beta_of_mask, rendering_error
-
-# The rendering error of a confirmed cell fades: where it stands still, the map is wrong. [-]
-CONFIRMED_ERROR = 1.5
 
 
 @dataclass(frozen=True)
@@ -24,12 +22,6 @@ class View:
     image: Tensor  # (h, w, 3) RGB in [0, 1]
     depth: Tensor  # (h, w) world units, 0 where unknown
     exposure: Tensor | None = None  # (3,) of a `Keyframe`
-
-    def shown(self, rendering: Rendering) -> Rendering:
-        """Return a rendering as the camera would show it: exposed, and at most white."""
-        if self.exposure is None:
-            return rendering
-        return rendering._replace(color=(rendering.color * self.exposure).clamp_max(1))
 
 
 @dataclass
@@ -112,7 +104,4 @@ def keyframe_rendering_error(rendering: Rendering, how: Comparison) -> Rendering
     color, reference = shrink_image(rendering.color, *size), how.reference
     grid = how.grid_shape, how.depth_unit, how.config
     error = rendering_error(reference.image, reference.depth, color, depth, opacity, *grid)
-    if how.confirmation is not None:
-        doubt = (1 - CONFIRMED_ERROR * how.confirmation).clamp_min(0)
-        error = replace(error, ssim=doubt * error.ssim, depth=doubt * error.depth)
-    return error
+    return doubted_error(error, how.confirmation)

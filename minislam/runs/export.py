@@ -108,7 +108,8 @@ def static_mask(run: Run, frame: int, camera: Camera) -> np.ndarray:  # (H, W) u
     map_x, map_y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
     border = cv2.BORDER_REPLICATE
     beta = cv2.remap(run.beta(frame), map_x, map_y, cv2.INTER_LINEAR, borderMode=border)
-    weight = mapping_weight(torch.from_numpy(np.asarray(beta, np.float32)), camera)
+    raw = torch.from_numpy(np.asarray(beta, np.float32))
+    weight = mapping_weight(raw, camera, run.least_weight)
     return np.where(weight > 0, 255, 0).astype(np.uint8)
 
 

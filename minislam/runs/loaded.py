@@ -26,6 +26,7 @@ from minislam.runs.summary import Line, summarise
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.uncertainty import UncertaintyMLP, beta_of_mask
+from minislam.uncertainty.weights import MAPPING_CUT
 from minislam.viz import Figure, Page, overview, summary_html
 
 
@@ -56,6 +57,7 @@ def scene_of(slam: Slam) -> dict[str, Any]:
         "camera": asdict(slam.tracker.grid.camera),
         "unit": unit_of(slam),
         "background": slam.mapper.background.tolist(),
+        "least_weight": slam.mapper.least_weight,
         "preparation": sequence.preparation,
         "frames": [asdict(frame) for frame in frames],
     }
@@ -83,6 +85,7 @@ class Run:
             self.camera = Camera(**scene["camera"])
             self.unit: str = scene["unit"]
             self.background = np.array(scene["background"], np.float32).reshape(3)
+            self.least_weight = float(scene.get("least_weight", MAPPING_CUT))  # of a static pixel
             self.frames = [SourceFrame(**frame) for frame in scene["frames"]]
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
+from minislam.splatting import projection
 from minislam.splatting.compositing import moments_vjp
 from minislam.splatting.constants import (
     LOW_PASS_VARIANCE,
@@ -17,17 +18,6 @@ from minislam.splatting.constants import (
     tangent_limits,
 )
 from minislam.splatting.covariance import covariance_factors, covariance_factors_vjp
-from minislam.splatting.projection import (
-    conics_from_factors2d,
-    conics_from_factors2d_vjp,
-    project_factors,
-    project_factors_vjp,
-    project_means,
-    project_means_vjp,
-    to_camera,
-    to_camera_twist_vjp,
-    to_camera_vjp,
-)
 
 # px. The determinant of Sigma' grows with the fourth power of it, and float32 ends at 1e38.
 _MAX_RADIUS = 1e8
@@ -86,14 +76,14 @@ def project_gaussians(
     )
     # Capped per Gaussian, not per pixel: the profile stays smooth, and alpha <= o is safe as well.
     opacities = opacities[rows].clamp(max=MAX_OPACITY)
-    points_camera, camera_factors = to_camera(
+    points_camera, camera_factors = projection.to_camera(
         means, covariance_factors(quats, scales), T_camera_world
     )
-    means2d = project_means(points_camera, camera)
+    means2d = projection.project_means(points_camera, camera)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[rows].T
-    factors2d = project_factors(points_camera, camera_factors, camera)
-    conics, covariances2d = conics_from_factors2d(factors2d)
+    factors2d = projection.project_factors(points_camera, camera_factors, camera)
+    conics, covariances2d = projection.conics_from_factors2d(factors2d)
     return VisibleGaussians(
         rows, quats, scales, opacities, points_camera, camera_factors,
         factors2d, means2d, conics, covariances2d,
@@ -113,15 +103,17 @@ def project_gaussians_vjp(
     v_log_opacities, v_means2d, v_conics = moments_vjp(g.conics, moments)
     v_opacities = v_log_opacities / g.opacities * (g.opacities < MAX_OPACITY)
 
-    v_factors2d = conics_from_factors2d_vjp(g.factors2d, g.conics, v_conics)
-    v_points, v_camera_factors = project_factors_vjp(
+    v_factors2d = projection.conics_from_factors2d_vjp(g.factors2d, g.conics, v_conics)
+    v_points, v_camera_factors = projection.project_factors_vjp(
         g.points_camera, g.camera_factors, g.factors2d, camera, v_factors2d
     )
-    v_points += project_means_vjp(g.points_camera, camera, v_means2d)
+    v_points += projection.project_means_vjp(g.points_camera, camera, v_means2d)
     v_points[2] += v_depths
 
-    v_twist = to_camera_twist_vjp(g.points_camera, g.camera_factors, v_points, v_camera_factors)
-    v_means, v_factors = to_camera_vjp(T_camera_world, v_points, v_camera_factors)
+    v_twist = projection.to_camera_twist_vjp(
+        g.points_camera, g.camera_factors, v_points, v_camera_factors
+    )
+    v_means, v_factors = projection.to_camera_vjp(T_camera_world, v_points, v_camera_factors)
     v_quats = v_scales = None
     if needs_shape:
         v_quats, v_scales = covariance_factors_vjp(g.quats, g.scales, v_factors)

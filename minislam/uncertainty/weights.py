@@ -6,7 +6,8 @@ follow here, first stretches beta, then caps the weight in tracking and cuts it 
     beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
     tracking: w capped at 1,        mapping: w below 0.1 set to 0, and (ours) capped at 5.
 
-So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41.
+So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41, or
+above less where the betas of a clip tell two modes apart (ours, `mapping/safeguards.py`).
 """
 
 import torch
@@ -25,6 +26,11 @@ BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: the largest t
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
 BETA_CUT = 1.41  # the beta_raw of that weight
+LEAST_UPPER_MODE = (
+    1.0  # beta_raw: with less in the mean, the upper mode is what the map shows badly
+)
+UPPER_MODE = 0.8  # of its mean, from which on a beta_raw belongs to the upper mode
+LEVELS = 50  # histogram bins per unit of beta_raw
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
 
 
@@ -47,19 +53,24 @@ def beta_of_mask(moving: Tensor) -> Tensor:
     return torch.where(moving, largest, BETA_FLOOR)
 
 
+def stretched(beta: Tensor) -> Tensor:
+    """Return beta_adj of a clipped beta, of any shape."""
+    return (beta - BETA_FLOOR) * DATA_RATE + BETA_FLOOR
+
+
 def adjusted_beta(beta_raw: Tensor, camera: Camera) -> Tensor:
     """Return the stretched beta (H, W) of a grid (h', w'), without gradient."""
-    beta = resample(clipped_beta(beta_raw.detach()), camera.height, camera.width)
-    return (beta - BETA_FLOOR) * DATA_RATE + BETA_FLOOR
+    return stretched(resample(clipped_beta(beta_raw.detach()), camera.height, camera.width))
 
 
 def mapping_weight(
     beta_raw: Tensor,  # (h', w') output of the MLP
     camera: Camera,
-) -> Tensor:  # (H, W) 0, or from 0.1 to 5
+    least: float = MAPPING_CUT,  # a smaller weight is 0
+) -> Tensor:  # (H, W) 0, or from `least` to 5
     """Return the weight of each pixel in L_render, Eq. (6): 0.5 / beta_adj^2, cut and capped."""
     weight = (WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2).clamp_max(MAPPING_CAP)
-    return torch.where(weight < MAPPING_CUT, torch.zeros_like(weight), weight)
+    return torch.where(weight < least, torch.zeros_like(weight), weight)
 
 
 def tracking_weight(

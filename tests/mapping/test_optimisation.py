@@ -5,7 +5,6 @@ import torch
 
 from minislam.mapping import DensityConfig
 from minislam.mapping.view_gradients import view_gradients
-from minislam.mapping.views import MappedKeyframe
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 
@@ -64,14 +63,3 @@ def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
     weight = mapper.static_weight(mapper.beta_of(mapper.keyframes[0]), CAMERA)
     assert torch.equal(weight, torch.ones(24, 32))
     assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
-
-
-def test_confirmation_lessens_doubt_but_not_a_beta_above_the_cut(monkeypatch):
-    mapper = make_mapper(replace(CONFIG, init_iterations=0))
-    beta = torch.tensor([[0.2, 1.0, 1.4, 1.6, 3.0]])
-    monkeypatch.setattr(mapper, "predict_beta", lambda features: beta)
-    keyframe = MappedKeyframe.from_record(wall_keyframe(0))
-    assert mapper.beta_of(keyframe) is beta
-    keyframe.confirmation = torch.tensor([[0.0, 0.5, 1.0, 1.0, 1.0]])
-    expected = torch.tensor([[0.2, 0.8, 0.84, 1.6, 3.0]])
-    torch.testing.assert_close(mapper.beta_of(keyframe), expected)

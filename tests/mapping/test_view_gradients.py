@@ -1,3 +1,6 @@
+from dataclasses import replace
+
+import pytest
 import torch
 
 from minislam.mapping.losses import render_loss
@@ -8,9 +11,10 @@ from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 # Identities
 
 
-def test_the_gradients_are_those_of_the_loss_of_one_keyframe():
+@pytest.mark.parametrize("exposure", [None, torch.tensor([0.5, 1.0, 1.6])])
+def test_the_gradients_are_those_of_the_loss_of_one_keyframe(exposure):
     mapper = make_mapper()
-    mapper.initialise([wall_keyframe(0)])
+    mapper.initialise([replace(wall_keyframe(0), exposure=exposure)])
     keyframe, gaussians = mapper.keyframes[0], mapper._optimizer.gaussians
     mapper._optimizer.zero_grad()
     share = view_gradients(*mapper._call(keyframe, CAMERA, trains=False))
@@ -18,6 +22,8 @@ def test_the_gradients_are_those_of_the_loss_of_one_keyframe():
 
     pose, view = keyframe.T_camera_world.float(), keyframe.view(CAMERA)
     rendering = render(gaussians, CAMERA, pose, mapper.background)
+    if exposure is not None:
+        rendering = rendering._replace(color=(rendering.color * exposure).clamp_max(1))
     weight = mapper.static_weight(mapper.beta_of(keyframe), CAMERA)
     reference = view.image, view.depth, weight, mapper.median_depth, mapper.config
     loss = render_loss(gaussians, rendering, *reference)

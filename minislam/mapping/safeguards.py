@@ -1,0 +1,59 @@
+"""Against dynamic things that beta alone leaves in the map. All of this is ours, not the paper's.
+
+Other views know what stands still: `stereo/votes.py` gives the confirmation of each patch. And the
+betas of a whole clip know how large beta is on what moves there, if anything does.
+"""
+
+from dataclasses import replace
+
+import cv2
+import torch
+from torch import Tensor
+
+from minislam.uncertainty import RenderingError
+from minislam.uncertainty.weights import (
+    BETA_CUT,
+    MAPPING_CUT,
+    WEIGHT_SCALE,
+    clipped_beta,
+    stretched,
+)
+
+# The rendering error of a confirmed cell fades: where it stands still, the map is wrong. [-]
+CONFIRMED_ERROR = 1.5
+# Fraction of beta that is taken away where other views confirm. A beta above the cut is kept: what
+# it excludes may have stood still for a while. [-]
+CONFIRMED_BETA = 0.4
+LEAST_UPPER_MODE = 1.0  # mean raw beta: with less, the upper mode is what the map does not show yet
+UPPER_MODE = 0.8  # of that mean, from which on a raw beta belongs to the mode
+BINS = 50  # of the histogram, per unit of raw beta
+
+
+def confirmed_beta(beta: Tensor, confirmation: Tensor | None) -> Tensor:
+    """Return the raw beta (h', w'), less where other views confirm (h', w')."""
+    if confirmation is None:
+        return beta
+    return torch.where(beta > BETA_CUT, beta, beta * (1 - CONFIRMED_BETA * confirmation))
+
+
+def doubted_error(error: RenderingError, confirmation: Tensor | None) -> RenderingError:
+    """Return the rendering error that the MLP learns from, less where other views confirm."""
+    if confirmation is None:
+        return error
+    doubt = (1 - CONFIRMED_ERROR * confirmation).clamp_min(0)
+    return replace(error, ssim=doubt * error.ssim, depth=doubt * error.depth)
+
+
+def least_weight(beta_raw: Tensor) -> float:
+    """Return the weight below which a pixel is excluded, 0.1 or more, by all betas (n,) of a clip.
+
+    How large beta is on a dynamic object depends on how unlike its background it looks. Otsu's
+    threshold splits the betas into two modes; if the upper one is large, all of it is excluded.
+    """
+    bins = (BINS * beta_raw).clamp_max(255).byte().cpu().numpy()
+    split, _ = cv2.threshold(bins, 0, 255, cv2.THRESH_OTSU)
+    upper = beta_raw[BINS * beta_raw > split].mean()
+    if not upper > LEAST_UPPER_MODE:  # nan without one
+        return MAPPING_CUT
+    cut = stretched(clipped_beta(UPPER_MODE * upper))
+    return max(MAPPING_CUT, WEIGHT_SCALE / float(cut) ** 2)

@@ -1,0 +1,89 @@
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from minislam.mapping.safeguards import confirmed_beta, doubted_error, least_weight
+from minislam.uncertainty import RenderingError
+from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
+from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe
+
+# Known answers
+
+
+def test_confirmation_lessens_doubt_but_not_a_beta_above_the_cut():
+    beta = torch.tensor([[0.2, 1.0, 1.4, 1.6, 3.0]])
+    assert confirmed_beta(beta, None) is beta
+    confirmation = torch.tensor([[0.0, 0.5, 1.0, 1.0, 1.0]])
+    expected = torch.tensor([[0.2, 0.8, 0.84, 1.6, 3.0]])
+    torch.testing.assert_close(confirmed_beta(beta, confirmation), expected)
+
+
+def test_the_rendering_error_of_what_is_confirmed_fades():
+    error = RenderingError(torch.ones(1, 3), torch.full((1, 3), 2.0), torch.ones(1, 3))
+    assert doubted_error(error, None) is error
+    faded = doubted_error(error, torch.tensor([[0.0, 0.5, 1.0]]))
+    torch.testing.assert_close(faded.ssim, torch.tensor([[1.0, 0.25, 0.0]]))
+    torch.testing.assert_close(faded.depth, torch.tensor([[2.0, 0.5, 0.0]]))
+    assert faded.opacity is error.opacity
+
+
+def betas(*modes: tuple[float, int]) -> torch.Tensor:
+    """Return as many betas around each value as asked for."""
+    generator = torch.Generator().manual_seed(1)
+    around = [mean + 0.05 * torch.randn(n, generator=generator) for mean, n in modes]
+    return torch.cat(around).clamp_min(0.01)
+
+
+def test_what_moves_in_this_clip_is_excluded_though_its_beta_is_below_the_usual_cut():
+    least = least_weight(betas((0.1, 900), (1.15, 100)))
+    excluded = [float(mapping_weight(torch.full((2, 2), beta), CAMERA, least).max()) == 0
+                for beta in (0.85, 0.90, 0.94, 1.15)]  # fmt: skip
+    assert excluded == [False, False, True, True]  # four fifths of 1.15 are .92
+
+
+@pytest.mark.parametrize(
+    "modes",
+    [
+        [(0.1, 1000)],  # nothing moves
+        [(0.1, 900), (0.7, 100)],  # nothing moves, but a part is not shown well
+        [(0.4, 500), (1.9, 500)],  # the usual cut lies below
+        [(0.1, 500), (4.47, 500)],  # given masks
+        [(0.3, 1)],
+    ],
+)
+def test_otherwise_the_usual_cut_stays(modes):
+    assert least_weight(betas(*modes)) == MAPPING_CUT
+
+
+# Whole refinements
+
+
+def moving_square(iterations: int) -> tuple[object, list[object]]:
+    """Refine a map in which a square moves; its beta is 1.15. Return the mapper half way, too."""
+    mapper, halves = make_mapper(replace(CONFIG, init_iterations=2)), []
+    mapper.predict_beta = lambda features: 0.1 + 1.05 * features[..., 1]
+    mapper.initialise([wall_keyframe(k, mover_column=4 + 4 * k) for k in range(3)])
+
+    def remember(done: int, total: int) -> None:
+        if done == total // 2:
+            halves.append(deepcopy(mapper))
+
+    mapper.refine(iterations, remember)
+    return mapper, halves
+
+
+def test_half_way_all_that_moves_leaves_the_map():
+    mapper, (half,) = moving_square(8)
+    movers = [int((m.gaussians.means[:, 2] < 1.5).sum()) for m in (half, mapper)]
+    assert half.least_weight == MAPPING_CUT < mapper.least_weight
+    assert movers[1] < 0.4 * movers[0]
+
+
+def test_a_refinement_that_is_resumed_half_way_ends_at_the_same_map():
+    whole, (resumed,) = moving_square(8)
+    resumed.predict_beta = whole.predict_beta
+    resumed.refine(8, None, 4)
+    assert resumed.least_weight == whole.least_weight
+    assert torch.equal(resumed.gaussians.means, whole.gaussians.means)
