@@ -16,14 +16,7 @@ from minislam.checks.bundle_adjustment import (
 )
 from minislam.checks.cases import Case
 from minislam.checks.geometry import check_reproject, check_resized_intrinsics, check_warped_photo
-from minislam.checks.grading import (
-    NOT_YET,
-    PASSED,
-    WRONG,
-    Verdict,
-    check_function,
-    is_written,
-)
+from minislam.checks.grading import NOT_YET, PASSED, WRONG, Verdict, check_function, is_written
 from minislam.checks.mapping import (
     check_deformed_means,
     check_followed_pose,
@@ -32,12 +25,7 @@ from minislam.checks.mapping import (
     check_sampling,
 )
 from minislam.checks.real_video import check_gains, check_stride
-from minislam.checks.slam import (
-    check_alignment,
-    check_ate,
-    check_separability,
-    check_sign_test,
-)
+from minislam.checks.slam import check_alignment, check_ate, check_separability, check_sign_test
 from minislam.checks.splatting import (
     check_conic_vjp,
     check_picture_gradient,

@@ -25,7 +25,7 @@ CONFIRMED_ERROR = 1.5
 # it excludes may have stood still for a while. [-]
 CONFIRMED_BETA = 0.4
 LEAST_UPPER_MODE = 1.0  # mean raw beta: with less, the upper mode is what the map does not show yet
-UPPER_MODE = 0.8  # of that mean, from which on a raw beta belongs to the mode
+UPPER_MODE = 0.75  # of that mean, from which on a raw beta belongs to the mode
 BINS = 50  # of the histogram, per unit of raw beta
 
 

@@ -26,7 +26,7 @@ BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the d
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
 KEPT = 20  # blurred images: most links are among neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
-STEADY = 1e-4  # weight of "as bright as the keyframe before", where no link tells more
+STEADY = 1e-6  # weight of "as bright as the keyframe before", where no link tells more
 
 
 def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:

@@ -42,6 +42,16 @@ def test_a_wall_that_was_exposed_darker_has_its_colour_in_the_map():
     assert errors[0] < 0.2 * errors[1]  # measured: .11
 
 
+def test_exposures_that_are_told_later_count_from_then_on():
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+    mapper.expose(None)
+    assert not mapper.exposures
+    mapper.expose(torch.tensor([[1.0, 1.0, 1.0], [0.5, 0.6, 0.7]]))
+    assert list(mapper.exposures) == [0, 5]
+    assert mapper.keyframes[1].view(CAMERA).exposure is mapper.exposures[5]
+
+
 def test_a_mover_becomes_uncertain_and_fades_from_the_map():
     # The square is elsewhere in each keyframe: no static map can explain it.
     mapper = make_mapper(replace(CONFIG, init_iterations=250))

@@ -15,10 +15,10 @@ FRAMES = [0, 3, 6, 9]
 FACTORS = torch.tensor([[1.0, 1.0, 1.0], [0.7, 0.8, 0.9], [1.3, 1.2, 1.0], [1.0, 1.0, 1.0]])
 
 
-def exposed_graph(factors: torch.Tensor) -> KeyframeGraph:
+def exposed_graph(factors: torch.Tensor, linked: int = len(FRAMES)) -> KeyframeGraph:
     """Return a graph with the true flow of a grey wall, exposed by these factors."""
     graph = true_graph(FRAMES)
-    graph.match(neighbourhood_edges(0, len(FRAMES), 5))
+    graph.match(neighbourhood_edges(0, linked, 5))
     frames = graph.keyframes.frames
     for index, (frame, factor) in enumerate(zip(frames, factors, strict=True)):
         frames[index] = replace(frame, pixels=torch.ones_like(frame.image) * 0.5 * factor)
@@ -62,6 +62,20 @@ def test_a_frame_between_keyframes_is_exposed_as_between_them():
     torch.testing.assert_close(between.exposed(between.levelled), frame.image)
     last = with_exposure(replace(frame, frame_index=9), exposures)
     assert last.exposure[0] == pytest.approx(4)
+
+
+def test_links_of_little_weight_tell_as_much():
+    graph = exposed_graph(FACTORS)
+    for index in range(len(FRAMES)):
+        graph.keyframes.set_static_weight(index, torch.full_like(graph.grid.rays[:, 0], 0.02))
+    torch.testing.assert_close(keyframe_exposures(graph), FACTORS, rtol=0.01, atol=0)
+
+
+def test_a_keyframe_without_links_is_exposed_like_its_neighbour():
+    graph = exposed_graph(torch.tensor([0.7, 0.7, 1.3, 1.3])[:, None].expand(4, 3), linked=3)
+    found = keyframe_exposures(graph)
+    torch.testing.assert_close(found[3], found[2], rtol=1e-3, atol=0)
+    torch.testing.assert_close(found[2] / found[0], torch.full((3,), 1.3 / 0.7), rtol=0.02, atol=0)
 
 
 # Degenerate input
