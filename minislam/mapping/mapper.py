@@ -89,7 +89,7 @@ class Mapper(JointOptimisation):
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size.
 
-        A resumed run continues after the iterations that are done.
+        Half way, what is now known to move is excluded. A resumed run goes on after what is done.
         """
         if done == 0:
             self._replace_dynamic_gaussians()
