@@ -63,7 +63,6 @@ class Keyframe(Pictured):
     T_camera_world: Tensor  # (4, 4) float64
     moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
-    exposure: Tensor | None = None  # (3,) as of all that has an image
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
-from minislam.stereo.exposure import keyframe_exposures, with_exposure, with_exposures
+from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
 from minislam.tracking.safeguards.first_frame import FirstFrame
 from minislam.tracking.safeguards.focal_length import (
@@ -171,8 +171,8 @@ class Slam(Stateful):
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         swept = sweep_keyframes(graph, self.sequence, self._poses, progress, self.workers)
         self.mapper = self._new_mapper()
-        keyframes = with_exposures(fill_depth(self._keyframes(), swept), graph)
-        self.mapper.initialise(keyframes, self.steps.on_progress("first map"))
+        keyframes, exposures = fill_depth(self._keyframes(), swept), keyframe_exposures(graph)
+        self.mapper.initialise(keyframes, self.steps.on_progress("first map"), exposures)
 
     def _refine_map(self) -> None:
         stage = "refining the map"

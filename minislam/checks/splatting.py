@@ -9,12 +9,8 @@ from torch import Tensor
 from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, transform_points
+from minislam.splatting import projection
 from minislam.splatting.constants import LOW_PASS_VARIANCE, NEAR_DEPTH
-from minislam.splatting.projection import (
-    conics_from_factors2d,
-    conics_from_factors2d_vjp,
-    to_camera_twist_vjp,
-)
 from minislam.splatting.reference import composite, gaussian_alphas, project_covariances
 
 
@@ -134,7 +130,7 @@ def check_rendered_image(student: Function) -> Verdict:
 
 def check_conic_vjp(student: Function) -> Verdict:
     """Check (factors2d, conics, v_conics) -> v_factors2d (2, 3, N)."""
-    reference = conics_from_factors2d_vjp
+    reference = projection.conics_from_factors2d_vjp
 
     def product(factors: str, above: float, below: float, *a: Tensor) -> Tensor:
         """Return -2 times a product like QGQ with V, from two parts of v_b."""
@@ -146,7 +142,7 @@ def check_conic_vjp(student: Function) -> Verdict:
         return -2 * V
 
     def case(V: Tensor, v_conics: Tensor, description: str) -> Case:
-        return Case((V, conics_from_factors2d(V)[0], v_conics), description)
+        return Case((V, projection.conics_from_factors2d(V)[0], v_conics), description)
 
     def draw(seed: int) -> Case:
         values = normals(seed, 3, 3, 1 + seed % 4)
@@ -174,7 +170,7 @@ def check_conic_vjp(student: Function) -> Verdict:
 
 def check_twist_vjp(student: Function) -> Verdict:
     """Check (points, factors, v_points, v_factors) -> v_twist (6,) of (rho, phi)."""
-    right, exchanged = to_camera_twist_vjp, doubles(1, 1, 1, -1, -1, -1)
+    right, exchanged = projection.to_camera_twist_vjp, doubles(1, 1, 1, -1, -1, -1)
 
     def moves_factors(x: Tensor, B: Tensor, v_x: Tensor, v_B: Tensor) -> Tensor:
         return right(x, B, v_x, v_B) + torch.cat([v_B.sum((1, 2)), v_B.new_zeros(3)])

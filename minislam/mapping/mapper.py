@@ -26,16 +26,23 @@ VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum 
 class Mapper(JointOptimisation):
     """Grow the map of the static scene keyframe by keyframe, and train the MLP on the way."""
 
-    def initialise(self, keyframes: list[Keyframe], progress: Progress | None = None) -> None:
+    def initialise(
+        self,
+        keyframes: list[Keyframe],
+        progress: Progress | None = None,
+        exposures: Tensor | None = None,  # (K, 3) as of `expose`
+    ) -> None:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
         if not keyframes:
             raise InputError("expected at least one keyframe to start the map from, found none")
         self.median_depth = median_depth(keyframes)
+        self.keyframes = [MappedKeyframe.from_record(keyframe) for keyframe in keyframes]
+        self.expose(exposures)
         if self.config.mean_background:
-            self.background = torch.stack([k.levelled.mean((0, 1)) for k in keyframes]).mean(0)
-        for keyframe in keyframes:
-            self.keyframes.append(MappedKeyframe.from_record(keyframe))
-            self._insert(self.keyframes[-1])
+            means = [keyframe.levelled.mean((0, 1)) for keyframe in self.keyframes]
+            self.background = torch.stack(means).mean(0)
+        for keyframe in self.keyframes:
+            self._insert(keyframe)
         count = len(self.keyframes)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
         uniform = torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")

@@ -10,14 +10,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from minislam.uncertainty import RenderingError
-from minislam.uncertainty.weights import (
-    BETA_CUT,
-    MAPPING_CUT,
-    WEIGHT_SCALE,
-    clipped_beta,
-    stretched,
-)
+from minislam.uncertainty import RenderingError, weights
 
 # The rendering error of a confirmed cell fades: where it stands still, the map is wrong. [-]
 CONFIRMED_ERROR = 1.5
@@ -33,7 +26,7 @@ def confirmed_beta(beta: Tensor, confirmation: Tensor | None) -> Tensor:
     """Return the raw beta (h', w'), less where other views confirm (h', w')."""
     if confirmation is None:
         return beta
-    return torch.where(beta > BETA_CUT, beta, beta * (1 - CONFIRMED_BETA * confirmation))
+    return torch.where(beta > weights.BETA_CUT, beta, beta * (1 - CONFIRMED_BETA * confirmation))
 
 
 def doubted_error(error: RenderingError, confirmation: Tensor | None) -> RenderingError:
@@ -54,6 +47,6 @@ def least_weight(beta_raw: Tensor) -> float:
     split, _ = cv2.threshold(bins, 0, 255, cv2.THRESH_OTSU)
     upper = beta_raw[BINS * beta_raw > split].mean()
     if not upper > LEAST_UPPER_MODE:  # nan without one
-        return MAPPING_CUT
-    cut = stretched(clipped_beta(UPPER_MODE * upper))
-    return max(MAPPING_CUT, WEIGHT_SCALE / float(cut) ** 2)
+        return weights.MAPPING_CUT
+    cut = weights.stretched(weights.clipped_beta(UPPER_MODE * upper))
+    return max(weights.MAPPING_CUT, weights.WEIGHT_SCALE / float(cut) ** 2)

@@ -21,7 +21,7 @@ class View:
 
     image: Tensor  # (h, w, 3) RGB in [0, 1]
     depth: Tensor  # (h, w) world units, 0 where unknown
-    exposure: Tensor | None = None  # (3,) of a `Keyframe`
+    exposure: Tensor | None = None  # (3,) of its keyframe
 
 
 @dataclass
@@ -36,7 +36,7 @@ class MappedKeyframe(Pictured):
     T_camera_world: Tensor  # (4, 4) float64
     given_beta: Tensor | None = None  # (h, w) instead of the MLP's
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
-    exposure: Tensor | None = None  # (3,) of a `Keyframe`
+    exposure: Tensor | None = None  # (3,) as of all that has an image
     _small: dict[tuple[int, int], tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     @classmethod
@@ -46,7 +46,6 @@ class MappedKeyframe(Pictured):
         return cls(
             keyframe.keyframe_index, keyframe.frame_index, keyframe.features, keyframe.pixels,
             depth, pose, None if mask is None else beta_of_mask(mask), keyframe.confirmation,
-            keyframe.exposure,
         )  # fmt: skip
 
     def saved_state(self) -> Tree:

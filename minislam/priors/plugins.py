@@ -11,17 +11,13 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from minislam.errors import InputError
-from minislam.priors.conformance import (
-    check_depth_prior,
-    check_feature_extractor,
-    check_flow_estimator,
-)
+from minislam.priors import conformance
 from minislam.priors.names import PYTHON
 
 _CHECKS = {
-    "flow": check_flow_estimator,
-    "features": check_feature_extractor,
-    "depth": check_depth_prior,
+    "flow": conformance.check_flow_estimator,
+    "features": conformance.check_feature_extractor,
+    "depth": conformance.check_depth_prior,
 }
 
 

@@ -10,13 +10,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.splatting.compositing import (
-    Workspace,
-    composite,
-    composite_vjp,
-    log_alpha_coefficients,
-    log_alpha_coefficients_vjp,
-)
+from minislam.splatting import compositing
 from minislam.splatting.tiles import PIXELS, build_tile_lists, from_tiles, tile_centres, to_tiles
 from minislam.splatting.visible import VisibleGaussians
 
@@ -42,7 +36,7 @@ class CompositedImage(NamedTuple):
     opacity: Tensor  # (H, W)
     weight_sums: Tensor  # (V,) px, blending weight of a Gaussian summed over all pixels
     groups: list[CompositedGroup]
-    workspace: Workspace  # reused by the backward, which saves allocating a second one
+    workspace: compositing.Workspace  # reused by the backward, which saves allocating a second one
 
 
 def composite_image(
@@ -66,16 +60,18 @@ def composite_image(
     canvas = background[:, None].repeat(len(inside), 1, PIXELS)  # (tiles, 4, P)
     opacities = torch.zeros_like(inside)
     weight_sums = channels.new_zeros(len(channels))
-    workspace = Workspace(lists.largest_group, channels)
+    workspace = compositing.Workspace(lists.largest_group, channels)
     groups = []
     for tiles, length, span in lists.groups:
         gaussians = lists.slot_gaussian[span]
         slots = table.index_select(1, gaussians)
         offsets = slots[:2].view(2, length, -1) - centres[:, None, tiles]
         offsets = offsets.view(2, -1)
-        coefficients = log_alpha_coefficients(offsets, slots[2:5], slots[5])
+        coefficients = compositing.log_alpha_coefficients(offsets, slots[2:5], slots[5])
         group_channels = channels.index_select(0, gaussians).view(length, -1, 4)
-        out = composite(coefficients, group_channels, background, inside[tiles], workspace)
+        out = compositing.composite(
+            coefficients, group_channels, background, inside[tiles], workspace
+        )
         canvas[tiles] = out.channels
         opacities[tiles] = 1 - out.transmittance
         weight_sums.index_add_(0, gaussians, out.weight_sums.view(-1))
@@ -88,7 +84,7 @@ def composite_image(
 
 def composite_image_vjp(
     groups: list[CompositedGroup],
-    workspace: Workspace,
+    workspace: compositing.Workspace,
     count: int,  # V
     background: Tensor,  # (4,)
     v_channels: Tensor,  # (4, H, W)
@@ -100,11 +96,11 @@ def composite_image_vjp(
     v_transmittances = to_tiles(-v_opacity[None], camera)[:, 0]
     sums = v_channels.new_zeros(10, count + 1)  # the last column collects the padding
     for group in groups:
-        v_coefficients, v_group = composite_vjp(
+        v_coefficients, v_group = compositing.composite_vjp(
             group.coefficients, group.channels, background, group.checkpoints,
             v_canvas[group.tiles], v_transmittances[group.tiles], workspace,
         )  # fmt: skip
-        moments = log_alpha_coefficients_vjp(group.offsets, v_coefficients)
+        moments = compositing.log_alpha_coefficients_vjp(group.offsets, v_coefficients)
         sums[:6].index_add_(1, group.gaussians, moments)
         sums[6:].index_add_(1, group.gaussians, v_group.view(-1, 4).T)
     return sums[:6, :-1], sums[6:, :-1]

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.records import Frame, Keyframe
+from minislam.records import Frame
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.diagnostics import weighted_median
 
@@ -62,15 +62,6 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
     if np.abs(levels).max() < LEAST_CHANGE:
         return None
     return torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)
-
-
-def with_exposures(keyframes: list[Keyframe], graph: KeyframeGraph) -> list[Keyframe]:
-    """Return the keyframes of the graph with their exposures, if these differ."""
-    exposures = keyframe_exposures(graph)
-    if exposures is None:
-        return keyframes
-    pairs = zip(keyframes, exposures, strict=True)
-    return [replace(keyframe, exposure=exposure) for keyframe, exposure in pairs]
 
 
 def with_exposure(frame: Frame, exposures: dict[int, Tensor]) -> Frame:

@@ -8,15 +8,8 @@ from torch import Tensor
 
 from minislam.images import resample
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
+from minislam.uncertainty import losses
 from minislam.uncertainty.config import UncertaintyConfig
-from minislam.uncertainty.losses import (
-    FAR_FACTOR,
-    cell_loss,
-    depth_loss,
-    median_filter,
-    modified_ssim_loss,
-    variance_regulariser,
-)
 from minislam.uncertainty.mlp import UncertaintyMLP
 
 BETAS, EPSILON = (0.9, 0.999), 1e-8  # of Adam: decay of the moments, floor of the denominator
@@ -43,13 +36,14 @@ def rendering_error(
     config: UncertaintyConfig,
 ) -> RenderingError:
     """Compare a rendering with its keyframe and resample the errors to the feature grid."""
-    ssim = modified_ssim_loss(image, rendered_color, opacity, config)
-    ssim = median_filter(resample(ssim, *grid_shape), config.median_size)
+    ssim = losses.modified_ssim_loss(image, rendered_color, opacity, config)
+    ssim = losses.median_filter(resample(ssim, *grid_shape), config.median_size)
 
     known = reference_depth > 0
     # Without any reference depth there is no median, and every pixel is masked anyway.
     median = float(reference_depth[known].median()) if known.any() else 1.0
-    depth = depth_loss(rendered_depth, reference_depth, FAR_FACTOR * median) / depth_unit
+    limit = losses.FAR_FACTOR * median
+    depth = losses.depth_loss(rendered_depth, reference_depth, limit) / depth_unit
     depth = resample(depth.clamp_max(config.loss_cap), *grid_shape)
     return RenderingError(ssim, depth, resample(opacity, *grid_shape))
 
@@ -63,8 +57,8 @@ def uncertainty_loss(
 ) -> Tensor:  # ()
     """Return L_uncer: the mean cell loss plus lambda_2 L_reg_V. Eq. (4)."""
     numerator = error.ssim + config.lambda_depth * error.depth
-    cells = cell_loss(beta_raw, numerator, error.opacity, config)
-    regulariser = variance_regulariser(sample_beta_raw, sample_features, config)
+    cells = losses.cell_loss(beta_raw, numerator, error.opacity, config)
+    regulariser = losses.variance_regulariser(sample_beta_raw, sample_features, config)
     return cells.mean() + config.lambda_variance * regulariser
 
 

@@ -34,11 +34,12 @@ def test_a_wall_that_was_exposed_darker_has_its_colour_in_the_map():
     exposure, errors = torch.tensor([0.5, 0.6, 0.7]), []
     for known in (exposure, None):
         mapper, dark = make_mapper(), wall_keyframe(1)
-        dark = replace(dark, pixels=dark.image * exposure, exposure=known)
-        mapper.initialise([wall_keyframe(0), dark])
+        dark = replace(dark, pixels=dark.image * exposure)
+        known = None if known is None else torch.stack([torch.ones(3), known])
+        mapper.initialise([wall_keyframe(0), dark], exposures=known)
         shown = mapper.render(wall_keyframe(2).T_camera_world).color
         errors.append(float((shown - wall_keyframe(2).image).square().mean()))
-        assert len(mapper.exposures) == (known is not None)
+        assert len(mapper.exposures) == (0 if known is None else 2)
     assert errors[0] < 0.2 * errors[1]  # measured: .11
 
 

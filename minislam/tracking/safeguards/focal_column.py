@@ -18,12 +18,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.tracking.reprojection import (
-    MIN_DEPTH_RATIO,
-    Linearisation,
-    reproject_with_jacobians,
-    scaled_points,
-)
+from minislam.tracking import reprojection
 
 
 def zoomed(camera: Camera, rays: Tensor, log_focal: float) -> tuple[Camera, Tensor]:
@@ -42,10 +37,10 @@ def reproject_with_focal(
     camera: Camera,  # at s = 0
     log_focal: float,  # s
     is_free: bool,  # append the column of s to J_target
-) -> Linearisation:
+) -> reprojection.Linearisation:
     """Return the reprojection at s with its derivatives. Eq. (5)."""
     camera, rays = zoomed(camera, rays, log_focal)
-    found = reproject_with_jacobians(T_target_source, disparities, rays, camera)
+    found = reprojection.reproject_with_jacobians(T_target_source, disparities, rays, camera)
     if not is_free:
         return found
     column = focal_jacobian(T_target_source, disparities, rays, camera)
@@ -59,10 +54,10 @@ def focal_jacobian(
     camera: Camera,
 ) -> Tensor:  # (E, 2, N) px per unit of s
     """Return the derivative of all reprojections by s = ln(f / f_0). Eq. (5)."""
-    x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
+    x, y, z = reprojection.scaled_points(T_target_source, disparities, rays).unbind(1)
     narrowed = rays * rays.new_tensor([-1.0, -1.0, 0.0])
     dx, dy, dz = (T_target_source[:, :3, :3] @ narrowed.T).unbind(1)
-    inverse_z = torch.where(z >= MIN_DEPTH_RATIO, z, torch.ones_like(z)).reciprocal()
+    inverse_z = torch.where(z >= reprojection.MIN_DEPTH_RATIO, z, torch.ones_like(z)).reciprocal()
     a, b = x * inverse_z, y * inverse_z
     J_u = camera.fx * (a + (dx - a * dz) * inverse_z)
     J_v = camera.fy * (b + (dy - b * dz) * inverse_z)
