@@ -69,8 +69,8 @@ ROOMS_BORDERS = {
     "tracking/pose_from_flow.py", "tracking/safeguards/first_depth.py",
     "tracking/safeguards/overlay.py", "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py",
-    "mapping/view_gradients.py", "stereo/second_adjustment.py", "stereo/dense_structure.py",
-    "stereo/exposure.py", "slam.py", "splatting/gaussians.py",
+    "mapping/view_gradients.py", "mapping/safeguards.py", "stereo/second_adjustment.py",
+    "stereo/dense_structure.py", "stereo/exposure.py", "slam.py", "splatting/gaussians.py",
 }  # fmt: skip
 # What stays on the CPU: random numbers, so that no draw depends on the device.
 OF_THE_CPU = ("generator", "_generator")

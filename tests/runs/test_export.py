@@ -18,7 +18,7 @@ from minislam.data import GaussianArrays, InputOptions, open_sequence, read_ply
 from minislam.data.ply import encode_ply
 from minislam.errors import InputError
 from minislam.runs import export
-from minislam.uncertainty.weights import beta_of_mask
+from minislam.uncertainty.weights import MAPPING_CUT, beta_of_mask
 from tests.recordings import save
 
 RAW_SIZE, LENS = (200, 148), (170.0, 175.0, 95.0, 70.0)
@@ -85,7 +85,7 @@ def run(tmp_path: Path) -> SimpleNamespace:
     return SimpleNamespace(
         folder=SimpleNamespace(path=tmp_path / "run"), camera=sequence.camera, unit="m",
         poses={frame: pose(frame) for frame in FRAMES}, keyframes=[5], gaussians=gaussians,
-        sequence=sequence, beta=beta,
+        sequence=sequence, beta=beta, least_weight=MAPPING_CUT,
         render_depth=lambda T, camera=None: np.full((64, 96), T[2, 3] + 2),
     )  # fmt: skip
 
@@ -194,6 +194,15 @@ def test_masks_of_a_static_scene_are_white(run, tmp_path: Path):
     mask = cv2.imread(str(tmp_path / "masks/000005.png"), cv2.IMREAD_GRAYSCALE)
     full = run.sequence.full_camera(run.camera)
     assert (mask == 255).all() and mask.shape == (full.height, full.width)
+
+
+def test_masks_follow_the_cut_of_the_run(run, tmp_path: Path):
+    run.beta = lambda frame: np.full((64, 96), 1.2, np.float32)
+    for name, least, expected in (("usual", MAPPING_CUT, 255), ("of this clip", 0.17, 0)):
+        run.least_weight = least
+        export.export_masks(run, tmp_path / name, [5], quiet)
+        mask = cv2.imread(str(tmp_path / name / "000005.png"), cv2.IMREAD_GRAYSCALE)
+        assert (mask == expected).all()
 
 
 def test_higher_harmonics_are_zeros_between_colour_and_opacity(run, tmp_path: Path):
