@@ -156,8 +156,9 @@ class Mapper(JointOptimisation):
 
     def _exclude_upper_mode(self) -> None:
         """Exclude all of what the betas of this clip tell to move, now that the map is grown."""
-        betas = torch.cat([self.beta_of(keyframe).flatten() for keyframe in self.keyframes])
-        least = least_weight(betas)
+        # Without confirmation, what stands still but is not shown well yet would go with it.
+        betas = [self.beta_of(k).flatten() for k in self.keyframes if k.confirmation is not None]
+        least = least_weight(torch.cat(betas)) if betas else self.least_weight
         if least > self.least_weight and self.uncertainty.enabled:
             self.least_weight = least
             self._replace_dynamic_gaussians()

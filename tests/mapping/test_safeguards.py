@@ -7,7 +7,7 @@ import torch
 from minislam.mapping.safeguards import confirmed_beta, doubted_error, least_weight
 from minislam.uncertainty import RenderingError
 from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
-from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe
+from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 
 # Known answers
 
@@ -60,11 +60,14 @@ def test_otherwise_the_usual_cut_stays(modes):
 # Whole refinements
 
 
-def moving_square(iterations: int) -> tuple[object, list[object]]:
+def moving_square(iterations: int, confirms: bool = True) -> tuple[object, list[object]]:
     """Refine a map in which a square moves; its beta is 1.15. Return the mapper half way, too."""
+    keyframes = [wall_keyframe(k, mover_column=4 + 4 * k) for k in range(3)]
+    if confirms:
+        keyframes = [replace(keyframe, confirmation=torch.zeros(GRID)) for keyframe in keyframes]
     mapper, halves = make_mapper(replace(CONFIG, init_iterations=2)), []
     mapper.predict_beta = lambda features: 0.1 + 1.05 * features[..., 1]
-    mapper.initialise([wall_keyframe(k, mover_column=4 + 4 * k) for k in range(3)])
+    mapper.initialise(keyframes)
 
     def remember(done: int, total: int) -> None:
         if done == total // 2:
@@ -79,6 +82,11 @@ def test_half_way_all_that_moves_leaves_the_map():
     movers = [int((m.gaussians.means[:, 2] < 1.5).sum()) for m in (half, mapper)]
     assert half.least_weight == MAPPING_CUT < mapper.least_weight
     assert movers[1] < 0.4 * movers[0]
+
+
+def test_without_confirmation_the_usual_cut_stays():
+    mapper, _ = moving_square(4, confirms=False)
+    assert mapper.least_weight == MAPPING_CUT
 
 
 def test_a_refinement_that_is_resumed_half_way_ends_at_the_same_map():
