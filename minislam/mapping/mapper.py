@@ -14,7 +14,7 @@ from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
-from minislam.mapping.safeguards import least_weight
+from minislam.mapping.safeguards import LEAST_VIEWS, least_weight
 from minislam.mapping.views import MappedKeyframe, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
@@ -108,7 +108,8 @@ class Mapper(JointOptimisation):
         half = iterations // 2 // self.config.views_per_step * self.config.views_per_step
         if done <= half:
             self._optimise(*how, range(done, half))
-            self._exclude_upper_mode()
+            if half >= LEAST_VIEWS * count:
+                self._exclude_upper_mode()
         self._optimise(*how, range(max(done, half), iterations))
 
     def refine_poses(
@@ -155,8 +156,7 @@ class Mapper(JointOptimisation):
         self._reset_gradients()
 
     def _exclude_upper_mode(self) -> None:
-        """Exclude all of what the betas of this clip tell to move, now that the map is grown."""
-        # Without confirmation, what stands still but is not shown well yet would go with it.
+        """Exclude all that the betas tell to move, where confirmation holds what stands still."""
         betas = [self.beta_of(k).flatten() for k in self.keyframes if k.confirmation is not None]
         least = least_weight(torch.cat(betas)) if betas else self.least_weight
         if least > self.least_weight and self.uncertainty.enabled:

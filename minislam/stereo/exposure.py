@@ -5,9 +5,8 @@ measured in spite of it, so matched cells that stand still tell the factors a_k 
 
     log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of a link.
 
-All links together are a linear least-squares problem, in which a link counts by the weight of its
-cells. It leaves a common factor free; the median of all keyframes is 1. Not in the paper; MonoGS
-optimises an exposure of each keyframe.
+All links together are a linear least-squares problem, in which each counts by its cells' weight.
+A common factor is free: the median is 1. Not in the paper; MonoGS optimises such factors.
 """
 
 from dataclasses import replace

@@ -78,20 +78,25 @@ def moving_square(iterations: int, confirms: bool = True) -> tuple[object, list[
 
 
 def test_half_way_all_that_moves_leaves_the_map():
-    mapper, (half,) = moving_square(8)
+    mapper, (half,) = moving_square(48)
     movers = [int((m.gaussians.means[:, 2] < 1.5).sum()) for m in (half, mapper)]
     assert half.least_weight == MAPPING_CUT < mapper.least_weight
     assert movers[1] < 0.4 * movers[0]
 
 
 def test_without_confirmation_the_usual_cut_stays():
-    mapper, _ = moving_square(4, confirms=False)
+    mapper, _ = moving_square(48, confirms=False)
+    assert mapper.least_weight == MAPPING_CUT
+
+
+def test_before_a_keyframe_was_rendered_eight_times_the_usual_cut_stays():
+    mapper, _ = moving_square(44)  # the half are 22 renderings of 3 keyframes
     assert mapper.least_weight == MAPPING_CUT
 
 
 def test_a_refinement_that_is_resumed_half_way_ends_at_the_same_map():
-    whole, (resumed,) = moving_square(8)
+    whole, (resumed,) = moving_square(48)
     resumed.predict_beta = whole.predict_beta
-    resumed.refine(8, None, 4)
+    resumed.refine(48, None, 24)
     assert resumed.least_weight == whole.least_weight
     assert torch.equal(resumed.gaussians.means, whole.gaussians.means)
