@@ -118,11 +118,8 @@ class JointOptimisation(Stateful):
         """Run the iterations. Each renders a keyframe drawn at random; a few make a step."""
         if len(self._optimizer.gaussians) == 0:
             return  # There is nothing to optimise: all was pruned, or nothing was inserted.
-        interval, total, views = (
-            self.config.density.interval,
-            len(cameras),
-            self.config.views_per_step,
-        )
+        interval, views = self.config.density.interval, self.config.views_per_step
+        total = len(cameras)
         for done in (range(total) if iterations is None else iterations)[::views]:
             count = min(views, total - done)
             repeats = int((probabilities > 0).sum()) < count
