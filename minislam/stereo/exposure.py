@@ -25,6 +25,7 @@ BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the d
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
 KEPT = 20  # blurred images: most links are among neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
+LEAST_WEIGHT = 0.005  # mean of a link's cells: with less, a few chance matches would tell [-]
 STEADY = 1e-6  # weight of "as bright as the keyframe before", where no link tells more
 
 
@@ -50,7 +51,7 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
         static = cells[source] * graph.grid.sample(cells[target][:, None], matches.T)[:, 0]
         weight = visible * (links.confidences[link][0] * static).cpu()
-        if weight.any():
+        if weight.mean() > LEAST_WEIGHT:
             ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
             steps.append(keyframe_axes[target] - keyframe_axes[source])
             ratios.append([weighted_median(channel, weight) for channel in ratio.T])

@@ -26,11 +26,6 @@ BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: the largest t
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
 BETA_CUT = 1.41  # the beta_raw of that weight
-LEAST_UPPER_MODE = (
-    1.0  # beta_raw: with less in the mean, the upper mode is what the map shows badly
-)
-UPPER_MODE = 0.8  # of its mean, from which on a beta_raw belongs to the upper mode
-LEVELS = 50  # histogram bins per unit of beta_raw
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
 
 

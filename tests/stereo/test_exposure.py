@@ -1,11 +1,14 @@
 """Exposure: told by matches of what stands still, taken out of images, put back into pictures."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from minislam.config import SlamConfig
 from minislam.records import Frame
+from minislam.slam import Slam
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -64,8 +67,14 @@ def test_a_frame_between_keyframes_is_exposed_as_between_them():
 def test_links_of_little_weight_tell_as_much():
     graph = exposed_graph(FACTORS)
     for index in range(len(FRAMES)):
-        graph.keyframes.set_static_weight(index, torch.full_like(graph.grid.rays[:, 0], 0.02))
+        graph.keyframes.set_static_weight(index, torch.full_like(graph.grid.rays[:, 0], 0.1))
     torch.testing.assert_close(keyframe_exposures(graph), FACTORS, rtol=0.01, atol=0)
+
+
+def test_chance_matches_tell_nothing():
+    graph = exposed_graph(torch.tensor([1.0, 1.0, 1.0, 0.7])[:, None].expand(4, 3))
+    graph.keyframes.set_static_weight(3, torch.full_like(graph.grid.rays[:, 0], 0.001))
+    assert keyframe_exposures(graph) is None
 
 
 def test_a_keyframe_without_links_is_exposed_like_its_neighbour():
@@ -73,6 +82,21 @@ def test_a_keyframe_without_links_is_exposed_like_its_neighbour():
     found = keyframe_exposures(graph)
     torch.testing.assert_close(found[3], found[2], rtol=1e-3, atol=0)
     torch.testing.assert_close(found[2] / found[0], torch.full((3,), 1.3 / 0.7), rtol=0.02, atol=0)
+
+
+def test_a_map_that_grew_online_is_exposed_before_its_refinement(monkeypatch):
+    told: list[str] = []
+    mapper = SimpleNamespace(
+        exposures={}, expose=told.append, refine=lambda *arguments: told.append("refined")
+    )
+    steps = SimpleNamespace(on_step=lambda stage: None, done=lambda stage: 0)
+    tracker = SimpleNamespace(graph="told by this graph")
+    slam = SimpleNamespace(mapper=mapper, steps=steps, tracker=tracker, config=SlamConfig())
+    monkeypatch.setattr("minislam.slam.keyframe_exposures", lambda graph: graph)
+    Slam._refine_map(slam)
+    mapper.exposures = {0: torch.ones(3)}  # then they are known
+    Slam._refine_map(slam)
+    assert told == ["told by this graph", "refined", "refined"]
 
 
 # Degenerate input
