@@ -14,7 +14,7 @@ from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
-from minislam.mapping.safeguards import LEAST_VIEWS, least_weight
+from minislam.mapping.safeguards import FIRST_VIEWS, LEAST_VIEWS, least_weight
 from minislam.mapping.views import MappedKeyframe, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
@@ -41,12 +41,15 @@ class Mapper(JointOptimisation):
         if self.config.mean_background:
             means = [keyframe.levelled.mean((0, 1)) for keyframe in self.keyframes]
             self.background = torch.stack(means).mean(0)
+        count = len(self.keyframes)
+        if self.uncertainty.is_learnt:
+            self._weighted_from = FIRST_VIEWS * count
         for keyframe in self.keyframes:
             self._insert(keyframe)
-        count = len(self.keyframes)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
         uniform = torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
-        self._optimise([self._online_camera] * self.config.init_iterations, uniform, progress)
+        iterations = max(self.config.init_iterations, self._weighted_from)
+        self._optimise([self._online_camera] * iterations, uniform, progress)
         self._replace_dynamic_gaussians()
 
     def integrate(self, keyframe: Keyframe) -> None:

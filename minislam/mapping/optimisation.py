@@ -41,6 +41,7 @@ class JointOptimisation(Stateful):
     _gradients: Tensor  # (2, N) screen gradients of the views since the last change of density
     _iteration: int = 0
     _frozen_until: int = 0  # iteration before which the MLP is not trained
+    _weighted_from: int = 0  # iteration before which beta weights nothing
 
     def __init__(
         self,
@@ -102,8 +103,8 @@ class JointOptimisation(Stateful):
         return confirmed_beta(self.predict_beta(keyframe.features), keyframe.confirmation)
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
-        """Return the static weight (H, W) for a raw beta; 1 with uncertainty switched off."""
-        if not self.uncertainty.enabled:
+        """Return the static weight (H, W) for a raw beta; 1 at first, or with uncertainty off."""
+        if not self.uncertainty.enabled or self._iteration < self._weighted_from:
             return torch.ones(camera.height, camera.width, device=beta.device)
         return mapping_weight(beta, camera, self.least_weight)
 

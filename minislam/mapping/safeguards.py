@@ -17,6 +17,9 @@ CONFIRMED_ERROR = 1.5
 # Fraction of beta that is taken away where other views confirm. A beta above the cut is kept: what
 # it excludes may have stood still for a while. [-]
 CONFIRMED_BETA = 0.4
+# Renderings of each keyframe before which beta weights nothing: as long as the map is not fitted,
+# its errors tell what it lacks. What is excluded then is never shown, so its errors stay.
+FIRST_VIEWS = 4
 LEAST_UPPER_MODE = 1.0  # mean raw beta: with less, the upper mode is what the map does not show yet
 UPPER_MODE = 0.75  # of that mean, from which on a raw beta belongs to the mode
 BINS = 50  # of the histogram, per unit of raw beta

@@ -63,6 +63,25 @@ def test_a_mover_becomes_uncertain_and_fades_from_the_map():
     assert psnr(mapper.render(empty.T_camera_world).color, empty.image) > 18
 
 
+def test_an_mlp_that_took_everything_to_move_at_first_hides_nothing_of_a_static_wall():
+    mapper, keyframes = make_mapper(), [wall_keyframe(k) for k in range(3)]
+    with torch.no_grad():
+        mapper.mlp.biases[-1].fill_(4.0)
+    beta = mapper.predict_beta(keyframes[0].features)
+    assert beta.min() > 3 and (mapper.static_weight(beta, CAMERA) == 0).all()
+    mapper.initialise(keyframes)
+    rendering = mapper.render(keyframes[1].T_camera_world)
+    assert psnr(rendering.color[2:-2, 2:-2], keyframes[1].image[2:-2, 2:-2]) > 25
+    beta = mapper.predict_beta(keyframes[0].features)
+    assert (mapper.static_weight(beta, CAMERA) > 0).all()
+
+
+def test_the_first_map_sees_every_keyframe_some_times_however_many_there_are():
+    mapper = make_mapper(replace(CONFIG, init_iterations=1))
+    mapper.initialise([wall_keyframe(k) for k in range(5)])
+    assert len(mapper.history.render) == 20
+
+
 def test_gaussians_on_a_mover_are_removed_and_not_inserted_again_once_the_mlp_knows_it():
     mapper = make_mapper(replace(CONFIG, init_iterations=1))
     mapper.initialise([wall_keyframe(0, mover_column=12)])
@@ -125,14 +144,14 @@ def test_covered_pixels_are_not_inserted_again():
 
 
 def test_in_fast_mode_most_keyframes_wait_for_their_optimisation():
-    mapper = make_mapper(replace(CONFIG, init_iterations=2, keyframe_stride=3))
+    mapper = make_mapper(replace(CONFIG, init_iterations=4, keyframe_stride=3))
     mapper.initialise([wall_keyframe(0)])
     counts = []
     for index in range(1, 7):
         mapper.integrate(wall_keyframe(index))
         counts.append(len(mapper.history.render))
     # Keyframes 3 and 6 are optimised, with five iterations each; all others are only inserted.
-    assert counts == [2, 2, 7, 7, 7, 12]
+    assert counts == [4, 4, 9, 9, 9, 14]
     assert set(mapper.gaussians.anchor_keyframe.tolist()) == set(range(7))
 
 
