@@ -177,7 +177,7 @@ class Slam(Stateful):
     def _refine_map(self) -> None:
         stage = "refining the map"
         iterations = self.config.mapping.refine_iterations
-        if not self.mapper.exposures:
+        if self.tracker.keyframes.known_prior >= DENSE_PRIOR:  # else told when the map was rebuilt
             self.mapper.expose(keyframe_exposures(self.tracker.graph))
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 

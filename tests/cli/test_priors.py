@@ -94,6 +94,18 @@ def test_the_papers_front_end_runs_from_its_checkpoint_files(
     assert len(read_ply(folder.path / "map.ply").means) > 100
 
 
+def test_the_paper_preset_runs_on_its_networks(files: Path, tmp_path: Path):
+    out, few = tmp_path / "out", ["--max-frames", "5", "--tracking.keyframe_interval", "2"]
+    for name, count in ("init", 8), ("keyframe", 2), ("refine", 8):  # of some 20,000
+        few += [f"--mapping.{name}_iterations", str(count)]
+    clip = ["synth:ball", "--size", SIZE, "--preset", "paper", "-o", str(out)]
+    assert main(["run", *clip, *few, *located(files, FRONT_END[:12])]) in (0, 3)
+    folder = RunFolder(out)
+    assert folder.read_run()["frames"] == 5
+    assert np.isfinite(folder.read_trajectory().T_world_camera).all()
+    assert len(read_ply(folder.path / "map.ply").means) > 100
+
+
 def test_priors_written_to_files_give_the_same_run(files: Path, tmp_path: Path, capsys):
     clip = ["synth:ball", "--size", SIZE, "--preset", "test"]
     every, second = ["--max-frames", "6"], ["--stride", "2", "--max-frames", "3"]
