@@ -7,6 +7,7 @@ small residuals. Therefore several hypotheses go through the same bundle adjustm
 lowest cost is kept.
 """
 
+import itertools
 from dataclasses import replace
 
 import torch
@@ -32,6 +33,7 @@ from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.tracking.safeguards.two_views import pose_with_depth
 
 HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps per width before hypotheses are compared
+ROBUST_NARROWING = (0.5, 0.25)  # [-], times the final width
 
 
 def first_disparity_hypotheses(
@@ -92,15 +94,20 @@ def best_hypothesis(
 ) -> tuple[BundleState, BundleReport]:
     """Adjust every hypothesis on the same measurements and return the one of lowest cost.
 
-    No threshold is used, because a wrong minimum can have small residuals too; on the same
-    measurements the right one has smaller ones. A wide robust weight lets a bad guess leave its
-    wrong minimum. A depth prior gives only one hypothesis, which is already near.
+    No threshold is used, because a wrong minimum can have small residuals too. A wide robust weight
+    lets a bad guess leave its wrong minimum, but under the widest one a large dynamic object may
+    outvote the room. So every hypothesis starts from the two widest, and the costs are compared
+    under a narrow one: there the room fits, and a compromise between room and dynamic object does
+    not. A depth prior gives only one hypothesis, which is already near.
     """
     robust = problem.robust
-    widenings = ROBUST_WIDENING if robust and len(states) > 1 else (1.0,)
+    starts: list[tuple[float, ...]] = [(1.0,)]
+    if robust and len(states) > 1:
+        widenings = ROBUST_WIDENING + ROBUST_NARROWING
+        starts = [widenings, widenings[1:]]
     results = []
-    for state in states:
-        for widening in widenings:
+    for state, start in itertools.product(states, starts):
+        for widening in start:
             problem = replace(problem, robust=robust and robust.widened(widening))
             state, report = bundle_adjust(problem, state, HYPOTHESIS_ITERATIONS)
         results.append((state, report))
