@@ -90,25 +90,16 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     views, likeness = [], []
     for index, keyframe in enumerate(slam.mapper.keyframes):
         rendering = slam.mapper.render(keyframe.T_camera_world)
-        view = MappedView(
-            keyframe.frame_index,
-            se3_inverse(keyframe.T_camera_world).cpu().numpy(),
-            slam.beta_image(index) if slam.config.uncertainty.is_learnt else None,
-            surface_depth(rendering).cpu().numpy(),
-        )
-        views.append(view)
+        beta = slam.beta_image(index) if slam.config.uncertainty.is_learnt else None
+        pose = se3_inverse(keyframe.T_camera_world).cpu().numpy()
+        depth = surface_depth(rendering).cpu().numpy()
+        views.append(MappedView(keyframe.frame_index, pose, beta, depth))
         static = slam.mapper.static_weight(slam.mapper.beta_of(keyframe), slam.mapper.camera) > 0
         if static.any():
             pictures = keyframe.exposed(rendering.color), keyframe.image, static
             likeness.append(psnr(*(picture.cpu() for picture in pictures)))
-    metrics: dict[str, Any] = measure_run(
-        slam.sequence.ground_truth,
-        slam.trajectory(),
-        slam.keyframe_trajectory(),
-        views,
-        slam.render,
-        lpips,
-    )
+    truth, paths = slam.sequence.ground_truth, (slam.trajectory(), slam.keyframe_trajectory())
+    metrics: dict[str, Any] = measure_run(truth, *paths, views, slam.render, lpips)
     metrics |= _segment_errors(slam)
     metrics["focal_length_px"] = slam.tracker.grid.camera.fx
     metrics["seconds_total"] = seconds
