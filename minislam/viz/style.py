@@ -25,6 +25,7 @@ _COLORMAPS = {"depth": "viridis", "beta": "magma", "weight": "gray", "error": "R
 _DPI = 110  # dots per inch
 _UNKNOWN_RGB = (0.25, 0.25, 0.25)  # where there is no depth
 _QUANTILES = (0.02, 0.98)  # a few outliers must not take the whole colour range
+_LEAST_BETA = 0.1  # a smaller one counts as this, `uncertainty.weights.clipped_beta`
 # A range at least this wide keeps the noise of a static frame from filling all colours.
 _LEAST_BETA_RATIO = 4.0
 
@@ -161,10 +162,10 @@ def beta_to_rgb(
 
 
 def beta_limits(beta: np.ndarray) -> tuple[float, float]:
-    """Return the beta drawn darkest and the beta drawn brightest, for maps of any shape."""
-    low, high = np.quantile(np.asarray(beta, dtype=np.float64), _QUANTILES)
-    low = max(float(low), float(np.finfo(np.float64).tiny))
-    return low, max(float(high), _LEAST_BETA_RATIO * low)
+    """Return the beta drawn darkest, at least 0.1, and the beta drawn brightest."""
+    least = np.maximum(np.asarray(beta, dtype=np.float64), _LEAST_BETA)
+    low, high = map(float, np.quantile(least, _QUANTILES))
+    return low, max(high, _LEAST_BETA_RATIO * low)
 
 
 def _mapped(values: np.ndarray, low: float, high: float, colormap: str) -> np.ndarray:

@@ -86,15 +86,14 @@ def test_a_keyframe_without_links_is_exposed_like_its_neighbour():
 
 def test_a_map_that_grew_online_is_exposed_before_its_refinement(monkeypatch):
     told: list[str] = []
-    mapper = SimpleNamespace(
-        exposures={}, expose=told.append, refine=lambda *arguments: told.append("refined")
-    )
+    mapper = SimpleNamespace(expose=told.append, refine=lambda *more: told.append("refined"))
     steps = SimpleNamespace(on_step=lambda stage: None, done=lambda stage: 0)
-    tracker = SimpleNamespace(graph="told by this graph")
+    keyframes = SimpleNamespace(known_prior=1.0)
+    tracker = SimpleNamespace(graph="told by this graph", keyframes=keyframes)
     slam = SimpleNamespace(mapper=mapper, steps=steps, tracker=tracker, config=SlamConfig())
     monkeypatch.setattr("minislam.slam.keyframe_exposures", lambda graph: graph)
     Slam._refine_map(slam)
-    mapper.exposures = {0: torch.ones(3)}  # then they are known
+    keyframes.known_prior = 0.5  # then the map was rebuilt, and told
     Slam._refine_map(slam)
     assert told == ["told by this graph", "refined", "refined"]
 
