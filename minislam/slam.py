@@ -29,6 +29,7 @@ from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
+from minislam.tracking.keyframe_selection import has_warmed_up
 from minislam.tracking.safeguards.first_frame import FirstFrame
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
@@ -85,13 +86,12 @@ class Slam(Stateful):
 
     def run(self) -> None:
         """Process the sequence to the final map, from its start or from a restored state."""
-        warmup = self.config.tracking.warmup_keyframes
         for frame in self._frames_left():
             with self.steps.timed("tracking"):
                 has_new_keyframes = self.tracker.track(frame)
             if has_new_keyframes and self.tracker.initialised:
                 self._map_new_keyframes()
-            elif has_new_keyframes and len(self.tracker.keyframes) >= warmup:
+            elif has_new_keyframes and has_warmed_up(self.tracker.graph):
                 self._initialise()
             self.steps.finish("tracking and mapping", frame.frame_index + 1, len(self.sequence))
         if not self.tracker.initialised:

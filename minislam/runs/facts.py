@@ -186,8 +186,7 @@ def _warnings(slam: Slam) -> Iterator[str]:
             "and changed nothing: poses and depths there are those of the start"
         )
     yield from _focal_length_warnings(slam)
-    least = slam.config.tracking.min_parallax * graph.pixel_scale
-    without = sum(keyframe.parallax < least for keyframe in diagnostics)
+    without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
     if without and 2 * without >= len(diagnostics):
         yield (
             f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera "

@@ -131,6 +131,8 @@ def first_geometry(
     guesses = first_disparity_hypotheses(
         graph.grid, keyframes.prior_disparities[0], graph.links.flow_from(0)
     )
+    if not keyframes.has_prior:  # residuals tell motion only once the disparities are known
+        memory_scale = None
     known = keyframes.prior_disparities
     strength = graph.config.lambda_disparity_prior * graph.grid.camera.fx**2
     settings = known, graph.robust, memory_scale, strength, keyframes.cell_weights[0]

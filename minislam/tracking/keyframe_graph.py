@@ -75,6 +75,7 @@ class KeyframeGraph(Stateful):
         self.links = FrameGraph()
         self.flow = flow
         self.pixel_scale = pixel_scale(camera)
+        self.least_parallax = self.config.min_parallax * self.pixel_scale  # px, that measures depth
 
     @property
     def robust(self) -> RobustKernel | None:

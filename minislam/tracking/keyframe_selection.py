@@ -8,6 +8,16 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import lengths
 
 KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyframe is needed [-]
+# Keyframes of the start without a depth prior, at most: a dynamic object may soon fill the view.
+WARM_UP_WITHOUT_PRIOR = 8
+
+
+def has_warmed_up(graph: KeyframeGraph) -> bool:
+    """Tell whether there are enough keyframes for the start."""
+    enough = graph.config.warmup_keyframes
+    if not graph.keyframes.has_prior:
+        enough = min(enough, WARM_UP_WITHOUT_PRIOR)
+    return len(graph.keyframes) >= enough
 
 
 def keyframe_flow(graph: KeyframeGraph) -> float:
@@ -36,12 +46,14 @@ def needs_keyframe(
     It should if the mean flow is large, if few cells are matched, or if the last keyframe was
     `keyframe_interval` frames ago.
     """
-    if mean_flow(graph, matches) > keyframe_flow(graph):
+    flow = mean_flow(graph, matches)
+    if flow > keyframe_flow(graph):
         return True
     if float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
-    # Without a depth prior the first keyframes need parallax, so none is forced.
-    return (is_initialised or graph.keyframes.has_prior) and _is_due(graph, frame)
+    # Without a depth prior the first keyframes need parallax, so a camera at rest makes none.
+    may_rest = is_initialised or graph.keyframes.has_prior
+    return _is_due(graph, frame) and (may_rest or flow > graph.least_parallax)
 
 
 def is_redundant(graph: KeyframeGraph, frame: Frame, T_camera_world: Tensor) -> bool:

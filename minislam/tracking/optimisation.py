@@ -135,4 +135,4 @@ def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K
     most = graph.grid.rays.new_zeros(len(graph.keyframes))
     seen = graph.parallaxes(problem.edges_source, problem.edges_target)
     most.scatter_reduce_(0, problem.edges_source, seen, "amax")
-    return most >= graph.config.min_parallax * graph.pixel_scale
+    return most >= graph.least_parallax

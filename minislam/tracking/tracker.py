@@ -274,6 +274,7 @@ class Tracker(Stateful):
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
         if not self.keyframes.has_prior:
             self.keyframes.normalise_scale()
+            self._motion.judge_all(self.graph.flow_to_next)
 
     def refine_initialisation(self) -> None:
         """Adjust the warm-up keyframes again, now that beta is known (second stage)."""
@@ -286,6 +287,8 @@ class Tracker(Stateful):
     def finish(self, progress: Progress | None = None) -> None:
         """Run the final global BA, with the newest beta."""
         self._update_static_weights()
+        if not self.keyframes.has_prior:  # online, the newest disparities were hardly settled
+            self._motion.judge_all(self.graph.flow_to_next)
         final_global_ba(self.graph, progress)
         self.watch.conclude()
 

@@ -1,4 +1,6 @@
-"""Which frames become keyframes: by flow, by matched ratio, by time; and which are redundant."""
+"""Which frames become keyframes, how many the start takes, and which are redundant."""
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +11,7 @@ from minislam.tracking.config import TrackingConfig
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.keyframe_selection import (
     KEYFRAME_MATCHED_RATIO,
+    has_warmed_up,
     is_redundant,
     keyframe_flow,
     needs_keyframe,
@@ -50,7 +53,24 @@ def test_few_matches_make_a_keyframe():
 def test_time_makes_a_keyframe_unless_the_start_needs_parallax():
     graph, last = true_graph([0]), CONFIG.keyframe_interval
     assert needs(graph, last, shifted(0.0)) and not needs(graph, last - 1, shifted(0.0))
-    assert not needs(graph, last, shifted(0.0), initialised=False)
+    least = CONFIG.min_parallax * graph.pixel_scale
+    assert not needs(graph, last, shifted(0.99 * least), initialised=False)
+    assert needs(graph, last, shifted(1.01 * least), initialised=False)
+    assert not needs(graph, last - 1, shifted(1.01 * least), initialised=False)
+
+
+@pytest.mark.parametrize(
+    ("asked", "has_prior", "enough"), [(12, True, 12), (12, False, 8), (6, False, 6)]
+)
+def test_without_a_prior_the_start_takes_few_keyframes(asked: int, has_prior: bool, enough: int):
+    graph = true_graph([*range(enough - 1)])
+    graph.config = replace(CONFIG, warmup_keyframes=asked)
+    graph.keyframes.metric_depths[0] = torch.ones(1, 1) if has_prior else None
+    assert not has_warmed_up(graph)
+    graph = true_graph([*range(enough)])
+    graph.config = replace(CONFIG, warmup_keyframes=asked)
+    graph.keyframes.metric_depths[0] = torch.ones(1, 1) if has_prior else None
+    assert has_warmed_up(graph)
 
 
 @pytest.mark.parametrize(("relative", "expected"), [(0.8, True), (1.2, False)])

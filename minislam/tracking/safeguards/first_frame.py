@@ -43,8 +43,9 @@ def can_tell_depth(tracker: Tracker) -> bool:
     """Tell whether the warm-up knows depth: by a prior, or because enough of it moves."""
     graph = tracker.graph
     seen = [*graph.flow_to_next, *(tracker.last_non_keyframe or ())[1:]]
-    least = graph.config.min_parallax * graph.pixel_scale
-    return graph.keyframes.has_prior or any(mean_flow(graph, flow) >= least for flow in seen)
+    return graph.keyframes.has_prior or any(
+        mean_flow(graph, flow) >= graph.least_parallax for flow in seen
+    )
 
 
 def begin_anew(tracker: Tracker, first: int) -> None:

@@ -25,43 +25,43 @@ DEPTH_ERROR = 0.1  # of a depth prior, relative: so much of the parallax is no m
 
 
 class MotionMemory:
-    """Updates the motion weights of the newest keyframe."""
+    """Updates the motion weights of the keyframes, once poses and disparities are known."""
 
     def __init__(self, grid: Grid, keyframes: KeyframeStore, scale: float) -> None:
         self._grid, self._keyframes = grid, keyframes
-        self._scale = scale  # px, of the residuals that still count; 0: nothing is remembered
+        self.scale = scale or None  # px, of the residuals that still count; None: no memory
 
-    @property
-    def scale(self) -> float | None:
-        """Return the scale of the residuals [px], None while nothing is remembered."""
-        # Without a depth prior both disparities and motion come from the flow, so its residuals do
-        # not show which cells move.
-        return self._scale if self._scale > 0 and self._keyframes.has_prior else None
+    def judge_all(self, flow_to_next: list[FlowMatches | None]) -> None:
+        """Set all motion weights anew, by the present poses and disparities.
 
-    def remember(self, matches: FlowMatches, T_camera_world: Tensor) -> None:
-        """Lower the weight of the newest keyframe's cells whose flow does not fit the motion.
+        Where there is no flow to a keyframe, the camera was relocalised, and memory begins anew.
+        """
+        keyframes = self._keyframes
+        for index, matches in enumerate([None, *flow_to_next]):
+            if matches is None:
+                keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
+            else:
+                self.remember(matches, keyframes.T_camera_world[index], index - 1)
+                self.inherit(matches, index)
+
+    def remember(self, matches: FlowMatches, T_camera_world: Tensor, index: int = -1) -> None:
+        """Lower the weight of a keyframe's cells whose flow does not fit the motion.
 
         The camera moves on to `T_camera_world` (4, 4).
         """
-        keyframes, scale = self._keyframes, self.scale
-        if scale is None:
+        keyframes = self._keyframes
+        if self.scale is None:
             return
-        weight = update_motion_weight(
-            self._grid,
-            matches,
-            keyframes.disparities[-1],
-            T_camera_world @ se3_inverse(keyframes.T_camera_world[-1]),
-            keyframes.motion_weights[-1],
-            scale,
-        )
-        keyframes.set_motion_weight(-1, weight)
+        motion = T_camera_world @ se3_inverse(keyframes.T_camera_world[index])
+        known = keyframes.disparities[index], motion, keyframes.motion_weights[index], self.scale
+        keyframes.set_motion_weight(index, update_motion_weight(self._grid, matches, *known))
 
-    def inherit(self, matches: FlowMatches) -> None:
-        """Set the motion weights of the newest keyframe from those of the keyframe before it."""
+    def inherit(self, matches: FlowMatches, index: int = -1) -> None:
+        """Set the motion weights of a keyframe from those of the keyframe before it."""
         if self.scale is not None:
-            before = self._keyframes.motion_weights[-2]
+            before = self._keyframes.motion_weights[index - 1]
             weight = inherit_motion_weight(self._grid, matches, before)
-            self._keyframes.set_motion_weight(-1, weight)
+            self._keyframes.set_motion_weight(index, weight)
 
 
 def update_motion_weight(

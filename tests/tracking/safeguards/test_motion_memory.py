@@ -5,9 +5,15 @@ import torch
 from minislam.geometry import se3_exp
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import reproject
-from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, update_motion_weight
+from minislam.tracking.safeguards.motion_memory import (
+    MotionMemory,
+    inherit_motion_weight,
+    update_motion_weight,
+)
 from tests.tracking.scene import CAMERA, STRIDE
+from tests.tracking.wall import wall_frame
 
 GRID = Grid.of(CAMERA, STRIDE)
 CELLS = len(GRID.rays)
@@ -95,3 +101,46 @@ def test_where_two_cells_meet_the_lower_weight_counts():
     matches = FlowMatches(everything_to_one, torch.ones(1, 2, CELLS), torch.ones(1))
     warped = inherit_motion_weight(GRID, matches, torch.linspace(0.2, 1, CELLS))
     torch.testing.assert_close(warped, torch.full((CELLS,), 0.2))
+
+
+def store_of(count: int) -> KeyframeStore:
+    """Return keyframes, each moved on by MOTION, whose motion weights are not one."""
+    store = KeyframeStore(GRID.rays[:, 0])
+    pose = torch.eye(4, dtype=torch.float64)
+    for index in range(count):
+        store.append(wall_frame(index), torch.zeros(1), None, pose, DISPARITIES, DISPARITIES)
+        store.set_motion_weight(index, torch.full((CELLS,), 0.5))
+        pose = MOTION @ pose
+    return store
+
+
+def test_all_keyframes_are_judged_anew_from_the_first_on():
+    moves = torch.zeros(CELLS, 2)
+    moves[: CELLS // 2] = torch.tensor([30.0, 0.0])
+    flow = [matches_of(moves), matches_of(moves)]
+    store = store_of(3)
+    memory = MotionMemory(GRID, store, SCALE)
+    memory.judge_all(flow)
+    first = update_motion_weight(GRID, flow[0], DISPARITIES, MOTION, torch.ones(CELLS), SCALE)
+    assert torch.equal(store.motion_weights[0], first)
+    second = inherit_motion_weight(GRID, flow[0], first)
+    judged = update_motion_weight(GRID, flow[1], DISPARITIES, MOTION, second, SCALE)
+    torch.testing.assert_close(store.motion_weights[1], judged)
+    assert torch.equal(store.motion_weights[2], inherit_motion_weight(GRID, flow[1], judged))
+    before = store.motion_weights.clone()
+    memory.judge_all(flow)  # what was judged before has no effect
+    assert torch.equal(store.motion_weights, before)
+
+
+def test_memory_begins_anew_where_the_camera_was_relocalised():
+    off = torch.full((CELLS, 2), 30.0)
+    store = store_of(3)
+    MotionMemory(GRID, store, SCALE).judge_all([matches_of(off), None])
+    assert store.motion_weights[0].max() < 0.15 and store.motion_weights[2].min() == 1
+
+
+def test_no_scale_is_no_memory():
+    store = store_of(2)
+    memory = MotionMemory(GRID, store, 0.0)
+    memory.judge_all([matches_of(torch.full((CELLS, 2), 30.0))])
+    assert memory.scale is None and store.motion_weights[0].min() == 1
