@@ -9,7 +9,7 @@ from minislam.tracking.reprojection import lengths
 
 KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyframe is needed [-]
 # Keyframes of the start without a depth prior, at most: a dynamic object may soon fill the view.
-WARM_UP_WITHOUT_PRIOR = 8
+WARM_UP_WITHOUT_PRIOR = 6
 
 
 def has_warmed_up(graph: KeyframeGraph) -> bool:

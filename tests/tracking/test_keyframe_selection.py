@@ -60,7 +60,7 @@ def test_time_makes_a_keyframe_unless_the_start_needs_parallax():
 
 
 @pytest.mark.parametrize(
-    ("asked", "has_prior", "enough"), [(12, True, 12), (12, False, 8), (6, False, 6)]
+    ("asked", "has_prior", "enough"), [(12, True, 12), (12, False, 6), (4, False, 4)]
 )
 def test_without_a_prior_the_start_takes_few_keyframes(asked: int, has_prior: bool, enough: int):
     graph = true_graph([*range(enough - 1)])
