@@ -29,8 +29,7 @@ from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
-from minislam.tracking.keyframe_selection import has_warmed_up
-from minislam.tracking.safeguards.first_frame import FirstFrame
+from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
     check_focal_length,
@@ -91,7 +90,7 @@ class Slam(Stateful):
                 has_new_keyframes = self.tracker.track(frame)
             if has_new_keyframes and self.tracker.initialised:
                 self._map_new_keyframes()
-            elif has_new_keyframes and has_warmed_up(self.tracker.graph):
+            elif has_new_keyframes and has_warmed_up(self.tracker):
                 self._initialise()
             self.steps.finish("tracking and mapping", frame.frame_index + 1, len(self.sequence))
         if not self.tracker.initialised:

@@ -47,7 +47,7 @@ class FlowEstimator(Protocol):
         """Register the image (H, W, 3) of a keyframe under its index."""
 
     def remove_frame(self, keyframe_index: int) -> None:
-        """Forget a keyframe, for instance one that was culled."""
+        """Forget a keyframe."""
 
     def match(
         self,

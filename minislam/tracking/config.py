@@ -15,7 +15,6 @@ class LearnedFlowConfig:
 
     keyframe_flow: float = parameter(10.0, "as tracking.keyframe_flow [px]")
     keyframe_flow_without_prior: float = parameter(18.0, "the same without depth prior [px]")
-    cull_fraction: float = parameter(0.3, "as tracking.cull_fraction [-]", most=1)
     warmup_rounds: int = parameter(4, "turns before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "turns once beta is known")
     warmup_iterations: int = parameter(2, "Gauss-Newton steps per turn of the warm-up", 1)
@@ -45,16 +44,10 @@ class TrackingConfig:
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement", 1
     )
-    cull_fraction: float = parameter(
-        0.3,
-        "a keyframe nearer to the last than this part of the flow that made it is left out [-]; "
-        "official code: 24 of 24 px",
-        most=1,
-    )
     recently_lost_frames: int = parameter(
         15, "a camera lost for longer counts as lost, no longer as recently lost [frames]"
     )
-    warmup_keyframes: int = parameter(12, "keyframes of the two-stage start, paper Sec. 3.3", 1)
+    warmup_keyframes: int = parameter(12, "keyframes of the start, paper; 6 without depth prior", 1)
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up", 1)
@@ -128,7 +121,6 @@ def paper_schedule() -> LearnedFlowConfig:
     return LearnedFlowConfig(
         keyframe_flow=15.0,
         keyframe_flow_without_prior=15.0,
-        cull_fraction=1.0,
         warmup_rounds=8 + 8,
         warmup_rounds_with_beta=8,
         window=25,

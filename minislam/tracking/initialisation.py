@@ -128,12 +128,8 @@ def first_geometry(
     keyframes.overlay = overlay_weights(flow_to_next, graph.grid)
     for target in range(1, len(keyframes)):
         graph.match_composed(target)
-    guesses = first_disparity_hypotheses(
-        graph.grid, keyframes.prior_disparities[0], graph.links.flow_from(0)
-    )
-    if not keyframes.has_prior:  # residuals tell motion only once the disparities are known
-        memory_scale = None
     known = keyframes.prior_disparities
+    guesses = first_disparity_hypotheses(graph.grid, known[0], graph.links.flow_from(0))
     strength = graph.config.lambda_disparity_prior * graph.grid.camera.fx**2
     settings = known, graph.robust, memory_scale, strength, keyframes.cell_weights[0]
     hypotheses = [chain_state(graph.grid, flow_to_next, guess, *settings) for guess in guesses]

@@ -277,20 +277,9 @@ class KeyframeGraph(Stateful):
     def distances(self, start: int = 0, rows: range | None = None, limit: float = FAR) -> Tensor:
         """Return the flow distances (K', K') [px] of the keyframes from `start` on."""
         poses, disparities = self.keyframes.T_camera_world, self.keyframes.disparities
-        return self._flow_distances(poses[start:], disparities[start:], rows, limit)
-
-    def distance_to_newest(self, T_camera_world: Tensor) -> float:  # px
-        """Return the flow distance of a pose (4, 4) from the newest keyframe."""
-        pair = torch.stack([self.keyframes.T_camera_world[-1], T_camera_world])
-        disparities = self.keyframes.disparities[-1:].expand(2, -1)
-        return float(self._flow_distances(pair, disparities)[0, 1])
-
-    def _flow_distances(
-        self, poses: Tensor, disparities: Tensor, rows: range | None = None, limit: float = FAR
-    ) -> Tensor:
-        view = self.grid.rays, self.grid.pixels, self.grid.camera
+        known = poses[start:], disparities[start:], self.grid.rays, self.grid.pixels
         # On the CPU, because pairs are chosen by one number after the other.
-        return flow_distances(poses, disparities, *view, ROTATION_WEIGHT, rows, limit).cpu()
+        return flow_distances(*known, self.grid.camera, ROTATION_WEIGHT, rows, limit).cpu()
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""

@@ -22,7 +22,7 @@ from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.initialisation import first_geometry
 from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
-from minislam.tracking.keyframe_selection import is_redundant, needs_keyframe
+from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards.diagnostics import Watch
@@ -32,7 +32,6 @@ from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, atta
 from minislam.tracking.safeguards.settling import Settling, certainty
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
-MAX_CULLED_IN_A_ROW = 2  # keyframes, official code
 LONGEST_TAIL = 2  # frames after the last keyframe
 LEAST_GROWTH = 5  # online all keyframes are adjusted again once a fifth of them is new
 
@@ -64,7 +63,6 @@ class Tracker(Stateful):
     mode: Mode = Mode.WAITING
     last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
     _lost_in_a_row: int = 0  # frames
-    _culled_in_a_row: int = 0  # keyframes
     _last_global: int = 0  # keyframes at the last online global BA
 
     def __init__(
@@ -129,7 +127,7 @@ class Tracker(Stateful):
         if self.last_non_keyframe is not None:
             last = self.last_non_keyframe[0].frame_index
             if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:
-                self._insert(*self.last_non_keyframe, may_cull=False)
+                self._insert(*self.last_non_keyframe)
 
     def _begin(self, frame: Frame) -> None:
         """Make the first frame the first keyframe; its camera frame is the world frame."""
@@ -147,7 +145,7 @@ class Tracker(Stateful):
         if ratio < MIN_MATCHED_RATIO and self.last_non_keyframe is not None:
             # Too far from the last keyframe, but perhaps not from the last frame: make the last
             # frame a keyframe and match with it.
-            self._insert(*self.last_non_keyframe, may_cull=False)
+            self._insert(*self.last_non_keyframe)
             chain, matches = self._advance(frame)
             ratio = float(matches.matched_ratios)
         if ratio < MIN_MATCHED_RATIO:
@@ -174,8 +172,8 @@ class Tracker(Stateful):
 
     # Keyframes ----------------------------------------------------------------------------------
 
-    def _insert(self, frame: Frame, matches: FlowMatches, may_cull: bool = True) -> None:
-        """Make a frame a keyframe, unless it is culled, and adjust the graph around it.
+    def _insert(self, frame: Frame, matches: FlowMatches) -> None:
+        """Make a frame a keyframe, and adjust the graph around it.
 
         Its pose comes from its flow, its disparities from its predecessor.
         """
@@ -185,8 +183,6 @@ class Tracker(Stateful):
             pose = self.graph.start_pose(matches, certainty(information))
             if self.graph.is_learned:
                 pose, _ = self.graph.fit_pose(frame.image, [len(self.keyframes) - 1], pose)
-            if may_cull and self._is_culled(frame, pose):
-                return
             disparities = self._settling.hand_on(information, pose)
             self._motion.remember(matches, pose)
         assert self._chain is not None, "there is a chain from the first frame on"
@@ -199,13 +195,6 @@ class Tracker(Stateful):
             local_ba(self.graph)
             self.watch.judge_newest()
             self._adjust_all_if_due()
-
-    def _is_culled(self, frame: Frame, pose: Tensor) -> bool:
-        """Tell whether a keyframe is left out, because it would repeat the last one."""
-        may_cull = self._culled_in_a_row < MAX_CULLED_IN_A_ROW
-        is_culled = may_cull and is_redundant(self.graph, frame, pose)
-        self._culled_in_a_row = self._culled_in_a_row + 1 if is_culled else 0
-        return is_culled
 
     def _add_keyframe(
         self, frame: Frame, features: Tensor, pose: Tensor, disparities: Tensor
@@ -268,7 +257,7 @@ class Tracker(Stateful):
                 "expected at least two frames that show the same scene, found none among "
                 f"{len(self.tracked)} frames; check that the images are not blank and overlap"
             )
-        first_geometry(self.graph, self._motion.scale)
+        first_geometry(self.graph, self._motion.scale if self.keyframes.has_prior else None)
         self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)

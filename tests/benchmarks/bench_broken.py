@@ -28,7 +28,7 @@ from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame, Sequence, Trajectory
 from minislam.stereo.second_adjustment import adjust_again
 from minislam.tracking.config import TrackingConfig
-from minislam.tracking.keyframe_selection import has_warmed_up
+from minislam.tracking.safeguards.first_frame import has_warmed_up
 from minislam.tracking.safeguards.focal_length import check_focal_length
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
@@ -72,7 +72,7 @@ def followed(sequence: Sequence, with_prior: bool, warm_up: int) -> Tracker:
     )
     for frame in sequence:
         tracker.track(frame)
-        if not tracker.initialised and has_warmed_up(tracker.graph):
+        if not tracker.initialised and has_warmed_up(tracker):
             tracker.initialise()
             tracker.refine_initialisation()
     if not tracker.initialised:

@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.bench_mechanisms MECHANISM [NAME:SEED ...]
 
-The depth prior is simulated. `culling` and `relocalisation` track alone, about 20 s a row.
+The depth prior is simulated. `relocalisation` tracks alone, about 20 s a row.
 `pose_refinement` (of the frames between the keyframes), `fine_beta` (a finer grid) and
 `densification` do whole runs, about 100 s each; `--frames 60 --set mapping.refine_iterations=300`
 halves that. Differences below 0.01 cm in ATE and 0.1 dB in PSNR are noise.
@@ -31,8 +31,8 @@ from minislam.slam import Slam
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.safeguards.relocalisation import Relocaliser
 from minislam.tracking.trajectory import pose_all_frames
-from tests.benchmarks.bench_movers import ate, keyframe_error, tracked
-from tests.benchmarks.incidents import COVERED, covered_clip, standing_clip
+from tests.benchmarks.bench_movers import ate, tracked
+from tests.benchmarks.incidents import COVERED, covered_clip
 
 SEQUENCES = ("ball:71", "crowd:71", "table2:71")
 Rows = Iterator[tuple[str, dict[str, float]]]  # heading of the row, and its figures by name
@@ -59,22 +59,6 @@ class Source:
         """Return its first frames."""
         options = InputOptions(max_frames=self.frames, size=self.size)
         return open_sequence(f"synth:{self.name}:{self.seed}", options)
-
-
-def culling(clip: Source, config: SlamConfig) -> Rows:
-    """Track a walk, and a walk with a pause in which only the dynamic objects move."""
-    clips = {
-        "walk": clip.sequence(),
-        "with a pause": standing_clip(clip.name, clip.seed, clip.size),
-    }
-    for heading, sequence in clips.items():
-        for state, fraction in {"off": 0.0, "on": config.tracking.cull_fraction}.items():
-            tracker = tracked(sequence, replace(config.tracking, cull_fraction=fraction))
-            figures = {"keyframes": len(tracker.keyframes)}
-            figures["ATE before [cm]"] = keyframe_error(tracker, sequence)
-            tracker.finish()
-            figures["ATE after [cm]"] = keyframe_error(tracker, sequence)
-            yield f"{heading}, {state}", figures
 
 
 def relocalisation(clip: Source, config: SlamConfig) -> Rows:
@@ -148,7 +132,6 @@ def densification(clip: Source, config: SlamConfig) -> Rows:
 
 
 MECHANISMS = {
-    "culling": culling,
     "relocalisation": relocalisation,
     "pose_refinement": pose_refinement,
     "fine_beta": fine_beta,

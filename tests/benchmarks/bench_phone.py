@@ -19,7 +19,7 @@ from minislam.priors.depth import NoDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame, Trajectory
-from minislam.tracking.keyframe_selection import has_warmed_up
+from minislam.tracking.safeguards.first_frame import has_warmed_up
 from minislam.tracking.safeguards.focal_length import seek_focal_length
 from minislam.tracking.tracker import Tracker
 
@@ -60,7 +60,7 @@ def follow(frames: list[Frame], seeks_focal: bool) -> tuple[Trajectory, float]:
     tracker.graph.seeks_focal = seeks_focal
     for frame in frames:
         tracker.track(frame)
-        if has_warmed_up(tracker.graph) and not tracker.initialised:
+        if has_warmed_up(tracker) and not tracker.initialised:
             tracker.initialise()
             tracker.refine_initialisation()
     tracker.end()

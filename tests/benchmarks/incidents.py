@@ -1,4 +1,4 @@
-"""Clips in which the camera stands still for a second, or sees only black."""
+"""Clips in which the camera sees only black for a while."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,8 +12,6 @@ from data_synth.sequence import in_order
 from minislam.geometry import Camera
 from minislam.records import Frame, Trajectory
 
-FRAMES = 115  # of a clip with a pause
-STANDS, MOVES_ON = 70, 100  # frames between which the camera stands, after the warm-up
 COVERED, UNCOVERED = 75, 90  # frames between which every image is black; the warm-up is over
 FRAMES_AFTER = 25  # that follow the black ones
 
@@ -63,19 +61,6 @@ class ClipTruth:
     def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return no held-out views."""
         return []
-
-
-def standing_clip(name: str, seed: int, size: tuple[int, int]) -> Clip:
-    """Return a clip whose camera stands still for a second, while the dynamic objects move on."""
-    view = scene(name, seed)
-    first, last = STANDS / FRAME_RATE, MOVES_ON / FRAME_RATE
-
-    def path(time: float) -> np.ndarray:  # (4, 4)
-        return view.path(min(time, first) + max(0.0, time - last))
-
-    held, intrinsics = replace(view, path=path), default_intrinsics(size)
-    frames = in_order(lambda i: render_frame(held, intrinsics, i), FRAMES)
-    return Clip(f"standing:{name}:{seed}", list(frames), intrinsics)
 
 
 def covered_clip(name: str, seed: int, size: tuple[int, int], first_after: int) -> Clip:

@@ -22,7 +22,7 @@ def test_every_setting_is_listed_with_default_and_meaning(capsys):
 @pytest.mark.parametrize(
     ("pattern", "name"),
     [
-        ("cull", "--tracking.cull_fraction 0.3  (0 to 1)"),
+        ("mask_min_sim", "--tracking.mask_min_similarity 0.9  (0 to 1)"),
         ("metric3d.size", "--networks.metric3d.size 616,1064  (at least 1; test 112,168)"),
         ("tracking.*mask", "--tracking.prior_mask on  (on or off; paper-fast off)"),
     ],

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from minislam.geometry import se3_exp
 from minislam.tracking.config import TrackingConfig
 from tests.tracking.wall import TrueFlow, true_graph
 
@@ -16,15 +15,6 @@ def test_a_new_link_needs_both_directions():
     asked = [(0, 3), (3, 0), (1, 3), (3, 1)]
     assert graph.filter_confirmed(asked) == [(1, 3), (3, 1)]
     assert graph.filter_confirmed([]) == [] and len(graph.links) == 0
-
-
-@pytest.mark.parametrize("moved", [0.0, 0.05])
-def test_distance_to_the_newest_keyframe(moved: float):
-    graph = true_graph([0, 1])
-    slide = torch.tensor([moved, 0, 0, 0, 0, 0], dtype=torch.float64)
-    pose = se3_exp(slide) @ graph.keyframes.T_camera_world[-1]
-    expected = moved * 60.0 * float(graph.keyframes.disparities[-1].mean())  # fx t d
-    assert graph.distance_to_newest(pose) == pytest.approx(expected, rel=0.05, abs=1e-6)
 
 
 @pytest.mark.parametrize("has_prior", [False, True])

@@ -1,18 +1,12 @@
-"""Which frames become keyframes, how many the start takes, and which are redundant."""
+"""Which frames become keyframes: by flow, by matched ratio, by time."""
 
-from dataclasses import replace
-
-import pytest
 import torch
 
-from minislam.geometry import se3_exp
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.keyframe_selection import (
     KEYFRAME_MATCHED_RATIO,
-    has_warmed_up,
-    is_redundant,
     keyframe_flow,
     needs_keyframe,
 )
@@ -57,29 +51,3 @@ def test_time_makes_a_keyframe_unless_the_start_needs_parallax():
     assert not needs(graph, last, shifted(0.99 * least), initialised=False)
     assert needs(graph, last, shifted(1.01 * least), initialised=False)
     assert not needs(graph, last - 1, shifted(1.01 * least), initialised=False)
-
-
-@pytest.mark.parametrize(
-    ("asked", "has_prior", "enough"), [(12, True, 12), (12, False, 6), (4, False, 4)]
-)
-def test_without_a_prior_the_start_takes_few_keyframes(asked: int, has_prior: bool, enough: int):
-    graph = true_graph([*range(enough - 1)])
-    graph.config = replace(CONFIG, warmup_keyframes=asked)
-    graph.keyframes.metric_depths[0] = torch.ones(1, 1) if has_prior else None
-    assert not has_warmed_up(graph)
-    graph = true_graph([*range(enough)])
-    graph.config = replace(CONFIG, warmup_keyframes=asked)
-    graph.keyframes.metric_depths[0] = torch.ones(1, 1) if has_prior else None
-    assert has_warmed_up(graph)
-
-
-@pytest.mark.parametrize(("relative", "expected"), [(0.8, True), (1.2, False)])
-def test_a_frame_near_the_last_keyframe_is_redundant(relative: float, expected: bool):
-    graph = true_graph([0])
-    last = graph.keyframes.T_camera_world[-1]
-    slide = torch.tensor([0.05, 0, 0, 0, 0, 0], dtype=torch.float64)
-    per_slide = graph.distance_to_newest(se3_exp(slide) @ last)
-    factor = relative * CONFIG.cull_fraction * keyframe_flow(graph) / per_slide
-    pose = se3_exp(factor * slide) @ last
-    assert is_redundant(graph, wall_frame(1), pose) is expected
-    assert not is_redundant(graph, wall_frame(CONFIG.keyframe_interval), pose)

@@ -1,8 +1,9 @@
-"""Which frame the warm-up begins with: a black first frame, a slate or a jump cut must not end it.
+"""Which frame the warm-up begins with, and when it is over.
 
-During the warm-up a lost camera cannot be found again. So the warm-up begins anew with the first
-lost frame, once as many frames were lost as were followed before. If the sequence ends before any
-start has made enough keyframes, the best of all starts is repeated.
+A black first frame, a slate or a jump cut must not end the run. During the warm-up a lost camera
+cannot be found again. So the warm-up begins anew with the first lost frame, once as many frames
+were lost as were followed before. If the sequence ends before any start has made enough keyframes,
+the best of all starts is repeated.
 """
 
 from dataclasses import replace
@@ -11,6 +12,10 @@ from minislam.records import TrackingStatus
 from minislam.state.stateful import Stateful
 from minislam.tracking.keyframe_selection import mean_flow
 from minislam.tracking.tracker import Mode, Tracker
+
+# Keyframes of the warm-up without a depth prior, at most: it must be over before a dynamic object
+# fills the view, because motion is remembered from then on only.
+MOST_WITHOUT_PRIOR = 6
 
 Worth = tuple[bool, int]  # whether a start can tell depth; the frames that it followed
 
@@ -37,6 +42,14 @@ class FirstFrame(Stateful):
                 self.is_repeated = True
                 begin_anew(tracker, self.best)
         return len(tracked) if len(tracked) < count else None
+
+
+def has_warmed_up(tracker: Tracker) -> bool:
+    """Tell whether the warm-up has its keyframes."""
+    enough = tracker.config.warmup_keyframes
+    if not tracker.keyframes.has_prior:
+        enough = min(enough, MOST_WITHOUT_PRIOR)
+    return len(tracker.keyframes) >= enough
 
 
 def can_tell_depth(tracker: Tracker) -> bool:

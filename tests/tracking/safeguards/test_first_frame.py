@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,13 +14,13 @@ from minislam.priors.depth import NoDepth
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import TrackingStatus
 from minislam.tracking.config import TrackingConfig
-from minislam.tracking.safeguards.first_frame import FirstFrame
+from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
 from minislam.tracking.tracker import Tracker
 from tests.helpers import generator
 from tests.tracking.recording import frames, lost_frames, new_tracker, run
 from tests.tracking.scene import CAMERA, STRIDE
 from tests.tracking.test_tracker_losing import centres, renumbered
-from tests.tracking.wall import GRID
+from tests.tracking.wall import GRID, true_graph
 
 PLACE_ERROR = 0.03  # of the length of the path; measured .004 to .006
 
@@ -67,6 +68,19 @@ def test_a_start_of_more_frames_than_are_lost_is_kept():
     run(tracker, renumbered(sequence))
     assert lost_frames(tracker) == [4, 5]
     assert tracker.keyframes.frames[0].frame_index == 0
+
+
+@pytest.mark.parametrize(
+    ("asked", "has_prior", "enough"), [(12, True, 12), (12, False, 6), (4, False, 4)]
+)
+def test_without_a_prior_few_keyframes_are_enough(asked: int, has_prior: bool, enough: int):
+    for count in (enough - 1, enough):
+        keyframes = true_graph([*range(count)]).keyframes
+        keyframes.metric_depths[0] = torch.ones(1, 1) if has_prior else None
+        tracker = SimpleNamespace(
+            config=TrackingConfig(warmup_keyframes=asked), keyframes=keyframes
+        )
+        assert has_warmed_up(tracker) is (count == enough)
 
 
 # Cuts between scenes, with a flow that only knows which scene an image shows, and where
