@@ -29,7 +29,7 @@ from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
-from minislam.tracking.safeguards.settling import Settling, certainty
+from minislam.tracking.safeguards.settling import SETTLED, Settling, certainty
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 LONGEST_TAIL = 2  # frames after the last keyframe
@@ -184,7 +184,7 @@ class Tracker(Stateful):
             if self.graph.is_learned:
                 pose, _ = self.graph.fit_pose(frame.image, [len(self.keyframes) - 1], pose)
             disparities = self._settling.hand_on(information, pose)
-            self._motion.remember(matches, pose)
+            self._motion.remember(matches, pose, settled=information > SETTLED)
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()
         self.last_non_keyframe = None

@@ -44,17 +44,26 @@ class MotionMemory:
                 self.remember(matches, keyframes.T_camera_world[index], index - 1)
                 self.inherit(matches, index)
 
-    def remember(self, matches: FlowMatches, T_camera_world: Tensor, index: int = -1) -> None:
+    def remember(
+        self,
+        matches: FlowMatches,
+        T_camera_world: Tensor,  # (4, 4) where the camera moves on to
+        index: int = -1,
+        settled: Tensor | None = None,  # (N,) bool, whose disparity is known; None: of all
+    ) -> None:
         """Lower the weight of a keyframe's cells whose flow does not fit the motion.
 
-        The camera moves on to `T_camera_world` (4, 4).
+        A wrong disparity does not fit either, so a cell that is not settled keeps its weight.
         """
         keyframes = self._keyframes
         if self.scale is None:
             return
+        before = keyframes.motion_weights[index]
         motion = T_camera_world @ se3_inverse(keyframes.T_camera_world[index])
-        known = keyframes.disparities[index], motion, keyframes.motion_weights[index], self.scale
-        keyframes.set_motion_weight(index, update_motion_weight(self._grid, matches, *known))
+        known = keyframes.disparities[index], motion, before, self.scale
+        after = update_motion_weight(self._grid, matches, *known)
+        weight = after if settled is None else torch.where(settled, after, before)
+        keyframes.set_motion_weight(index, weight)
 
     def inherit(self, matches: FlowMatches, index: int = -1) -> None:
         """Set the motion weights of a keyframe from those of the keyframe before it."""

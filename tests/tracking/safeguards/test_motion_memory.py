@@ -144,3 +144,13 @@ def test_no_scale_is_no_memory():
     memory = MotionMemory(GRID, store, 0.0)
     memory.judge_all([matches_of(torch.full((CELLS, 2), 30.0))])
     assert memory.scale is None and store.motion_weights[0].min() == 1
+
+
+def test_a_cell_whose_disparity_is_unknown_keeps_its_weight():
+    store, settled = store_of(2), torch.arange(CELLS) % 2 == 0
+    memory = MotionMemory(GRID, store, SCALE)
+    moves = matches_of(torch.full((CELLS, 2), 30.0))
+    memory.remember(moves, store.T_camera_world[1], index=0, settled=settled)
+    judged = store.motion_weights[0]
+    assert judged[settled].max() < 0.15
+    assert torch.equal(judged[~settled], torch.full_like(judged[~settled], 0.5))
