@@ -20,7 +20,7 @@ def slam(**parts: object) -> SimpleNamespace:
     failed = parts.pop("failed", 0)
     graph = SimpleNamespace(
         adjustments=AdjustmentCount(2 + failed, failed, "singular" if failed else ""),
-        pixel_scale=1.0,
+        least_parallax=1.0,
         seeks_focal=parts.pop("seeks_focal", False),
         focal_is_free=parts.pop("focal_is_free", False),
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
@@ -42,7 +42,6 @@ def slam(**parts: object) -> SimpleNamespace:
         sequence=SimpleNamespace(warnings=[], camera=CAMERA),
         lost_frames=lambda: [None] * lost,
         tracker=tracker,
-        config=SimpleNamespace(tracking=SimpleNamespace(min_parallax=1.0)),
         focal_length=parts.pop("focal_length", None),
     )
 
