@@ -169,7 +169,7 @@ def clips(
         "zoom": ([*frames[:b], *zoom], True, 1.0),
         "stretched": (tail(_zoomed(1.0, 1.4)), True, 1.0),
         "mirrored": (tail(lambda image: image[:, ::-1]), False, 1.0),
-        "upside down": (tail(lambda image: image[::-1, ::-1]), False, 1.0),
+        "upside down": (tail(lambda image: image[::-1, ::-1]), True, 1.0),  # a camera rolled over
         "unbroken": (frames, True, 1.0),
     }
 

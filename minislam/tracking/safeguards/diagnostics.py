@@ -5,7 +5,7 @@ all residuals stay small. A low matched ratio and little parallax are the signs.
 
 A run may also go wrong where everything is matched. Two measurements tell broken keyframes from
 healthy ones (tests/benchmarks/bench_broken.py has the table). A wrong pose does not explain the
-flow to the keyframes before it. After a wrong scale two keyframes see a thing at different depths.
+flow of the keyframes before it. After a wrong scale two keyframes see a thing at different depths.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,12 @@ from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, relative_transforms, scaled_points
+from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
-# Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .9 to 1, two in a
-# row on fast real video .57; broken ones .3 to .5, and the worse of many in a row .6 to .84.
+# Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .94 to 1, two in a
+# row on fast real video .68 and .82; broken ones .3 to .4, the worse of many in a row .6 to .84.
 MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
 LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
@@ -39,7 +40,7 @@ class KeyframeDiagnostics:
     frame_index: int
     matched_ratio: float  # of its cells, in the best of its links [-]
     parallax: float  # px, the largest mean flow by translation alone among its links
-    explained: float | None  # of the matched flow between it and its predecessors; None: no link
+    explained: float | None  # of the matched flow from its predecessors; None: no link
     depth_error: float | None  # median relative difference from them; None: they see other things
 
 
@@ -108,9 +109,9 @@ def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
 def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
     """Return how a keyframe agrees with the keyframes before it, over the links between them.
 
-    First the part of the flow, by its weight in Eq. (5), that poses and disparities explain [-].
-    Then the median relative difference of the depths that the two ends of a link see, over the
-    cells that count in the adjustment; a dynamic object does not. None where there is no link.
+    First the part of the flow from there, of what was static so far, that poses and disparities
+    explain [-]. Then the median relative difference of the depths that the two ends of a link see,
+    over the cells that count in the adjustment; a dynamic object does not. None: no link.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
     positions = [p for p, edge in enumerate(graph.links.edges()) if edge in near]
@@ -119,10 +120,12 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     problem, keyframes, grid = bundle_problem(graph, positions, 0, 0.0), graph.keyframes, graph.grid
     residual, robust_weights = residuals(problem, graph.state)
     fits = lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
-    weights = problem.weights[:, 0]
+    sources, targets = problem.edges_source, problem.edges_target
+    confidences = torch.stack([graph.links.confidences[p][0] for p in positions])
+    weights = confidences * torch.stack([weight_so_far(graph, k) for k in sources.tolist()])
+    weights *= (targets == keyframe)[:, None]
     explained = float((weights * fits).sum() / weights.sum().clamp_min(1e-6))
 
-    sources, targets = problem.edges_source, problem.edges_target
     transforms = relative_transforms(keyframes.T_camera_world, sources, targets).float()
     disparities = keyframes.disparities[sources]
     expected = disparities / scaled_points(transforms, disparities, grid.rays)[:, 2].clamp_min(1e-6)
@@ -130,6 +133,19 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     seen = grid.sample(keyframes.disparities[targets][..., None], positions_seen)[..., 0]
     counted = robust_weights[:, 0] * grid.camera.contains(positions_seen)
     return explained, weighted_median((seen / expected).log().abs(), counted)
+
+
+def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
+    """Return the weight of a keyframe's cells as it was before the next keyframe judged them.
+
+    A wrong pose lowers the motion weight of all that contradicts it. What is left agrees with it.
+    """
+    keyframes, matches = graph.keyframes, graph.flow_to_next[keyframe - 1] if keyframe else None
+    weight = keyframes.static_weights[keyframe]
+    if matches is not None:
+        before = keyframes.motion_weights[keyframe - 1]
+        weight = weight * inherit_motion_weight(graph.grid, matches, before)
+    return weight if keyframes.overlay is None else weight * keyframes.overlay
 
 
 def weighted_median(values: Tensor, weights: Tensor) -> float | None:

@@ -16,9 +16,11 @@ from minislam.tracking.safeguards.diagnostics import (
     diagnose,
     find_breaks,
     is_unexplained,
+    weight_so_far,
     weighted_median,
 )
-from tests.tracking.wall import true_graph
+from minislam.tracking.safeguards.motion_memory import MotionMemory
+from tests.tracking.wall import CAMERA, GRID, true_graph
 
 HEALTHY, WEAK, UNEXPLAINED, DEEP = (
     (0.97, 0.02),
@@ -50,6 +52,36 @@ def test_a_wrong_pose_does_not_explain_the_flow():
     graph.keyframes.T_camera_world[2] = turn @ graph.keyframes.T_camera_world[2]
     assert diagnose(graph, 2).explained < 0.1
     assert diagnose(graph, 1).explained == 1  # judged by keyframes before it
+
+
+def test_what_contradicts_a_pose_counts_although_the_memory_takes_it_for_motion():
+    graph = true_graph([0, 1, 2])
+    graph.match(neighbourhood_edges(0, 3, 2))
+    contradicts = GRID.pixels[:, 0] < 0.7 * CAMERA.width
+    last = [p for p, edge in enumerate(graph.links.edges()) if edge[1] == 2]
+    for targets in [*(graph.links.targets[p] for p in last), graph.flow_to_next[1].targets[0]]:
+        targets[:, contradicts] += 8  # px
+    MotionMemory(graph.grid, graph.keyframes, scale=0.5).judge_all(graph.flow_to_next)
+    assert graph.keyframes.cell_weights[1, contradicts].mean() < 0.3  # excluded from now on
+    assert diagnose(graph, 2).explained == pytest.approx(0.3, abs=0.1)
+    assert diagnose(graph, 1).explained == 1
+
+
+def test_what_was_known_to_move_need_not_be_explained():
+    graph = true_graph([0, 1, 2])
+    graph.match(neighbourhood_edges(0, 3, 2))
+    keyframes, (height, width) = graph.keyframes, graph.grid.shape
+    moving = torch.zeros(height, width, dtype=torch.bool)
+    moving[:, : width // 2] = True
+    keyframes.disparities[:, moving.flatten()] *= 3  # so that its flow contradicts all poses
+    assert diagnose(graph, 2).explained < 0.9
+    keyframes.static_weights[:, moving.flatten()] = 0
+    assert diagnose(graph, 2).explained == 1
+    keyframes.static_weights[:] = 1
+    keyframes.motion_weights[0] = 1 - moving.flatten().float()
+    assert weight_so_far(graph, 1).reshape(height, width)[:, : width // 2 - 1].max() == 0
+    keyframes.overlay = torch.zeros_like(keyframes.disparities[0])
+    assert weight_so_far(graph, 2).max() == 0
 
 
 def test_a_keyframe_of_another_scale_sees_other_depths():
