@@ -1,11 +1,13 @@
 """The command line, `minislam COMMAND`; `main` first."""
 
 import argparse
+import ctypes
 import os
 import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import minislam
 from minislam.cli.bench import add_bench_parser
@@ -30,10 +32,16 @@ ADD_PARSERS: list[Callable[[argparse._SubParsersAction], object]] = [
     add_notebooks_parser, add_grade_parser, add_doctor_parser,
 ]  # fmt: skip
 FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
+# Settings of glibc's malloc and their values: one arena for all threads, and blocks of 4 MB and
+# more mapped one by one. Otherwise freed images leave holes that later ones do not fit.
+MALLOC = {-8: 1, -3: 4 << 20}  # M_ARENA_MAX, M_MMAP_THRESHOLD
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
+    with suppress(OSError, TypeError, AttributeError):  # another C library has no such settings
+        for parameter, value in MALLOC.items():
+            ctypes.CDLL(None).mallopt(parameter, value)
     # OpenCV and FFmpeg would print messages about a damaged file beside our own error message.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

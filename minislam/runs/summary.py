@@ -70,7 +70,8 @@ def _measured(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[
 def _spent(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[Line]:
     focal, verdict = facts["focal_length"], ""
     length, _, origin = focal["used"].partition(", ")
-    if focal.get("factor") is not None:
+    is_whole = not facts["breaks"] and not facts["lost_frames"]  # else it fits any focal length
+    if focal.get("factor") is not None and is_whole:
         verdict = "poor" if focal["is_doubtful"] else "good"
         origin += f"; the flow fits {focal['factor']:.2f} times this one best"
     yield Line("focal length", length.partition(" for ")[0], verdict, detail=origin)

@@ -80,8 +80,7 @@ def followed(sequence: Sequence, with_prior: bool, warm_up: int) -> Tracker:
         tracker.refine_initialisation()
     tracker.end()
     tracker.finish()
-    if not with_prior:
-        adjust_again(tracker, sequence)
+    adjust_again(tracker, sequence)
     return tracker
 
 

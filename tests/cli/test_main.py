@@ -231,3 +231,9 @@ def test_an_unknown_setting_in_a_file_names_the_nearest(tree: dict, tmp_path: Pa
     (tmp_path / "settings.json").write_text(json.dumps(tree))
     assert run("synth:crowd", "--config", tmp_path / "settings.json") == 1
     assert "the nearest is tracking.window" in the_sentence(capsys)
+
+
+def test_another_c_library_has_no_such_settings_of_malloc(monkeypatch: pytest.MonkeyPatch):
+    for library in (lambda name: object(), lambda name: len(name)):  # macOS; Windows takes no None
+        monkeypatch.setattr("ctypes.CDLL", library)
+        assert main(["weights", "list"]) == 0

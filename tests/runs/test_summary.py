@@ -49,8 +49,11 @@ def test_a_broken_trajectory_is_said():
 def test_the_check_of_the_focal_length_is_said(doubtful: bool, verdict: str):
     assert lines()["focal length"] == ("272.0 px", "", "as given")
     checked = FACTS["focal_length"] | {"factor": 1.1, "is_doubtful": doubtful}
-    found = lines(focal_length=checked)["focal length"]
+    whole = {"focal_length": checked, "lost_frames": 0, "breaks": []}
+    found = lines(**whole)["focal length"]
     assert found == ("272.0 px", verdict, "as given; the flow fits 1.10 times this one best")
+    for broken in ({"breaks": [{"first_frame": 4, "last_frame": 9}]}, {"lost_frames": 2}):
+        assert lines(**whole | broken)["focal length"] == ("272.0 px", "", "as given")
 
 
 @pytest.mark.parametrize(

@@ -67,10 +67,9 @@ class MotionMemory:
 
     def inherit(self, matches: FlowMatches, index: int = -1) -> None:
         """Set the motion weights of a keyframe from those of the keyframe before it."""
-        if self.scale is not None:
-            before = self._keyframes.motion_weights[index - 1]
-            weight = inherit_motion_weight(self._grid, matches, before)
-            self._keyframes.set_motion_weight(index, weight)
+        before = self._keyframes.motion_weights[index - 1]
+        weight = inherit_motion_weight(self._grid, matches, before)
+        self._keyframes.set_motion_weight(index, weight)
 
 
 def update_motion_weight(
