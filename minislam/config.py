@@ -55,7 +55,7 @@ def _leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, Mapping[s
 def _paper_settings() -> dict[str, Any]:
     """Return the values in which the paper and the official code differ from the default tree."""
     paper = SlamConfig(
-        tracking=TrackingConfig(learned=paper_schedule()),
+        tracking=TrackingConfig(warmup_keyframes=12, learned=paper_schedule()),
         mapping=paper_mapping(),
         uncertainty=paper_uncertainty(),
         networks=NetworksConfig(DroidFlowConfig(chain_updates=1)),
@@ -78,7 +78,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mapping.pose_refinement.enabled": False,
     },
     "test": {
-        "tracking.warmup_keyframes": 6,
         "tracking.warmup_rounds": 2,
         "tracking.warmup_rounds_with_beta": 1,
         "tracking.rounds": 1,

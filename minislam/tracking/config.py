@@ -14,7 +14,7 @@ class LearnedFlowConfig:
     """
 
     keyframe_flow: float = parameter(10.0, "as tracking.keyframe_flow [px]")
-    keyframe_flow_without_prior: float = parameter(18.0, "the same without depth prior [px]")
+    keyframe_flow_without_prior: float = parameter(18.0, "without prior, in the start [px]")
     warmup_rounds: int = parameter(4, "turns before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "turns once beta is known")
     warmup_iterations: int = parameter(2, "Gauss-Newton steps per turn of the warm-up", 1)
@@ -39,7 +39,7 @@ class TrackingConfig:
 
     keyframe_flow: float = parameter(10.0, "mean flow since the last keyframe that makes one [px]")
     keyframe_flow_without_prior: float = parameter(
-        18.0, "the same where no depth prior is known and depth needs parallax [px]"
+        18.0, "the same where depth needs parallax: without depth prior, and in the start [px]"
     )
     keyframe_interval: int = parameter(
         8, "a keyframe at the latest after so many frames [frames], paper supplement", 1
@@ -47,7 +47,7 @@ class TrackingConfig:
     recently_lost_frames: int = parameter(
         15, "a camera lost for longer counts as lost, no longer as recently lost [frames]"
     )
-    warmup_keyframes: int = parameter(12, "keyframes of the start, paper; 6 without depth prior", 1)
+    warmup_keyframes: int = parameter(6, "keyframes of the start; the paper takes 12", 1)
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up", 1)

@@ -27,10 +27,9 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
 from minislam.tracking.safeguards.first_depth import essential_disparities
 from minislam.tracking.safeguards.focal_length import seek_focal_length
-from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, update_motion_weight
+from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
 from minislam.tracking.safeguards.overlay import overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
-from minislam.tracking.safeguards.two_views import pose_with_depth
 
 HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps per width before hypotheses are compared
 ROBUST_NARROWING = (0.5, 0.25)  # [-], times the final width
@@ -58,35 +57,24 @@ def chain_state(
     first_disparities: Tensor,  # (N,)
     known_disparities: Tensor,  # (K, N), 0 where there is no depth prior
     robust: RobustKernel | None,
-    memory_scale: float | None,  # px; None: motion is not remembered
-    prior_strength: float,  # lambda_4 fx^2
     first_weights: Tensor | None = None,  # (N,) in [0, 1] of the first keyframe; None: ones
-) -> tuple[BundleState, Tensor]:  # and the motion weights (K, N)
+) -> BundleState:
     """Return poses and disparities of K keyframes, each from its predecessor."""
     poses = [torch.eye(4, dtype=torch.float64, device=first_disparities.device)]
     disparities = [first_disparities]
-    weights = [torch.ones_like(first_disparities) if first_weights is None else first_weights]
+    weights = torch.ones_like(first_disparities) if first_weights is None else first_weights
     for index, matches in enumerate(flow_to_next):
         last, of_last = poses[-1], disparities[-1]
         starts = [last]
         if index > 0:
             starts.append(se3_interpolate(poses[-2], last, 2.0))
-        pose = start_pose(grid, matches, of_last, weights[-1], last, starts, robust)
-        if memory_scale is not None:
-            pair = BundleState(torch.stack([last, pose]), of_last.expand(2, -1))
-            prior = known_disparities[index]
-            pose = pose_with_depth(grid, matches, pair, prior, prior_strength, weights[-1], robust)
-        motion = pose @ se3_inverse(last)
-        if memory_scale is not None:
-            weights[-1] = update_motion_weight(
-                grid, matches, of_last, motion, weights[-1], memory_scale
-            )
-        weights.append(inherit_motion_weight(grid, matches, weights[-1]))
-        warped = warp_disparities(grid, motion, of_last)
+        pose = start_pose(grid, matches, of_last, weights, last, starts, robust)
+        weights = inherit_motion_weight(grid, matches, weights)
+        warped = warp_disparities(grid, pose @ se3_inverse(last), of_last)
         known = known_disparities[index + 1]
         poses.append(pose)
         disparities.append(torch.where(known > 0, known, warped))
-    return BundleState(torch.stack(poses), torch.stack(disparities)), torch.stack(weights)
+    return BundleState(torch.stack(poses), torch.stack(disparities))
 
 
 def best_hypothesis(
@@ -98,13 +86,10 @@ def best_hypothesis(
     lets a bad guess leave its wrong minimum, but under the widest one a large dynamic object may
     outvote the room. So every hypothesis starts from the two widest, and the costs are compared
     under a narrow one: there the room fits, and a compromise between room and dynamic object does
-    not. A depth prior gives only one hypothesis, which is already near.
+    not.
     """
-    robust = problem.robust
-    starts: list[tuple[float, ...]] = [(1.0,)]
-    if robust and len(states) > 1:
-        widenings = ROBUST_WIDENING + ROBUST_NARROWING
-        starts = [widenings, widenings[1:]]
+    robust, widenings = problem.robust, ROBUST_WIDENING + ROBUST_NARROWING
+    starts = [widenings, widenings[1:]] if robust else [(1.0,)]
     results = []
     for state, start in itertools.product(states, starts):
         for widening in start:
@@ -114,10 +99,7 @@ def best_hypothesis(
     return min(results, key=lambda result: result[1].cost_after)
 
 
-def first_geometry(
-    graph: KeyframeGraph,
-    memory_scale: float | None,  # px; None: motion is not remembered
-) -> None:
+def first_geometry(graph: KeyframeGraph) -> None:
     """Estimate poses and disparities of all keyframes of the warm-up, beta unknown.
 
     A focal length that nobody gave is estimated with them.
@@ -130,14 +112,10 @@ def first_geometry(
         graph.match_composed(target)
     known = keyframes.prior_disparities
     guesses = first_disparity_hypotheses(graph.grid, known[0], graph.links.flow_from(0))
-    strength = graph.config.lambda_disparity_prior * graph.grid.camera.fx**2
-    settings = known, graph.robust, memory_scale, strength, keyframes.cell_weights[0]
+    settings = known, graph.robust, keyframes.cell_weights[0]
     hypotheses = [chain_state(graph.grid, flow_to_next, guess, *settings) for guess in guesses]
-    if memory_scale is not None:  # then there is a depth prior, and with it one hypothesis
-        for index, weight in enumerate(hypotheses[0][1]):
-            keyframes.set_motion_weight(index, weight)
     problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
-    state, report = best_hypothesis(problem, [state for state, _ in hypotheses])
+    state, report = best_hypothesis(problem, hypotheses)
     graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)
     seek_focal_length(graph)

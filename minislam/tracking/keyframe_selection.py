@@ -8,11 +8,14 @@ from minislam.tracking.reprojection import lengths
 KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyframe is needed [-]
 
 
-def keyframe_flow(graph: KeyframeGraph) -> float:
-    """Return the mean flow that makes a keyframe [px]."""
-    config = graph.config
-    known = graph.keyframes.has_prior
-    flow = config.keyframe_flow if known else config.keyframe_flow_without_prior
+def keyframe_flow(graph: KeyframeGraph, is_initialised: bool) -> float:
+    """Return the mean flow that makes a keyframe [px].
+
+    The start needs parallax even with a depth prior: over short baselines a dynamic object that
+    fills much of the view fits the motion of the camera as well as the room does.
+    """
+    config, may_be_near = graph.config, is_initialised and graph.keyframes.has_prior
+    flow = config.keyframe_flow if may_be_near else config.keyframe_flow_without_prior
     return flow * graph.pixel_scale
 
 
@@ -34,11 +37,10 @@ def needs_keyframe(
     It should if the mean flow is large, if few cells are matched, or if the last keyframe was
     `keyframe_interval` frames ago.
     """
-    flow = mean_flow(graph, matches)
-    if flow > keyframe_flow(graph) or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
+    flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
+    if flow > enough or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
-    # Without a depth prior the first keyframes need parallax, so a camera at rest makes none.
-    may_rest = is_initialised or graph.keyframes.has_prior
+    # The first keyframes need parallax, so a camera at rest makes none.
     elapsed = frame.frame_index - graph.keyframes.frames[-1].frame_index
     is_due = elapsed >= graph.config.keyframe_interval
-    return is_due and (may_rest or flow > graph.least_parallax)
+    return is_due and (is_initialised or flow > graph.least_parallax)

@@ -257,13 +257,13 @@ class Tracker(Stateful):
                 "expected at least two frames that show the same scene, found none among "
                 f"{len(self.tracked)} frames; check that the images are not blank and overlap"
             )
-        first_geometry(self.graph, self._motion.scale if self.keyframes.has_prior else None)
+        first_geometry(self.graph)
         self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
         if not self.keyframes.has_prior:
             self.keyframes.normalise_scale()
-            self._motion.judge_all(self.graph.flow_to_next)
+        self._motion.judge_all(self.graph.flow_to_next)
 
     def refine_initialisation(self) -> None:
         """Adjust the warm-up keyframes again, now that beta is known (second stage)."""

@@ -202,7 +202,7 @@ REFUSALS = [
     ([*INPUT, "--depth", "none"], "expected priors.depth = simulated .* found none"),
     ([*INPUT, "--tracking.window", "3"], "settings.tracking.window = 10 .* found 3; repeat"),
     ([*INPUT, "--seed", "7"], "expected settings.seed = 0 .* found 7"),
-    ([*INPUT, "--preset", "laptop"], "settings.tracking.warmup_keyframes = 6 .* found 12"),
+    ([*INPUT, "--preset", "laptop"], "settings.tracking.warmup_rounds = 1 .* found 3"),
     ([*INPUT, "--no-uncertainty"], "expected settings.uncertainty.enabled = True .* found False"),
 ]
 

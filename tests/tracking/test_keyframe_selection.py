@@ -24,17 +24,18 @@ def needs(graph: KeyframeGraph, frame: int, matches: FlowMatches, initialised: b
     return needs_keyframe(graph, wall_frame(frame), matches, initialised)
 
 
-def test_a_prior_asks_for_less_flow():
+def test_a_prior_asks_for_less_flow_once_the_start_is_over():
     graph = true_graph([0])
-    scale = graph.pixel_scale
-    assert keyframe_flow(graph) == CONFIG.keyframe_flow_without_prior * scale
+    wide = CONFIG.keyframe_flow_without_prior * graph.pixel_scale
+    assert keyframe_flow(graph, True) == keyframe_flow(graph, False) == wide
     graph.keyframes.metric_depths[0] = torch.ones(1, 1)
-    assert keyframe_flow(graph) == CONFIG.keyframe_flow * scale
+    assert keyframe_flow(graph, True) == CONFIG.keyframe_flow * graph.pixel_scale
+    assert keyframe_flow(graph, False) == wide
 
 
 def test_much_flow_makes_a_keyframe():
     graph = true_graph([0])
-    enough = keyframe_flow(graph)
+    enough = keyframe_flow(graph, True)
     assert needs(graph, 1, shifted(1.01 * enough)) and not needs(graph, 1, shifted(0.99 * enough))
 
 

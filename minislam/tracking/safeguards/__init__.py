@@ -4,7 +4,6 @@ robust           the robust weight inside Sigma, for a flow without a learned co
 motion_memory    remembers which cells have moved, so that a growing dynamic object stays excluded
 settling         which disparities parallax has measured; only these are handed on to a new keyframe
 inverse_flow     flow back from a new keyframe that does not start from its own disparities
-two_views        a pose from a depth prior that has errors
 relocalisation   finds a lost camera among the keyframes
 pose_support     tries other starts for poses between keyframes that little of the flow supports
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut

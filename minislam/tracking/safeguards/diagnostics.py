@@ -114,7 +114,8 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     over the cells that count in the adjustment; a dynamic object does not. None: no link.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
-    positions = [p for p, edge in enumerate(graph.links.edges()) if edge in near]
+    edges = graph.links.edges()
+    positions = [p for p, edge in enumerate(edges) if edge in near]
     if not positions:
         return None, None
     problem, keyframes, grid = bundle_problem(graph, positions, 0, 0.0), graph.keyframes, graph.grid
@@ -122,7 +123,7 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     fits = lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
     sources, targets = problem.edges_source, problem.edges_target
     confidences = torch.stack([graph.links.confidences[p][0] for p in positions])
-    weights = confidences * torch.stack([weight_so_far(graph, k) for k in sources.tolist()])
+    weights = confidences * torch.stack([weight_so_far(graph, edges[p][0]) for p in positions])
     weights *= (targets == keyframe)[:, None]
     explained = float((weights * fits).sum() / weights.sum().clamp_min(1e-6))
 

@@ -13,10 +13,6 @@ from minislam.state.stateful import Stateful
 from minislam.tracking.keyframe_selection import mean_flow
 from minislam.tracking.tracker import Mode, Tracker
 
-# Keyframes of the warm-up without a depth prior, at most: it must be over before a dynamic object
-# fills the view, because motion is remembered from then on only.
-MOST_WITHOUT_PRIOR = 6
-
 Worth = tuple[bool, int]  # whether a start can tell depth; the frames that it followed
 
 
@@ -45,11 +41,12 @@ class FirstFrame(Stateful):
 
 
 def has_warmed_up(tracker: Tracker) -> bool:
-    """Tell whether the warm-up has its keyframes."""
-    enough = tracker.config.warmup_keyframes
-    if not tracker.keyframes.has_prior:
-        enough = min(enough, MOST_WITHOUT_PRIOR)
-    return len(tracker.keyframes) >= enough
+    """Tell whether the warm-up has its keyframes.
+
+    They are few, because it must be over before a dynamic object fills the view: motion is
+    remembered from then on only.
+    """
+    return len(tracker.keyframes) >= tracker.config.warmup_keyframes
 
 
 def can_tell_depth(tracker: Tracker) -> bool:

@@ -20,7 +20,7 @@ from tests.helpers import generator
 from tests.tracking.recording import frames, lost_frames, new_tracker, run
 from tests.tracking.scene import CAMERA, STRIDE
 from tests.tracking.test_tracker_losing import centres, renumbered
-from tests.tracking.wall import GRID, true_graph
+from tests.tracking.wall import GRID
 
 PLACE_ERROR = 0.03  # of the length of the path; measured .004 to .006
 
@@ -70,17 +70,13 @@ def test_a_start_of_more_frames_than_are_lost_is_kept():
     assert tracker.keyframes.frames[0].frame_index == 0
 
 
-@pytest.mark.parametrize(
-    ("asked", "has_prior", "enough"), [(12, True, 12), (12, False, 6), (4, False, 4)]
-)
-def test_without_a_prior_few_keyframes_are_enough(asked: int, has_prior: bool, enough: int):
+@pytest.mark.parametrize("enough", [2, 6])
+def test_the_warm_up_ends_with_its_last_keyframe(enough: int):
     for count in (enough - 1, enough):
-        keyframes = true_graph([*range(count)]).keyframes
-        keyframes.metric_depths[0] = torch.ones(1, 1) if has_prior else None
-        tracker = SimpleNamespace(
-            config=TrackingConfig(warmup_keyframes=asked), keyframes=keyframes
+        config, keyframes = TrackingConfig(warmup_keyframes=enough), [None] * count
+        assert has_warmed_up(SimpleNamespace(config=config, keyframes=keyframes)) is (
+            count == enough
         )
-        assert has_warmed_up(tracker) is (count == enough)
 
 
 # Cuts between scenes, with a flow that only knows which scene an image shows, and where
