@@ -40,7 +40,8 @@ def needs_keyframe(
     flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
     if flow > enough or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
-    # The first keyframes need parallax, so a camera at rest makes none.
+    # Without a depth prior the first keyframes need parallax, so a camera at rest makes none.
+    may_rest = is_initialised or graph.keyframes.has_prior
     elapsed = frame.frame_index - graph.keyframes.frames[-1].frame_index
     is_due = elapsed >= graph.config.keyframe_interval
-    return is_due and (is_initialised or flow > graph.least_parallax)
+    return is_due and (may_rest or flow > graph.least_parallax)
