@@ -35,7 +35,6 @@ from minislam.tracking.trajectory import pose_all_frames
 from tests.benchmarks.broken_clips import base, clip, clips
 
 SURVIVED = 0.05  # of the spread of the camera centres
-WARM_UP = 6  # keyframes; the clips are short
 
 
 class Piece:
@@ -61,11 +60,11 @@ class Piece:
         return self._whole.sensor_depth(self._first + frame_index)
 
 
-def followed(sequence: Sequence, with_prior: bool, warm_up: int) -> Tracker:
+def followed(sequence: Sequence, with_prior: bool) -> Tracker:
     """Return a tracker that has followed the sequence, final adjustments included."""
     depth = sequence.depth if isinstance(sequence, Piece) else sequence.ground_truth.depth
     prior = SimulatedDepth(depth, 0) if with_prior else NoDepth()
-    config = TrackingConfig(warmup_keyframes=warm_up)
+    config = TrackingConfig()
     flow, features = ClassicalFlow(), ClassicalFeatures()
     tracker = Tracker(
         sequence.camera, config, flow, features, prior, lambda _: torch.ones(tracker.grid.shape)
@@ -84,12 +83,10 @@ def followed(sequence: Sequence, with_prior: bool, warm_up: int) -> Tracker:
     return tracker
 
 
-def row(
-    name: str, sequence: Sequence, with_prior: bool, holds: bool = True, warm_up=WARM_UP
-) -> str:
+def row(name: str, sequence: Sequence, with_prior: bool, holds: bool = True) -> str:
     """Run a clip; return a line of the table. `holds`: the truth holds across the break."""
     begun = time.perf_counter()
-    tracker = followed(sequence, with_prior, warm_up)
+    tracker = followed(sequence, with_prior)
     focal = check_focal_length(tracker.graph)
     poses = pose_all_frames(tracker, sequence)
     stamps = {tracked.frame_index: tracked.timestamp for tracked in tracker.tracked}
@@ -149,7 +146,7 @@ def main() -> None:
         whole, length = open_sequence(arguments[0]), int(arguments[1])
         for first in range(0, len(whole) - length + 1, length):
             piece = Piece(whole, first, length)
-            print(row(piece.name, piece, with_prior, warm_up=12), flush=True)
+            print(row(piece.name, piece, with_prior), flush=True)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
-# Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .94 to 1, two in a
+# Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .88 to 1, two in a
 # row on fast real video .68 and .82; broken ones .3 to .4, the worse of many in a row .6 to .84.
 MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
 LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
