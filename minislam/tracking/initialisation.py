@@ -102,7 +102,9 @@ def best_hypothesis(
 def first_geometry(graph: KeyframeGraph) -> None:
     """Estimate poses and disparities of all keyframes of the warm-up, beta unknown.
 
-    A focal length that nobody gave is estimated with them.
+    Flow alone decides: a depth prior that is wrong by a few per cent would bend them. It only says
+    where the search starts, and gives the unit of length. A focal length that nobody gave is
+    estimated as well.
     """
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
@@ -114,8 +116,9 @@ def first_geometry(graph: KeyframeGraph) -> None:
     guesses = first_disparity_hypotheses(graph.grid, known[0], graph.links.flow_from(0))
     settings = known, graph.robust, keyframes.cell_weights[0]
     hypotheses = [chain_state(graph.grid, flow_to_next, guess, *settings) for guess in guesses]
-    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.links)), first_free=0, lambda_prior=0.0)
     state, report = best_hypothesis(problem, hypotheses)
     graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)
+    keyframes.normalise_scale()
     seek_focal_length(graph)

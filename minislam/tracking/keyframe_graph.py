@@ -189,8 +189,8 @@ class KeyframeGraph(Stateful):
     def match_composed(self, target: int) -> None:
         """Measure the flow between a keyframe and its predecessors, since the last loss.
 
-        It starts from the flow between neighbours, composed. No pose is needed, so a wrong one does
-        no harm. Without a depth prior disparities may be wrong too: the flow back is measured now.
+        It starts from the flow between neighbours, composed. Neither poses nor disparities are
+        needed, so wrong ones do no harm.
         """
         edges: list[Edge] = []
         predictions, composed = [], None
@@ -199,11 +199,8 @@ class KeyframeGraph(Stateful):
             if matches is None:
                 break
             composed = compose_matches(matches, composed, self.grid) if composed else matches
-            edges.append((source, target))
-            predictions.append(composed.targets)
-            if not self.keyframes.has_prior:
-                edges.append((target, source))
-                predictions.append(inverted_targets(composed.targets, self.grid))
+            edges += both_directions([(source, target)])
+            predictions += [composed.targets, inverted_targets(composed.targets, self.grid)]
         sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
         self.links.record(edges, self.flow.match(sources, targets, torch.cat(predictions)))
 

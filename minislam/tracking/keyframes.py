@@ -100,7 +100,9 @@ class KeyframeStore(Stateful):
         self.motion_weights[index] = weight
 
     def normalise_scale(self) -> None:
-        """Set the unit of length so that the median disparity is one: nothing else fixes it."""
-        scale = self.disparities.median()
+        """Set the unit of length: that of the prior, or else the median disparity becomes one."""
+        known = self.prior_disparities > 0
+        relative = self.disparities / torch.where(known, self.prior_disparities, 1.0)
+        scale = (relative[known] if known.any() else relative).median()
         self.disparities /= scale
         self.T_camera_world[:, :3, 3] *= float(scale)

@@ -261,8 +261,6 @@ class Tracker(Stateful):
         self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
-        if not self.keyframes.has_prior:
-            self.keyframes.normalise_scale()
         self._motion.judge_all(self.graph.flow_to_next)
 
     def refine_initialisation(self) -> None:

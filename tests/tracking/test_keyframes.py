@@ -69,11 +69,22 @@ def test_the_newest_keyframe_can_be_removed():
     assert torch.equal(store.disparities, before.disparities[:2])
 
 
-def test_a_normalised_store_has_median_disparity_one_and_the_same_view():
+def test_without_a_prior_the_median_disparity_becomes_one_and_the_view_stays():
     store, before = filled(3), filled(3)
+    store.prior_disparities.zero_()
     store.normalise_scale()
     assert float(store.disparities.median()) == pytest.approx(1)
     scale = before.disparities.median()
     torch.testing.assert_close(store.disparities * scale, before.disparities)
     moved = store.T_camera_world[:, :3, 3] / scale
+    torch.testing.assert_close(moved, before.T_camera_world[:, :3, 3])
+
+
+def test_a_prior_gives_its_unit_of_length_where_it_is_known():
+    store, before = filled(3), filled(3)
+    store.prior_disparities.zero_()
+    store.prior_disparities[1, :6] = 5 * store.disparities[1, :6]
+    store.normalise_scale()
+    torch.testing.assert_close(store.disparities, 5 * before.disparities)
+    moved = 5 * store.T_camera_world[:, :3, 3]
     torch.testing.assert_close(moved, before.T_camera_world[:, :3, 3])

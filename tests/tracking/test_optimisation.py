@@ -13,6 +13,8 @@ from minislam.tracking.optimisation import adjust, bundle_problem, final_global_
 from tests.tracking.scene import CAMERA, assert_same_bits
 from tests.tracking.wall import true_graph, true_poses
 
+# As a network errs: a scale of its own in each of four keyframes.
+WRONG = torch.tensor([[1.3], [0.8], [1.2], [0.7]])
 XI = torch.tensor([0.03, -0.02, 0.02, 0.01, -0.01, 0.015], dtype=torch.float64)
 
 
@@ -98,6 +100,16 @@ def test_a_new_keyframe_is_linked_and_adjusted_without_knowing_where_it_is():
     found, truth = (T[:3, 3] / T[:3, 3].norm() for T in (last, true_poses()[3]))
     assert float((found - truth).norm()) < 1e-2
     assert float((last[:3, :3] - true_poses()[3][:3, :3]).norm()) < 1e-3
+
+
+def test_a_wrong_prior_does_not_bend_a_new_keyframe_while_the_weight_is_wide():
+    graphs = [true_graph(list(range(4)), TrackingConfig(rounds=0)) for _ in range(2)]
+    graphs[1].keyframes.prior_disparities = graphs[1].keyframes.disparities * WRONG
+    for graph in graphs:
+        graph.match(neighbourhood_edges(0, 3, 2))
+        local_ba(graph)
+    plain, bent = (graph.keyframes.T_camera_world for graph in graphs)
+    assert torch.equal(plain, bent)
 
 
 def test_the_last_adjustment_keeps_the_truth():
