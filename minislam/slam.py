@@ -26,7 +26,7 @@ from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimat
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.stereo.dense_structure import DENSE_PRIOR, fill_depth
+from minislam.stereo.dense_structure import with_swept_depth
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
 from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
@@ -100,8 +100,7 @@ class Slam(Stateful):
         if self.config.uncertainty.enabled:
             self.steps.once("second adjustment", self._adjust_again)
         self.steps.once("all frames", self._pose_all_frames)
-        if self.tracker.keyframes.known_prior < DENSE_PRIOR:
-            self.steps.once("dense structure", self._rebuild_map)
+        self.steps.once("dense structure", self._rebuild_map)
         self.steps.once("refinement", self._refine_map)
         if self.config.mapping.pose_refinement.enabled:
             self.steps.once("photometric refinement", self._refine_other_poses)
@@ -130,21 +129,23 @@ class Slam(Stateful):
         """Start in two stages (paper Sec. 3.3): first without beta, then with beta."""
         with self.steps.timed("initialisation"):
             self.tracker.initialise()
-        if self.tracker.keyframes.has_prior:
-            with self.steps.timed("mapping"):
-                self.mapper.camera = self.tracker.grid.camera
-                self.mapper.initialise(self._keyframes(), self.steps.on_progress("first map"))
+        self._map_new_keyframes()
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
 
     def _map_new_keyframes(self) -> None:
-        """Add new keyframes to the map. Without a depth prior it is built at the end."""
+        """Add new keyframes to the map. Without a depth prior it is built at the end alone."""
         new_keyframes = self._keyframes(first=len(self.mapper.keyframes))
-        if new_keyframes and self.tracker.keyframes.has_prior:
-            with self.steps.timed("mapping"):
+        if not (new_keyframes and self.tracker.keyframes.has_prior):
+            return
+        with self.steps.timed("mapping"):
+            if self.mapper.keyframes:
                 self._move_map()
                 for keyframe in new_keyframes:
                     self.mapper.integrate(keyframe)
+            else:
+                self.mapper.camera = self.tracker.grid.camera
+                self.mapper.initialise(new_keyframes, self.steps.on_progress("first map"))
 
     def _move_map(self) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""
@@ -166,18 +167,17 @@ class Slam(Stateful):
         self._move_map()
 
     def _rebuild_map(self) -> None:
-        """Build map and MLP anew on dense depth. Known depths of a prior with holes stay."""
+        """Build map and MLP anew, on depth that all views have measured together."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         swept = sweep_keyframes(graph, self.sequence, self._poses, progress, self.workers)
         self.mapper = self._new_mapper()
-        keyframes, exposures = fill_depth(self._keyframes(), swept), keyframe_exposures(graph)
-        self.mapper.initialise(keyframes, self.steps.on_progress("first map"), exposures)
+        keyframes = with_swept_depth(self._keyframes(), swept)
+        progress, exposures = self.steps.on_progress("first map"), keyframe_exposures(graph)
+        self.mapper.initialise(keyframes, progress, exposures)
 
     def _refine_map(self) -> None:
         stage = "refining the map"
         iterations = self.config.mapping.refine_iterations
-        if self.tracker.keyframes.known_prior >= DENSE_PRIOR:  # else told when the map was rebuilt
-            self.mapper.expose(keyframe_exposures(self.tracker.graph))
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:

@@ -66,7 +66,7 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
         {"final adjustment": 0.05 * per_frame},
         again if config.uncertainty.enabled else {},
         posing,
-        {} if has_prior else {"dense depth": 0.25 * per_frame} | first_map,
+        {"dense depth": 0.25 * per_frame} | first_map,
         {"refining the map": iteration * mapping.refine_iterations},
         {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
     ]

@@ -17,7 +17,6 @@ from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, keep_what_stays
 from minislam.workers import Workers
 
-DENSE_PRIOR = 0.9  # known fraction of a depth prior below which its holes are filled [-]
 WIDTH = 160  # px of the images that are swept for the map
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
@@ -28,22 +27,27 @@ VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
 LARGEST_QUANTILE = 0.98
 PLANES = (48, 96)  # fewest and most
+LEAST_COMMON = 100  # px, with two depths of which the ratio of their scales is told
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
 
 
-def fill_depth(
+def with_swept_depth(
     keyframes: list[Keyframe],
     swept: list[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
 ) -> list[Keyframe]:
-    """Return the keyframes with dense depth where theirs is unknown, and with confirmation."""
-    return [
-        replace(
-            keyframe,
-            depth=torch.where(keyframe.depth > 0, keyframe.depth, depth),
-            confirmation=resample(confirmation, *keyframe.features.shape[:2]),
-        )
-        for keyframe, (depth, confirmation) in zip(keyframes, swept, strict=True)
-    ]
+    """Return the keyframes with swept depth, where nothing was swept with their own, and confirmed.
+
+    What several views measure beats what a network guesses from one (RESULTS.md). The guess of each
+    keyframe is scaled to what was swept there, because a network errs in the scale of each image.
+    """
+    result = []
+    for keyframe, (depth, confirmation) in zip(keyframes, swept, strict=True):
+        both = (depth > 0) & (keyframe.depth > 0)
+        scale = (depth / keyframe.depth)[both].median() if int(both.sum()) > LEAST_COMMON else 1.0
+        depth = torch.where(depth > 0, depth, scale * keyframe.depth)
+        confirmation = resample(confirmation, *keyframe.features.shape[:2])
+        result.append(replace(keyframe, depth=depth, confirmation=confirmation))
+    return result
 
 
 def dense_depths(

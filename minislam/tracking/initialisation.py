@@ -37,18 +37,22 @@ ROBUST_NARROWING = (0.5, 0.25)  # [-], times the final width
 
 def first_disparity_hypotheses(
     grid: Grid,
-    prior_disparities: Tensor,  # (N,) of the first keyframe, 0 where unknown
+    known_disparities: Tensor,  # (K, N) of the depth prior, 0 where there is none
     from_first: list[tuple[Tensor, Tensor]],  # targets [px] and confidences (N, 2) to followers
-) -> list[Tensor]:
-    """Return guesses (N,) of the first keyframe's disparities.
+) -> list[tuple[Tensor, Tensor]]:
+    """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
-    With a depth prior that is the prior alone; without, a wall and essential matrices.
+    They are the depth prior, if there is one, a wall, and essential matrices, which know nothing of
+    the other keyframes. A prior with holes in the distance is a bad guess, so it is not the only
+    one. It comes first, because of equal costs the first wins, as where no flow tells any depth.
     """
-    known = prior_disparities > 0
-    if bool(known.any()):
-        return [torch.where(known, prior_disparities, prior_disparities[known].median())]
     triangulated = [essential_disparities(grid, *measured) for measured in from_first]
-    return [torch.ones_like(prior_disparities), *(d for d in triangulated if d is not None)]
+    alone = [torch.ones_like(known_disparities[0]), *(d for d in triangulated if d is not None)]
+    guesses = [(disparities, torch.zeros_like(known_disparities)) for disparities in alone]
+    known = (first := known_disparities[0]) > 0
+    if bool(known.any()):
+        guesses.insert(0, (torch.where(known, first, first[known].median()), known_disparities))
+    return guesses
 
 
 def chain_state(
@@ -113,9 +117,9 @@ def first_geometry(graph: KeyframeGraph) -> None:
     for target in range(1, len(keyframes)):
         graph.match_composed(target)
     known = keyframes.prior_disparities
-    guesses = first_disparity_hypotheses(graph.grid, known[0], graph.links.flow_from(0))
-    settings = known, graph.robust, keyframes.cell_weights[0]
-    hypotheses = [chain_state(graph.grid, flow_to_next, guess, *settings) for guess in guesses]
+    guesses = first_disparity_hypotheses(graph.grid, known, graph.links.flow_from(0))
+    settings = graph.robust, keyframes.cell_weights[0]
+    hypotheses = [chain_state(graph.grid, flow_to_next, *guess, *settings) for guess in guesses]
     problem = bundle_problem(graph, range(len(graph.links)), first_free=0, lambda_prior=0.0)
     state, report = best_hypothesis(problem, hypotheses)
     graph.count_adjustment(report)

@@ -111,9 +111,9 @@ class KeyframeGraph(Stateful):
         if metric_depth is not None:
             depth = metric_depth[:: self.grid.stride, :: self.grid.stride].reshape(-1)
             prior = torch.where(depth > 0, depth.clamp_min(1e-6).reciprocal(), prior)
-        disparities = torch.where(prior > 0, prior, disparities)
         self.flow.add_frame(len(self.keyframes), frame.image)
         self.keyframes.append(frame, features, metric_depth, T_camera_world, disparities, prior)
+        self.keyframes.start_from_prior()
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe, which has no links yet."""

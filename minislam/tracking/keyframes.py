@@ -40,11 +40,6 @@ class KeyframeStore(Stateful):
         return any(depth is not None for depth in self.metric_depths)
 
     @property
-    def known_prior(self) -> float:
-        """Return the fraction of the cells with a known prior."""
-        return float((self.prior_disparities > 0).float().mean())
-
-    @property
     def cell_weights(self) -> Tensor:  # (K, N) in [0, 1]
         """Return the weight of each cell: by its appearance (beta) and by its motion so far."""
         weights = self.static_weights * self.motion_weights
@@ -98,6 +93,14 @@ class KeyframeStore(Stateful):
     def set_motion_weight(self, index: int, weight: Tensor) -> None:
         """Replace the motion weight (N,) of a keyframe."""
         self.motion_weights[index] = weight
+
+    def start_from_prior(self) -> None:
+        """Take the newest keyframe's prior for its disparities; the first prior gives the unit."""
+        known = self.prior_disparities > 0
+        if known[-1].any() and not known[:-1].any():
+            self.normalise_scale()
+        newest = self.disparities[-1]
+        self.disparities[-1] = torch.where(known[-1], self.prior_disparities[-1], newest)
 
     def normalise_scale(self) -> None:
         """Set the unit of length: that of the prior, or else the median disparity becomes one."""

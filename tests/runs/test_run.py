@@ -54,7 +54,7 @@ def test_a_run_that_ends_without_a_map_keeps_its_trajectory(root: Path, monkeypa
     def no_depth(*arguments: object) -> list:
         raise InputError("expected some known depth, found none")
 
-    monkeypatch.setattr(slam, "fill_depth", no_depth)
+    monkeypatch.setattr(slam, "with_swept_depth", no_depth)
     out = root / "no_map"
     assert main([*COMMAND, "-o", str(out)]) == 1
     folder = RunFolder(out)

@@ -9,9 +9,9 @@ from minislam.records import Keyframe
 from minislam.stereo.dense_structure import (
     SweepPlanner,
     dense_depths,
-    fill_depth,
     full_size,
     swept_frames,
+    with_swept_depth,
 )
 from minislam.stereo.votes import ConfirmedDepth
 from minislam.workers import Workers
@@ -121,25 +121,30 @@ def test_the_swept_camera_sees_what_the_camera_sees():
 # Keyframes
 
 
-def test_known_depth_stays_and_confirmation_comes_on_the_grid_of_the_features():
-    known = torch.zeros(SIZE[::-1])
-    known[:60] = 7.0
-    keyframes = [
-        Keyframe(
-            k,
-            index,
-            float(clip().timestamps[index]),
-            torch.from_numpy(clip().rgb[index]),
-            torch.zeros(15, 20, 2),
-            known,
-            torch.from_numpy(pose(index)),
-        )
-        for k, index in enumerate((8, 16))
-    ]
+def keyframe(k: int, index: int, depth: torch.Tensor) -> Keyframe:
+    stamp, pixels = float(clip().timestamps[index]), torch.from_numpy(clip().rgb[index])
+    features, T_camera_world = torch.zeros(15, 20, 2), torch.from_numpy(pose(index))
+    return Keyframe(k, index, stamp, pixels, features, depth, T_camera_world)
+
+
+def test_swept_depth_comes_first_and_a_prior_of_another_scale_fills_the_rest():
     swept = [
         (torch.from_numpy(seen.depth), torch.from_numpy(seen.confirmation)) for seen in found()[1:3]
     ]
-    filled = fill_depth(keyframes, swept)
-    for before, after in zip(keyframes, filled, strict=True):
-        assert torch.equal(after.depth[:60], known[:60]) and float((after.depth[60:] > 0).sum()) > 0
-        assert after.confirmation.shape == (15, 20) and before.confirmation is None
+    guesses = [1.3 * depth + (depth == 0) * 7.0 for depth, _ in swept]  # of a network, all known
+    keyframes = [keyframe(k, 8 + 8 * k, guess) for k, guess in enumerate(guesses)]
+    for found_there, (depth, _) in zip(with_swept_depth(keyframes, swept), swept, strict=True):
+        known = depth > 0
+        assert 0 < float(known.float().mean()) < 1
+        assert torch.equal(found_there.depth[known], depth[known])
+        rest = found_there.depth[~known]
+        torch.testing.assert_close(rest, torch.full_like(rest, 7 / 1.3))
+        assert found_there.confirmation is not None
+        assert found_there.confirmation.shape == (15, 20)
+
+
+def test_where_nothing_was_swept_the_prior_stays_as_it_is():
+    guess = torch.full(SIZE[::-1], 7.0)
+    guess[0] = 0  # and an unknown depth stays unknown
+    [after] = with_swept_depth([keyframe(0, 8, guess)], [(0 * guess, 0 * guess)])
+    assert torch.equal(after.depth, guess)

@@ -1,14 +1,11 @@
 """Exposure: told by matches of what stands still, taken out of images, put back into pictures."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-from minislam.config import SlamConfig
 from minislam.records import Frame
-from minislam.slam import Slam
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -82,20 +79,6 @@ def test_a_keyframe_without_links_is_exposed_like_its_neighbour():
     found = keyframe_exposures(graph)
     torch.testing.assert_close(found[3], found[2], rtol=1e-3, atol=0)
     torch.testing.assert_close(found[2] / found[0], torch.full((3,), 1.3 / 0.7), rtol=0.02, atol=0)
-
-
-def test_a_map_that_grew_online_is_exposed_before_its_refinement(monkeypatch):
-    told: list[str] = []
-    mapper = SimpleNamespace(expose=told.append, refine=lambda *more: told.append("refined"))
-    steps = SimpleNamespace(on_step=lambda stage: None, done=lambda stage: 0)
-    keyframes = SimpleNamespace(known_prior=1.0)
-    tracker = SimpleNamespace(graph="told by this graph", keyframes=keyframes)
-    slam = SimpleNamespace(mapper=mapper, steps=steps, tracker=tracker, config=SlamConfig())
-    monkeypatch.setattr("minislam.slam.keyframe_exposures", lambda graph: graph)
-    Slam._refine_map(slam)
-    keyframes.known_prior = 0.5  # then the map was rebuilt, and told
-    Slam._refine_map(slam)
-    assert told == ["told by this graph", "refined", "refined"]
 
 
 # Degenerate input

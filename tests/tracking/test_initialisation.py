@@ -29,7 +29,7 @@ from tests.tracking.matches import (
 from tests.tracking.scene import CAMERA, known_problem, normal, perturbed
 from tests.tracking.wall import true_graph, true_poses
 
-UNKNOWN = torch.zeros(CELLS)
+UNKNOWN = torch.zeros(3, CELLS)  # of three keyframes
 
 
 # Known answers
@@ -59,19 +59,29 @@ def test_a_chain_carries_disparities_where_none_are_known():
 # Hypotheses
 
 
-def test_the_first_hypothesis_is_a_wall():
-    truth = room_disparities()
-    hypotheses = list(
-        first_disparity_hypotheses(GRID, UNKNOWN, [flat(seen_matches(sideways(), truth))])
-    )
-    assert len(hypotheses) == 2
-    assert torch.equal(hypotheses[0], torch.ones(CELLS))
-    assert hypotheses[1].median() == pytest.approx(1, abs=0.05)
+def test_without_a_prior_the_hypotheses_are_a_wall_and_essential_matrices():
+    matches = [flat(seen_matches(sideways(), room_disparities()))]
+    (wall, knows), (triangulated, _) = first_disparity_hypotheses(GRID, UNKNOWN, matches)
+    assert torch.equal(wall, torch.ones(CELLS)) and not knows.any()
+    assert triangulated.median() == pytest.approx(1, abs=0.05)
+
+
+def test_a_prior_is_the_first_hypothesis_and_not_the_only_one():
+    prior = UNKNOWN.clone()
+    prior[0, 5:] = torch.linspace(0.2, 0.4, CELLS - 5)
+    matches = [flat(seen_matches(sideways(), room_disparities()))]
+    (guess, knows), *others = first_disparity_hypotheses(GRID, prior, matches)
+    assert torch.equal(guess[5:], prior[0, 5:]) and (guess[:5] == prior[0, 5:].median()).all()
+    assert knows is prior
+    for expected, found in zip(
+        first_disparity_hypotheses(GRID, UNKNOWN, matches), others, strict=True
+    ):
+        assert torch.equal(expected[0], found[0]) and not found[1].any()
 
 
 def test_hypotheses_without_confident_matches_are_the_wall_alone():
     blind = matches_to(GRID.pixels, 0.1)
-    assert len(list(first_disparity_hypotheses(GRID, UNKNOWN, 2 * [flat(blind)]))) == 1
+    assert len(first_disparity_hypotheses(GRID, UNKNOWN, 2 * [flat(blind)])) == 1
 
 
 def test_the_best_hypothesis_is_the_one_that_explains_the_matches():

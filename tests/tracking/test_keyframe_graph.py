@@ -1,8 +1,5 @@
 """Links of the keyframe graph on exact flow: what is confirmed, and how far keyframes are apart."""
 
-import pytest
-import torch
-
 from minislam.tracking.config import TrackingConfig
 from tests.tracking.wall import TrueFlow, true_graph
 

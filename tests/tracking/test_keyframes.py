@@ -80,6 +80,30 @@ def test_without_a_prior_the_median_disparity_becomes_one_and_the_view_stays():
     torch.testing.assert_close(moved, before.T_camera_world[:, :3, 3])
 
 
+def test_the_first_prior_gives_its_unit_to_keyframes_that_came_without():
+    store, before = filled(3), filled(3)
+    store.prior_disparities.zero_()
+    store.start_from_prior()
+    assert torch.equal(store.disparities, before.disparities)  # none is known: nothing changes
+    prior = store.prior_disparities[2]
+    prior[:6] = 5 * store.disparities[2, :6] * torch.tensor([1, 1, 1, 1.1, 0.9, 1])
+    for _ in range(2):  # the second time it is the unit already
+        store.start_from_prior()
+        expected = 5 * before.disparities
+        expected[2, :6] = prior[:6]
+        torch.testing.assert_close(store.disparities, expected)
+        moved = 5 * store.T_camera_world[:, :3, 3]
+        torch.testing.assert_close(moved, before.T_camera_world[:, :3, 3])
+
+
+def test_a_later_prior_leaves_the_unit():
+    store, before = filled(3), filled(3)
+    store.start_from_prior()
+    assert torch.equal(store.T_camera_world, before.T_camera_world)
+    assert torch.equal(store.disparities[:2], before.disparities[:2])
+    assert torch.equal(store.disparities[2], before.prior_disparities[2])
+
+
 def test_a_prior_gives_its_unit_of_length_where_it_is_known():
     store, before = filled(3), filled(3)
     store.prior_disparities.zero_()

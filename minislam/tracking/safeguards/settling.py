@@ -40,12 +40,13 @@ class Settling(Stateful):
         self.handed_on = torch.zeros_like(graph.grid.rays[:, 0])
 
     def information(self) -> Tensor:  # (N,) px^2
-        """Return the information of the newest keyframe's disparities; a prior settles all."""
+        """Return the information of the newest keyframe's disparities; a prior settles them."""
         graph, newest = self._graph, len(self._graph.keyframes) - 1
-        if graph.keyframes.has_prior:
-            return torch.full_like(self.handed_on, torch.inf)
-        measured = measured_information(graph, newest)
-        return measured if graph.follows_a_loss(newest) else measured + self.handed_on
+        information = measured_information(graph, newest)
+        if not graph.follows_a_loss(newest):
+            information += self.handed_on
+        known = graph.keyframes.prior_disparities[newest] > 0
+        return torch.where(known, torch.inf, information)
 
     def hand_on(self, information: Tensor, T_camera_world: Tensor) -> Tensor:  # (N,)
         """Return the disparities of the next keyframe, warped from settled cells of the newest.

@@ -62,10 +62,15 @@ def test_where_nothing_is_settled_all_is_handed_on():
     assert torch.equal(disparities, graph.warp_disparities(1, true_poses()[2]))
 
 
-def test_a_depth_prior_settles_everything():
+def test_a_depth_prior_settles_the_cells_where_it_is_known():
     graph = true_graph([0, 1])
-    graph.keyframes.metric_depths[0] = torch.ones(1, 1)
+    graph.match([(1, 0)])
     settling = Settling(graph)
+    measured = settling.information()
+    graph.keyframes.prior_disparities[1, 5:] = 0.2
+    information = settling.information()
+    assert information[5:].isposinf().all() and torch.equal(information[:5], measured[:5])
+    graph.keyframes.prior_disparities[1] = 0.2
     information = settling.information()
     assert information.isposinf().all()
     disparities = settling.hand_on(information, true_poses()[2])
