@@ -274,8 +274,7 @@ class Tracker(Stateful):
     def finish(self, progress: Progress | None = None) -> None:
         """Run the final global BA, with the newest beta."""
         self._update_static_weights()
-        if not self.keyframes.has_prior:  # online, the newest disparities were hardly settled
-            self._motion.judge_all(self.graph.flow_to_next)
+        self._motion.judge_all(self.graph.flow_to_next)  # online, depths were hardly settled
         final_global_ba(self.graph, progress)
         self.watch.conclude()
 
