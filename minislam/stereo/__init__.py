@@ -1,6 +1,6 @@
-"""Multi-view stereo: dense depth from posed frames, where no network and no sensor gives it.
+"""Multi-view stereo: dense depth from posed frames, without any network.
 
-Not a part of the paper, which takes its depth from a network. Read the files in this order:
+Not a part of the paper, which takes its depth from a network alone. Read the files in this order:
 
     sweep              how well each pixel matches other images at each depth
     aggregation        depths of neighbouring pixels fit together

@@ -7,7 +7,7 @@ inverse_flow     flow back from a new keyframe that does not start from its own 
 relocalisation   finds a lost camera among the keyframes
 pose_support     tries other starts for poses between keyframes that little of the flow supports
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
-first_depth      depth of the first keyframe from matches alone, where there is no depth prior
+first_depth      depth of the first keyframe from matches alone
 structure        which disparities several keyframes agree on
 diagnostics      how well each keyframe is tied to the others
 focal_length     estimates an unknown focal length, tells whether a given one was wrong

@@ -1,6 +1,6 @@
-"""The first depth without a depth prior: an essential matrix, then triangulation.
+"""The first depth from flow alone: an essential matrix, then triangulation.
 
-The paper starts from metric depth, so it needs neither.
+The paper starts from the depth prior, so it needs neither.
 """
 
 import cv2
