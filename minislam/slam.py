@@ -171,7 +171,7 @@ class Slam(Stateful):
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         swept = sweep_keyframes(graph, self.sequence, self._poses, progress, self.workers)
         self.mapper = self._new_mapper()
-        keyframes = with_swept_depth(self._keyframes(), swept)
+        keyframes = with_swept_depth(graph.grid.camera, self._keyframes(), swept)
         progress, exposures = self.steps.on_progress("first map"), keyframe_exposures(graph)
         self.mapper.initialise(keyframes, progress, exposures)
 

@@ -14,7 +14,16 @@ from minislam.images import resample
 from minislam.records import Keyframe, Progress, Sequence
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
-from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, keep_what_stays
+from minislam.stereo.votes import (
+    MAX_REFUTED,
+    ConfirmedDepth,
+    SweptView,
+    confirm,
+    confirmed_view,
+    count_votes,
+    judges,
+    keep_what_stays,
+)
 from minislam.workers import Workers
 
 WIDTH = 160  # px of the images that are swept for the map
@@ -32,6 +41,7 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 
 
 def with_swept_depth(
+    camera: Camera,  # of the images
     keyframes: list[Keyframe],
     swept: list[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
 ) -> list[Keyframe]:
@@ -39,15 +49,44 @@ def with_swept_depth(
 
     What several views measure beats what a network guesses from one (RESULTS.md). The guess of each
     keyframe is scaled to what was swept there, because a network errs in the scale of each image.
+    Where other keyframes look through it, it is of something that moves, and left out.
     """
-    result = []
-    for keyframe, (depth, confirmation) in zip(keyframes, swept, strict=True):
-        both = (depth > 0) & (keyframe.depth > 0)
-        scale = (depth / keyframe.depth)[both].median() if int(both.sum()) > LEAST_COMMON else 1.0
-        depth = torch.where(depth > 0, depth, scale * keyframe.depth)
+    small, result = _small(camera, WIDTH), []
+    views = [
+        confirmed_view(ConfirmedDepth(*(_shrunk(i, small) for i in (_inverse(depth), seen))), 0.0,
+                       keyframe.T_camera_world.cpu().numpy())
+        for keyframe, (depth, seen) in zip(keyframes, swept, strict=True)
+    ]  # fmt: skip
+    for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
+        if bool(keyframe.depth.any()):
+            both = (depth > 0) & (keyframe.depth > 0)
+            enough = int(both.sum()) > LEAST_COMMON
+            guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
+            guessed = replace(views[index], inverse_depth=_shrunk(_inverse(guess), small))
+            agreeing, refuting = count_votes(small, guessed, judges(views, index))
+            moves = torch.from_numpy(refuting > MAX_REFUTED * agreeing).to(depth)
+            moves = resample(moves, *depth.shape) > 0.5
+            depth = torch.where((depth > 0) | moves, depth, guess)
         confirmation = resample(confirmation, *keyframe.features.shape[:2])
         result.append(replace(keyframe, depth=depth, confirmation=confirmation))
     return result
+
+
+def _inverse(depth: Tensor) -> Tensor:
+    """Return inverse depth, 0 where depth is unknown."""
+    return torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0)
+
+
+def _shrunk(image: Tensor, camera: Camera) -> np.ndarray:
+    """Return an image (H, W) at the size of a camera, by the nearest pixels."""
+    size = (camera.width, camera.height)
+    return cv2.resize(image.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST)
+
+
+def _small(camera: Camera, width: int) -> Camera:
+    """Return the camera of images that are at most so wide."""
+    width = min(width, camera.width)
+    return camera.resized(width, max(1, round(width * camera.height / camera.width)))
 
 
 def dense_depths(
@@ -119,8 +158,7 @@ class SweepPlanner:
     def __init__(
         self, sequence: Sequence, camera: Camera, poses: dict[int, Tensor], width: int = WIDTH
     ) -> None:
-        width = min(width, camera.width)
-        self.camera = camera.resized(width, max(1, round(width * camera.height / camera.width)))
+        self.camera = _small(camera, width)
         self._sequence = sequence
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)

@@ -25,17 +25,15 @@ BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the d
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
 KEPT = 20  # blurred images: most links are among neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
-LEAST_WEIGHT = 0.005  # mean of a link's cells: with less, a few chance matches would tell [-]
+LEAST_WEIGHT = 0.015  # of the heaviest link: with less, a few chance matches would tell [-]
 STEADY = 1e-6  # weight of "as bright as the keyframe before", where no link tells more
 
 
 def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
     """Return how bright the keyframes are (K, 3), their median being 1; None if all are alike."""
     links, cells, frames = graph.links, graph.keyframes.cell_weights, graph.keyframes.frames
-    keyframe_axes = np.eye(len(frames))
-    steps = list(np.diff(keyframe_axes, axis=0))
-    ratios: list[list[float | None]] = [[0.0] * 3] * len(steps)
-    weights = [STEADY] * len(steps)
+    ratios: list[list[float | None]] = []
+    weights: list[float] = []
 
     @lru_cache(maxsize=KEPT)
     def blurred(keyframe: int) -> np.ndarray:  # (H, W, 3)
@@ -51,13 +49,16 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
         static = cells[source] * graph.grid.sample(cells[target][:, None], matches.T)[:, 0]
         weight = visible * (links.confidences[link][0] * static).cpu()
-        if weight.mean() > LEAST_WEIGHT:
-            ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
-            steps.append(keyframe_axes[target] - keyframe_axes[source])
-            ratios.append([weighted_median(channel, weight) for channel in ratio.T])
-            weights.append(float(weight.mean()))
-    root = np.sqrt(weights)[:, None]
-    levels = np.linalg.lstsq(root * steps, root * np.array(ratios, float), rcond=None)[0]
+        ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
+        ratios.append([weighted_median(channel, weight) for channel in ratio.T])
+        weights.append(float(weight.mean()))
+    telling = [k for k, w in enumerate(weights) if w > LEAST_WEIGHT * max(weights)]
+    axes = np.eye(len(frames))
+    steady, edges = np.diff(axes, axis=0), links.edges()
+    steps = [*steady, *(axes[edges[k][1]] - axes[edges[k][0]] for k in telling)]
+    values = [[0.0] * 3] * len(steady) + [ratios[k] for k in telling]
+    root = np.sqrt([STEADY] * len(steady) + [weights[k] for k in telling])[:, None]
+    levels = np.linalg.lstsq(root * steps, root * np.array(values, float), rcond=None)[0]
     levels -= np.median(levels, 0)
     if np.abs(levels).max() < LEAST_CHANGE:
         return None

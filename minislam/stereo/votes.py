@@ -64,25 +64,30 @@ def keep_what_stays(
     Only confirmed depths vote here. Around a dropped pixel the confirmation fades too.
     """
     known_only = [
-        SweptView(
-            np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
-            1 - depth.confirmation,
-            view.plane_step,
-            view.T_camera_world,
-        )
+        confirmed_view(depth, view.plane_step, view.T_camera_world)
         for view, depth in zip(views, depths, strict=True)
     ]
-    judges = np.linspace(0, len(views) - 1, JUDGES).round().astype(int)
     kept = []
     for index, (view, depth) in enumerate(zip(known_only, depths, strict=True)):
-        others = [known_only[k] for k in np.unique(judges[judges != index])]
-        agreeing, refuting = count_votes(camera, view, others)
+        agreeing, refuting = count_votes(camera, view, judges(known_only, index))
         left = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
         known = (depth.inverse_depth > 0) & ~left
         known &= _window_share(known) >= MIN_SUPPORT
         confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(left), 0)
         kept.append(ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation))
     return kept
+
+
+def confirmed_view(depth: ConfirmedDepth, plane_step: float, pose: np.ndarray) -> SweptView:
+    """Return a view that votes with its confirmed depths alone; the pose is T_camera_world."""
+    known = np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan)
+    return SweptView(known, 1 - depth.confirmation, plane_step, pose)
+
+
+def judges(views: list[SweptView], index: int) -> list[SweptView]:
+    """Return the views, of all times, that judge the view at an index."""
+    chosen = np.linspace(0, len(views) - 1, JUDGES).round().astype(int)
+    return [views[k] for k in np.unique(chosen[chosen != index])]
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32

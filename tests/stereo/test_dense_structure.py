@@ -133,7 +133,9 @@ def test_swept_depth_comes_first_and_a_prior_of_another_scale_fills_the_rest():
     ]
     guesses = [1.3 * depth + (depth == 0) * 7.0 for depth, _ in swept]  # of a network, all known
     keyframes = [keyframe(k, 8 + 8 * k, guess) for k, guess in enumerate(guesses)]
-    for found_there, (depth, _) in zip(with_swept_depth(keyframes, swept), swept, strict=True):
+    for found_there, (depth, _) in zip(
+        with_swept_depth(camera(), keyframes, swept), swept, strict=True
+    ):
         known = depth > 0
         assert 0 < float(known.float().mean()) < 1
         assert torch.equal(found_there.depth[known], depth[known])
@@ -146,5 +148,5 @@ def test_swept_depth_comes_first_and_a_prior_of_another_scale_fills_the_rest():
 def test_where_nothing_was_swept_the_prior_stays_as_it_is():
     guess = torch.full(SIZE[::-1], 7.0)
     guess[0] = 0  # and an unknown depth stays unknown
-    [after] = with_swept_depth([keyframe(0, 8, guess)], [(0 * guess, 0 * guess)])
+    [after] = with_swept_depth(camera(), [keyframe(0, 8, guess)], [(0 * guess, 0 * guess)])
     assert torch.equal(after.depth, guess)

@@ -64,7 +64,7 @@ def test_a_frame_between_keyframes_is_exposed_as_between_them():
 def test_links_of_little_weight_tell_as_much():
     graph = exposed_graph(FACTORS)
     for index in range(len(FRAMES)):
-        graph.keyframes.set_static_weight(index, torch.full_like(graph.grid.rays[:, 0], 0.1))
+        graph.keyframes.set_static_weight(index, torch.full_like(graph.grid.rays[:, 0], 0.02))
     torch.testing.assert_close(keyframe_exposures(graph), FACTORS, rtol=0.01, atol=0)
 
 

@@ -1,9 +1,9 @@
 """Settled disparities: those that parallax has measured, of this keyframe or of one before it.
 
 Where no depth prior is known, a new keyframe gets its disparities from its predecessor; where its
-view is new, they are filled in from the nearest cells. If one of those is an outlier, a whole strip of the
-image is wrong, its residuals are so long that the robust weight takes the cells for outliers for
-ever, and the next keyframe fills a wider strip from it, until the poses follow. Therefore only
+view is new, they are filled in from the nearest cells. If one of those is an outlier, a whole strip
+of the image is wrong, its residuals are so long that the robust weight takes the cells for outliers
+for ever, and the next keyframe fills a wider strip from it, until the poses follow. Therefore only
 settled cells are handed on, and the pose of a new frame trusts a cell as far as it is settled.
 
 By its edges e a disparity d has the information sum_e w_e |J_e|^2 (its entry of C in Eq. (5); w_e
