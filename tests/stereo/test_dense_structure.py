@@ -150,3 +150,15 @@ def test_where_nothing_was_swept_the_prior_stays_as_it_is():
     guess[0] = 0  # and an unknown depth stays unknown
     [after] = with_swept_depth(camera(), [keyframe(0, 8, guess)], [(0 * guess, 0 * guess)])
     assert torch.equal(after.depth, guess)
+
+
+def test_a_guess_that_other_keyframes_look_through_is_left_out():
+    near, wall = torch.full(SIZE[::-1], 1.0), torch.full(SIZE[::-1], 4.0)
+    unknown = torch.zeros_like(wall)
+    guess = torch.where(torch.arange(160) < 80, near, wall)
+    keyframes = [keyframe(k, 8, depth) for k, depth in enumerate((unknown, guess, unknown))]
+    seen = wall, torch.ones_like(wall)
+    swept = [seen, (unknown, unknown), seen]  # all three from one place
+    _, after, _ = with_swept_depth(camera(), keyframes, swept)
+    inside = after.depth[2:-2, 2:-2]
+    assert not inside[:, :76].any() and (inside[:, 78:] == 4).all()
