@@ -120,7 +120,7 @@ def test_every_ablation_runs_to_the_end_and_changes_the_result(
 def test_the_time_of_every_stage_is_told(usual: Slam):
     assert list(usual.steps.seconds) == [
         "tracking", "initialisation", "mapping", "final adjustment", "second adjustment",
-        "all frames", "refinement", "photometric refinement",
+        "all frames", "dense structure", "refinement", "photometric refinement",
     ]  # fmt: skip
 
 

@@ -30,14 +30,16 @@ class Mapper(JointOptimisation):
         self,
         keyframes: list[Keyframe],
         progress: Progress | None = None,
-        exposures: Tensor | None = None,  # (K, 3) as of `expose`
+        exposures: Tensor | None = None,  # (K, 3) how bright the keyframes are, if they differ
     ) -> None:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
         if not keyframes:
             raise InputError("expected at least one keyframe to start the map from, found none")
         self.median_depth = median_depth(keyframes)
         self.keyframes = [MappedKeyframe.from_record(keyframe) for keyframe in keyframes]
-        self.expose(exposures)
+        if exposures is not None:
+            for keyframe, exposure in zip(self.keyframes, exposures, strict=True):
+                keyframe.exposure = exposure
         if self.config.mean_background:
             means = [keyframe.levelled.mean((0, 1)) for keyframe in self.keyframes]
             self.background = torch.stack(means).mean(0)
@@ -89,12 +91,6 @@ class Mapper(JointOptimisation):
         self._optimizer.replace(deform_rigidly(self.gaussians, self.anchor_rows(), old, new))
         for keyframe, pose in zip(self.keyframes, new, strict=True):
             keyframe.T_camera_world = pose
-
-    def expose(self, exposures: Tensor | None) -> None:
-        """Take over how bright the keyframes are (K, 3), if they differ."""
-        if exposures is not None:
-            for keyframe, exposure in zip(self.keyframes, exposures, strict=True):
-                keyframe.exposure = exposure
 
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size.

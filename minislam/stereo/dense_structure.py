@@ -19,7 +19,6 @@ from minislam.stereo.votes import (
     ConfirmedDepth,
     SweptView,
     confirm,
-    confirmed_view,
     count_votes,
     judges,
     keep_what_stays,
@@ -52,17 +51,13 @@ def with_swept_depth(
     Where other keyframes look through it, it is of something that moves, and left out.
     """
     small, result = _small(camera, WIDTH), []
-    views = [
-        confirmed_view(ConfirmedDepth(*(_shrunk(i, small) for i in (_inverse(depth), seen))), 0.0,
-                       keyframe.T_camera_world.cpu().numpy())
-        for keyframe, (depth, seen) in zip(keyframes, swept, strict=True)
-    ]  # fmt: skip
+    views = [_view(small, k, *found) for k, found in zip(keyframes, swept, strict=True)]
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
         if bool(keyframe.depth.any()):
             both = (depth > 0) & (keyframe.depth > 0)
             enough = int(both.sum()) > LEAST_COMMON
             guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
-            guessed = replace(views[index], inverse_depth=_shrunk(_inverse(guess), small))
+            guessed = _view(small, keyframe, guess, confirmation)
             agreeing, refuting = count_votes(small, guessed, judges(views, index))
             moves = torch.from_numpy(refuting > MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
@@ -72,15 +67,12 @@ def with_swept_depth(
     return result
 
 
-def _inverse(depth: Tensor) -> Tensor:
-    """Return inverse depth, 0 where depth is unknown."""
-    return torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0)
-
-
-def _shrunk(image: Tensor, camera: Camera) -> np.ndarray:
-    """Return an image (H, W) at the size of a camera, by the nearest pixels."""
-    size = (camera.width, camera.height)
-    return cv2.resize(image.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST)
+def _view(camera: Camera, keyframe: Keyframe, depth: Tensor, confirmation: Tensor) -> SweptView:
+    """Return a view that votes with a depth (H, W) of a keyframe, at the size of a camera."""
+    size, images = (camera.width, camera.height), (depth, confirmation)
+    small = [cv2.resize(i.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST) for i in images]
+    known = np.where(small[0] > 0, 1 / np.maximum(small[0], 1e-6), np.nan)
+    return SweptView(known, 1 - small[1], 0.0, keyframe.T_camera_world.cpu().numpy())
 
 
 def _small(camera: Camera, width: int) -> Camera:

@@ -64,7 +64,12 @@ def keep_what_stays(
     Only confirmed depths vote here. Around a dropped pixel the confirmation fades too.
     """
     known_only = [
-        confirmed_view(depth, view.plane_step, view.T_camera_world)
+        SweptView(
+            np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
+            1 - depth.confirmation,
+            view.plane_step,
+            view.T_camera_world,
+        )
         for view, depth in zip(views, depths, strict=True)
     ]
     kept = []
@@ -76,12 +81,6 @@ def keep_what_stays(
         confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(left), 0)
         kept.append(ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation))
     return kept
-
-
-def confirmed_view(depth: ConfirmedDepth, plane_step: float, pose: np.ndarray) -> SweptView:
-    """Return a view that votes with its confirmed depths alone; the pose is T_camera_world."""
-    known = np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan)
-    return SweptView(known, 1 - depth.confirmation, plane_step, pose)
 
 
 def judges(views: list[SweptView], index: int) -> list[SweptView]:

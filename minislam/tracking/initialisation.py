@@ -106,9 +106,8 @@ def best_hypothesis(
 def first_geometry(graph: KeyframeGraph) -> None:
     """Estimate poses and disparities of all keyframes of the warm-up, beta unknown.
 
-    Flow alone decides: a depth prior that is wrong by a few per cent would bend them. It only says
-    where the search starts, and gives the unit of length. A focal length that nobody gave is
-    estimated as well.
+    Flow alone decides, because a wrong depth prior would bend them: it is one start of the search
+    and gives the unit of length. A focal length that nobody gave is estimated as well.
     """
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
