@@ -71,7 +71,7 @@ class TrackingConfig:
     motion_memory: float = parameter(
         3.0,
         "residual at which a cell no longer follows the camera; its motion weight falls and is "
-        "handed on along the flow; needs a depth prior; 0: off [px]",
+        "handed on along the flow; 0: off [px]",
     )
     lambda_disparity_prior: float = parameter(
         0.0005,
