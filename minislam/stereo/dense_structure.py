@@ -46,8 +46,8 @@ def with_swept_depth(
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth, where nothing was swept with their own, and confirmed.
 
-    What several views measure beats what a network guesses from one (RESULTS.md). The guess of each
-    keyframe is scaled to what was swept there, because a network errs in the scale of each image.
+    What several views measure was better than a simulated or noisy prior (RESULTS.md). The prior of
+    each keyframe is scaled to what was swept there, because a network errs image by image.
     Where other keyframes look through it, it is of something that moves, and left out.
     """
     small, result = _small(camera, WIDTH), []
