@@ -52,7 +52,8 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
         ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
         ratios.append([weighted_median(channel, weight) for channel in ratio.T])
         weights.append(float(weight.mean()))
-    telling = [k for k, w in enumerate(weights) if w > LEAST_WEIGHT * max(weights)]
+    least = LEAST_WEIGHT * max(weights, default=0.0)
+    telling = [link for link, weight in enumerate(weights) if weight > least]
     axes = np.eye(len(frames))
     steady, edges = np.diff(axes, axis=0), links.edges()
     steps = [*steady, *(axes[edges[k][1]] - axes[edges[k][0]] for k in telling)]
