@@ -32,6 +32,7 @@ SHORT = {
     "tracking.warmup_iterations": 3,
     "tracking.rounds": 1,
     "tracking.final_rounds": 1,
+    "tracking.lambda_disparity_prior": 0.0005,  # three of the switches act on it
     "mapping.image_scale": 1.0,
     "mapping.init_iterations": 12,
     "mapping.keyframe_iterations": 2,

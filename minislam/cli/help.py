@@ -46,7 +46,7 @@ settings: every constant is an option, like --tracking.window 8; minislam settin
   --no-uncertainty                       the same weight for every pixel
   --uncertainty.lambda_depth 0           no depth term in L_uncer, Eq. (4)
   --uncertainty.given_masks on           the sequence's own masks instead of the learnt beta
-  --tracking.lambda_disparity_prior 0    no disparity prior in Eq. (5)
+  --tracking.lambda_disparity_prior .01  disparity prior in Eq. (5), else with learned flow only
   --tracking.prior_mask off              no mask M
   --tracking.final_prior on              disparity prior also in the final adjustment
   --mapping.pose_refinement.enabled off  no photometric refinement of the other frames

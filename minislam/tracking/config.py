@@ -74,9 +74,9 @@ class TrackingConfig:
         "handed on along the flow; 0: off [px]",
     )
     lambda_disparity_prior: float = parameter(
-        0.0005,
+        0.0,
         "lambda_4: disparity prior, times fx^2, so that it weighs a disparity error by the pixels "
-        "that a unit baseline would turn it into [-], Eq. (5)",
+        "that a unit baseline would turn it into; 0: it is a start and the unit [-], Eq. (5)",
     )
     prior_mask: bool = parameter(
         True,

@@ -44,7 +44,7 @@ def mask_priors(
     first: int = 0,
 ) -> None:
     """Set the mask of the keyframes from `first` on, from the keyframes that edges link them to."""
-    if not config.prior_mask:
+    if not (config.prior_mask and config.lambda_disparity_prior):
         return
     rows = zip(keyframes.metric_depths, keyframes.features, keyframes.T_camera_world, strict=True)
     views = {

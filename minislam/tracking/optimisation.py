@@ -21,15 +21,14 @@ def local_ba(graph: KeyframeGraph) -> None:
     """Link the newest keyframe, then adjust the newest `window` keyframes together.
 
     First comes a BA on flow from and to its predecessors that was found without its pose, because
-    that pose may still be wrong. It has no disparity prior: under so wide a weight that would hold
-    a dynamic object in place and move the camera instead. Then edges to its neighbourhood and to
-    nearby older keyframes are added, and flow and BA alternate for some rounds.
+    that pose may still be wrong. Then edges to its neighbourhood and to nearby older keyframes are
+    added, and flow and BA alternate for some rounds.
     """
     config, newest = graph.config, len(graph.keyframes) - 1
     first_free = max(0, newest + 1 - config.window)
     if not graph.is_learned:
         graph.match_composed(newest)
-        adjust(graph, first_free, config.iterations, lambda_prior=0.0, widening=FIRST_WIDENING)
+        adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
     edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
     mask_priors(graph.keyframes, graph.grid, edges, config, first=newest)
     edges += graph.links.edges()[max(0, len(graph.links) + len(edges) - config.active_edges) :]

@@ -29,7 +29,7 @@ from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
-from minislam.tracking.safeguards.settling import SETTLED, Settling, certainty
+from minislam.tracking.safeguards.settling import SETTLED, Settling
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 LONGEST_TAIL = 2  # frames after the last keyframe
@@ -180,7 +180,8 @@ class Tracker(Stateful):
         pose, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
         if self.initialised:  # before, initialise() will estimate all poses together
             information = self._settling.information()
-            pose = self.graph.start_pose(matches, certainty(information))
+            trust = self._settling.certainty(information)
+            pose = self.graph.start_pose(matches, trust)
             if self.graph.is_learned:
                 pose, _ = self.graph.fit_pose(frame.image, [len(self.keyframes) - 1], pose)
             disparities = self._settling.hand_on(information, pose)

@@ -22,7 +22,7 @@ from minislam.tracking.optimisation import bundle_problem
 from tests.tracking.scene import CAMERA, STRIDE, uniform
 from tests.tracking.wall import true_graph
 
-CONFIG = TrackingConfig(prior_mask=True)
+CONFIG = TrackingConfig(prior_mask=True, lambda_disparity_prior=0.01)
 EPSILON, GAMMA = 0.02, 0.9  # paper
 GRID = Grid.of(CAMERA, 1)  # every pixel is a cell
 SHAPE = (CAMERA.height, CAMERA.width)

@@ -6,6 +6,9 @@ of the image is wrong, its residuals are so long that the robust weight takes th
 for ever, and the next keyframe fills a wider strip from it, until the poses follow. Therefore only
 settled cells are handed on, and the pose of a new frame trusts a cell as far as it is settled.
 
+A depth prior settles nothing: it is a start. Were the motion memory to judge cells by a prior that
+is wrong by a tenth, it would take half of a static room for moving where parallax is large.
+
 By its edges e a disparity d has the information sum_e w_e |J_e|^2 (its entry of C in Eq. (5); w_e
 with the robust weight, J_e the derivative of the reprojection). So its relative standard deviation
 is 1 / sqrt(I) with I = d^2 sum_e w_e |J_e|^2 [px^2], which is about sum_e w_e parallax_e^2. I does
@@ -40,23 +43,34 @@ class Settling(Stateful):
         self.handed_on = torch.zeros_like(graph.grid.rays[:, 0])
 
     def information(self) -> Tensor:  # (N,) px^2
-        """Return the information of the newest keyframe's disparities; a prior settles them."""
+        """Return the information of the newest keyframe's disparities from flow, so far."""
         graph, newest = self._graph, len(self._graph.keyframes) - 1
         information = measured_information(graph, newest)
-        if not graph.follows_a_loss(newest):
-            information += self.handed_on
-        known = graph.keyframes.prior_disparities[newest] > 0
-        return torch.where(known, torch.inf, information)
+        return information if graph.follows_a_loss(newest) else information + self.handed_on
+
+    def certainty(self, information: Tensor) -> Tensor:  # (N,) px^2 -> (N,) in (0, 1]
+        """Return the weight of the newest keyframe's cells in a pose estimate.
+
+        It is one half where a cell is just settled, and one where there is a depth prior.
+        """
+        settled = (1 / (1 + SETTLED / information)).clamp_min(LEAST)
+        return torch.where(self._has_prior, 1.0, settled)
+
+    @property
+    def _has_prior(self) -> Tensor:  # (N,) bool
+        return self._graph.keyframes.prior_disparities[-1] > 0
 
     def hand_on(self, information: Tensor, T_camera_world: Tensor) -> Tensor:  # (N,)
         """Return the disparities of the next keyframe, warped from settled cells of the newest.
 
-        The camera moves on to `T_camera_world` (4, 4). Each cell is handed the information (N,) at
-        the point of the newest keyframe that is seen there. If no cell is settled, all are warped.
+        Those with a depth prior are warped, too. The camera moves on to `T_camera_world` (4, 4).
+        Each cell is handed the information (N,) at the point of the newest keyframe that is seen
+        there. If no cell is settled, all are warped.
         """
         grid, keyframes = self._graph.grid, self._graph.keyframes
         settled = information > SETTLED
-        known = keyframes.disparities[-1] * (settled | ~settled.any())
+        warped = settled | self._has_prior
+        known = keyframes.disparities[-1] * (warped | ~warped.any())
         motion = keyframes.T_camera_world[-1] @ se3_inverse(T_camera_world)
         disparities = warp_disparities(grid, se3_inverse(motion), known)
         known = HANDED_ON * torch.where(settled, information, 0).clamp_max(MOST)
@@ -66,11 +80,6 @@ class Settling(Stateful):
         seen = valid[0] & grid.camera.contains(positions[0].mT)
         self.handed_on = torch.where(seen, there, 0)
         return disparities
-
-
-def certainty(information: Tensor) -> Tensor:  # (N,) px^2 -> (N,) in (0, 1]
-    """Return the weight of cells in a pose estimate: one half where a cell is just settled."""
-    return (1 / (1 + SETTLED / information)).clamp_min(LEAST)
 
 
 def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) px^2
