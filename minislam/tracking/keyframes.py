@@ -99,8 +99,12 @@ class KeyframeStore(Stateful):
         known = self.prior_disparities > 0
         if known[-1].any() and not known[:-1].any():
             self.normalise_scale()
-        newest = self.disparities[-1]
-        self.disparities[-1] = torch.where(known[-1], self.prior_disparities[-1], newest)
+        self.take_prior(-1, known[-1])
+
+    def take_prior(self, index: int, cells: Tensor) -> None:
+        """Take the prior of a keyframe's cells (N,) bool for their disparities, where known."""
+        prior = self.prior_disparities[index]
+        self.disparities[index] = torch.where(cells & (prior > 0), prior, self.disparities[index])
 
     def normalise_scale(self) -> None:
         """Set the unit of length: that of the prior, or else the median disparity becomes one."""

@@ -83,11 +83,11 @@ def adjust(
     problem = bundle_problem(graph, graph.links.select(first_free), first_free, lambda_prior)
     robust = problem.robust and problem.robust.widened(widening)
     problem = replace(problem, robust=robust, free_focal=free_focal)
-    if first_free > 0:
-        # Without parallax the flow does not measure depth. Such a keyframe keeps its first
-        # disparities, and they keep the scale until the camera moves again.
-        known = problem.free_disparities & _has_parallax(graph, problem)
-        problem = replace(problem, free_disparities=known)
+    # Without parallax the flow does not measure depth. Such a keyframe keeps its first disparities,
+    # and they keep the scale until the camera moves again. In the start only a prior is worth it.
+    worth_keeping = (graph.keyframes.prior_disparities > 0).any(1) | (first_free > 0)
+    measured = _has_parallax(graph, problem) | ~worth_keeping
+    problem = replace(problem, free_disparities=problem.free_disparities & measured)
     state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.grid.zoom(state.log_focal)

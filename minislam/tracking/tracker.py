@@ -259,6 +259,7 @@ class Tracker(Stateful):
                 f"{len(self.tracked)} frames; check that the images are not blank and overlap"
             )
         first_geometry(self.graph)
+        self._settling.fall_back_on_prior()
         self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)

@@ -75,6 +75,17 @@ def test_the_prior_weighs_where_it_is_known_and_grows_with_the_focal_length():
 # What moves
 
 
+@pytest.mark.parametrize("has_prior", [True, False])
+def test_without_parallax_a_start_keeps_the_disparities_that_a_prior_gave(has_prior: bool):
+    graph = matched(3, min_parallax=1e3)
+    graph.keyframes.disparities *= 1.1
+    graph.keyframes.prior_disparities[1, 4] = 0.2 * has_prior
+    before = graph.keyframes.disparities.clone()
+    adjust(graph, first_free=0, iterations=3)
+    kept = (graph.keyframes.disparities == before).all(1)
+    assert kept.tolist() == [False, has_prior, False]
+
+
 def test_a_displaced_keyframe_finds_its_place():
     # The two keyframes before it are held: they fix the unit of length.
     graph = matched(rounds=1)

@@ -60,6 +60,15 @@ class Settling(Stateful):
     def _has_prior(self) -> Tensor:  # (N,) bool
         return self._graph.keyframes.prior_disparities[-1] > 0
 
+    def fall_back_on_prior(self) -> None:
+        """Take the prior of all keyframes where flow has not settled a disparity.
+
+        Where the camera only turns, a start by flow alone ends with any depths.
+        """
+        for index in range(len(self._graph.keyframes)):
+            unsettled = measured_information(self._graph, index) <= SETTLED
+            self._graph.keyframes.take_prior(index, unsettled)
+
     def hand_on(self, information: Tensor, T_camera_world: Tensor) -> Tensor:  # (N,)
         """Return the disparities of the next keyframe, warped from settled cells of the newest.
 

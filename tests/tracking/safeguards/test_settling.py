@@ -89,3 +89,18 @@ def test_the_information_of_the_newest_keyframe_includes_what_was_handed_on(coun
     torch.testing.assert_close(settling.information(), expected)
     graph.flow_to_next[-1] = None  # the camera was lost: nothing could be handed on
     torch.testing.assert_close(settling.information(), expected - 7.0)
+
+
+def test_where_flow_has_not_settled_a_start_the_prior_stays():
+    graph = true_graph([0, 1, 2])
+    graph.match([(0, 1), (1, 0), (1, 2), (2, 1)])
+    graph.keyframes.prior_disparities[:2] = 0.7
+    graph.keyframes.prior_disparities[1, 3] = 0
+    before, settled = graph.keyframes.disparities.clone(), torch.zeros(3, len(GRID.rays)).bool()
+    for index in range(3):
+        settled[index] = measured_information(graph, index) > SETTLED
+    assert settled.any() and not settled.all()
+    Settling(graph).fall_back_on_prior()
+    expected = torch.where(settled, before, 0.7)
+    expected[2], expected[1, 3] = before[2], before[1, 3]
+    assert torch.equal(graph.keyframes.disparities, expected)
