@@ -22,6 +22,7 @@ from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal
 from minislam.tracking.safeguards.parts import in_parts, joined
 from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
+from minislam.tracking.safeguards.rolling_shutter import with_readout
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
@@ -47,6 +48,7 @@ class BundleProblem:
     robust: RobustKernel | None = None  # None: plain least squares
     disparity_damping: Tensor | None = None  # (K, N) px^2; None: a fraction of the mean diagonal
     free_focal: bool = False  # f is one more unknown, not in the paper
+    shutter: Tensor | None = None  # (E, 2, 2, N) px/s; then the readout is free, too
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class BundleState:
     T_camera_world: Tensor  # (K, 4, 4) float64
     disparities: Tensor  # (K, N) 1/world unit
     log_focal: float = 0.0  # s = ln(f / f of the problem's camera)
+    readout: Tensor | None = None  # (2,) s, beside that of the problem's targets
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ class _Linearised:
     costs: Tensor  # (E,) float64 px^2
     residual: Tensor  # (E, 2, N) px
     weight: Tensor  # (E, 2, N), the robust one included
-    reprojection: Linearisation  # J_target is (E, 6 + G, 2, N); G = 1 if the focal length is free
+    reprojection: Linearisation  # J_target is (E, 6 + G, 2, N); G: focal length and readout, if free
     transforms: Tensor  # (E, 4, 4) T_target_source
 
 
@@ -149,6 +152,7 @@ def _linearised(problem: BundleProblem, state: BundleState) -> Iterator[_Lineari
         transforms = relative_transforms(state.T_camera_world, source, part.edges_target)
         view = part.rays, part.camera, state.log_focal, part.free_focal
         reprojection = reproject_with_focal(transforms.to(dtype), state.disparities[source], *view)
+        reprojection = with_readout(reprojection, part.shutter, state.readout)
         residual = part.targets - reprojection.positions
         weight = part.weights * reprojection.valid[:, None]
         if part.robust is not None:
@@ -289,7 +293,7 @@ def _damped_step(
 
     poses = state.T_camera_world.clone()
     moving = poses[problem.free_poses]
-    twists, zoom = xi[: 6 * len(moving)], xi[6 * len(moving) :]
+    twists, common = xi[: 6 * len(moving)], xi[6 * len(moving) :]
     poses[problem.free_poses] = se3_normalised(se3_exp(twists.reshape(-1, 6)) @ moving)
     step = equations.disparity_gradient.clone()
     for source, rows, E in equations.source_blocks:
@@ -297,4 +301,6 @@ def _damped_step(
     disparities = state.disparities + inverse_C * step
     clamped = disparities.clamp_min(MIN_DISPARITY)
     disparities = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
-    return BundleState(poses, disparities, state.log_focal + float(zoom.sum()))
+    zoom, readout = common.tensor_split([int(problem.free_focal)])
+    readout = readout if state.readout is None else state.readout + readout
+    return BundleState(poses, disparities, state.log_focal + float(zoom.sum()), readout)

@@ -5,6 +5,8 @@ see the same place (covisibility, measured by the flow distance). A link that sp
 neighbourhood is added only if the flow confirms it in both directions.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -39,6 +41,7 @@ from minislam.tracking.pose_from_flow import (
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
 from minislam.tracking.safeguards.inverse_flow import inverted_targets
 from minislam.tracking.safeguards.robust import RobustKernel
+from minislam.tracking.safeguards.rolling_shutter import RollingShutter, shift
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
@@ -60,6 +63,7 @@ class KeyframeGraph(Stateful):
     flow_to_next: list[FlowMatches | None]  # keyframe k to k + 1 (E = 1), None across a loss
     links: FrameGraph
     flow: FlowEstimator
+    shutter: RollingShutter
     adjustments: AdjustmentCount = AdjustmentCount()
     seeks_focal: bool = False  # the focal length is only a first guess
     focal_is_free: bool = False  # the motion has told it; adjustments of all keyframes refine it
@@ -70,6 +74,7 @@ class KeyframeGraph(Stateful):
         self.is_learned = flow.learned_confidence  # then flow and geometry take turns
         self.config = config.for_learned_flow() if self.is_learned else config
         self.grid = Grid.of(camera, flow.stride, device)
+        self.shutter = RollingShutter(self.grid)
         self.keyframes = KeyframeStore(self.grid.rays[:, 0])
         self.flow_to_next = []
         self.links = FrameGraph()
@@ -142,7 +147,7 @@ class KeyframeGraph(Stateful):
 
     def fit_pose(
         self,
-        image: Tensor,  # (H, W, 3), of no keyframe
+        frame: Frame,  # no keyframe
         around: list[int],  # keyframes that may show the same
         start: Tensor,  # (4, 4)
     ) -> tuple[Tensor, float]:
@@ -158,11 +163,13 @@ class KeyframeGraph(Stateful):
         unused = grid.rays.new_zeros(1, len(grid.rays))  # disparities of the image itself
         disparities = torch.cat([keyframes.disparities[around], unused])
         state = BundleState(torch.cat([known, start[None]]), disparities)
-        self.flow.add_frame(newest, image)
+        self.flow.add_frame(newest, frame.image)
+        ends_in = [keyframes.frames[k].frame_index for k in around], [frame.frame_index] * count
         for _ in range(self.config.pose_rounds):
             transforms = relative_transforms(state.T_camera_world, *ends).float()
             predicted, _ = reproject(transforms, disparities[:-1], grid.rays, grid.camera)
             matches = self.flow.match(around, [newest] * count, predicted)
+            matches = self.shutter.corrected(matches, *ends_in)
             measured = *ends, matches.targets, matches.confidences * weights[:, None]
             problem = motion_only_problem(grid, *measured, numbers == count, robust)
             if count == 1 and not self.is_learned:  # then it may follow a dynamic object
@@ -202,7 +209,8 @@ class KeyframeGraph(Stateful):
             edges += both_directions([(source, target)])
             predictions += [composed.targets, inverted_targets(composed.targets, self.grid)]
         sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
-        self.links.record(edges, self.flow.match(sources, targets, torch.cat(predictions)))
+        matches = self.flow.match(sources, targets, torch.cat(predictions))
+        self.links.record(edges, self._of_global_shutter(edges, matches))
 
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
         """Return those of these new edges whose flow is matched in both directions."""
@@ -223,7 +231,29 @@ class KeyframeGraph(Stateful):
         # Points near the camera plane project to anywhere; a flow started there finds nothing.
         size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
         predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
-        return self.flow.match(sources, targets, predicted)
+        return self._of_global_shutter(edges, self.flow.match(sources, targets, predicted))
+
+    def _of_global_shutter(self, edges: list[Edge], matches: FlowMatches) -> FlowMatches:
+        return self.shutter.corrected(matches, *self._frames_of(edges))
+
+    def _frames_of(self, edges: list[Edge]) -> tuple[list[int], list[int]]:
+        """Return the frame indices of the sources and of the targets."""
+        numbers = [frame.frame_index for frame in self.keyframes.frames]
+        return [numbers[i] for i, _ in edges], [numbers[j] for _, j in edges]
+
+    def shutter_columns(self, positions: Sequence[int]) -> Tensor:  # (E, 2, 2, N) px/s
+        """Return how the targets of some links change with the readout."""
+        edges = self.links.edges()
+        targets = torch.stack([self.links.targets[p] for p in positions])
+        return self.shutter.columns(*self._frames_of([edges[p] for p in positions]), targets)
+
+    def add_readout(self, seconds: Tensor | None) -> None:
+        """Make the readout longer, and correct all flow along links accordingly."""
+        if seconds is None or not seconds.any():
+            return
+        self.shutter.readout = self.shutter.readout + seconds.to(self.shutter.readout)
+        shifts = shift(self.shutter_columns(range(len(self.links))), seconds)
+        self.links.targets = [t + moved for t, moved in zip(self.links.targets, shifts, strict=True)]
 
     # Which keyframes to link --------------------------------------------------------------------
 

@@ -45,7 +45,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
     edges = graph.global_edges()
     if edges:
         graph.match(edges)
-    adjust(graph, 0, graph.config.global_iterations, free_focal=graph.focal_is_free)
+    adjust(graph, 0, graph.config.global_iterations, free_camera=True)
 
 
 def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:
@@ -59,7 +59,7 @@ def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> N
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
     for done in range(config.final_rounds):
         graph.match(edges)
-        adjust(graph, 0, config.global_iterations, lambda_prior, free_focal=graph.focal_is_free)
+        adjust(graph, 0, config.global_iterations, lambda_prior, free_camera=True)
         if progress:
             progress(done + 1, config.final_rounds)
 
@@ -68,7 +68,7 @@ def warm_up_ba(graph: KeyframeGraph, edges: list[Edge], rounds: int) -> None:
     """Adjust the keyframes of the warm-up together: rounds of flow and BA."""
     for _ in range(rounds):
         graph.match(edges)
-        adjust(graph, 0, graph.config.warmup_iterations, free_focal=graph.focal_is_free)
+        adjust(graph, 0, graph.config.warmup_iterations, free_camera=True)
 
 
 def adjust(
@@ -77,12 +77,15 @@ def adjust(
     iterations: int,
     lambda_prior: float | None = None,  # None: as configured
     widening: float = 1.0,  # of the robust weight
-    free_focal: bool = False,
+    free_camera: bool = False,  # refine its focal length and readout, where they are unknown
 ) -> None:
     """Run a bundle adjustment over the links that touch the free keyframes."""
-    problem = bundle_problem(graph, graph.links.select(first_free), first_free, lambda_prior)
-    robust = problem.robust and problem.robust.widened(widening)
-    problem = replace(problem, robust=robust, free_focal=free_focal)
+    positions = graph.links.select(first_free)
+    problem = bundle_problem(graph, positions, first_free, lambda_prior)
+    problem = replace(problem, robust=problem.robust and problem.robust.widened(widening))
+    if free_camera:
+        shutter = graph.shutter_columns(positions) if graph.shutter.is_free else None
+        problem = replace(problem, free_focal=graph.focal_is_free, shutter=shutter)
     # Without parallax the flow does not measure depth. Such a keyframe keeps its first disparities,
     # and they keep the scale until the camera moves again. In the start only a prior is worth it.
     worth_keeping = (graph.keyframes.prior_disparities > 0).any(1) | (first_free > 0)
@@ -91,6 +94,7 @@ def adjust(
     state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.grid.zoom(state.log_focal)
+    graph.add_readout(state.readout)
     graph.count_adjustment(report)
 
 

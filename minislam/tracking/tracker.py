@@ -116,6 +116,7 @@ class Tracker(Stateful):
     def track(self, frame: Frame) -> bool:
         """Follow the camera into the next frame; tell whether there are new keyframes."""
         count = len(self.keyframes)
+        self.graph.shutter.see(frame)
         if self.mode is Mode.WAITING:
             self._begin(frame)
         else:
@@ -178,12 +179,14 @@ class Tracker(Stateful):
         Its pose comes from its flow, its disparities from its predecessor.
         """
         pose, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
+        indices = [self.keyframes.frames[-1].frame_index], [frame.frame_index]
+        matches = self.graph.shutter.corrected(matches, *indices)
         if self.initialised:  # before, initialise() will estimate all poses together
             information = self._settling.information()
             trust = self._settling.certainty(information)
             pose = self.graph.start_pose(matches, trust)
             if self.graph.is_learned:
-                pose, _ = self.graph.fit_pose(frame.image, [len(self.keyframes) - 1], pose)
+                pose, _ = self.graph.fit_pose(frame, [len(self.keyframes) - 1], pose)
             disparities = self._settling.hand_on(information, pose)
             self._motion.remember(matches, pose, settled=information > SETTLED)
         assert self._chain is not None, "there is a chain from the first frame on"

@@ -31,7 +31,7 @@ def pose_all_frames(
         frame = sequence.frame(index).to(poses.device)
         if shown.repeats(frame) and index - 1 in fits:
             return fits[index - 1]
-        return PoseFit(*graph.fit_pose(frame.image, _around(graph, others[index]), start))
+        return PoseFit(*graph.fit_pose(frame, _around(graph, others[index]), start))
 
     for done, (index, tracked) in enumerate(others.items()):
         fits[index] = fit_from(index, _interpolate(graph, tracked))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from minislam.tracking.bundle_adjustment import BundleProblem
 
 CELLS_AT_ONCE = 300_000  # of all edges of a part: 200 bytes a cell
-_OF_EDGES = "edges_source", "edges_target", "targets", "weights"
+_OF_EDGES = "edges_source", "edges_target", "targets", "weights", "shutter"
 
 
 def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"]]:
@@ -24,10 +24,9 @@ def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"
     for part in number.unique():
         edges = (number == part).nonzero()[:, 0]
         if len(edges) < len(number):
-            yield (
-                edges,
-                replace(problem, **{name: getattr(problem, name)[edges] for name in _OF_EDGES}),
-            )
+            values: dict[str, Any] = {name: getattr(problem, name) for name in _OF_EDGES}
+            values = {n: None if column is None else column[edges] for n, column in values.items()}
+            yield edges, replace(problem, **values)
         else:
             yield edges, problem
 
