@@ -192,7 +192,8 @@ class Slam(Stateful):
         others = [index for index in self._poses if index not in keyframes]
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
             read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
-            frames = [with_exposure(frame, self.mapper.exposures) for frame in read]
+            undone = [self.tracker.graph.shutter.undone(frame) for frame in read]
+            frames = [with_exposure(frame, self.mapper.exposures) for frame in undone]
             start = [self._poses[frame.frame_index] for frame in frames]
             images = [frame.levelled for frame in frames]
             betas = [self._beta(frame, None) for frame in frames]
@@ -236,12 +237,12 @@ class Slam(Stateful):
 
     def _keyframes(self, first: int = 0) -> list[Keyframe]:
         """Return the tracker's keyframes from `first` on in the form that the mapper takes."""
-        store = self.tracker.keyframes
+        store, shutter = self.tracker.keyframes, self.tracker.graph.shutter
         size = self.sequence.camera.height, self.sequence.camera.width
         unknown = torch.zeros(size, device=self.device)
         result = []
         for index in range(first, len(store)):
-            frame, depth = store.frames[index], store.metric_depths[index]
+            frame, depth = shutter.undone(store.frames[index]), store.metric_depths[index]
             record = Keyframe(
                 keyframe_index=index, frame_index=frame.frame_index, timestamp=frame.timestamp,
                 pixels=frame.pixels, features=store.features[index],

@@ -1,5 +1,6 @@
 """Dense depth from all posed frames: which views to sweep, and from which others."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.images import resample
-from minislam.records import Keyframe, Progress, Sequence
+from minislam.records import Frame, Keyframe, Progress
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
 from minislam.stereo.votes import (
@@ -82,7 +83,7 @@ def _small(camera: Camera, width: int) -> Camera:
 
 
 def dense_depths(
-    sequence: Sequence,
+    read: Callable[[int], Frame],  # a frame by its index
     camera: Camera,  # of its images
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
     keyframes: list[int],  # K frame indices, increasing
@@ -95,7 +96,7 @@ def dense_depths(
 
     The known inverse depths of a keyframe and its neighbours say how near the nearest plane is.
     """
-    planner, workers = SweepPlanner(sequence, camera, poses, width), workers or Workers()
+    planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     frames = swept_frames(keyframes, list(poses))
     swept: list[SweptView] = []
     for first in range(0, len(frames), AT_ONCE):
@@ -148,10 +149,14 @@ class SweepPlanner:
     """Chooses the views and planes of a sweep. It keeps the small grey images that it has read."""
 
     def __init__(
-        self, sequence: Sequence, camera: Camera, poses: dict[int, Tensor], width: int = WIDTH
+        self,
+        read: Callable[[int], Frame],
+        camera: Camera,
+        poses: dict[int, Tensor],
+        width: int = WIDTH,
     ) -> None:
         self.camera = _small(camera, width)
-        self._sequence = sequence
+        self._read = read
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
 
@@ -168,7 +173,7 @@ class SweepPlanner:
         return self.camera, self._image(frame), views, planes
 
     def _read_image(self, frame_index: int) -> PosedImage:
-        gray = cv2.cvtColor(self._sequence.frame(frame_index).image.numpy(), cv2.COLOR_RGB2GRAY)
+        gray = cv2.cvtColor(self._read(frame_index).image.numpy(), cv2.COLOR_RGB2GRAY)
         size = (self.camera.width, self.camera.height)
         small = cv2.resize(gray, size, None, 0, 0, cv2.INTER_AREA)
         return PosedImage(small, self._poses[frame_index])

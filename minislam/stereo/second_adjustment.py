@@ -61,7 +61,10 @@ def sweep_keyframes(
     frames = [frame.frame_index for frame in graph.keyframes.frames]
     known = [agreed_disparities(graph, index).cpu().numpy() for index in range(len(frames))]
     how = progress, workers, width
-    swept = dense_depths(sequence, graph.grid.camera, poses, frames, known, *how)
+    swept = dense_depths(
+        lambda index: graph.shutter.undone(sequence.frame(index)),
+        graph.grid.camera, poses, frames, known, *how,
+    )  # fmt: skip
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return [(depth.to(device), confirmation.to(device)) for depth, confirmation in swept]
 

@@ -12,7 +12,7 @@ Disparities are marginalised (Schur complement), which leaves 6 unknowns per fre
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -70,7 +70,7 @@ class BundleState:
     T_camera_world: Tensor  # (K, 4, 4) float64
     disparities: Tensor  # (K, N) 1/world unit
     log_focal: float = 0.0  # s = ln(f / f of the problem's camera)
-    readout: Tensor | None = None  # (2,) s, beside that of the problem's targets
+    readout: tuple[float, ...] = (0.0, 0.0)  # s, beside that of the problem's targets
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class _Linearised:
     costs: Tensor  # (E,) float64 px^2
     residual: Tensor  # (E, 2, N) px
     weight: Tensor  # (E, 2, N), the robust one included
-    reprojection: Linearisation  # J_target is (E, 6 + G, 2, N); G: focal length and readout, if free
+    reprojection: Linearisation  # J_target is (E, 6 + G, 2, N), G free camera parameters
     transforms: Tensor  # (E, 4, 4) T_target_source
 
 
@@ -129,14 +129,6 @@ def bundle_adjust(
                 reason = "no step lowers the cost" if converged else "normal equations are singular"
                 break
     return state, BundleReport(converged, cost_before, cost, accepted, level, reason)
-
-
-def motion_only_adjust(
-    problem: BundleProblem, state: BundleState, iterations: int
-) -> tuple[BundleState, BundleReport]:
-    """Minimise over the free poses with all disparities held."""
-    held = torch.zeros_like(problem.free_disparities)
-    return bundle_adjust(replace(problem, free_disparities=held), state, iterations)
 
 
 def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
@@ -293,7 +285,7 @@ def _damped_step(
 
     poses = state.T_camera_world.clone()
     moving = poses[problem.free_poses]
-    twists, common = xi[: 6 * len(moving)], xi[6 * len(moving) :]
+    twists, common = xi[: 6 * len(moving)], xi[6 * len(moving) :].tolist()
     poses[problem.free_poses] = se3_normalised(se3_exp(twists.reshape(-1, 6)) @ moving)
     step = equations.disparity_gradient.clone()
     for source, rows, E in equations.source_blocks:
@@ -301,6 +293,6 @@ def _damped_step(
     disparities = state.disparities + inverse_C * step
     clamped = disparities.clamp_min(MIN_DISPARITY)
     disparities = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
-    zoom, readout = common.tensor_split([int(problem.free_focal)])
-    readout = readout if state.readout is None else state.readout + readout
-    return BundleState(poses, disparities, state.log_focal + float(zoom.sum()), readout)
+    zoom = common.pop(0) if problem.free_focal else 0.0
+    readout = [a + b for a, b in zip(state.readout, common or (0.0, 0.0), strict=True)]
+    return BundleState(poses, disparities, state.log_focal + zoom, tuple(readout))

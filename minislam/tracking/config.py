@@ -102,6 +102,7 @@ class TrackingConfig:
     loop_min_gap: int = parameter(20, "keyframes between the ends of a loop, official code", 1)
     loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")
     loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
+    rolling_shutter: bool = parameter(True, "estimate how long the camera takes to read an image")
     final_rounds: int = parameter(2, "rounds of the final global BA, paper supplement")
     final_prior: bool = parameter(False, "keep the disparity prior in the final BA (an ablation)")
     pose_rounds: int = parameter(1, "rounds of flow and pose per frame between keyframes", 1)

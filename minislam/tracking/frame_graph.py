@@ -68,6 +68,11 @@ class FrameGraph(Stateful):
             for column in (self.targets, self.confidences, self.matched_ratios):
                 column.pop()
 
+    def move_targets(self, displacements: Tensor) -> None:
+        """Displace the targets of all edges (E, 2, N) [px]."""
+        moved = torch.stack(self.targets) + displacements
+        self.targets = list(moved.unbind(0))
+
     def edges(self) -> list[tuple[int, int]]:
         """Return all edges, in the order they were added."""
         return list(zip(self.edges_source, self.edges_target, strict=True))

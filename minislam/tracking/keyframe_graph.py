@@ -5,8 +5,6 @@ see the same place (covisibility, measured by the flow distance). A link that sp
 neighbourhood is added only if the flow confirms it in both directions.
 """
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -18,7 +16,7 @@ from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import (
     BundleReport,
     BundleState,
-    motion_only_adjust,
+    bundle_adjust,
     residuals,
 )
 from minislam.tracking.config import TrackingConfig
@@ -41,7 +39,7 @@ from minislam.tracking.pose_from_flow import (
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
 from minislam.tracking.safeguards.inverse_flow import inverted_targets
 from minislam.tracking.safeguards.robust import RobustKernel
-from minislam.tracking.safeguards.rolling_shutter import RollingShutter, shift
+from minislam.tracking.safeguards.rolling_shutter import RollingShutter
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
@@ -74,10 +72,11 @@ class KeyframeGraph(Stateful):
         self.is_learned = flow.learned_confidence  # then flow and geometry take turns
         self.config = config.for_learned_flow() if self.is_learned else config
         self.grid = Grid.of(camera, flow.stride, device)
-        self.shutter = RollingShutter(self.grid)
         self.keyframes = KeyframeStore(self.grid.rays[:, 0])
         self.flow_to_next = []
         self.links = FrameGraph()
+        parts = self.grid, self.keyframes, self.links, self.config.rolling_shutter
+        self.shutter = RollingShutter(*parts)
         self.flow = flow
         self.pixel_scale = pixel_scale(camera)
         self.least_parallax = self.config.min_parallax * self.pixel_scale  # px, that measures depth
@@ -164,19 +163,19 @@ class KeyframeGraph(Stateful):
         disparities = torch.cat([keyframes.disparities[around], unused])
         state = BundleState(torch.cat([known, start[None]]), disparities)
         self.flow.add_frame(newest, frame.image)
-        ends_in = [keyframes.frames[k].frame_index for k in around], [frame.frame_index] * count
+        edges = [(keyframe, len(keyframes)) for keyframe in around]
         for _ in range(self.config.pose_rounds):
             transforms = relative_transforms(state.T_camera_world, *ends).float()
             predicted, _ = reproject(transforms, disparities[:-1], grid.rays, grid.camera)
             matches = self.flow.match(around, [newest] * count, predicted)
-            matches = self.shutter.corrected(matches, *ends_in)
+            matches = self.shutter.corrected(matches, edges, frame.frame_index)
             measured = *ends, matches.targets, matches.confidences * weights[:, None]
             problem = motion_only_problem(grid, *measured, numbers == count, robust)
             if count == 1 and not self.is_learned:  # then it may follow a dynamic object
                 poses = known[0], list(state.T_camera_world[1:])
                 pose = start_pose(grid, matches, disparities[0], weights[0], *poses, self.robust)
                 state = BundleState(torch.cat([known, pose[None]]), disparities)
-            state, report = motion_only_adjust(problem, state, self.config.pose_iterations)
+            state, report = bundle_adjust(problem, state, self.config.pose_iterations)
         self.flow.remove_frame(newest)
         self.count_adjustment(report)
         _, final_weights = residuals(problem, state)
@@ -210,7 +209,7 @@ class KeyframeGraph(Stateful):
             predictions += [composed.targets, inverted_targets(composed.targets, self.grid)]
         sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
         matches = self.flow.match(sources, targets, torch.cat(predictions))
-        self.links.record(edges, self._of_global_shutter(edges, matches))
+        self.links.record(edges, self.shutter.corrected(matches, edges))
 
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
         """Return those of these new edges whose flow is matched in both directions."""
@@ -231,29 +230,7 @@ class KeyframeGraph(Stateful):
         # Points near the camera plane project to anywhere; a flow started there finds nothing.
         size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
         predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
-        return self._of_global_shutter(edges, self.flow.match(sources, targets, predicted))
-
-    def _of_global_shutter(self, edges: list[Edge], matches: FlowMatches) -> FlowMatches:
-        return self.shutter.corrected(matches, *self._frames_of(edges))
-
-    def _frames_of(self, edges: list[Edge]) -> tuple[list[int], list[int]]:
-        """Return the frame indices of the sources and of the targets."""
-        numbers = [frame.frame_index for frame in self.keyframes.frames]
-        return [numbers[i] for i, _ in edges], [numbers[j] for _, j in edges]
-
-    def shutter_columns(self, positions: Sequence[int]) -> Tensor:  # (E, 2, 2, N) px/s
-        """Return how the targets of some links change with the readout."""
-        edges = self.links.edges()
-        targets = torch.stack([self.links.targets[p] for p in positions])
-        return self.shutter.columns(*self._frames_of([edges[p] for p in positions]), targets)
-
-    def add_readout(self, seconds: Tensor | None) -> None:
-        """Make the readout longer, and correct all flow along links accordingly."""
-        if seconds is None or not seconds.any():
-            return
-        self.shutter.readout = self.shutter.readout + seconds.to(self.shutter.readout)
-        shifts = shift(self.shutter_columns(range(len(self.links))), seconds)
-        self.links.targets = [t + moved for t, moved in zip(self.links.targets, shifts, strict=True)]
+        return self.shutter.corrected(self.flow.match(sources, targets, predicted), edges)
 
     # Which keyframes to link --------------------------------------------------------------------
 

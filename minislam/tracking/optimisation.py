@@ -77,15 +77,15 @@ def adjust(
     iterations: int,
     lambda_prior: float | None = None,  # None: as configured
     widening: float = 1.0,  # of the robust weight
-    free_camera: bool = False,  # refine its focal length and readout, where they are unknown
+    free_camera: bool = False,  # refine an unknown focal length, and the readouts
 ) -> None:
     """Run a bundle adjustment over the links that touch the free keyframes."""
     positions = graph.links.select(first_free)
     problem = bundle_problem(graph, positions, first_free, lambda_prior)
     problem = replace(problem, robust=problem.robust and problem.robust.widened(widening))
     if free_camera:
-        shutter = graph.shutter_columns(positions) if graph.shutter.is_free else None
-        problem = replace(problem, free_focal=graph.focal_is_free, shutter=shutter)
+        columns = graph.shutter.link_columns(positions)
+        problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
     # Without parallax the flow does not measure depth. Such a keyframe keeps its first disparities,
     # and they keep the scale until the camera moves again. In the start only a prior is worth it.
     worth_keeping = (graph.keyframes.prior_disparities > 0).any(1) | (first_free > 0)
@@ -94,7 +94,7 @@ def adjust(
     state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.grid.zoom(state.log_focal)
-    graph.add_readout(state.readout)
+    graph.shutter.lengthen(state.readout)
     graph.count_adjustment(report)
 
 

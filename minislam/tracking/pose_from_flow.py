@@ -8,8 +8,8 @@ from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleState,
+    bundle_adjust,
     edge_costs,
-    motion_only_adjust,
 )
 from minislam.tracking.grid import Grid
 from minislam.tracking.reprojection import splat_disparities
@@ -78,7 +78,7 @@ def start_pose(
         problem = motion_only_problem(grid, *measured, numbers > 0, kernel)
         poses = torch.stack([T_source_world, *candidates])
         state = BundleState(poses, disparities.expand(count + 1, -1))
-        state, _ = motion_only_adjust(problem, state, POSE_ITERATIONS)
+        state, _ = bundle_adjust(problem, state, POSE_ITERATIONS)
         candidates = list(state.T_camera_world[1:])
     return candidates[int(edge_costs(problem, state).argmin())]
 

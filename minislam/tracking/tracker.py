@@ -179,8 +179,8 @@ class Tracker(Stateful):
         Its pose comes from its flow, its disparities from its predecessor.
         """
         pose, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
-        indices = [self.keyframes.frames[-1].frame_index], [frame.frame_index]
-        matches = self.graph.shutter.corrected(matches, *indices)
+        edge = len(self.keyframes) - 1, len(self.keyframes)
+        matches = self.graph.shutter.corrected(matches, [edge], frame.frame_index)
         if self.initialised:  # before, initialise() will estimate all poses together
             information = self._settling.information()
             trust = self._settling.certainty(information)

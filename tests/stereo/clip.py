@@ -56,7 +56,7 @@ class Found:
 def found() -> list[Found]:
     poses = {index: torch.from_numpy(pose(index)) for index in range(len(clip().rgb))}
     sparse = [1 / clip().depth[k][::8, ::8].reshape(-1) for k in KEYFRAMES]
-    depths = dense_depths(sequence(), camera(), poses, KEYFRAMES, sparse)
+    depths = dense_depths(sequence().frame, camera(), poses, KEYFRAMES, sparse)
     return [
         Found(depth.numpy(), confirmation.numpy(), clip().depth[k], clip().masks[k])
         for k, (depth, confirmation) in zip(KEYFRAMES, depths, strict=True)

@@ -54,7 +54,7 @@ def test_views_of_much_parallax_are_not_used():
     for index in range(20):
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.1 * index
-    planner = SweepPlanner(sequence(), camera(), poses)
+    planner = SweepPlanner(sequence().frame, camera(), poses)
     near = planner._views(0, 0.3)
     largest = max(near) * 0.1 * 0.3 * planner.camera.fx
     assert len(near) >= 2 and largest <= 0.125 * planner.camera.width
@@ -67,13 +67,13 @@ def test_views_of_much_parallax_are_not_used():
 
 def test_a_camera_that_stands_still_gives_no_depth():
     poses = {index: torch.from_numpy(pose(0)) for index in range(6)}
-    depths = dense_depths(sequence(), camera(), poses, [0, 5], [np.ones(3), np.ones(3)])
+    depths = dense_depths(sequence().frame, camera(), poses, [0, 5], [np.ones(3), np.ones(3)])
     assert all(float(depth.max()) == 0 == float(c.max()) for depth, c in depths)
 
 
 def test_a_single_frame_gives_no_depth():
     ((depth, confirmation),) = dense_depths(
-        sequence(), camera(), {0: torch.from_numpy(pose(0))}, [0], [np.ones(3)]
+        sequence().frame, camera(), {0: torch.from_numpy(pose(0))}, [0], [np.ones(3)]
     )
     assert depth.shape == SIZE[::-1] and float(depth.max()) == 0 == float(confirmation.max())
 
@@ -82,14 +82,14 @@ def test_progress_counts_the_swept_frames():
     told = []
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
     dense_depths(
-        sequence(), camera(), poses, [0, 2], [np.ones(3)] * 2, lambda *step: told.append(step)
+        sequence().frame, camera(), poses, [0, 2], [np.ones(3)] * 2, lambda *step: told.append(step)
     )
     assert told == [(2, 2)]
 
 
 def test_a_helper_sweeps_to_the_same_bits():
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
-    calls = sequence(), camera(), poses, [0, 2], [np.ones(3)] * 2
+    calls = sequence().frame, camera(), poses, [0, 2], [np.ones(3)] * 2
     with Workers(2) as two:
         alone, shared = dense_depths(*calls), dense_depths(*calls, workers=two)
     for (depth, confirmation), other in zip(alone, shared, strict=True):
@@ -114,7 +114,7 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
 
 
 def test_the_swept_camera_sees_what_the_camera_sees():
-    small = SweepPlanner(sequence(), camera(), {}).camera
+    small = SweepPlanner(sequence().frame, camera(), {}).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx
 
 

@@ -104,7 +104,7 @@ def test_where_nothing_is_confirmed_all_cells_count_alike():
 def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
     told = {}
 
-    def dense_depths(sequence, camera, poses, keyframes, disparities, *how):
+    def dense_depths(read, camera, poses, keyframes, disparities, *how):
         told.update(camera=camera, poses=poses, keyframes=keyframes, disparities=disparities)
         return []
 

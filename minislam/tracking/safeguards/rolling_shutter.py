@@ -1,102 +1,141 @@
-"""A rolling shutter: the rows of an image are exposed one after the other.
+"""A rolling shutter: an image whose rows are not exposed at the same time.
 
-Not in the paper, whose cameras have a global shutter; most phones and webcams have a rolling one.
-With a readout of rho seconds from the first row to the last, a point seen in row v is seen
+The paper's cameras have a global shutter; phones, webcams and a Kinect have a rolling one. Let rho
+be the readout, the seconds from the first row to the last. The point x in row v is seen
 
-    rho s(v),    s(v) = v / H - 1/2,
+    rho s(x),    s(x) = v / H - 1/2,
 
-later than the middle of the frame. If the image moves there with u px/s, the point was at
-x - rho s u in the middle row's moment. So flow from x to p~ becomes that of a global shutter by
+later than the middle row. If the image moves there at u px/s, a global shutter would have seen the
+point at x - rho s u. So to first order in rho, flow from cell x of keyframe i to p~ in keyframe j
+becomes that of a global shutter by
 
-    p~  +  rho c,    c = s(x) u_i(x) - s(p~) u_j(p~),
+    p~ + rho c,    c = s(x) u_i(x) - s(p~) u_j(p~).
 
-to first order in rho. u is the flow to the frame before, so no pose is needed; rho is one more
-unknown of Eq. (5), whose residual is linear in it.
+The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
+rho, which is one more unknown with the column c. A phone held upright reads its columns one after
+the other instead. So there are two readouts, one along x and one along y, each with its column.
 """
 
+import math
 from dataclasses import replace
 
+import cv2
 import torch
 from torch import Tensor
 
-from minislam.priors.dense_flow import grayscale, residual_flow
+from minislam.priors.dense_flow import grayscale, residual_flow, warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
+from minislam.tracking.frame_graph import FrameGraph
 from minislam.tracking.grid import Grid
+from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import Linearisation
+
+NEGLIGIBLE = 0.1  # px; an image that is displaced by less is left as it is
 
 
 class RollingShutter(Stateful):
-    """The readout time, and how fast the image of each frame moves."""
+    """The readouts, and how fast the image of each frame moves."""
 
-    readout: Tensor  # (2,) s, from the left edge to the right and from the top to the bottom
-    is_free: bool = True  # adjustments of all keyframes refine it
-    velocities: list[Tensor]  # per frame (2, N) px/s, since the frame before
-    first: int = 0  # index of the first of these frames
+    readout: tuple[float, ...] = (0.0, 0.0)  # s, from left to right and from top to bottom
+    velocities: list[Tensor]  # per frame u (2, N) px/s, by the frame before it
+    shortest_step: float = math.inf  # s between two frames: no readout is longer
     _newest: Frame | None = None
 
-    def __init__(self, grid: Grid) -> None:
-        self._grid = grid
+    def __init__(self, grid: Grid, keyframes: KeyframeStore, links: FrameGraph, is_on: bool):
+        self._grid, self._keyframes, self._links, self.is_on = grid, keyframes, links, is_on
         self.velocities = []
-        self.readout = grid.pixels.new_zeros(2)
 
     def see(self, frame: Frame) -> None:
-        """Measure how the image has moved since the frame before."""
+        """Measure how the image has moved since the frame before. Frames come in their order."""
+        before, self._newest = self._newest, frame
+        del self.velocities[frame.frame_index :]
         velocity = torch.zeros_like(self._grid.pixels.T)
-        if self._newest is None:
-            self.first = frame.frame_index
-        elif (seconds := frame.timestamp - self._newest.timestamp) > 0:
-            flow = residual_flow(grayscale(frame.image), grayscale(self._newest.image))
-            stride = self._grid.stride
-            cells = torch.from_numpy(flow[::stride, ::stride].copy()).reshape(-1, 2).T
-            velocity = -cells.to(velocity) / seconds
+        if before is not None and before.frame_index == frame.frame_index - 1 and self.is_on:
+            seconds = frame.timestamp - before.timestamp
+            back = residual_flow(grayscale(frame.image), grayscale(before.image))
+            cells = back[:: self._grid.stride, :: self._grid.stride].reshape(-1, 2).T.copy()
+            velocity = torch.from_numpy(cells).to(velocity) / -seconds
+            self.shortest_step = min(self.shortest_step, seconds)
         self.velocities.append(velocity)
-        self._newest = frame
 
     def velocity(self, frame_index: int) -> Tensor:  # (2, N) px/s
-        """Return how fast the image of a frame moves: mean of before and after it."""
-        known = self.velocities
-        around = known[max(1, frame_index - self.first) :][:2]
-        return torch.stack(around or [torch.zeros_like(self._grid.pixels.T)]).mean(0)
+        """Return how fast the image of a frame moves: the mean of before and after it."""
+        return torch.stack(self.velocities[max(frame_index, 1) :][:2] or self.velocities).mean(0)
 
-    def columns(self, sources: list[int], targets: list[int], positions: Tensor) -> Tensor:
-        """Return c (E, 2, 2, N) [px/s] of edges between frames, given by their frame indices.
-
-        Positions (E, 2, N) [px] are those of the source's cells in the target.
-        """
-        pixels, camera = self._grid.pixels, self._grid.camera
+    def columns(
+        self,
+        edges: list[tuple[int, int]],  # keyframe indices
+        positions: Tensor,  # (E, 2, N) px, of the source's cells in the target
+        next_frame: int | None = None,  # frame that counts as the keyframe after the newest
+    ) -> Tensor:  # (E, 2, 2, N) px/s
+        """Return c of some edges for either readout, Eq. (5)."""
+        camera, pixels = self._grid.camera, self._grid.pixels
+        frames = [frame.frame_index for frame in self._keyframes.frames]
+        frames += [] if next_frame is None else [next_frame]
+        u = {keyframe: self.velocity(frames[keyframe]) for edge in edges for keyframe in edge}
+        u_source = torch.stack([u[source] for source, _ in edges])
+        u_target = torch.stack([u[target].mT for _, target in edges])
+        u_target = self._grid.sample(u_target, positions.mT).mT
         size = pixels.new_tensor([[camera.width], [camera.height]])
-        u = {frame: self.velocity(frame) for frame in {*sources, *targets}}
-        at_source = torch.stack([u[frame] for frame in sources])
-        at_target = torch.stack([u[frame].mT for frame in targets])
-        at_target = self._grid.sample(at_target, positions.mT).mT
         late_source, late_target = pixels.T / size - 0.5, positions / size - 0.5
-        return late_source[:, None] * at_source[:, None] - late_target[:, :, None] * at_target[:, None]
+        at_source = late_source[:, None] * u_source[:, None]
+        return at_source - late_target[:, :, None] * u_target[:, None]
 
     def corrected(
-        self, matches: FlowMatches, sources: list[int], targets: list[int]
+        self, matches: FlowMatches, edges: list[tuple[int, int]], next_frame: int | None = None
     ) -> FlowMatches:
-        """Return the matches between frames as a global shutter would have seen them."""
-        if not self.readout.any():
+        """Return the matches of some edges as a global shutter would have seen them."""
+        if not any(self.readout):
             return matches
-        columns = self.columns(sources, targets, matches.targets)
-        return replace(matches, targets=matches.targets + shift(columns, self.readout))
+        columns = self.columns(edges, matches.targets, next_frame)
+        return replace(matches, targets=matches.targets + displacements(columns, self.readout))
+
+    def link_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
+        """Return c of the links at these positions in the graph, None if readouts are held."""
+        if not self.is_on:
+            return None
+        edges = self._links.edges()
+        targets = torch.stack([self._links.targets[position] for position in positions])
+        return self.columns([edges[position] for position in positions], targets)
+
+    def lengthen(self, seconds: tuple[float, ...]) -> None:
+        """Make the readouts longer, and correct the flow along all links accordingly."""
+        columns = self.link_columns(list(range(len(self._links)))) if any(seconds) else None
+        if columns is None:
+            return
+        before, longest = self.readout, self.shortest_step
+        after = [a + b for a, b in zip(before, seconds, strict=True)]
+        self.readout = tuple(min(max(-longest, rho), longest) for rho in after)
+        moved = displacements(columns, self.readout) - displacements(columns, before)
+        self._links.move_targets(moved)
+
+    def undone(self, frame: Frame) -> Frame:
+        """Return a frame as a global shutter would have seen it."""
+        grid, shape = self._grid, frame.pixels.shape[:2]
+        late = grid.pixels.T / grid.pixels.new_tensor([shape[1:], shape[:1]]) - 0.5
+        moved = self.velocity(frame.frame_index) * (grid.pixels.new_tensor(self.readout) @ late)
+        if not moved.abs().max() > NEGLIGIBLE:
+            return frame
+        cells = moved.T.reshape(*grid.shape, 2).cpu().numpy()
+        dense = cv2.resize(cells, shape[::-1], interpolation=cv2.INTER_LINEAR)
+        pixels = warp(frame.pixels.cpu().numpy(), dense, cv2.INTER_CUBIC)
+        return replace(frame, pixels=torch.from_numpy(pixels).to(frame.pixels))
 
 
-def shift(columns: Tensor, readout: Tensor) -> Tensor:
-    return torch.einsum("eakn,a->ekn", columns, readout.to(columns))
+def displacements(columns: Tensor, readout: tuple[float, ...]) -> Tensor:  # (E, 2, N) px
+    """Return rho_x c_x + rho_y c_y: how far flow moves with columns (E, 2, 2, N) and readouts."""
+    return readout[0] * columns[:, 0] + readout[1] * columns[:, 1]
 
 
 def with_readout(
-    found: Linearisation, columns: Tensor | None, readout: Tensor | None
+    found: Linearisation,
+    columns: Tensor | None,  # c (E, 2, 2, N) px/s; None: the readouts are held
+    readout: tuple[float, ...],  # s
 ) -> Linearisation:
-    """Return a reprojection as a rolling shutter sees it, with the derivative by the readout.
-
-    Columns c (E, 2, N) [px/s]; None: the readout is held. Eq. (5).
-    """
+    """Return a reprojection as a rolling shutter sees it; its J_target gains their columns."""
     if columns is None:
         return found
-    J_target = torch.cat([found.J_target, -columns], 1)
-    moved = found.positions if readout is None else found.positions - shift(columns, readout)
-    return replace(found, positions=moved, J_target=J_target)
+    seen = found.positions - displacements(columns, readout)
+    return replace(found, positions=seen, J_target=torch.cat([found.J_target, -columns], 1))
