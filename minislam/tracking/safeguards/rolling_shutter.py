@@ -62,7 +62,8 @@ class RollingShutter(Stateful):
 
     def velocity(self, frame_index: int) -> Tensor:  # (2, N) px/s
         """Return how fast the image of a frame moves: the mean of before and after it."""
-        return torch.stack(self.velocities[max(frame_index, 1) :][:2] or self.velocities).mean(0)
+        around = self.velocities[max(frame_index, 1) :][:2]  # nothing is known of the first alone
+        return torch.stack(around).mean(0) if around else torch.zeros_like(self._grid.pixels.T)
 
     def columns(
         self,
