@@ -22,7 +22,7 @@ from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal
 from minislam.tracking.safeguards.parts import in_parts, joined
 from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
-from minislam.tracking.safeguards.rolling_shutter import with_readout
+from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
@@ -70,7 +70,7 @@ class BundleState:
     T_camera_world: Tensor  # (K, 4, 4) float64
     disparities: Tensor  # (K, N) 1/world unit
     log_focal: float = 0.0  # s = ln(f / f of the problem's camera)
-    readout: tuple[float, ...] = (0.0, 0.0)  # s, beside that of the problem's targets
+    readout: Readout = (0.0, 0.0)  # s, beside that of the problem's targets
 
 
 @dataclass(frozen=True)
@@ -294,5 +294,6 @@ def _damped_step(
     clamped = disparities.clamp_min(MIN_DISPARITY)
     disparities = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
     zoom = common.pop(0) if problem.free_focal else 0.0
-    readout = [a + b for a, b in zip(state.readout, common or (0.0, 0.0), strict=True)]
-    return BundleState(poses, disparities, state.log_focal + zoom, tuple(readout))
+    later = common if common else (0.0, 0.0)
+    readout = state.readout[0] + later[0], state.readout[1] + later[1]
+    return BundleState(poses, disparities, state.log_focal + zoom, readout)

@@ -32,13 +32,15 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import Linearisation
 
+Readout = tuple[float, float]  # s, from left to right and from top to bottom
+
 NEGLIGIBLE = 0.1  # px; an image that is displaced by less is left as it is
 
 
 class RollingShutter(Stateful):
     """The readouts, and how fast the image of each frame moves."""
 
-    readout: tuple[float, ...] = (0.0, 0.0)  # s, from left to right and from top to bottom
+    readout: Readout = (0.0, 0.0)
     velocities: list[Tensor]  # per frame u (2, N) px/s, by the frame before it
     shortest_step: float = math.inf  # s between two frames: no readout is longer
     _newest: Frame | None = None
@@ -101,14 +103,14 @@ class RollingShutter(Stateful):
         targets = torch.stack([self._links.targets[position] for position in positions])
         return self.columns([edges[position] for position in positions], targets)
 
-    def lengthen(self, seconds: tuple[float, ...]) -> None:
+    def lengthen(self, seconds: Readout) -> None:
         """Make the readouts longer, and correct the flow along all links accordingly."""
         columns = self.link_columns(list(range(len(self._links)))) if any(seconds) else None
         if columns is None:
             return
         before, longest = self.readout, self.shortest_step
-        after = [a + b for a, b in zip(before, seconds, strict=True)]
-        self.readout = tuple(min(max(-longest, rho), longest) for rho in after)
+        after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
+        self.readout = after[0], after[1]
         moved = displacements(columns, self.readout) - displacements(columns, before)
         self._links.move_targets(moved)
 
@@ -125,7 +127,7 @@ class RollingShutter(Stateful):
         return replace(frame, pixels=torch.from_numpy(pixels).to(frame.pixels))
 
 
-def displacements(columns: Tensor, readout: tuple[float, ...]) -> Tensor:  # (E, 2, N) px
+def displacements(columns: Tensor, readout: Readout) -> Tensor:  # (E, 2, N) px
     """Return rho_x c_x + rho_y c_y: how far flow moves with columns (E, 2, 2, N) and readouts."""
     return readout[0] * columns[:, 0] + readout[1] * columns[:, 1]
 
@@ -133,7 +135,7 @@ def displacements(columns: Tensor, readout: tuple[float, ...]) -> Tensor:  # (E,
 def with_readout(
     found: Linearisation,
     columns: Tensor | None,  # c (E, 2, 2, N) px/s; None: the readouts are held
-    readout: tuple[float, ...],  # s
+    readout: Readout,
 ) -> Linearisation:
     """Return a reprojection as a rolling shutter sees it; its J_target gains their columns."""
     if columns is None:
