@@ -23,7 +23,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from minislam.priors.dense_flow import grayscale, residual_flow, warp
+from minislam.priors.dense_flow import dense_from_grid, grayscale, residual_flow, warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
@@ -64,7 +64,7 @@ class RollingShutter(Stateful):
 
     def velocity(self, frame_index: int) -> Tensor:  # (2, N) px/s
         """Return how fast the image of a frame moves: the mean of before and after it."""
-        around = self.velocities[max(frame_index, 1) :][:2]  # nothing is known of the first alone
+        around = self.velocities[max(frame_index, 1) : frame_index + 2]  # none before the first
         return torch.stack(around).mean(0) if around else torch.zeros_like(self._grid.pixels.T)
 
     def columns(
@@ -105,9 +105,9 @@ class RollingShutter(Stateful):
 
     def lengthen(self, seconds: Readout) -> None:
         """Make the readouts longer, and correct the flow along all links accordingly."""
-        columns = self.link_columns(list(range(len(self._links)))) if any(seconds) else None
-        if columns is None:
+        if not any(seconds):
             return
+        columns = self.columns(self._links.edges(), torch.stack(self._links.targets))
         before, longest = self.readout, self.shortest_step
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
@@ -121,8 +121,8 @@ class RollingShutter(Stateful):
         moved = self.velocity(frame.frame_index) * (grid.pixels.new_tensor(self.readout) @ late)
         if not moved.abs().max() > NEGLIGIBLE:
             return frame
-        cells = moved.T.reshape(*grid.shape, 2).cpu().numpy()
-        dense = cv2.resize(cells, shape[::-1], interpolation=cv2.INTER_LINEAR)
+        cells = (grid.pixels + moved.T).reshape(*grid.shape, 2).cpu().numpy()
+        dense = dense_from_grid(cells, (shape[0], shape[1]), grid.stride)
         pixels = warp(frame.pixels.cpu().numpy(), dense, cv2.INTER_CUBIC)
         return replace(frame, pixels=torch.from_numpy(pixels).to(frame.pixels))
 
