@@ -63,6 +63,7 @@ def run_facts(
         "focal_length": {"used": focal_length_note(slam)}
         | (asdict(slam.focal_length) if slam.focal_length else {})
         | ({"is_doubtful": slam.focal_length.is_doubtful} if slam.focal_length else {}),
+        "readout_seconds": list(slam.tracker.graph.shutter.readout),
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
         "segments": slam.tracker.watch.segments,
         "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],

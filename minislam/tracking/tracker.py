@@ -28,6 +28,7 @@ from minislam.tracking.optimisation import final_global_ba, local_ba, online_glo
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
+from minislam.tracking.safeguards.readout import seek_readouts
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.settling import SETTLED, Settling
 
@@ -264,6 +265,7 @@ class Tracker(Stateful):
         first_geometry(self.graph)
         self._settling.fall_back_on_prior()
         self.mode = Mode.TRACKING
+        seek_readouts(self.graph)
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
         self._motion.judge_all(self.graph.flow_to_next)
@@ -280,6 +282,7 @@ class Tracker(Stateful):
         """Run the final global BA, with the newest beta."""
         self._update_static_weights()
         self._motion.judge_all(self.graph.flow_to_next)  # online, depths were hardly settled
+        seek_readouts(self.graph)
         final_global_ba(self.graph, progress)
         self.watch.conclude()
 

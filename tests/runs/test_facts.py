@@ -24,6 +24,7 @@ def slam(**parts: object) -> SimpleNamespace:
         seeks_focal=parts.pop("seeks_focal", False),
         focal_is_free=parts.pop("focal_is_free", False),
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
+        shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
     tracker = SimpleNamespace(
         tracked=[None] * 4,

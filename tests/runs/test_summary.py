@@ -12,6 +12,7 @@ FACTS = {
     "gaussians": 14083,
     "unit": "m",
     "focal_length": {"used": "272.0 px for 320x240 images, as given"},
+    "readout_seconds": [0.0004, 0.0261],
     "seconds": {"total": 94.4, "tracking": 8.2, "mapping": 20.0, "final adjustment": 0.1},
 }
 
@@ -23,7 +24,8 @@ def lines(metrics: dict | None = None, **facts: object) -> dict[str, tuple[str, 
 
 def test_what_is_not_known_is_not_shown():
     assert list(lines({"ate_all_cm": None, "psnr_static_db": None})) == [
-        "frames followed", "keyframes", "Gaussians in the map", "focal length", "time",
+        "frames followed", "keyframes", "Gaussians in the map", "focal length", "rolling shutter",
+        "time",
     ]  # fmt: skip
 
 
@@ -34,6 +36,7 @@ def test_numbers_have_units_words_and_verdicts():
     assert found["path of the camera"] == ("2.77 m", "", "")
     assert found["reprojection error, median"] == ("0.10 px", "good", "")
     assert found["map against input, static pixels"] == ("17.0 dB", "poor", "")
+    assert found["rolling shutter"][0] == "0, 26 ms"
     assert found["time"] == ("94 s", "", "mapping 20 s, tracking 8 s")
     assert lines({"path_length": 1.0}, unit="world units")["path of the camera"][0] == (
         "1.00 world units"

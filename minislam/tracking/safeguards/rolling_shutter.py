@@ -41,6 +41,7 @@ class RollingShutter(Stateful):
     """The readouts, and how fast the image of each frame moves."""
 
     readout: Readout = (0.0, 0.0)
+    is_found: bool = False  # the flow has told it; adjustments of all keyframes refine it
     velocities: list[Tensor]  # per frame u (2, N) px/s, by the frame before it
     shortest_step: float = math.inf  # s between two frames: no readout is longer
     _newest: Frame | None = None
@@ -96,7 +97,7 @@ class RollingShutter(Stateful):
         return replace(matches, targets=matches.targets + displacements(columns, self.readout))
 
     def link_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
-        """Return c of the links at these positions in the graph, None if readouts are held."""
+        """Return c of the links at these positions in the graph, None if nothing is estimated."""
         if not self.is_on:
             return None
         edges = self._links.edges()

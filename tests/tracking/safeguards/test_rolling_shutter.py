@@ -1,6 +1,5 @@
 """The readout of a rolling shutter: undone by the image's own motion, and found as an unknown."""
 
-import dataclasses
 from dataclasses import replace
 
 import cv2
@@ -9,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from minislam.evaluation import absolute_trajectory_error
 from minislam.geometry import Camera, se3_exp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
@@ -26,7 +24,6 @@ from minislam.tracking.safeguards.rolling_shutter import (
     displacements,
     with_readout,
 )
-from tests.benchmarks.bench_phone import NONE, filmed, follow, truth
 from tests.helpers import generator
 from tests.tracking.scene import (
     CAMERA,
@@ -288,15 +285,3 @@ def test_an_image_is_undone():
 def test_an_image_that_hardly_moved_is_left_alone():
     shutter, frame = shutter_of(0), picture(0, 0)
     assert shutter.undone(frame) is frame
-
-
-# The whole tracker
-
-
-def test_a_phone_is_followed_as_if_it_had_a_global_shutter():
-    # Upright, so columns are read. Measured: 19.4 ms, 0.36 cm; with the readouts held 3.7 cm.
-    frames = filmed("ball", 7, dataclasses.replace(NONE, readout=0.02))
-    estimate, _, readout = follow(frames, seeks_focal=False)
-    assert readout == pytest.approx((0.02, 0.0), abs=0.002)
-    error = absolute_trajectory_error(estimate, truth("ball", 7)).statistics["rmse"]
-    assert error < 0.006
