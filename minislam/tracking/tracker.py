@@ -215,6 +215,7 @@ class Tracker(Stateful):
         closed = config.loop_closure and close_loops(self.graph)
         is_due = 0 < config.global_interval <= count - self._last_global >= count // LEAST_GROWTH
         if is_due and not closed:
+            seek_readouts(self.graph)
             online_global_ba(self.graph)
         if is_due or closed:
             self._last_global = count
@@ -265,7 +266,6 @@ class Tracker(Stateful):
         first_geometry(self.graph)
         self._settling.fall_back_on_prior()
         self.mode = Mode.TRACKING
-        seek_readouts(self.graph)
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
         self._motion.judge_all(self.graph.flow_to_next)
@@ -275,6 +275,7 @@ class Tracker(Stateful):
         self._update_static_weights()
         edges = self.graph.links.edges()
         mask_priors(self.keyframes, self.grid, edges, self.config)
+        seek_readouts(self.graph)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds_with_beta)
         self.watch.judge_all()
 
