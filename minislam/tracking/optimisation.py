@@ -84,7 +84,7 @@ def adjust(
     problem = bundle_problem(graph, positions, first_free, lambda_prior)
     problem = replace(problem, robust=problem.robust and problem.robust.widened(widening))
     if free_camera:
-        columns = graph.shutter.link_columns(positions) if graph.shutter.is_found else None
+        columns = graph.shutter.link_columns(positions) if graph.shutter.axis is not None else None
         problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
     # Without parallax the flow does not measure depth. Such a keyframe keeps its first disparities,
     # and they keep the scale until the camera moves again. In the start only a prior is worth it.

@@ -13,7 +13,8 @@ becomes that of a global shutter by
 
 The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
 rho, which is one more unknown with the column c. A phone held upright reads its columns one after
-the other instead. So there are two readouts, one along x and one along y, each with its column.
+the other instead. So there are two readouts, one along x and one along y, each with its column; the
+one that displaces the flow less is held at zero once a readout is found.
 """
 
 import math
@@ -41,7 +42,7 @@ class RollingShutter(Stateful):
     """The readouts, and how fast the image of each frame moves."""
 
     readout: Readout = (0.0, 0.0)
-    is_found: bool = False  # the flow has told it; adjustments of all keyframes refine it
+    axis: int | None = None  # 0: x, 1: y; of the readout that the flow has told; None: of neither
     velocities: list[Tensor]  # per frame u (2, N) px/s, by the frame before it
     shortest_step: float = math.inf  # s between two frames: no readout is longer
     _newest: Frame | None = None
@@ -102,7 +103,10 @@ class RollingShutter(Stateful):
             return None
         edges = self._links.edges()
         targets = torch.stack([self._links.targets[position] for position in positions])
-        return self.columns([edges[position] for position in positions], targets)
+        columns = self.columns([edges[position] for position in positions], targets)
+        if self.axis is not None:
+            columns[:, 1 - self.axis] = 0
+        return columns
 
     def lengthen(self, seconds: Readout) -> None:
         """Make the readouts longer, and correct the flow along all links accordingly."""
