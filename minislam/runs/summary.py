@@ -75,10 +75,10 @@ def _spent(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[Lin
         verdict = "poor" if focal["is_doubtful"] else "good"
         origin += f"; the flow fits {focal['factor']:.2f} times this one best"
     yield Line("focal length", length.partition(" for ")[0], verdict, detail=origin)
-    across, down = (1000 * seconds for seconds in facts["readout_seconds"])
+    across, down = facts["readout_seconds"]
     if across or down:
-        detail = "read left to right, top to bottom"
-        yield Line("rolling shutter", f"{across:.0f}, {down:.0f} ms", detail=detail)
+        way = "read from left to right" if across else "read from top to bottom"
+        yield Line("rolling shutter", f"{1000 * (across or down):.0f} ms", detail=way)
     seconds = dict(facts["seconds"])
     total = seconds.pop("total")
     stages = sorted(seconds.items(), key=lambda stage: -stage[1])

@@ -12,7 +12,7 @@ FACTS = {
     "gaussians": 14083,
     "unit": "m",
     "focal_length": {"used": "272.0 px for 320x240 images, as given"},
-    "readout_seconds": [0.0004, 0.0261],
+    "readout_seconds": [0.0, 0.0261],
     "seconds": {"total": 94.4, "tracking": 8.2, "mapping": 20.0, "final adjustment": 0.1},
 }
 
@@ -36,7 +36,10 @@ def test_numbers_have_units_words_and_verdicts():
     assert found["path of the camera"] == ("2.77 m", "", "")
     assert found["reprojection error, median"] == ("0.10 px", "good", "")
     assert found["map against input, static pixels"] == ("17.0 dB", "poor", "")
-    assert found["rolling shutter"][0] == "0, 26 ms"
+    assert found["rolling shutter"] == ("26 ms", "", "read from top to bottom")
+    across = lines(readout_seconds=[0.02, 0.0])["rolling shutter"]
+    assert across == ("20 ms", "", "read from left to right")
+    assert "rolling shutter" not in lines(readout_seconds=[0.0, 0.0])
     assert found["time"] == ("94 s", "", "mapping 20 s, tracking 8 s")
     assert lines({"path_length": 1.0}, unit="world units")["path of the camera"][0] == (
         "1.00 world units"

@@ -250,6 +250,16 @@ def test_a_longer_readout_moves_the_targets_of_all_links():
     torch.testing.assert_close(moved, displacements(columns, (0.01, -0.02)), rtol=0, atol=1e-4)
 
 
+def test_once_an_axis_is_found_the_other_readout_is_held():
+    shutter, _ = linked()
+    both = shutter.link_columns([0, 1])
+    shutter.axis = 1
+    one = shutter.link_columns([0, 1])
+    assert both[:, 0].any()
+    assert not one[:, 0].any()
+    assert torch.equal(one[:, 1], both[:, 1])
+
+
 def test_no_readout_is_longer_than_the_time_between_two_frames():
     shutter, _ = linked()
     shutter.lengthen((0.3, -0.3))
