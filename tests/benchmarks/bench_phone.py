@@ -84,7 +84,7 @@ def follow(
 
 
 def main(clips: list[str]) -> None:
-    print("| clip | phone | ATE, readouts held [cm] | ATE [cm] | readouts [ms]", end=" ")
+    print("| clip | phone | ATE, readout held [cm] | ATE [cm] | readout along x / y [ms]", end=" ")
     print("| ATE, f sought [cm] | f [px] |")
     print("|---|---|---|---|---|---|---|")
     for clip in clips or ["ball:7", "crowd:7"]:
