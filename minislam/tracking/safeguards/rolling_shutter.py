@@ -99,7 +99,7 @@ class RollingShutter(Stateful):
 
     def link_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
         """Return c of the links at these positions in the graph, None if nothing is estimated."""
-        if not self.is_on:
+        if not (self.is_on and positions):
             return None
         edges = self._links.edges()
         targets = torch.stack([self._links.targets[position] for position in positions])
@@ -121,6 +121,8 @@ class RollingShutter(Stateful):
 
     def undone(self, frame: Frame) -> Frame:
         """Return a frame as a global shutter would have seen it."""
+        if not any(self.readout):
+            return frame
         grid, shape = self._grid, frame.pixels.shape[:2]
         late = grid.pixels.T / grid.pixels.new_tensor([shape[1:], shape[:1]]) - 0.5
         moved = self.velocity(frame.frame_index) * (grid.pixels.new_tensor(self.readout) @ late)
