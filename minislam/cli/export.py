@@ -11,6 +11,7 @@ SH_MAP = "map_sh.ply"  # in the run folder
 EPILOG = """\
 The world has the axes of the first camera, so y points down; the unit of length is printed.
 Images and masks have the size of the source; masks are 255 where static, 0 where it moves.
+Beside poses, both are as a global shutter would have seen them; --masks alone fits the source.
 
   minislam export output/my --nerfstudio my_ns       then: ns-train splatfacto --data my_ns
   minislam export output/my --colmap my_colmap       then: any trainer that reads COLMAP folders

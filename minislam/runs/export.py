@@ -1,6 +1,7 @@
 """What other programs go on with: COLMAP, nerfstudio, point clouds, depth and masks of a run.
 
-The images have the size of the source and no distortion. Masks are black where something moves,
+The images have the size of the source and no distortion; a rolling shutter that the run has found
+is undone in images and masks that come with poses. Masks are black where something moves,
 as trainers of radiance fields read them, and cut where the map's own training cuts (weights.py).
 The centre of our first pixel is (0, 0), theirs is (0.5, 0.5).
 """
@@ -20,6 +21,7 @@ from minislam.data.images import encode_png
 from minislam.data.ply import encode_points
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.priors.dense_flow import sample, warp
 from minislam.runs.loaded import Run
 from minislam.uncertainty import mapping_weight
 
@@ -103,11 +105,7 @@ def points_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 def static_mask(run: Run, frame: int, camera: Camera) -> np.ndarray:  # (H, W) uint8, 255 or 0
     """Return where a frame is static, for another image size of the same view."""
-    columns = (np.arange(camera.width) - camera.cx) / camera.fx * run.camera.fx + run.camera.cx
-    rows = (np.arange(camera.height) - camera.cy) / camera.fy * run.camera.fy + run.camera.cy
-    map_x, map_y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
-    border = cv2.BORDER_REPLICATE
-    beta = cv2.remap(run.beta(frame), map_x, map_y, cv2.INTER_LINEAR, borderMode=border)
+    beta = sample(run.beta(frame), *_working_pixels(run, camera))
     raw = torch.from_numpy(np.asarray(beta, np.float32))
     weight = mapping_weight(raw, camera, run.least_weight)
     return np.where(weight > 0, 255, 0).astype(np.uint8)
@@ -126,10 +124,23 @@ def _write_images(run: Run, folder: Path, frames: Sequence[int], show: Show) -> 
         (folder / part).mkdir(parents=True, exist_ok=True)
     camera = sequence.full_camera(run.camera)
     for done, frame in enumerate(frames, start=1):
-        atomic_write(folder / IMAGES / _name(frame), encode_png(sequence.full_image(frame)))
-        atomic_write(folder / MASKS / _name(frame), encode_png(static_mask(run, frame, camera)))
+        image, mask = sequence.full_image(frame), static_mask(run, frame, camera)
+        moved = run.displacement(frame)
+        if moved is not None:
+            enlarged = sample(moved, *_working_pixels(run, camera)) * (camera.fx / run.camera.fx)
+            image = warp(image, enlarged, cv2.INTER_CUBIC)
+            mask = warp(mask, enlarged, cv2.INTER_NEAREST)
+        atomic_write(folder / IMAGES / _name(frame), encode_png(image))
+        atomic_write(folder / MASKS / _name(frame), encode_png(mask))
         show(f"writing {folder}", done, len(frames))
     return camera
+
+
+def _working_pixels(run: Run, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the column and row in the run's images of every pixel of another size, (H, W) each."""
+    columns = (np.arange(camera.width) - camera.cx) / camera.fx * run.camera.fx + run.camera.cx
+    rows = (np.arange(camera.height) - camera.cy) / camera.fy * run.camera.fy + run.camera.cy
+    return np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
 
 
 def _name(frame: int, ending: str = ".png") -> str:

@@ -25,6 +25,8 @@ from minislam.runs.facts import surface_depth, unit_of
 from minislam.runs.summary import Line, summarise
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
+from minislam.tracking.grid import Grid
+from minislam.tracking.safeguards.image_motion import ImageMotion
 from minislam.uncertainty import UncertaintyMLP, beta_of_mask
 from minislam.uncertainty.weights import MAPPING_CUT
 from minislam.viz import Figure, Page, overview, summary_html
@@ -145,6 +147,13 @@ class Run:
                 self._betas[frame_index] = self._mlp(features)
         return resample(self._betas[frame_index], height, width).numpy()
 
+    def displacement(self, frame_index: int) -> np.ndarray | None:  # (H, W, 2) px
+        """Return how far a rolling shutter shows each pixel from its place; None: not at all."""
+        across, down = self.folder.read_run().get("readout_seconds", (0.0, 0.0))
+        if across == down == 0:
+            return None
+        return self._motion.displacement(frame_index, (across, down))
+
     def plot(self, frame_index: int | None = None) -> Figure:
         """Return one picture of the run: a frame (by default the middle keyframe) and the path."""
         index = self.keyframes[len(self.keyframes) // 2] if frame_index is None else frame_index
@@ -194,6 +203,13 @@ class Run:
         choice = PriorChoice(**self.folder.read_config()["priors"] | on_cpu)
         features = choose_features(choice, self.sequence.camera, self.config.networks)
         return with_finer_grid(features, self.config.uncertainty.grid_factor)
+
+    @cached_property
+    def _motion(self) -> ImageMotion:
+        motion = ImageMotion(Grid.of(self.camera, self.config.flow.stride))
+        for frame in self.frames:
+            motion.see(self.sequence.frame(frame.index))
+        return motion
 
     @cached_property
     def _mlp(self) -> UncertaintyMLP:

@@ -85,7 +85,7 @@ def run(tmp_path: Path) -> SimpleNamespace:
     return SimpleNamespace(
         folder=SimpleNamespace(path=tmp_path / "run"), camera=sequence.camera, unit="m",
         poses={frame: pose(frame) for frame in FRAMES}, keyframes=[5], gaussians=gaussians,
-        sequence=sequence, beta=beta, least_weight=MAPPING_CUT,
+        sequence=sequence, beta=beta, least_weight=MAPPING_CUT, displacement=lambda frame: None,
         render_depth=lambda T, camera=None: np.full((64, 96), T[2, 3] + 2),
     )  # fmt: skip
 
@@ -136,6 +136,25 @@ def test_nerfstudio_projects_a_point_where_the_exported_image_shows_it(run, tmp_
         assert (folder / view["file_path"]).exists() and (folder / view["mask_path"]).exists()
         assert mask[round(v - 0.5), round(u - 0.5)] == 0
     assert (folder / model["ply_file_path"]).exists()
+
+
+def test_images_and_masks_beside_poses_are_those_of_a_global_shutter(run, tmp_path: Path):
+    export.export_nerfstudio(run, tmp_path / "as filmed", FRAMES, quiet)
+    shift = np.float32([3.0, -2.0])  # px of the run's images, by which the spot is shown too far
+    run.displacement = lambda frame: np.broadcast_to(shift, (64, 96, 2)) if frame == 5 else None
+    export.export_nerfstudio(run, tmp_path / "undone", FRAMES, quiet)
+    scale = run.sequence.full_camera(run.camera).fx / run.camera.fx
+    assert scale > 1.5
+    for frame, moved in ((2, 0 * shift), (5, shift)):
+        before, after = (exported(tmp_path / name, frame) for name in ("as filmed", "undone"))
+        expected = centroid(before[0]) - scale * moved
+        np.testing.assert_allclose(centroid(after[0]), expected, atol=0.1)
+        expected = centroid(255 - before[1]) - scale * moved
+        np.testing.assert_allclose(centroid(255 - after[1]), expected, atol=0.6)
+    export.export_masks(run, tmp_path / "masks", [5], quiet)  # these belong to the source's images
+    assert (tmp_path / "masks/000005.png").read_bytes() == (
+        tmp_path / "as filmed/masks/000005.png"
+    ).read_bytes()
 
 
 def test_pycolmap_reads_what_we_write(run, tmp_path: Path):

@@ -14,6 +14,8 @@ from minislam.data import open_sequence
 from minislam.data.files import write_json
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.tracking.grid import Grid
+from minislam.tracking.safeguards.image_motion import ImageMotion
 
 pytestmark = pytest.mark.slow
 
@@ -71,6 +73,20 @@ def test_beta_is_larger_on_the_person_than_elsewhere(run: minislam.Run):
     moving, beta = truth.moving_mask(index), run.beta(index)
     assert moving is not None and beta.shape == moving.shape
     assert np.median(beta[moving]) > np.median(beta[~moving])
+
+
+def test_how_far_a_rolling_shutter_displaces_a_frame_is_measured_again(run: minislam.Run):
+    again, facts = minislam.load(run.folder.path), run.folder.read_run()
+    readout = (0.0, 0.05)
+    again.folder.read_run = lambda: facts | {"readout_seconds": list(readout)}
+    tracked = ImageMotion(Grid.of(run.camera, run.config.flow.stride))
+    for index in range(6):
+        tracked.see(run.sequence.frame(index))
+    moved = again.displacement(4)
+    assert moved is not None and moved.shape == (run.camera.height, run.camera.width, 2)
+    np.testing.assert_array_equal(moved, tracked.displacement(4, readout))
+    readout = (0.0, 0.0)  # a global shutter
+    assert again.displacement(4) is None
 
 
 def test_what_a_notebook_shows(run: minislam.Run):

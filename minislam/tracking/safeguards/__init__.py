@@ -12,6 +12,7 @@ structure        which disparities several keyframes agree on
 diagnostics      how well each keyframe is tied to the others
 focal_length     estimates an unknown focal length, tells whether a given one was wrong
 focal_column     the focal length as one more unknown of the bundle adjustment
+image_motion     how fast the image moves, and how far a rolling shutter displaces it
 rolling_shutter  the time to read an image as two more, and images as a global shutter sees them
 readout          tells whether the camera has a rolling shutter at all
 """

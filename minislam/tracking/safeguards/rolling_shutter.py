@@ -17,14 +17,13 @@ the other instead. So there are two readouts, one along x and one along y, each 
 one that displaces the flow less is held at zero once a readout is found.
 """
 
-import math
 from dataclasses import replace
 
 import cv2
 import torch
 from torch import Tensor
 
-from minislam.priors.dense_flow import dense_from_grid, grayscale, residual_flow, warp
+from minislam.priors.dense_flow import warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
@@ -32,42 +31,24 @@ from minislam.tracking.frame_graph import FrameGraph
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import Linearisation
-
-Readout = tuple[float, float]  # s, from left to right and from top to bottom
-
-NEGLIGIBLE = 0.1  # px; an image that is displaced by less is left as it is
+from minislam.tracking.safeguards.image_motion import ImageMotion, Readout
 
 
 class RollingShutter(Stateful):
-    """The readouts, and how fast the image of each frame moves."""
+    """The readouts, found from the flow along all links and from the motion of the image."""
 
     readout: Readout = (0.0, 0.0)
     axis: int | None = None  # 0: x, 1: y; of the readout that the flow has told; None: of neither
-    velocities: list[Tensor]  # per frame u (2, N) px/s, by the frame before it
-    shortest_step: float = math.inf  # s between two frames: no readout is longer
-    _newest: Frame | None = None
+    motion: ImageMotion
 
     def __init__(self, grid: Grid, keyframes: KeyframeStore, links: FrameGraph, is_on: bool):
         self._grid, self._keyframes, self._links, self.is_on = grid, keyframes, links, is_on
-        self.velocities = []
+        self.motion = ImageMotion(grid)
 
     def see(self, frame: Frame) -> None:
         """Measure how the image has moved since the frame before. Frames come in their order."""
-        before, self._newest = self._newest, frame
-        del self.velocities[frame.frame_index :]
-        velocity = torch.zeros_like(self._grid.pixels.T)
-        if before is not None and before.frame_index == frame.frame_index - 1 and self.is_on:
-            seconds = frame.timestamp - before.timestamp
-            back = residual_flow(grayscale(frame.image), grayscale(before.image))
-            cells = back[:: self._grid.stride, :: self._grid.stride].reshape(-1, 2).T.copy()
-            velocity = torch.from_numpy(cells).to(velocity) / -seconds
-            self.shortest_step = min(self.shortest_step, seconds)
-        self.velocities.append(velocity)
-
-    def velocity(self, frame_index: int) -> Tensor:  # (2, N) px/s
-        """Return how fast the image of a frame moves: the mean of before and after it."""
-        around = self.velocities[max(frame_index, 1) : frame_index + 2]  # none before the first
-        return torch.stack(around).mean(0) if around else torch.zeros_like(self._grid.pixels.T)
+        if self.is_on:
+            self.motion.see(frame)
 
     def columns(
         self,
@@ -79,7 +60,7 @@ class RollingShutter(Stateful):
         camera, pixels = self._grid.camera, self._grid.pixels
         frames = [frame.frame_index for frame in self._keyframes.frames]
         frames += [] if next_frame is None else [next_frame]
-        u = {keyframe: self.velocity(frames[keyframe]) for edge in edges for keyframe in edge}
+        u = {end: self.motion.velocity(frames[end]) for edge in edges for end in edge}
         u_source = torch.stack([u[source] for source, _ in edges])
         u_target = torch.stack([u[target].mT for _, target in edges])
         u_target = self._grid.sample(u_target, positions.mT).mT
@@ -113,7 +94,7 @@ class RollingShutter(Stateful):
         if not any(seconds):
             return
         columns = self.columns(self._links.edges(), torch.stack(self._links.targets))
-        before, longest = self.readout, self.shortest_step
+        before, longest = self.readout, self.motion.shortest_step
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
         moved = displacements(columns, self.readout) - displacements(columns, before)
@@ -121,16 +102,10 @@ class RollingShutter(Stateful):
 
     def undone(self, frame: Frame) -> Frame:
         """Return a frame as a global shutter would have seen it."""
-        if not any(self.readout):
+        moved = self.motion.displacement(frame.frame_index, self.readout)
+        if moved is None:
             return frame
-        grid, shape = self._grid, frame.pixels.shape[:2]
-        late = grid.pixels.T / grid.pixels.new_tensor([shape[1:], shape[:1]]) - 0.5
-        moved = self.velocity(frame.frame_index) * (grid.pixels.new_tensor(self.readout) @ late)
-        if not moved.abs().max() > NEGLIGIBLE:
-            return frame
-        cells = (grid.pixels + moved.T).reshape(*grid.shape, 2).cpu().numpy()
-        dense = dense_from_grid(cells, (shape[0], shape[1]), grid.stride)
-        pixels = warp(frame.pixels.cpu().numpy(), dense, cv2.INTER_CUBIC)
+        pixels = warp(frame.pixels.cpu().numpy(), moved, cv2.INTER_CUBIC)
         return replace(frame, pixels=torch.from_numpy(pixels).to(frame.pixels))
 
 

@@ -2,18 +2,16 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from minislam.geometry import Camera, se3_exp
+from minislam.geometry import se3_exp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
 from minislam.tracking.frame_graph import FrameGraph
-from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reference import moved, predicted_positions
 from minislam.tracking.reprojection import reproject_with_jacobians
@@ -25,6 +23,7 @@ from minislam.tracking.safeguards.rolling_shutter import (
     with_readout,
 )
 from tests.helpers import generator
+from tests.tracking.safeguards.moving_cloth import GRID, RATE, WIDE, picture, texture
 from tests.tracking.scene import (
     CAMERA,
     CELLS,
@@ -40,9 +39,6 @@ from tests.tracking.scene import (
     uniform,
 )
 
-WIDE = Camera(fx=150.0, fy=150.0, cx=79.5, cy=59.5, width=160, height=120)
-GRID = Grid.of(WIDE, 8)
-RATE = 20.0  # frames per second
 READOUT = 0.03, 0.04  # s
 
 
@@ -53,52 +49,6 @@ def shutter_of(count: int, is_on: bool = True, links: FrameGraph | None = None) 
     shutter = RollingShutter(GRID, store, links, is_on)
     store.frames = [Frame(index, index / RATE, torch.zeros(120, 160, 3)) for index in range(count)]
     return shutter
-
-
-CLOTH = cv2.GaussianBlur(np.random.default_rng(1).random((120, 200)).astype(np.float32), None, 1.5)
-
-
-def texture(columns: np.ndarray | float) -> np.ndarray:  # (H, W, 3)
-    """Return a texture that has moved to the right by some pixels, a number or one for each row."""
-    row, column = np.mgrid[:120, :160].astype(np.float32)
-    moved = np.float32(column + 20 - columns)
-    grey = 0.5 + 2 * (cv2.remap(CLOTH, moved, row, cv2.INTER_CUBIC) - 0.5)
-    return np.repeat(grey[..., None], 3, 2)
-
-
-def picture(index: int, columns: np.ndarray | float) -> Frame:
-    pixels = np.round(255 * texture(columns)).astype(np.uint8)
-    return Frame(index, index / RATE, torch.from_numpy(pixels))
-
-
-# How fast the image moves
-
-
-def test_the_velocity_is_that_of_the_image_before_and_after():
-    shutter = shutter_of(0)
-    for index, columns in enumerate((0, 3, 8)):
-        shutter.see(picture(index, columns))
-    inside = (GRID.pixels > 24).all(1) & (GRID.pixels < torch.tensor([136, 96])).all(1)
-    for frame, wanted in ((0, 3), (1, 4), (2, 5)):
-        u = shutter.velocity(frame)[:, inside] / RATE
-        torch.testing.assert_close(u[0], torch.full_like(u[0], wanted), rtol=0, atol=0.3)
-        assert u[1].abs().max() < 0.3
-    assert shutter.shortest_step == pytest.approx(1 / RATE)
-
-
-def test_a_frame_without_a_neighbour_does_not_move():
-    shutter = shutter_of(0)
-    assert not shutter.velocity(0).any()
-    shutter.see(picture(0, 0))
-    shutter.see(picture(2, 9))  # frame 1 was passed over
-    assert not shutter.velocity(0).any()
-
-
-def test_a_start_that_is_repeated_forgets_what_it_saw():
-    shutter = shutter_of(0)
-    for index in (0, 1, 2, 1):
-        shutter.see(picture(index, 3 * index))
-    assert len(shutter.velocities) == 2
 
 
 # Flow as a global shutter would have seen it
@@ -133,7 +83,7 @@ def test_corrected_flow_is_that_of_a_global_shutter(readout: Readout):
         return ((seen(points, time + h) - seen(points, time - h)) / (2 * h)).float()
 
     shutter = shutter_of(2)
-    shutter.readout, shutter.velocity = readout, velocity
+    shutter.readout, shutter.motion.velocity = readout, velocity
     matches = FlowMatches(rolling[None].float(), torch.ones(1, 2, len(pixels)), torch.ones(1))
     corrected = shutter.corrected(matches, [(0, 1)]).targets[0]
     before, after = (rolling - true).abs().mean(), (corrected - true).abs().mean()
@@ -147,7 +97,7 @@ def test_without_a_readout_matches_stay_as_they_are():
 
 def test_an_image_that_is_no_keyframe_yet_counts_as_the_next_one():
     shutter = shutter_of(1)
-    shutter.velocities = [torch.full_like(GRID.pixels.T, float(index)) for index in range(6)]
+    shutter.motion.velocities = [torch.full_like(GRID.pixels.T, float(index)) for index in range(6)]
     at = GRID.pixels.T[None]
     expected = shutter.columns([(0, 1)], at, next_frame=4)
     shutter._keyframes.frames.append(Frame(4, 4 / RATE, torch.zeros(120, 160, 3)))
@@ -231,10 +181,10 @@ def test_readouts_that_are_not_free_stay():
 def linked(is_on: bool = True) -> tuple[RollingShutter, FrameGraph]:
     links = FrameGraph()
     shutter = shutter_of(2, is_on, links)
-    shutter.velocities = [
+    shutter.motion.velocities = [
         50 * torch.randn(2, len(GRID.pixels), generator=generator(seed)) for seed in range(3)
     ]
-    shutter.shortest_step = 1 / RATE
+    shutter.motion.shortest_step = 1 / RATE
     targets = GRID.pixels.T[None] + torch.ones(2, 1, 1)
     links.record([(0, 1), (1, 0)], FlowMatches(targets, torch.ones_like(targets), torch.ones(2)))
     return shutter, links
@@ -273,7 +223,7 @@ def test_where_it_is_off_nothing_is_estimated():
     assert shutter.readout == (0.0, 0.0)
     shutter.see(picture(0, 0))
     shutter.see(picture(1, 5))
-    assert not shutter.velocity(1).any()
+    assert len(shutter.motion.velocities) == 3  # those of before
 
 
 # Images
@@ -284,7 +234,7 @@ def test_an_image_is_undone():
     shutter.readout = (0.0, 0.04)
     u = torch.zeros_like(GRID.pixels.T)
     u[0] = speed
-    shutter.velocities = [u, u]
+    shutter.motion.velocities = [u, u]
     frame = picture(0, speed * (np.arange(120)[:, None] / 120 - 0.5) * 0.04)
     inner = np.s_[8:-8, 8:-8]
     images = [image.numpy()[inner] for image in (frame.image, shutter.undone(frame).image)]
@@ -294,4 +244,7 @@ def test_an_image_is_undone():
 
 def test_an_image_that_hardly_moved_is_left_alone():
     shutter, frame = shutter_of(0), picture(0, 0)
+    assert shutter.undone(frame) is frame
+    shutter.readout = (0.0, 0.001)
+    shutter.motion.velocities = [torch.full_like(GRID.pixels.T, 60.0)] * 2  # .03 px at most
     assert shutter.undone(frame) is frame
