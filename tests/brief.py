@@ -24,7 +24,6 @@ BUDGETS = {
     "mapping.init_iterations": 5,
     "mapping.keyframe_iterations": 2,
     "mapping.refine_iterations": 5,
-    "mapping.pose_refinement.iterations": 1,
 }
 BLANK = encode_png(np.zeros((2, 2, 3), np.uint8))
 _rendered: dict[tuple[Any, ...], SyntheticFrame] = {}

@@ -60,7 +60,8 @@ SHORT = {
     "mapping.refine_iterations": 3,
     "mapping.density.interval": 3,
     "mapping.density.max_gaussians": 10000,
-    "mapping.pose_refinement.iterations": 1,
+    "mapping.pose_refinement.enabled": True,
+    "mapping.pose_refinement.tolerance": 1e3,  # px: such a map would lead the poses anywhere
 }
 # Where tensors come back to the CPU while a run computes: OpenCV, scipy, lists of indices.
 ROOMS_BORDERS = {

@@ -30,7 +30,6 @@ SHORT = {
     "mapping.init_iterations": 30,
     "mapping.keyframe_iterations": 3,
     "mapping.refine_iterations": 60,
-    "mapping.pose_refinement.enabled": False,
 }
 
 

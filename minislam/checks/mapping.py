@@ -252,7 +252,7 @@ def check_followed_pose(student: Function) -> Verdict:
         equal, black = torch.ones_like(weight), torch.zeros(3)
         return refine_pose(gaussians, camera, pose, image, equal, black, settings)
 
-    settings = PoseRefinementConfig(iterations=30, tolerance=0.0, farthest=1e9, fraction=1.0)
+    settings = PoseRefinementConfig(iterations=30, tolerance=0.0)
     mistakes = [
         (lambda *a: a[2], "The pose has not moved: return exp(twist) times the first pose."),
         (lambda *a: se3_inverse(true_pose(*a)), "This is T_world_camera."),

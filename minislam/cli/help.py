@@ -49,7 +49,7 @@ settings: every constant is an option, like --tracking.window 8; minislam settin
   --tracking.lambda_disparity_prior .01  disparity prior in Eq. (5), else with learned flow only
   --tracking.prior_mask off              no mask M
   --tracking.final_prior on              disparity prior also in the final adjustment
-  --mapping.pose_refinement.enabled off  no photometric refinement of the other frames
+  --mapping.pose_refinement.enabled on   poses between keyframes refined by re-rendering
   --mapping.keyframe_stride 5            map optimised every 5 keyframes (fast mode)
 """
 

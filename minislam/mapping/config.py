@@ -37,23 +37,12 @@ class DensityConfig:
 class PoseRefinementConfig:
     """How the poses between the keyframes are refined by re-rendering, at full image size."""
 
-    enabled: bool = parameter(True, "off: those poses come from flow alone (paper's fast mode)")
+    enabled: bool = parameter(False, "off: those poses come from flow alone (paper's fast mode)")
     iterations: int = parameter(
-        5, "most steps per frame; official 100 of Adam, ours divide by the curvature"
+        10, "most steps per frame; official 100 of Adam, ours divide by the curvature"
     )
     tolerance: float = parameter(
-        0.05, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
-    )
-    farthest: float = parameter(
-        1.0,
-        "reject a pose that moves the picture by more, because matched flow is more accurate "
-        "than that [px of a 320x240 image]",
-    )
-    fraction: float = parameter(
-        0.75,
-        "fraction of the way from the pose by flow to the pose by re-rendering [0, 1]; official 1."
-        " Both are measurements with errors of their own, so a mean is kept",
-        most=1,
+        0.01, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
     )
 
 
@@ -186,6 +175,5 @@ def paper_mapping() -> MappingConfig:
         refine_rate_end=1.0,
         insertion=InsertionConfig(cell=4, footprint=0.22, opacity=0.5),
         density=DensityConfig(max_gaussians=1_000_000),
-        # A few of our steps do as much as the official 100 of Adam; ten are for hard frames.
-        pose_refinement=PoseRefinementConfig(iterations=10, tolerance=0.01, fraction=1.0),
+        pose_refinement=PoseRefinementConfig(enabled=True),
     )

@@ -10,8 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from minislam.geometry import Camera, se3_exp, se3_inverse, se3_log
-from minislam.geometry.camera import pixel_scale
+from minislam.geometry import Camera, se3_exp
 from minislam.mapping.config import PoseRefinementConfig
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.uncertainty.losses import SURFACE_OPACITY
@@ -25,47 +24,25 @@ ROUNDING = 0.01  # colour difference below which |r| is rounded off to a parabol
 def refine_pose(
     gaussians: GaussianMap,  # constant
     camera: Camera,
-    T_camera_world: Tensor,  # (4, 4) float64, to start from
+    start: Tensor,  # T_camera_world (4, 4)
     image: Tensor,  # (H, W, 3) RGB in [0, 1], what the camera saw
     weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
     background: Tensor,  # (3,) RGB
     config: PoseRefinementConfig,
 ) -> Tensor:  # (4, 4) float64
-    """Move a pose a fraction of the way to the one of least rendering error.
-
-    Only a fraction, because the pose from flow is a measurement too.
-    """
-    start = T_camera_world.double()
-    best = _optimise_pose(gaussians, camera, start, image, weight, background, config)
-    return se3_exp(config.fraction * se3_log(best @ se3_inverse(start))) @ start
-
-
-def _optimise_pose(
-    gaussians: GaussianMap,
-    camera: Camera,
-    start: Tensor,  # (4, 4) float64
-    image: Tensor,  # (H, W, 3)
-    weight: Tensor,  # (H, W)
-    background: Tensor,  # (3,)
-    config: PoseRefinementConfig,
-) -> Tensor:  # (4, 4) float64
     """Return the pose near the start from which the rendering error is smallest.
 
-    A pose that moves the picture by more than `config.farthest` is rejected, and the start is
-    returned. A step that does not lower the loss is undone and repeated with more damping, so the
-    loss of the result is never larger than that of the start.
+    A step that does not lower the loss is undone and repeated with more damping, so the loss of
+    the result is never larger than that of the start.
     """
-    pose = candidate = start
+    pose = candidate = start.double()
     lowest, damping = math.inf, _FIRST_DAMPING
-    farthest = config.farthest * pixel_scale(camera)
     for steps_done in range(config.iterations + 1):
         twist = torch.zeros(6, dtype=gaussians.means.dtype, device=image.device, requires_grad=True)
         rendering = render(gaussians, camera, candidate, background, twist=twist)
         loss = rerendering_loss(rendering, image, weight)
         improved = float(loss.detach()) < lowest
         if improved:
-            if _motion(se3_log(candidate @ se3_inverse(start)), rendering, camera) > farthest:
-                return start  # Flow is more accurate than that: the map must be wrong, or blurred.
             pose, lowest, damping = candidate, float(loss.detach()), _LESS_DAMPING * damping
         if steps_done == config.iterations or not math.isfinite(lowest):
             break

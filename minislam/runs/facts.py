@@ -64,10 +64,17 @@ def run_facts(
         | (asdict(slam.focal_length) if slam.focal_length else {})
         | ({"is_doubtful": slam.focal_length.is_doubtful} if slam.focal_length else {}),
         "readout_seconds": list(slam.tracker.graph.shutter.readout),
+        "frame_seconds": _frame_seconds(slam),
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
         "segments": slam.tracker.watch.segments,
         "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],
     }
+
+
+def _frame_seconds(slam: Slam) -> float | None:
+    """Return the median time between two frames; numbered images are a second apart."""
+    stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
+    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else None
 
 
 def unit_of(slam: Slam) -> str:
@@ -213,10 +220,18 @@ def _focal_length_warnings(slam: Slam) -> Iterator[str]:
         return
     # The flow of a broken run fits whatever focal length.
     is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.adjustments.failed
-    if fit is not None and fit.is_doubtful and not is_broken:
+    if fit is None or not fit.is_doubtful or is_broken:
+        return
+    better = f"fits {fit.factor:.2f} times the present focal length better, with {fit.saved:.0%}"
+    if fit.half:
         yield (
-            f"the flow fits {fit.factor:.2f} times the present focal length better, with "
-            f"{fit.saved:.0%} less cost: check the calibration, or give {fit.factor:.2f} times the "
-            "present --fx and --fy. If the lens zoomed while it filmed, no focal length is right, "
-            "and the trajectory is bent"
+            f"from frame {fit.half[0]} to {fit.half[1]} the flow {better} less cost: if the lens "
+            "zoomed while it filmed, no focal length is right, and the trajectory is bent; run "
+            "each part for itself"
+        )
+    else:
+        yield (
+            f"the flow {better} less cost: check the calibration, or give {fit.factor:.2f} times "
+            "the present --fx and --fy. If the lens zoomed while it filmed, no focal length is "
+            "right, and the trajectory is bent"
         )

@@ -73,12 +73,16 @@ def _spent(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[Lin
     is_whole = not facts["breaks"] and not facts["lost_frames"]  # else it fits any focal length
     if focal.get("factor") is not None and is_whole:
         verdict = "poor" if focal["is_doubtful"] else "good"
-        origin += f"; the flow fits {focal['factor']:.2f} times this one best"
+        where = "from frame {} to {} ".format(*focal["half"]) if focal.get("half") else ""
+        origin += f"; {where}the flow fits {focal['factor']:.2f} times this one best"
     yield Line("focal length", length.partition(" for ")[0], verdict, detail=origin)
     across, down = facts["readout_seconds"]
     if across or down:
-        way = "read from left to right" if across else "read from top to bottom"
-        yield Line("rolling shutter", f"{1000 * (across or down):.0f} ms", detail=way)
+        ends = ("left", "right") if across else ("top", "bottom")
+        first, last = ends if across + down > 0 else ends[::-1]
+        part = abs(across + down) / facts["frame_seconds"]  # stamps may count frames, not seconds
+        detail = f"of a frame's time, {first} to {last}"
+        yield Line("rolling shutter", f"{part:.0%}", detail=detail)
     seconds = dict(facts["seconds"])
     total = seconds.pop("total")
     stages = sorted(seconds.items(), key=lambda stage: -stage[1])

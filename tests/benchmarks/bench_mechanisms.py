@@ -10,9 +10,8 @@ halves that. Differences below 0.01 cm in ATE and 0.1 dB in PSNR are noise.
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
-from math import inf
 from unittest import mock
 
 import numpy as np
@@ -37,12 +36,6 @@ from tests.benchmarks.incidents import COVERED, covered_clip
 SEQUENCES = ("ball:71", "crowd:71", "table2:71")
 Rows = Iterator[tuple[str, dict[str, float]]]  # heading of the row, and its figures by name
 FAR_BACK = 10  # frame shown after the black ones when the camera is at an earlier place
-REFINEMENTS = {
-    "off": None,
-    "the whole step": {"fraction": 1.0},
-    "3/4 of the step": {},
-    "3/4, no limit": {"farthest": inf},
-}
 MANY_GAUSSIANS = 200_000  # a limit that densification does not reach here
 
 
@@ -82,18 +75,12 @@ def followed_frames(sequence: Sequence, config: TrackingConfig) -> dict[str, flo
 
 
 def pose_refinement(clip: Source, config: SlamConfig) -> Rows:
-    """Refine the poses between the keyframes of one run in several ways."""
+    """Leave the poses between the keyframes of one run as they are, and refine them."""
     slam = finished(clip, config)
-    start, own = slam.trajectory(), slam.mapper.config
-    for heading, changes in REFINEMENTS.items():
-        trajectory = start
-        if changes is not None:
-            settings = replace(own.pose_refinement, **changes)
-            slam.mapper.config = replace(own, pose_refinement=settings)
-            trajectory = refined(slam, start)
+    start = slam.trajectory()
+    for heading, trajectory in {"off": start, "on": refined(slam, start)}.items():
         found = measured(slam, trajectory, views=[])
         yield heading, chosen(found, "ate_all_cm", "psnr_novel_db", "psnr_novel_oriented_db")
-    slam.mapper.config = own
 
 
 def refined(slam: Slam, start: Trajectory) -> Trajectory:
@@ -142,9 +129,8 @@ SIMULATED = PriorChoice(depth="simulated")
 
 @cache
 def finished(clip: Source, config: SlamConfig) -> Slam:
-    """Return the system after a whole run, but for the refinement of poses between keyframes."""
+    """Return the system after a whole run."""
     sequence = clip.sequence()
-    config = with_settings(config, {"mapping.pose_refinement.enabled": False})
     slam = Slam(sequence, config, choose_priors(SIMULATED, sequence, config))
     slam.run()
     return slam

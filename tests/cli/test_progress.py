@@ -117,4 +117,4 @@ def test_every_run_has_a_plan(name: str, has_prior: bool):
     shown = [part for stage in plan for part in stage if part]
     assert shown[0] == "tracking and mapping" and "dense depth" in shown
     assert min(seconds for stage in plan for seconds in stage.values()) >= 0
-    assert shown.count("first map") == 1 + has_prior and len(plan) == 7 - (name == "paper-fast")
+    assert shown.count("first map") == 1 + has_prior and len(plan) == 6 + (name == "paper")

@@ -13,6 +13,7 @@ from minislam.records import AdjustmentCount
 from minislam.runs import facts
 from minislam.splatting import Rendering
 from minislam.tracking.safeguards.diagnostics import Break
+from minislam.tracking.safeguards.focal_length import FocalLengthFit
 
 
 def slam(**parts: object) -> SimpleNamespace:
@@ -48,13 +49,15 @@ def slam(**parts: object) -> SimpleNamespace:
 
 
 CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
-DOUBTFUL = SimpleNamespace(is_doubtful=True, factor=1.1, saved=0.25)
+DOUBTFUL = FocalLengthFit(272.0, 1.1, 0.25)
+ZOOMED = FocalLengthFit(272.0, 1.4, 0.52, half=(8, 15))
 WARNINGS = [
     ({"lost": 1}, "1 of 4 frames could not be tracked"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
     ({"breaks": [Break(2, 2)]}, "each piece (frames 0 to 1, 3 to 3) stands for itself"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
+    ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
     ({"seeks_focal": True}, "the motion does not tell it"),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
     ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),

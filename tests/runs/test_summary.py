@@ -13,6 +13,7 @@ FACTS = {
     "unit": "m",
     "focal_length": {"used": "272.0 px for 320x240 images, as given"},
     "readout_seconds": [0.0, 0.0261],
+    "frame_seconds": 0.033,
     "seconds": {"total": 94.4, "tracking": 8.2, "mapping": 20.0, "final adjustment": 0.1},
 }
 
@@ -36,9 +37,10 @@ def test_numbers_have_units_words_and_verdicts():
     assert found["path of the camera"] == ("2.77 m", "", "")
     assert found["reprojection error, median"] == ("0.10 px", "good", "")
     assert found["map against input, static pixels"] == ("17.0 dB", "poor", "")
-    assert found["rolling shutter"] == ("26 ms", "", "read from top to bottom")
-    across = lines(readout_seconds=[0.02, 0.0])["rolling shutter"]
-    assert across == ("20 ms", "", "read from left to right")
+    between = "of a frame's time,"
+    assert found["rolling shutter"] == ("79%", "", f"{between} top to bottom")
+    across = lines(readout_seconds=[-0.02, 0.0], frame_seconds=0.04)["rolling shutter"]
+    assert across == ("50%", "", f"{between} right to left")
     assert "rolling shutter" not in lines(readout_seconds=[0.0, 0.0])
     assert found["time"] == ("94 s", "", "mapping 20 s, tracking 8 s")
     assert lines({"path_length": 1.0}, unit="world units")["path of the camera"][0] == (
@@ -58,6 +60,8 @@ def test_the_check_of_the_focal_length_is_said(doubtful: bool, verdict: str):
     whole = {"focal_length": checked, "lost_frames": 0, "breaks": []}
     found = lines(**whole)["focal length"]
     assert found == ("272.0 px", verdict, "as given; the flow fits 1.10 times this one best")
+    whole["focal_length"] = checked | {"half": [30, 59]}
+    assert "; from frame 30 to 59 the flow fits" in lines(**whole)["focal length"][2]
     for broken in ({"breaks": [{"first_frame": 4, "last_frame": 9}]}, {"lost_frames": 2}):
         assert lines(**whole | broken)["focal length"] == ("272.0 px", "", "as given")
 

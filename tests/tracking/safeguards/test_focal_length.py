@@ -13,6 +13,7 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import warm_up_ba
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.safeguards import focal_length
+from minislam.tracking.safeguards.focal_column import zoomed
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
     check_focal_length,
@@ -21,7 +22,7 @@ from minislam.tracking.safeguards.focal_length import (
 )
 from minislam.workers import Workers
 from tests.tracking.scene import CAMERA, RAYS, known_problem, noisy, normal, poses_on_an_arc
-from tests.tracking.wall import true_graph
+from tests.tracking.wall import disparities_at, true_graph
 
 NOISE = 0.1  # px
 FOUND = 0.005  # relative
@@ -139,16 +140,57 @@ def test_a_check_adjusts_the_first_keyframes_alone(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("keyframes", [99, 100, 101, 130])
 def test_a_check_costs_no_more_above_a_hundred_keyframes(monkeypatch, keyframes: int):
-    asked = []
-    monkeypatch.setattr(focal_length, "fit_focal_length", lambda *parts: asked.append(parts) or [0])
+    asked, fits = [], FocalLengthFit(272.0, 1.0, 0.0)
+    monkeypatch.setattr(
+        focal_length, "fit_focal_length", lambda *parts: asked.append(parts) or [fits]
+    )
     graph = true_graph([number % 12 for number in range(keyframes)])
     graph.match(neighbourhood_edges(1, keyframes, 1))
     check_focal_length(graph)
-    ((problem, state, _),) = asked
-    used = min(keyframes, 100)
-    assert len(state.T_camera_world) == len(state.disparities) == len(problem.free_poses) == used
-    assert len(problem.edges_source) == len(problem.targets) == 2 * (used - 1)
-    assert int(torch.maximum(problem.edges_source, problem.edges_target).max()) == used - 1
+    parts = min(keyframes, 100), keyframes // 2, keyframes - keyframes // 2
+    for (problem, state, _), used in zip(asked, parts, strict=True):
+        assert len(state.T_camera_world) == len(state.disparities) == used
+        assert len(problem.edges_source) == len(problem.targets) == 2 * (used - 1)
+        assert problem.free_poses.tolist() == [False] + [True] * (used - 1)
+
+
+def zoomed_graph(zooms: list[float]) -> KeyframeGraph:
+    """Return a graph of a lens whose focal length is another one in each part of the keyframes."""
+    graph = true_graph([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11])
+    size = len(graph.keyframes) // len(zooms)
+    edges = neighbourhood_edges(0, len(graph.keyframes), 3)
+    graph.match([(i, j) for i, j in edges if i // size == j // size])
+    poses = graph.keyframes.T_camera_world
+    for position, (source, target) in enumerate(graph.links.edges()):
+        camera, rays = zoomed(CAMERA, RAYS, math.log(zooms[source // size]))
+        disparities = disparities_at(poses[source], rays)[None]
+        transforms = relative_transforms(poses, [source], [target])
+        seen, _ = reproject(transforms, disparities, rays, camera)
+        graph.links.targets[position] = seen[0].float()
+    return graph
+
+
+def test_a_zoom_about_the_present_focal_length_is_seen_in_the_halves():
+    found = check_focal_length(zoomed_graph([0.85, 1.18]))
+    assert found.is_doubtful and found.half == (0, 5)
+    assert found.factor == pytest.approx(0.85, rel=FOUND)
+
+
+def test_a_found_focal_length_is_checked_in_the_halves_alone():
+    graph = zoomed_graph([1.0, 1.3])
+    graph.seeks_focal = True
+    assert check_focal_length(graph).half == (6, 11)
+    graph = true_graph([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11])
+    graph.match(neighbourhood_edges(0, 12, 3))
+    assert check_focal_length(graph).half is None
+    graph.seeks_focal = True
+    assert check_focal_length(graph) is None
+
+
+def test_a_half_without_links_tells_nothing():
+    graph = true_graph([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11])
+    graph.match(neighbourhood_edges(0, 6, 3))
+    assert check_focal_length(graph).half is None
 
 
 @pytest.mark.parametrize(
@@ -157,3 +199,4 @@ def test_a_check_costs_no_more_above_a_hundred_keyframes(monkeypatch, keyframes:
 )
 def test_only_a_clear_difference_is_worth_saying(factor: float, saved: float, is_doubtful: bool):
     assert FocalLengthFit(272.0, factor, saved).is_doubtful == is_doubtful
+    assert not FocalLengthFit(272.0, factor, min(saved, 0.09), half=(0, 9)).is_doubtful
