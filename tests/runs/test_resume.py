@@ -24,7 +24,7 @@ FRAMES = 13
 INPUT = ["--stride", "3", "--max-frames", str(FRAMES), "--size", "96x72"]
 SETTINGS = [
     "--preset", "test", "--mapping.init_iterations", "8", "--mapping.keyframe_iterations", "2",
-    "--mapping.refine_iterations", "8",
+    "--mapping.refine_iterations", "8", "--mapping.pose_refinement.enabled", "on",
 ]  # fmt: skip
 SAME = ("trajectory.txt", "keyframe_trajectory.txt", "lost_frames.txt", "map.ply", "config.json")
 OF_TIME = ("seconds_total", "frames_per_second", "peak_memory_mb")  # all that may differ
