@@ -5,6 +5,7 @@ student copy differs from the notebook in nothing else, and nothing else depends
 """
 
 import ast
+import base64
 import json
 import re
 from pathlib import Path
@@ -26,6 +27,9 @@ LONGEST_SETUP = 900  # characters of imports, of a scene ("# Setup: ...") or of 
 LONGEST_BUILDING = 2_000  # characters of an exercise that builds a part of the system
 LONGEST_LINE = 100  # characters
 LONGEST_TEXT = 180  # words, formulas and tables not counted
+NARROWEST = 900  # pixels of a picture, so that it can be projected
+LARGEST_PAGE = 400_000  # characters of a flipbook
+FEWEST_REFERENCES = 3
 WARM_UP = 2  # points
 MACHINE_PATH = re.compile(r"(?<![\w.])(/home/|/Users/|/root/|/tmp/|[A-Z]:\\\\)")
 
@@ -130,6 +134,33 @@ def test_it_opens_like_a_lesson(path: Path):
     first = source(load(path)["cells"][0])
     assert re.match(r"# \d\db? ", first), "the title starts with the notebook's number"
     assert all(words in first for words in ("You will learn", "You need", "Time"))
+
+
+@each_notebook
+def test_its_pictures_can_be_projected_and_load_nothing(path: Path):
+    for number, cell in enumerate(load(path)["cells"]):
+        for data in (output["data"] for output in cell.get("outputs", []) if "data" in output):
+            if "image/png" in data:
+                header = base64.b64decode("".join(data["image/png"])[:64])
+                width = int.from_bytes(header[16:20], "big")
+                assert width >= NARROWEST, f"cell {number}: {width} px"
+            page = "".join(data.get("text/html", ""))
+            assert len(page) < LARGEST_PAGE and "http" not in page, f"cell {number}"
+
+
+@each_notebook
+def test_a_map_in_colours_has_a_colour_bar(path: Path):
+    for cell in code_cells(path):
+        if "beta_to_rgb(" in source(cell):
+            assert "viz.colour_bar(" in source(cell), source(cell)
+
+
+@each_notebook
+def test_it_names_what_to_read_next(path: Path):
+    text = "\n".join(map(source, load(path)["cells"]))
+    references = text.partition("**Read more.**")[2]
+    links = re.findall(r"\]\((https?://[^)\s]+)\)", references)
+    assert len(set(links)) >= FEWEST_REFERENCES, links
 
 
 @each_notebook
