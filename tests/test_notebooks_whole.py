@@ -156,6 +156,20 @@ def test_a_map_in_colours_has_a_colour_bar(path: Path):
 
 
 @each_notebook
+def test_a_symbol_stands_for_one_thing_and_is_used(path: Path):
+    text = "\n".join(source(c) for c in load(path)["cells"] if c["cell_type"] == "markdown")
+    if "$$" not in text:
+        pytest.skip("this notebook has no displayed formula")
+    match = re.search(r"\*\*Symbols\.\*\* (.+?)(?=\n\n|\Z)", text, re.S)
+    assert match, 'expected a paragraph "**Symbols.**"'
+    named = re.findall(r"\$([^$]+)\$ ", match[1].replace("\n", " "))
+    symbols = [name.strip() for group in named for name in group.strip("()").split(",")]
+    assert sorted(set(symbols)) == sorted(symbols) and len(symbols) > 3
+    rest = text.replace(match[0], "")
+    assert [name for name in symbols if name not in rest] == []
+
+
+@each_notebook
 def test_it_names_what_to_read_next(path: Path):
     text = "\n".join(map(source, load(path)["cells"]))
     references = text.partition("**Read more.**")[2]

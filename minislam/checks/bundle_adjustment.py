@@ -161,27 +161,27 @@ def check_bundle_adjustment(student: Function) -> Verdict:
 
 
 def check_robust_weight(student: Function) -> Verdict:
-    """Check (residuals (N, 2) [px], scale c [px], power p) -> the weight of each cell (N,)."""
+    """Check (residuals (N, 2) [px], scale c [px], power k) -> the weight of each cell (N,)."""
 
-    def squared(r2: Tensor, c: float, p: float) -> Tensor:
-        return RobustKernel(c, p).weight(r2)
+    def squared(r2: Tensor, c: float, k: float) -> Tensor:
+        return RobustKernel(c, k).weight(r2)
 
-    def reference(r: Tensor, c: float, p: float) -> Tensor:
-        return squared(r.square().sum(-1), c, p)
+    def reference(r: Tensor, c: float, k: float) -> Tensor:
+        return squared(r.square().sum(-1), c, k)
 
     cases = [
-        Case((doubles([0, 0], [0.3, 0.4], [3, -4]), 2.0, 1.0), "c = 2 px and p = 1"),
-        Case((2 * normals(1, 6, 2), 1.5, 2.0), "c = 1.5 px and p = 2"),
-        *drawn(lambda seed: Case((normals(seed, 5, 2), 0.5, 1.5), "c = 0.5 px and p = 1.5")),
+        Case((doubles([0, 0], [0.3, 0.4], [3, -4]), 2.0, 1.0), "c = 2 px and k = 1"),
+        Case((2 * normals(1, 6, 2), 1.5, 2.0), "c = 1.5 px and k = 2"),
+        *drawn(lambda seed: Case((normals(seed, 5, 2), 0.5, 1.5), "c = 0.5 px and k = 1.5")),
     ]
     hints = [
-        (lambda r, c, p: reference(r, c, 1.0), "The power p is an argument."),
-        (lambda r, c, p: reference(r, 1.0, p), "The residual is divided by c."),
-        (lambda r, c, p: reference(r, c**0.5, p), "c is squared, like the residual."),
-        (lambda r, c, p: 1 / reference(r, c, p), "The power is -p: large residuals count little."),
-        (lambda r, c, p: r.norm(dim=1) * reference(r, c, p), "This is the pull, w r."),
-        (lambda r, c, p: squared(r**2, c, p), "A cell has one weight: sum over u, v."),
-        (lambda r, c, p: squared(r.norm(dim=1), c, p), "r is squared, like c."),
+        (lambda r, c, k: reference(r, c, 1.0), "The power k is an argument."),
+        (lambda r, c, k: reference(r, 1.0, k), "The residual is divided by c."),
+        (lambda r, c, k: reference(r, c**0.5, k), "c is squared, like the residual."),
+        (lambda r, c, k: 1 / reference(r, c, k), "The power is -k: large residuals count little."),
+        (lambda r, c, k: r.norm(dim=1) * reference(r, c, k), "This is the pull, w r."),
+        (lambda r, c, k: squared(r**2, c, k), "A cell has one weight: sum over u, v."),
+        (lambda r, c, k: squared(r.norm(dim=1), c, k), "r is squared, like c."),
     ]
     return check_function(student, reference, cases, 1e-9, hints)
 

@@ -178,24 +178,24 @@ def check_keyframes(student: Function) -> Verdict:
 
 
 def check_bounded_loss(student: Function) -> Verdict:
-    """Check (lengths r of residuals (N,) [px], scale c [px], p = 1 or 2) -> L_p (N,) [px^2]."""
+    """Check (lengths r of residuals (N,) [px], scale c [px], k = 1 or 2) -> L_k (N,) [px^2]."""
 
-    def reference(r: Tensor, c: float, p: int) -> Tensor:
-        return RobustKernel(c, p).loss(r**2)
+    def reference(r: Tensor, c: float, k: int) -> Tensor:
+        return RobustKernel(c, k).loss(r**2)
 
     cases = [
-        Case((doubles(0, 0.5, 3, 40), 2.0, 1), "p = 1 and c = 2 px"),
-        Case((doubles(0, 0.5, 3, 40), 2.0, 2), "p = 2 and c = 2 px"),
+        Case((doubles(0, 0.5, 3, 40), 2.0, 1), "k = 1 and c = 2 px"),
+        Case((doubles(0, 0.5, 3, 40), 2.0, 2), "k = 2 and c = 2 px"),
         *drawn(lambda seed: Case((normals(seed, 5).abs(), 0.5, 1 + seed % 2), "c = 0.5 px")),
     ]
     hints = [
-        (lambda r, c, p: reference(r, c, 1), "With p = 2 the loss is bounded: L_2."),
-        (lambda r, c, p: reference(r, c, 2), "With p = 1 the loss is a logarithm: L_1."),
-        (lambda r, c, p: reference(r, c, p) / c**2, "The factor c^2 in front is missing."),
-        (lambda r, c, p: r**2, "This is least squares: not yet robust."),
-        (lambda r, c, p: RobustKernel(c, p).weight(r**2), "This is the weight, the loss's slope."),
-        (lambda r, c, p: RobustKernel(c, p).loss(r * c), "r / c is squared."),
-        (lambda r, c, p: reference(r, c, p) / 2, "This is half of the loss."),
+        (lambda r, c, k: reference(r, c, 1), "With k = 2 the loss is bounded: L_2."),
+        (lambda r, c, k: reference(r, c, 2), "With k = 1 the loss is a logarithm: L_1."),
+        (lambda r, c, k: reference(r, c, k) / c**2, "The factor c^2 in front is missing."),
+        (lambda r, c, k: r**2, "This is least squares: not yet robust."),
+        (lambda r, c, k: RobustKernel(c, k).weight(r**2), "This is the weight, the loss's slope."),
+        (lambda r, c, k: RobustKernel(c, k).loss(r * c), "r / c is squared."),
+        (lambda r, c, k: reference(r, c, k) / 2, "This is half of the loss."),
     ]
     return check_function(student, reference, cases, 1e-9, hints)
 

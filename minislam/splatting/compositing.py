@@ -178,11 +178,11 @@ def composite_vjp(
 ) -> tuple[Tensor, Tensor]:  # (6, K * B), (K, B, 4)
     """Pull gradients of a group's pixels back to coefficients and channels. Eq. (2).
 
-    From back to front, let R_k be v_out . (what slot k and all slots behind it would show if
+    From back to front, let A_k be v_out . (what slot k and all slots behind it would show if
     nothing stood in front of slot k):
 
-        R_K = f_background . v_out + v_T_K,
-        R_k = R_{k+1} + g_k,   g_k = alpha_k (f_k . v_out - R_{k+1}),
+        A_K = f_background . v_out + v_T_K,
+        A_k = A_{k+1} + g_k,   g_k = alpha_k (f_k . v_out - A_{k+1}),
         dL/d ln alpha_k = T_k g_k,
         dL/df_k = sum over pixels of (T_k - T_{k+1}) v_out.
 
@@ -192,8 +192,8 @@ def composite_vjp(
     v_coefficients = torch.empty_like(coefficients)
     v_out_t = v_out.transpose(1, 2).contiguous()
     T_v_sums = channels.new_empty(slots + 1, tiles, 4)  # T_k v_out summed over a tile's pixels
-    R = (background[:, None] * v_out).sum(1).add_(v_transmittance)
-    gain = torch.empty_like(R)  # f_k . v_out - R_{k+1}: slot k instead of what it hides
+    A = (background[:, None] * v_out).sum(1).add_(v_transmittance)
+    gain = torch.empty_like(A)  # f_k . v_out - A_{k+1}: slot k instead of what it hides
 
     for chunk in reversed(range(len(checkpoints))):
         first, last = chunk * CHUNK, min((chunk + 1) * CHUNK, slots)
@@ -209,8 +209,8 @@ def composite_vjp(
         # f_k . v_out, in memory tile by tile because bmm fills no other order.
         torch.bmm(channels[first:last].transpose(0, 1), v_out, out=v_weights.all.transpose(0, 1))
         for v_weight, alpha in zip(v_weights.slots[::-1], alphas.slots[::-1], strict=True):
-            torch.sub(v_weight, R, out=gain)
-            R.add_(alpha.mul_(gain))  # alpha_k is not needed again: g_k takes its place
+            torch.sub(v_weight, A, out=gain)
+            A.add_(alpha.mul_(gain))  # alpha_k is not needed again: g_k takes its place
         v_log_alphas = alphas.all.mul_(T.all[:-1]).view(-1, PIXELS)
         torch.mm(workspace.monomials, v_log_alphas.T, out=v_coefficients[:, span])
     return v_coefficients, T_v_sums[:-1] - T_v_sums[1:]

@@ -66,7 +66,7 @@ class TrackingConfig:
         "c: width of the robust weight inside Sigma, also in smaller images [px]; 0: least squares",
     )
     robust_power: float = parameter(
-        2.0, "p of that weight (1 + r^2/c^2)^-p; 1: Cauchy, 2: Geman-McClure [-]"
+        2.0, "k of that weight (1 + r^2/c^2)^-k; 1: Cauchy, 2: Geman-McClure [-]"
     )
     motion_memory: float = parameter(
         3.0,

@@ -1,9 +1,9 @@
 """The robust weight inside Sigma of Eq. (5), for a flow without a learned confidence.
 
-    weight(r) = (1 + r^2 / c^2)^-p
+    weight(r) = (1 + r^2 / c^2)^-k
 
-is the derivative of a loss by r^2. With p = 1 it is Cauchy's loss, which grows like log r, so
-that even far outliers pull. With p = 2 it is that of Geman and McClure, bounded by c^2: beyond a
+is the derivative of a loss by r^2. With k = 1 it is Cauchy's loss, which grows like log r, so
+that even far outliers pull. With k = 2 it is that of Geman and McClure, bounded by c^2: beyond a
 few c only the number of outlier cells counts, not how far a dynamic object has moved.
 """
 
@@ -18,7 +18,7 @@ class RobustKernel:
     """A robust loss of squared residuals."""
 
     scale: float  # c, px
-    power: float = 2.0  # p >= 1
+    power: float = 2.0  # k >= 1
 
     def weight(self, squared: Tensor) -> Tensor:
         """Return d loss / d r^2, in (0, 1], of squared residuals [px^2]."""
