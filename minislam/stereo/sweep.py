@@ -61,22 +61,19 @@ def sweep(
     something may have moved there.
     """
     T_world_this = np.linalg.inv(reference.T_camera_world)
-    homographies = [
-        plane_homographies(camera, other.T_camera_world @ T_world_this, inverse_depths)
-        for other in others
-    ]
+    motions = [other.T_camera_world @ T_world_this for other in others]
+    homographies = np.stack([plane_homographies(camera, T, inverse_depths) for T in motions], 1)
     gray = reference.gray
     mean, variance = _moments(gray[None])
     spread = np.sqrt(variance + NCC_VARIANCE)
-    cost = np.empty((*gray.shape, len(inverse_depths)), np.float32)
-    for plane in range(len(inverse_depths)):
-        warped = np.stack(
-            [warp(other.gray, H[plane]) for other, H in zip(others, homographies, strict=True)]
-        )
+    cost = np.empty((len(inverse_depths), *gray.shape), np.float32)
+    for plane, of_views in enumerate(homographies):
+        views = zip(others, of_views, strict=True)
+        warped = np.stack([warp(other.gray, H) for other, H in views])
         seen = warped >= 0
         costs = _dissimilarity(gray, mean, spread, np.where(seen, warped, gray))
-        cost[..., plane] = _mean_of_better_half(costs, seen)
-    return cost
+        cost[plane] = _mean_of_better_half(costs, seen)
+    return np.ascontiguousarray(cost.transpose(1, 2, 0))
 
 
 def warp(gray: np.ndarray, H: np.ndarray) -> np.ndarray:  # (h, w)
@@ -117,10 +114,13 @@ def _dissimilarity(
 
 def _mean_of_better_half(costs: np.ndarray, seen: np.ndarray) -> np.ndarray:  # (h, w)
     """Return the mean of the lower half of the costs (V, h, w) of the views that see a pixel."""
-    views = len(costs)
-    number = seen.sum(0)
+    number = seen.sum(0, dtype=np.uint8)
     half = np.maximum((number + 1) // 2, 1)
-    ordered = np.sort(np.where(seen, costs, 2), 0)
-    rank = np.arange(views)[:, None, None]
-    mean = np.where(rank < half, ordered, 0).sum(0) / half
-    return np.where(number >= max(1, MIN_SEEN * views), mean, UNSEEN_COST)
+    ordered = np.where(seen, costs, np.float32(2))
+    total = np.zeros_like(ordered[0])
+    for rank in range((len(costs) + 1) // 2):
+        for first in range(len(costs) - 1, rank, -1):  # the lowest of the rest sinks to its rank
+            low, high = ordered[first - 1], ordered[first]
+            low[:], high[:] = np.minimum(low, high), np.maximum(low, high)
+        total += ordered[rank] * (rank < half)
+    return np.where(number >= max(1, MIN_SEEN * len(costs)), total / half, UNSEEN_COST)
