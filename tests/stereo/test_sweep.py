@@ -91,3 +91,16 @@ def test_the_worse_half_of_the_views_has_no_say():
     np.testing.assert_allclose(_mean_of_better_half(costs, unseen), 0.5, rtol=1e-6)
     unseen[1:4] = False
     np.testing.assert_allclose(_mean_of_better_half(costs, unseen), UNSEEN_COST)  # one of five
+
+
+@pytest.mark.parametrize("views", range(1, 9))
+def test_the_better_half_is_that_of_a_sort(views: int):
+    source = np.random.default_rng(views)
+    costs = source.random((views, 5, 7), np.float32)
+    seen = source.random(costs.shape) < 0.8
+    mean = _mean_of_better_half(costs, seen)
+    for row, column in np.ndindex(5, 7):
+        of_pixel = np.sort(costs[:, row, column][seen[:, row, column]])
+        half = of_pixel[: (len(of_pixel) + 1) // 2]
+        expected = half.mean() if len(of_pixel) >= max(1, 0.25 * views) else UNSEEN_COST
+        np.testing.assert_allclose(mean[row, column], expected, rtol=1e-6)
