@@ -176,8 +176,9 @@ class Slam(Stateful):
         self.mapper.initialise(keyframes, progress, exposures)
 
     def _refine_map(self) -> None:
-        stage = "refining the map"
-        iterations = self.config.mapping.refine_iterations
+        stage, config = "refining the map", self.config.mapping
+        views = config.refine_views * len(self.mapper.keyframes)
+        iterations = min(config.refine_iterations, views)
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-from minislam.errors import InputError
 from minislam.parameters import parameter
 from minislam.splatting import LearningRates
 
@@ -12,7 +11,9 @@ class InsertionConfig:
     """How densely a keyframe adds Gaussians, and how they start."""
 
     cell: int = parameter(3, "one Gaussian per square cell of this side [px of the full image]", 1)
-    footprint: float = parameter(0.6, "first scale over the side of a cell seen at its depth [1]")
+    footprint: float = parameter(
+        0.45, "first scale over the side of a cell seen at its depth [1]; official 0.22"
+    )
     opacity: float = parameter(0.9, "first opacity; official 0.5", 0.01, 0.99)
 
 
@@ -53,7 +54,9 @@ class MappingConfig:
     The world has no fixed unit, so lengths are given in median depths of the first keyframes.
     """
 
-    image_scale: float = parameter(0.5, "size of the images used online, of the full size (0, 1]")
+    image_scale: float = parameter(
+        0.5, "size of the images used online, of the full size [-]", 0.01, 1
+    )
     views_per_step: int = parameter(
         2,
         "keyframes rendered per step, side by side if there are --workers; an iteration is one"
@@ -61,11 +64,16 @@ class MappingConfig:
         1,
     )
     init_iterations: int = parameter(150, "on the first keyframes, at least 4 each; official 1050")
-    keyframe_iterations: int = parameter(25, "iterations per keyframe; official 450")
+    keyframe_iterations: int = parameter(12, "iterations per keyframe; official 450")
     keyframe_stride: int = parameter(
-        1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode"
+        1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode", 1
     )
-    refine_iterations: int = parameter(700, "iterations at the end; official 20000, fast 3000")
+    refine_iterations: int = parameter(
+        700, "iterations at the end, at most `refine_views` per keyframe; official 20000, fast 3000"
+    )
+    refine_views: int = parameter(
+        30, "most renderings of a keyframe at the end, in the mean; official: no limit", 1
+    )
     refine_full_fraction: float = parameter(
         0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1
     )
@@ -73,7 +81,7 @@ class MappingConfig:
         5, "iterations without MLP training after a change of density; official 20 of 450"
     )
 
-    window_size: int = parameter(10, "most keyframes in the local window, official")
+    window_size: int = parameter(10, "most keyframes in the local window, official", 3)
     window_probability: float = parameter(
         0.5, "probability that an iteration takes a keyframe of the window, paper 3.4", most=1
     )
@@ -116,23 +124,6 @@ class MappingConfig:
         metadata={"meaning": "photometric refinement of the poses between the keyframes"},
     )
 
-    def __post_init__(self) -> None:
-        if not 0 < self.image_scale <= 1:
-            raise InputError(
-                f"expected an image scale in (0, 1], found {self.image_scale}; "
-                "set mapping.image_scale to 1 for full size or 0.5 for half"
-            )
-        if self.keyframe_stride < 1:
-            raise InputError(
-                f"expected a stride of at least 1 keyframe, found {self.keyframe_stride}; "
-                "set mapping.keyframe_stride to 1 to optimise the map at each of them"
-            )
-        if self.window_size < 3:
-            raise InputError(
-                f"expected a window of at least 3 keyframes, found {self.window_size}; "
-                "two of them are always kept, set mapping.window_size to 10"
-            )
-
     def rates_at(
         self,
         iteration: int,
@@ -162,6 +153,7 @@ def paper_mapping() -> MappingConfig:
         init_iterations=1050,
         keyframe_iterations=450,
         refine_iterations=20000,
+        refine_views=20000,
         refine_full_fraction=1.0,
         freeze_iterations=20,
         color_weight=0.5,

@@ -2,6 +2,7 @@ from dataclasses import fields
 
 import pytest
 
+from minislam.config import SlamConfig, with_settings
 from minislam.errors import InputError
 from minislam.mapping import (
     DensityConfig,
@@ -36,10 +37,9 @@ def test_every_constant_says_what_it_means(config):
 
 
 def test_impossible_values_are_refused_in_one_sentence():
-    with pytest.raises(InputError, match="image scale"):
-        MappingConfig(image_scale=0.0)
-    with pytest.raises(InputError, match="window of at least 3"):
-        MappingConfig(window_size=2)
+    for name, value in (("image_scale", 0.0), ("window_size", 2), ("keyframe_stride", 0)):
+        with pytest.raises(InputError, match=f"expected mapping.{name} of at least"):
+            with_settings(SlamConfig(), {f"mapping.{name}": value})
 
 
 def test_the_paper_values_are_the_official_ones():
