@@ -128,7 +128,7 @@ class Slam(Stateful):
     def _initialise(self) -> None:
         """Start in two stages (paper Sec. 3.3): first without beta, then with beta."""
         with self.steps.timed("initialisation"):
-            self.tracker.initialise()
+            self.tracker.initialise(self.workers)
         self._map_new_keyframes()
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()

@@ -54,9 +54,7 @@ class MappingConfig:
     The world has no fixed unit, so lengths are given in median depths of the first keyframes.
     """
 
-    image_scale: float = parameter(
-        0.5, "size of the images used online, of the full size [-]", 0.01, 1
-    )
+    image_scale: float = parameter(0.5, "size of the images used online, of the full one", 0.01, 1)
     views_per_step: int = parameter(
         2,
         "keyframes rendered per step, side by side if there are --workers; an iteration is one"

@@ -8,28 +8,23 @@ lowest cost is kept.
 """
 
 import itertools
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from minislam.geometry import se3_interpolate, se3_inverse
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.bundle_adjustment import (
-    BundleProblem,
-    BundleReport,
-    BundleState,
-    bundle_adjust,
-)
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleReport, BundleState
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
 from minislam.tracking.safeguards.first_depth import essential_disparities
 from minislam.tracking.safeguards.focal_length import seek_focal_length
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
 from minislam.tracking.safeguards.overlay import overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
+from minislam.workers import Workers
 
 HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps per width before hypotheses are compared
 ROBUST_NARROWING = (0.5, 0.25)  # [-], times the final width
@@ -82,7 +77,9 @@ def chain_state(
 
 
 def best_hypothesis(
-    problem: BundleProblem, states: list[BundleState]
+    problem: BundleProblem,
+    states: list[BundleState],
+    workers: Workers | None = None,  # adjust side by side
 ) -> tuple[BundleState, BundleReport]:
     """Adjust every hypothesis on the same measurements and return the one of lowest cost.
 
@@ -92,18 +89,14 @@ def best_hypothesis(
     under a narrow one: there the room fits, and a compromise between room and dynamic object does
     not.
     """
-    robust, widenings = problem.robust, ROBUST_WIDENING + ROBUST_NARROWING
-    starts = [widenings, widenings[1:]] if robust else [(1.0,)]
-    results = []
-    for state, start in itertools.product(states, starts):
-        for widening in start:
-            problem = replace(problem, robust=robust and robust.widened(widening))
-            state, report = bundle_adjust(problem, state, HYPOTHESIS_ITERATIONS)
-        results.append((state, report))
+    widenings = [*ROBUST_WIDENING, *ROBUST_NARROWING]
+    starts = [widenings, widenings[1:]] if problem.robust else [[1.0]]
+    calls = [(problem, *pair, HYPOTHESIS_ITERATIONS) for pair in itertools.product(states, starts)]
+    results = (workers or Workers()).map(adjust_narrowing, calls)
     return min(results, key=lambda result: result[1].cost_after)
 
 
-def first_geometry(graph: KeyframeGraph) -> None:
+def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None:
     """Estimate poses and disparities of all keyframes of the warm-up, beta unknown.
 
     Flow alone decides, because a wrong depth prior would bend them: it is one start of the search
@@ -120,7 +113,7 @@ def first_geometry(graph: KeyframeGraph) -> None:
     settings = graph.robust, keyframes.cell_weights[0]
     hypotheses = [chain_state(graph.grid, flow_to_next, *guess, *settings) for guess in guesses]
     problem = bundle_problem(graph, range(len(graph.links)), first_free=0, lambda_prior=0.0)
-    state, report = best_hypothesis(problem, hypotheses)
+    state, report = best_hypothesis(problem, hypotheses, workers)
     graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)
     keyframes.normalise_scale()

@@ -7,7 +7,12 @@ import torch
 from torch import Tensor
 
 from minislam.records import Progress
-from minislam.tracking.bundle_adjustment import BundleProblem
+from minislam.tracking.bundle_adjustment import (
+    BundleProblem,
+    BundleReport,
+    BundleState,
+    bundle_adjust,
+)
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 from minislam.tracking.safeguards.touched import adjust_touched
@@ -96,6 +101,19 @@ def adjust(
     graph.grid.zoom(state.log_focal)
     graph.shutter.lengthen(state.readout)
     graph.count_adjustment(report)
+
+
+def adjust_narrowing(
+    problem: BundleProblem,
+    state: BundleState,
+    widenings: list[float],  # of the robust weight, one after the other
+    iterations: int,  # with each
+) -> tuple[BundleState, BundleReport]:
+    """Return the adjusted state and the last report. Any process can compute it."""
+    for widening in widenings:
+        robust = problem.robust and problem.robust.widened(widening)
+        state, report = bundle_adjust(replace(problem, robust=robust), state, iterations)
+    return state, report
 
 
 def bundle_problem(

@@ -31,6 +31,7 @@ from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.readout import seek_readouts
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.settling import SETTLED, Settling
+from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 LONGEST_TAIL = 2  # frames after the last keyframe
@@ -254,7 +255,7 @@ class Tracker(Stateful):
 
     # The stages ---------------------------------------------------------------------------------
 
-    def initialise(self) -> None:
+    def initialise(self, workers: Workers | None = None) -> None:
         """Estimate the warm-up keyframes together, beta unknown (first of the two stages)."""
         if len(self.keyframes) == 1 and self.last_non_keyframe is not None:
             self._insert(*self.last_non_keyframe)
@@ -263,7 +264,7 @@ class Tracker(Stateful):
                 "expected at least two frames that show the same scene, found none among "
                 f"{len(self.tracked)} frames; check that the images are not blank and overlap"
             )
-        first_geometry(self.graph)
+        first_geometry(self.graph, workers)
         self._settling.fall_back_on_prior()
         self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)

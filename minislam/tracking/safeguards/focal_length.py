@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.safeguards.touched import of_rows
 from minislam.workers import Workers
 
@@ -112,30 +112,23 @@ def fit_focal_length(
 ) -> tuple[FocalLengthFit, BundleState]:
     """Return the focal length at which the adjusted cost is lowest, and the state there."""
     workers, free = workers or Workers(), replace(problem, free_focal=True)
-    starts = [(p, state, WIDENINGS) for p in (problem, free)]
-    (_, present), (found, lowest) = workers.map(adjust_narrowing, starts)
+    starts = [(p, state, WIDENINGS, ITERATIONS) for p in (problem, free)]
+    (_, present), (found, best) = workers.map(adjust_narrowing, starts)
     for _ in range(MAX_TRIES):
         ends = [replace(found, log_focal=found.log_focal + step) for step in (-STEP, STEP)]
-        beside = workers.map(adjust_narrowing, [(problem, end, [1.0]) for end in ends])
-        rises = [cost - lowest for _, cost in beside]
+        calls = [(problem, end, [1.0], ITERATIONS) for end in ends]
+        beside = workers.map(adjust_narrowing, calls)
+        rises = [report.cost_after - best.cost_after for _, report in beside]
         if min(rises) > 0:
             break
         # Not yet in the valley: go on from there. A wide weight might lead back.
-        found, lowest = adjust_narrowing(free, beside[rises.index(min(rises))][0], [1.0])
+        better = beside[rises.index(min(rises))][0]
+        found, best = adjust_narrowing(free, better, [1.0], ITERATIONS)
+    lowest = best.cost_after
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
-    saved = (present - lowest) / max(present, floor)
+    saved = (present.cost_after - lowest) / max(present.cost_after, floor)
     rises_enough = sum(rises) / 2 >= MIN_RISE * max(lowest, floor) or saved >= WORTH_SAVING
     fx, change = problem.camera.fx * math.exp(state.log_focal), found.log_focal - state.log_focal
     if min(rises) <= 0 or not rises_enough or abs(change) > LARGEST:
         return FocalLengthFit(fx, None, 0.0), state
     return FocalLengthFit(fx, math.exp(change), saved), found
-
-
-def adjust_narrowing(
-    problem: BundleProblem, state: BundleState, widenings: list[float]
-) -> tuple[BundleState, float]:
-    """Return the adjusted state and its cost [px^2], under one robust weight after the other."""
-    for widening in widenings:
-        robust = problem.robust and problem.robust.widened(widening)
-        state, report = bundle_adjust(replace(problem, robust=robust), state, ITERATIONS)
-    return state, report.cost_after
