@@ -29,7 +29,7 @@ class ClassicalFlowConfig:
 
     stride: int = parameter(8, "distance between grid cells [px], as DROID-SLAM", least=1)
     start_tolerance: float = parameter(
-        0.25, "an edge is measured again if its start has moved by this (median) [px]; 0: always"
+        2.0, "an edge is measured again if its start has moved by this (median) [px]; 0: always"
     )
 
 
