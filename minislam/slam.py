@@ -176,9 +176,8 @@ class Slam(Stateful):
         self.mapper.initialise(keyframes, progress, exposures)
 
     def _refine_map(self) -> None:
-        stage, config = "refining the map", self.config.mapping
-        views = config.refine_views * len(self.mapper.keyframes)
-        iterations = min(config.refine_iterations, views)
+        stage = "refining the map"
+        iterations = self.config.mapping.refinement(len(self.mapper.keyframes))
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:

@@ -56,9 +56,7 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
     scale = sequence.camera.width * sequence.camera.height / REFERENCE_PIXELS
     per_frame, iteration = frames * scale, 0.24 * mapping.image_scale * scale
     first_map = {"first map": iteration * mapping.init_iterations}
-    keyframes = 0.2 * frames
-    late_keyframes = max(0.0, keyframes - config.tracking.warmup_keyframes)
-    refinement = min(mapping.refine_iterations, mapping.refine_views * keyframes)
+    late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
     online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
     posing = {"posing all frames": 0.12 * per_frame}
     coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}
@@ -69,7 +67,7 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
         again if config.uncertainty.enabled else {},
         posing,
         {"dense depth": 0.25 * per_frame} | first_map,
-        {"refining the map": iteration * refinement},
+        {"refining the map": iteration * mapping.refinement(1 + frames // 5)},
         {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
     ]
     stages[-1 if stages[-1] else -2][""] = 0.1 * per_frame

@@ -122,6 +122,10 @@ class MappingConfig:
         metadata={"meaning": "photometric refinement of the poses between the keyframes"},
     )
 
+    def refinement(self, keyframes: int) -> int:
+        """Return how many iterations refine a map of so many keyframes."""
+        return min(self.refine_iterations, self.refine_views * keyframes)
+
     def rates_at(
         self,
         iteration: int,
