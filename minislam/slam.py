@@ -177,7 +177,7 @@ class Slam(Stateful):
 
     def _refine_map(self) -> None:
         stage = "refining the map"
-        iterations = self.config.mapping.refinement(len(self.mapper.keyframes))
+        iterations = self.config.mapping.refine_iterations
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:

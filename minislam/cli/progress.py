@@ -67,7 +67,7 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
         again if config.uncertainty.enabled else {},
         posing,
         {"dense depth": 0.25 * per_frame} | first_map,
-        {"refining the map": iteration * mapping.refinement(1 + frames // 5)},
+        {"refining the map": iteration * mapping.refine_iterations},
         {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
     ]
     stages[-1 if stages[-1] else -2][""] = 0.1 * per_frame

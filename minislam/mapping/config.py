@@ -66,12 +66,7 @@ class MappingConfig:
     keyframe_stride: int = parameter(
         1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode", 1
     )
-    refine_iterations: int = parameter(
-        700, "iterations at the end, at most `refine_views` per keyframe; official 20000, fast 3000"
-    )
-    refine_views: int = parameter(
-        30, "most renderings of a keyframe at the end, in the mean; official: no limit", 1
-    )
+    refine_iterations: int = parameter(600, "iterations at the end; official 20000, fast 3000")
     refine_full_fraction: float = parameter(
         0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1
     )
@@ -122,10 +117,6 @@ class MappingConfig:
         metadata={"meaning": "photometric refinement of the poses between the keyframes"},
     )
 
-    def refinement(self, keyframes: int) -> int:
-        """Return how many iterations refine a map of so many keyframes."""
-        return min(self.refine_iterations, self.refine_views * keyframes)
-
     def rates_at(
         self,
         iteration: int,
@@ -155,7 +146,6 @@ def paper_mapping() -> MappingConfig:
         init_iterations=1050,
         keyframe_iterations=450,
         refine_iterations=20000,
-        refine_views=20000,
         refine_full_fraction=1.0,
         freeze_iterations=20,
         color_weight=0.5,

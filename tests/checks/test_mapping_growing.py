@@ -28,7 +28,7 @@ def inserted(
     points = torch.stack([x, y, z], -1).double()
     means = transform_points(T if how.get("forward") else se3_inverse(T), points)
     means = points if how.get("stay") else means
-    size = 0.6 * cell / math.sqrt(camera.fx * camera.fy) * (1 if how.get("flat") else z)
+    size = 0.45 * cell / math.sqrt(camera.fx * camera.fy) * (1 if how.get("flat") else z)
     scale = torch.as_tensor(size).expand(len(z))[:, None]
     return torch.cat([means.to(z), scale.to(z), image[row, column].to(z)], -1)
 
@@ -41,7 +41,7 @@ def in_a_loop(image, depth, weight, opacity, camera, T, cell):
                 z = float(depth[v, u])
                 ray = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0, 1 / z]
                 mean = torch.linalg.inv(T) @ torch.tensor(ray).to(T) * z
-                scale = 0.6 * cell * z / math.sqrt(camera.fx * camera.fy)
+                scale = 0.45 * cell * z / math.sqrt(camera.fx * camera.fy)
                 rows.append([*mean[:3].tolist(), scale, *image[v, u].tolist()])
     return torch.tensor(rows)
 

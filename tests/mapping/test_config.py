@@ -29,14 +29,6 @@ def test_the_common_factor_reaches_every_parameter():
         assert getattr(half, rate.name) == pytest.approx(0.5 * getattr(whole, rate.name))
 
 
-def test_few_keyframes_are_refined_for_as_long_as_each_gains_and_many_for_a_fixed_time():
-    config = MappingConfig(refine_iterations=700, refine_views=30)
-    assert [config.refinement(count) for count in (0, 1, 17, 23, 24, 500)] == [
-        0, 30, 510, 690, 700, 700,
-    ]  # fmt: skip
-    assert paper_mapping().refinement(1) == 20000
-
-
 @pytest.mark.parametrize(
     "config", [MappingConfig, InsertionConfig, DensityConfig, PoseRefinementConfig]
 )
