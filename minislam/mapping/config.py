@@ -62,7 +62,7 @@ class MappingConfig:
         1,
     )
     init_iterations: int = parameter(150, "on the first keyframes, at least 4 each; official 1050")
-    keyframe_iterations: int = parameter(12, "iterations per keyframe; official 450")
+    keyframe_iterations: int = parameter(25, "iterations per keyframe; official 450")
     keyframe_stride: int = parameter(
         1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode", 1
     )
