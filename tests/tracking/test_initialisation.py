@@ -16,6 +16,7 @@ from minislam.tracking.initialisation import (
     first_geometry,
 )
 from minislam.tracking.safeguards.robust import RobustKernel
+from minislam.workers import Workers
 from tests.tracking import oracle
 from tests.tracking.matches import (
     CELLS,
@@ -109,6 +110,9 @@ def test_the_best_hypothesis_is_the_one_that_explains_the_matches():
     for states in ([wrong, right], [right, wrong]):
         best, _ = best_hypothesis(problem, states)
         torch.testing.assert_close(best.T_camera_world, poses, rtol=0, atol=1e-3)
+    with Workers(2) as workers:  # the last order again, side by side
+        shared, _ = best_hypothesis(problem, states, workers)
+    assert torch.equal(shared.T_camera_world, best.T_camera_world)
 
 
 def test_a_wrong_prior_starts_the_search_and_does_not_bend_its_result():
