@@ -79,7 +79,7 @@ class Slam(Stateful):
         parts = priors.flow, self._features, priors.depth, self._static_weight
         self.tracker = Tracker(sequence.camera, config.tracking, *parts, device)
         self.tracker.graph.seeks_focal = sequence.refines_focal
-        self.mapper = self._new_mapper()
+        self.mapper = self._new_mapper(config.mapping.insertion.online_cell)
         self._stride = priors.flow.stride
         self._poses, self.first_frame = {}, FirstFrame()
 
@@ -105,11 +105,13 @@ class Slam(Stateful):
         if self.config.mapping.pose_refinement.enabled:
             self.steps.once("photometric refinement", self._refine_other_poses)
 
-    def _new_mapper(self) -> Mapper:
+    def _new_mapper(self, cell: int) -> Mapper:
         config, dimension = self.config, self._features.dimension
         camera = self.tracker.grid.camera
         parts = config.mapping, config.uncertainty
-        return Mapper(camera, *parts, dimension, config.seed, self.device, self.workers)
+        mapper = Mapper(camera, *parts, dimension, config.seed, self.device, self.workers)
+        mapper.cell = cell
+        return mapper
 
     def frame(self, frame_index: int) -> Frame:
         """Read a frame; it moves to the device of the run."""
@@ -170,7 +172,7 @@ class Slam(Stateful):
         """Build map and MLP anew, on depth that all views have measured together."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         swept = sweep_keyframes(graph, self.sequence, self._poses, progress, self.workers)
-        self.mapper = self._new_mapper()
+        self.mapper = self._new_mapper(self.config.mapping.insertion.cell)
         keyframes = with_swept_depth(graph.grid.camera, self._keyframes(), swept)
         progress, exposures = self.steps.on_progress("first map"), keyframe_exposures(graph)
         self.mapper.initialise(keyframes, progress, exposures)

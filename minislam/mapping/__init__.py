@@ -7,7 +7,7 @@ Read the files in this order:
     view_gradients     what one keyframe adds to a step; worker processes compute it
     losses             L_render, Eq. (6), and L_color, Eq. (7)
     insertion          where a keyframe adds Gaussians, and which lie on dynamic objects
-    window             the local window of keyframes, and the probability to draw each keyframe
+    window             the local window of keyframes, and which keyframe each iteration renders
     deformation        the map follows its keyframes when bundle adjustment moves them
     pose_refinement    the poses between the keyframes, by re-rendering
     density            clone, split and prune

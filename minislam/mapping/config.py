@@ -11,6 +11,9 @@ class InsertionConfig:
     """How densely a keyframe adds Gaussians, and how they start."""
 
     cell: int = parameter(3, "one Gaussian per square cell of this side [px of the full image]", 1)
+    online_cell: int = parameter(
+        4, "the same in the map that is learnt online, which the final one replaces", 1
+    )
     footprint: float = parameter(
         0.45, "first scale over the side of a cell seen at its depth [1]; official 0.22"
     )
@@ -66,7 +69,7 @@ class MappingConfig:
     keyframe_stride: int = parameter(
         1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode", 1
     )
-    refine_iterations: int = parameter(600, "iterations at the end; official 20000, fast 3000")
+    refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
     refine_full_fraction: float = parameter(
         0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1
     )
@@ -103,7 +106,7 @@ class MappingConfig:
     opacity_rate: float = parameter(5e-2, "Adam step of the opacity logits, official")
     colors_rate: float = parameter(5e-3, "Adam step of the colours; official 7.05e-4")
     refine_rate_end: float = parameter(
-        0.5, "last step over the first one in the refinement, all parameters; official 1"
+        0.2, "last step over the first one in the refinement, all parameters; official 1"
     )
 
     insertion: InsertionConfig = field(

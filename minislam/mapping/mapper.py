@@ -5,6 +5,7 @@ built. `update_keyframes` moves it when the tracker has corrected poses.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -49,9 +50,8 @@ class Mapper(JointOptimisation):
         for keyframe in self.keyframes:
             self._insert(keyframe)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
-        uniform = torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
         iterations = max(self.config.init_iterations, self._weighted_from)
-        self._optimise([self._online_camera] * iterations, uniform, progress)
+        self._optimise([self._online_camera] * iterations, progress=progress)
         self._replace_dynamic_gaussians()
 
     def integrate(self, keyframe: Keyframe) -> None:
@@ -99,15 +99,13 @@ class Mapper(JointOptimisation):
         """
         if done == 0:
             self._replace_dynamic_gaussians()
-        count = len(self.keyframes)
-        uniform = torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
-        how = cameras, uniform, progress, self.config.refine_rate_end
+        how = cameras, None, progress, self.config.refine_rate_end
         half = iterations // 2 // self.config.views_per_step * self.config.views_per_step
         if done <= half:
             self._optimise(*how, range(done, half))
-            if half >= LEAST_VIEWS * count:
+            if half >= LEAST_VIEWS * len(self.keyframes):
                 self._exclude_upper_mode()
         self._optimise(*how, range(max(done, half), iterations))
 
@@ -136,7 +134,8 @@ class Mapper(JointOptimisation):
         rendering = self.render(keyframe.T_camera_world) if len(self.gaussians) else None
         weight = self.static_weight(self.beta_of(keyframe), self.camera)
         scene = self.camera, rendering, weight, self.median_depth
-        new = gaussians_of_keyframe(keyframe, *scene, self.config.insertion, self._generator)
+        insertion = replace(self.config.insertion, cell=self.cell)
+        new = gaussians_of_keyframe(keyframe, *scene, insertion, self._generator)
         self._optimizer.append(new)
         self._reset_gradients()
 

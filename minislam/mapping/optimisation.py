@@ -13,6 +13,7 @@ from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
 from minislam.mapping.view_gradients import ViewGradients, view_gradients
 from minislam.mapping.views import Comparison, MappedKeyframe
+from minislam.mapping.window import in_turn
 from minislam.records import MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.stateful import Stateful
@@ -32,6 +33,7 @@ class JointOptimisation(Stateful):
     keyframes: list[MappedKeyframe]
     window: list[int]  # positions in `keyframes`, newest first
     median_depth: float = 1.0  # world units; set by the first keyframes, then fixed
+    cell: int  # px, side of the square that gets one Gaussian
     least_weight: float = MAPPING_CUT  # a pixel with less is excluded
     background: Tensor  # RGB of what no keyframe sees
     history: MappingHistory
@@ -56,6 +58,8 @@ class JointOptimisation(Stateful):
         self.camera = camera
         self.config = config
         self.uncertainty = uncertainty
+        self.seed = seed
+        self.cell = config.insertion.cell
         self.keyframes = []
         self.window = []
         self.background = torch.zeros(3, device=device)
@@ -111,26 +115,36 @@ class JointOptimisation(Stateful):
     def _optimise(
         self,
         cameras: list[Camera],  # size at which each iteration renders
-        probabilities: Tensor,  # (K,) of the keyframes
+        probabilities: Tensor | None = None,  # (K,) of the keyframes; None: all in turn
         progress: Progress | None = None,
         last_rate: float = 1.0,  # last step over the first one, log-linear in between
         iterations: range | None = None,  # of the cameras; None: all
     ) -> None:
-        """Run the iterations. Each renders a keyframe drawn at random; a few make a step."""
+        """Run the iterations. Each renders one keyframe; a few make a step."""
         if len(self._optimizer.gaussians) == 0:
             return  # There is nothing to optimise: all was pruned, or nothing was inserted.
         interval, views = self.config.density.interval, self.config.views_per_step
         total = len(cameras)
         for done in (range(total) if iterations is None else iterations)[::views]:
             count = min(views, total - done)
-            repeats = int((probabilities > 0).sum()) < count
-            drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)
+            if probabilities is None:
+                turns = range(done, done + count)
+                positions = in_turn(turns, len(self.keyframes), self.seed)
+            else:
+                positions = self._drawn(probabilities, count)
             rounds = self._iteration // interval
-            self._step(drawn.tolist(), cameras[done], last_rate ** (done / total))
+            self._step(positions, cameras[done], last_rate ** (done / total))
             if self._iteration // interval > rounds:
                 self._change_density()
             if progress is not None:
                 progress(done + count, total)
+
+    def _drawn(self, probabilities: Tensor, count: int) -> list[int]:
+        """Draw keyframes at random, none twice unless there are too few."""
+        repeats = int((probabilities > 0).sum()) < count
+        drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)
+        positions: list[int] = drawn.tolist()
+        return positions
 
     def _step(self, positions: list[int], camera: Camera, rate_factor: float) -> None:
         """Take one step of the map on the mean L_render of some keyframes, then train the MLP.

@@ -1,4 +1,4 @@
-"""The local window of keyframes, and the probability to optimise each keyframe (Sec. 3.4)."""
+"""The local window of keyframes, and which keyframe each iteration renders (Sec. 3.4)."""
 
 import torch
 from torch import Tensor
@@ -71,3 +71,17 @@ def sampling_probabilities(
     probabilities = torch.full((count,), others, dtype=torch.float64, device="cpu")
     probabilities[window] = window_probability / len(window)
     return probabilities
+
+
+def in_turn(iterations: range, count: int, seed: int) -> list[int]:
+    """Return the keyframe of each iteration: all `count` in turn, each round in another order.
+
+    Drawn one by one, some would be rendered half as often as others.
+    """
+    orders = {turn: _order(turn, count, seed) for turn in {i // count for i in iterations}}
+    return [orders[i // count][i % count] for i in iterations]
+
+
+def _order(turn: int, count: int, seed: int) -> list[int]:
+    generator = torch.Generator().manual_seed(seed + turn)
+    return torch.randperm(count, generator=generator).tolist()

@@ -1,7 +1,12 @@
 import pytest
 import torch
 
-from minislam.mapping.window import overlap_coefficient, sampling_probabilities, update_window
+from minislam.mapping.window import (
+    in_turn,
+    overlap_coefficient,
+    sampling_probabilities,
+    update_window,
+)
 from tests.mapping.plane_scene import pose
 
 
@@ -79,3 +84,19 @@ def test_the_window_never_exceeds_its_size():
     for new in range(1, 40):
         window = update_window(window, new, views, poses(*range(40)), 10)
         assert len(window) == min(new + 1, 10) and window[0] == new
+
+
+# Keyframes in turn
+
+
+def test_each_round_renders_every_keyframe_once_in_an_order_of_its_own():
+    drawn = in_turn(range(30), 10, seed=0)
+    rounds = [drawn[start : start + 10] for start in range(0, 30, 10)]
+    assert all(sorted(one) == list(range(10)) for one in rounds)
+    assert rounds[0] != rounds[1] != rounds[2]
+    assert in_turn(range(10), 10, seed=1) != rounds[0]
+
+
+def test_a_part_of_the_iterations_is_as_in_the_whole():
+    assert in_turn(range(7, 23), 10, seed=3) == in_turn(range(30), 10, seed=3)[7:23]
+    assert in_turn(range(4), 1, seed=0) == [0] * 4

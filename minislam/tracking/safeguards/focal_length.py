@@ -20,13 +20,14 @@ import torch
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
-from minislam.tracking.safeguards.touched import of_rows
+from minislam.tracking.safeguards.touched import of_cells, of_rows
 from minislam.workers import Workers
 
 STEP = math.log(1.05)  # to either side, where the cost must have risen
 ITERATIONS = 10  # Gauss-Newton steps of each adjustment
 WIDENINGS = [4.0, 1.0]  # of the robust weight: a focal length far off has large residuals [-]
 MOST_KEYFRAMES = 100  # from the first on, that a check adjusts, dozens of times
+EVERY = 2  # cells of a check along each side: it adjusts so often, and one unknown asks for few
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
 # Smallest mean rise of the cost. In six pieces of real video, two seconds each, the cost rose by
@@ -86,6 +87,8 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     rows = torch.tensor(keyframes, device=problem.rays.device)
     problem, state = of_rows(problem, graph.state, rows)
+    cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
+    problem, state = of_cells(problem, state, cells[::EVERY, ::EVERY].flatten())
     problem.free_poses[0] = False  # the first of them is their world
     return fit_focal_length(problem, state, workers)[0]
 

@@ -20,6 +20,7 @@ FEW_KEYFRAMES = 100  # so few are not worth a selection
 _OF_KEYFRAMES = (
     "prior_disparities", "prior_weights", "free_poses", "free_disparities", "disparity_damping",
 )  # fmt: skip
+_OF_CELLS = "targets", "weights", "prior_disparities", "prior_weights", "disparity_damping"
 
 
 def adjust_touched(
@@ -51,3 +52,13 @@ def of_rows(
     problem = replace(problem, **values)
     poses, disparities = state.T_camera_world[rows], state.disparities[rows]
     return problem, replace(state, T_camera_world=poses, disparities=disparities)
+
+
+def of_cells(
+    problem: BundleProblem, state: BundleState, cells: Tensor
+) -> tuple[BundleProblem, BundleState]:
+    """Return problem and state of some cells (N',) of the grid alone."""
+    values: dict[str, Any] = {name: getattr(problem, name) for name in _OF_CELLS}
+    values = {name: None if value is None else value[..., cells] for name, value in values.items()}
+    problem = replace(problem, rays=problem.rays[cells], **values)
+    return problem, replace(state, disparities=state.disparities[:, cells])

@@ -7,7 +7,7 @@ import torch
 
 from minislam.tracking.bundle_adjustment import bundle_adjust
 from minislam.tracking.safeguards import touched
-from minislam.tracking.safeguards.touched import adjust_touched, touched_rows
+from minislam.tracking.safeguards.touched import adjust_touched, of_cells, touched_rows
 from tests.tracking.scene import known_problem, noisy, perturbed
 
 
@@ -35,3 +35,23 @@ def test_rows_that_nothing_touches_stay_and_the_others_move_as_in_the_whole(
     torch.testing.assert_close(state.T_camera_world, whole.T_camera_world, rtol=0, atol=1e-12)
     torch.testing.assert_close(state.disparities, whole.disparities, rtol=0, atol=1e-12)
     assert torch.equal(state.disparities[1], start.disparities[1])
+
+
+def test_cells_alone_are_adjusted_as_if_the_others_weighed_nothing():
+    known = known_problem(3)
+    problem, start = noisy(known, 1.0), perturbed(known, 0.02)
+    cells = torch.arange(0, len(problem.rays), 3)
+    others = torch.ones(len(problem.rays), dtype=torch.bool)
+    others[cells] = False
+    problem = replace(problem, robust=None)
+    weights = torch.where(others, 0, problem.weights)
+    priors = torch.where(others, 0, problem.prior_weights)
+    whole = replace(problem, weights=weights, prior_weights=priors)
+    damping = torch.full_like(start.disparities, 1e-3)  # else it is a fraction of the mean cell's
+    part, whole = (replace(p, disparity_damping=damping) for p in (problem, whole))
+    (state, report), (expected, _) = (
+        bundle_adjust(*some, 3) for some in (of_cells(part, start, cells), (whole, start))
+    )
+    assert report.iterations == 3
+    torch.testing.assert_close(state.T_camera_world, expected.T_camera_world, rtol=0, atol=1e-6)
+    torch.testing.assert_close(state.disparities, expected.disparities[:, cells])
