@@ -1,22 +1,27 @@
-"""What a keyframe costs the tracker early and late in a long sequence, and how memory grows.
+"""What a keyframe costs early and late in a long sequence, and how memory grows: the whole system.
 
-    python -m tests.benchmarks.bench_length [NAME:SEED] [--frames 1600] [--size 160x120]
+    python -m tests.benchmarks.bench_length [synth:NAME:SEED] [--frames 1600]
 
-Tracking alone, with the simulated depth prior, one thread: processor seconds per keyframe and
-resident memory after every eighth of the frames (Linux), then the final adjustment.
+One worker, processor seconds. A row per quarter of the frames: tracking and mapping per keyframe
+and the memory of the process (Linux); then all stages, and the error.
 """
 
 import argparse
+import ctypes
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 
+from minislam.cli.main import MALLOC
 from minislam.config import SlamConfig
 from minislam.data import InputOptions, open_sequence
+from minislam.evaluation.metrics import ate_cm
 from minislam.priors.choice import PriorChoice
 from minislam.runs.run import choose_priors
-from minislam.tracking.tracker import Tracker
+from minislam.slam import Slam
+from minislam.state import steps
 
 
 def memory() -> str:
@@ -26,39 +31,52 @@ def memory() -> str:
     return f"{now:.0f} | {peak:.0f}"
 
 
+class Quarters(steps.SilentObserver):
+    """Prints a row after every quarter of the frames."""
+
+    slam: Slam
+
+    def __init__(self) -> None:
+        self.before: dict[str, float] = {}
+        self.known = 0  # keyframes by then
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Print what the keyframes since the last row have cost."""
+        if stage != "tracking and mapping" or done * 4 % total >= 4:
+            return
+        seconds, known = dict(self.slam.steps.seconds), len(self.slam.tracker.keyframes)
+        costs = [
+            (seconds.get(name, 0) - self.before.get(name, 0)) / max(1, known - self.known)
+            for name in ("tracking", "mapping")
+        ]
+        print(f"| {done} | {known} | {costs[0]:.2f} | {costs[1]:.2f} | {memory()} |", flush=True)
+        self.before, self.known = seconds, known
+
+
 def main() -> None:
-    """Print one row per eighth."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("name", nargs="?", default="loop:4711")
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", nargs="?", default="synth:loop:4711")
     parser.add_argument("--frames", type=int, default=1600)
-    parser.add_argument("--size", default="160x120")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    width, height = map(int, given.size.split("x"))
-    options = InputOptions(max_frames=given.frames, size=(width, height))
-    sequence = open_sequence(f"synth:{given.name}", options)
-    config = SlamConfig()
+    steps.time = SimpleNamespace(perf_counter=time.process_time)
+    for parameter, value in MALLOC.items():  # as the command does
+        ctypes.CDLL(None).mallopt(parameter, value)
+    sequence = open_sequence(given.name, InputOptions(max_frames=given.frames))
+    config, quarters = SlamConfig(), Quarters()
     priors = choose_priors(PriorChoice(depth="simulated"), sequence, config)
-    parts = config.tracking, priors.flow, priors.features, priors.depth
-    tracker = Tracker(sequence.camera, *parts, lambda index: torch.ones(tracker.grid.shape))
-    print("| frames | keyframes | links | s per keyframe | MB | peak MB |")
+    slam = quarters.slam = Slam(sequence, config, priors, quarters)
+    print("| frames | keyframes | tracking | mapping [s per keyframe] | MB | peak MB |")
     print("|---|---|---|---|---|---|")
-    start, before = time.process_time(), 0
-    for index in range(len(sequence)):
-        is_new, count = tracker.track(sequence.frame(index)), len(tracker.keyframes)
-        if is_new and not tracker.initialised and count >= config.tracking.warmup_keyframes:
-            tracker.initialise()
-            tracker.refine_initialisation()
-        if (index + 1) % max(1, len(sequence) // 8) == 0:
-            cost = (time.process_time() - start) / max(1, count - before)
-            links = len(tracker.graph.links)
-            print(f"| {index + 1} | {count} | {links} | {cost:.2f} | {memory()} |", flush=True)
-            start, before = time.process_time(), count
-    tracker.end()
-    tracker.finish()
-    cost = (time.process_time() - start) / len(tracker.keyframes)
-    count, links = len(tracker.keyframes), len(tracker.graph.links)
-    print(f"| final | {count} | {links} | {cost:.2f} | {memory()} |")
+    slam.run()
+    count, seconds = len(slam.tracker.keyframes), slam.steps.seconds
+    for stage in list(seconds):
+        print(f"{stage}: {seconds[stage]:.0f} s, {seconds[stage] / count:.2f} per keyframe")
+    truth = sequence.ground_truth
+    if truth is not None and truth.trajectory is not None:
+        print(f"ATE of all frames {ate_cm(slam.trajectory(), truth.trajectory):.3f} cm")
+    print(f"{len(slam.mapper.gaussians)} Gaussians; memory now | peak {memory()} MB")
 
 
 if __name__ == "__main__":
