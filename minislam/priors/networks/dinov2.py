@@ -52,10 +52,3 @@ def is_antialiased(weights: Weights) -> bool:
         lost = "mask_token" if lacks_mask else "register tokens"
         raise InputError(f"expected {lost} in {weights.file}, found none; the file is not complete")
     return is_fit3d or has_registers
-
-
-def build_dino_features(weights: Weights) -> DinoFeatures:
-    """Return the features after one run on a tiny image, which asks for every tensor they need."""
-    features = DinoFeatures(weights)
-    features(Frame(0, 0.0, torch.zeros(PATCH, PATCH, 3)))
-    return features

@@ -232,12 +232,3 @@ def as_matches(targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatche
     ratios = matched.float().mean((1, 2))
     targets, confidences = (x.flatten(1, 2).mT.contiguous() for x in (targets, confidences))
     return FlowMatches(*(x.to(like) for x in (net.STRIDE * targets, confidences, ratios)))
-
-
-def build_droid(weights: Weights, config: DroidFlowConfig) -> DroidFlow:
-    """Return the flow after one run on a tiny image, which asks for every tensor it needs."""
-    flow = DroidFlow(weights, config)
-    tiny = torch.zeros(net.STRIDE * _SMALLEST_GRID, net.STRIDE * _SMALLEST_GRID, 3)
-    flow.add_frame(0, tiny)
-    flow.match([0], [0], torch.zeros(1, 2, _SMALLEST_GRID**2))
-    return DroidFlow(weights, config)

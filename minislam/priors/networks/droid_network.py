@@ -111,12 +111,12 @@ def update(
     motion = motion.clamp(-_MOTION_LIMIT, _MOTION_LIMIT).permute(0, 3, 1, 2)
     inputs = [
         context,
-        _two_convs(weights.below("corr_encoder."), correlation).relu(),
-        _two_convs(weights.below("flow_encoder."), motion).relu(),
+        weights.below("corr_encoder.").convs(correlation).relu(),
+        weights.below("flow_encoder.").convs(motion).relu(),
     ]
     hidden = _gru(weights.below("gru."), hidden, torch.cat(inputs, 1))
-    revision = _two_convs(weights.below("delta."), hidden, _HEAD)[:, :2]
-    confidence = _two_convs(weights.below("weight."), hidden, _HEAD)[:, :2].sigmoid()
+    revision = weights.below("delta.").convs(hidden, channels=_HEAD)[:, :2]
+    confidence = weights.below("weight.").convs(hidden, channels=_HEAD)[:, :2].sigmoid()
     return Update(hidden, revision.permute(0, 2, 3, 1), confidence.permute(0, 2, 3, 1))
 
 
@@ -137,10 +137,6 @@ def cell_grid(like: Tensor) -> Tensor:  # (h, w, 2) cells
     u = torch.arange(width, dtype=like.dtype, device=like.device)
     v = torch.arange(height, dtype=like.dtype, device=like.device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-
-
-def _two_convs(weights: Weights, x: Tensor, channels: tuple[int, ...] = ()) -> Tensor:
-    return weights.conv("2", weights.conv("0", x).relu(), channels=channels)
 
 
 def _gru(weights: Weights, hidden: Tensor, inputs: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """The second half of Metric3D v2: a first estimate, refined by recurrent units, then upsampled.
 
 As in RAFT, three gated recurrent units (GRU) at three resolutions read the present estimate and
-propose a change to it, several times. The state has six channels: scaled depth, depth confidence,
-normal (3), normal confidence.
+propose a change to it, several times. The estimate ("state") has six channels: scaled depth, depth
+confidence, normal (3), normal confidence.
 """
 
 import math
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.priors.networks.checkpoints import Weights
+from minislam.priors.networks.checkpoints import Weights, resize
 
 NEAREST, FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
 _BINS = 256  # of depth, between the two on a logarithmic scale
@@ -31,47 +31,37 @@ def refine(
     rounds: int,
 ) -> Tensor:  # (B, H, W) metre
     """Return the refined and upsampled depth for the canonical camera."""
-    state = first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
-    hidden, gates = _start(weights, context)
+    state = _first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
+    hidden, gates = [], []  # of the units; what the context adds to their three gates
+    for level, (name, seen) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
+        encoder = weights.below(f"context_feature_encoder.{name}.")
+        hidden.append(_context_head(encoder.below("0."), seen).tanh())
+        offsets = _context_head(encoder.below("1."), seen).relu()
+        gates.append(weights.conv(f"context_zqr_convs.{level}", offsets).chunk(3, 1))
     update = weights.below("update_block.")
     for _ in range(rounds):
         hidden = _recurrent_round(update, hidden, gates, state)
-        state = state + _proposed_change(update.below("flow_head."), hidden[0])
-    mask = update.conv("mask.2", update.conv("mask.0", hidden[0]).relu())
+        head = update.below("flow_head.")
+        depth = head.conv("conv2d", head.conv("conv1d", hidden[0]).relu(), channels=(2,))
+        normal = head.conv("conv2n", head.conv("conv1n", hidden[0]).relu(), channels=(4,))
+        state = state + torch.cat([depth, normal], 1)
+    mask = update.below("mask.").convs(hidden[0])
     fine = convex_upsample(state[:, :1], _MASK_SCALE * mask, _UPSAMPLING)[:, 0]
     return (_STATE_UNIT * fine + FARTHEST).clamp(NEAREST, FARTHEST)
 
 
-def first_estimate(
+def _first_estimate(
     weights: Weights, features: Tensor, depth_confidence: Tensor, normal_confidence: Tensor
 ) -> Tensor:  # (B, 6, h, w)
     """Return the state before refinement: depth is an expectation over logarithmic bins."""
-    logits = _head(weights.below("depth_regressor."), features, layers=2, channels=_BINS)
+    logits = weights.below("depth_regressor.").convs(features, channels=(_BINS,))
     bins = torch.linspace(math.log(NEAREST), math.log(FARTHEST), _BINS, device=features.device)
     depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
     depth = depth.clamp(NEAREST, FARTHEST)
-    normal = _head(weights.below("normal_predictor."), features, layers=4, channels=3)
+    normal = weights.below("normal_predictor.").convs(features, layers=4, channels=(3,))
     unit = normal / (normal.norm(dim=1, keepdim=True) + 1e-10)
     positive = functional.elu(normal_confidence) + 1.01
     return torch.cat([(depth - FARTHEST) / _STATE_UNIT, depth_confidence, unit, positive], 1)
-
-
-def _head(weights: Weights, x: Tensor, layers: int, channels: int) -> Tensor:
-    """Apply convolutions with ReLUs between them; they are numbered 0, 2, 4, ..."""
-    for k in range(layers - 1):
-        x = weights.conv(f"{2 * k}", x).relu()
-    return weights.conv(f"{2 * layers - 2}", x, channels=(channels,))
-
-
-def _start(weights: Weights, context: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-    """Return per level the hidden state, and the offsets that the context gives the three gates."""
-    hidden, gates = [], []
-    for level, (name, features) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
-        encoder = weights.below(f"context_feature_encoder.{name}.")
-        hidden.append(_context_head(encoder.below("0."), features).tanh())
-        seen = _context_head(encoder.below("1."), features).relu()
-        gates.append(weights.conv(f"context_zqr_convs.{level}", seen))
-    return hidden, gates
 
 
 def _context_head(weights: Weights, x: Tensor) -> Tensor:
@@ -88,36 +78,26 @@ def _channel_norm(weights: Weights, name: str, x: Tensor) -> Tensor:
 
 
 def _recurrent_round(
-    weights: Weights, hidden: list[Tensor], gates: list[Tensor], state: Tensor
+    weights: Weights, hidden: list[Tensor], gates: list[tuple[Tensor, ...]], state: Tensor
 ) -> list[Tensor]:
     """Update the coarsest unit three times, the middle one twice, the finest once."""
     fine, middle, coarse = hidden
+    size = middle.shape[-2:]
 
     def gru(level: int, h: Tensor, *inputs: Tensor) -> Tensor:
         unit = weights.below(f"{_GRU_NAMES[level]}.")
-        return unit.gru(h, torch.cat(inputs, 1), gates[level].chunk(3, 1))
+        return unit.gru(h, torch.cat(inputs, 1), gates[level])
 
     coarse = gru(2, coarse, _halved(middle))
     for _ in range(2):
         coarse = gru(2, coarse, _halved(middle))
-        middle = gru(1, middle, _resized(_halved(fine), middle), _resized(coarse, middle))
-    fine = gru(0, fine, state, _resized(middle, fine))
+        middle = gru(1, middle, resize(_halved(fine), size), resize(coarse, size))
+    fine = gru(0, fine, state, resize(middle, fine.shape[-2:]))
     return [fine, middle, coarse]
 
 
 def _halved(x: Tensor) -> Tensor:
     return functional.avg_pool2d(x, 3, stride=2, padding=1)  # counts the padding as zeros
-
-
-def _resized(x: Tensor, like: Tensor) -> Tensor:
-    return functional.interpolate(x, like.shape[-2:], mode="bilinear", align_corners=True)
-
-
-def _proposed_change(weights: Weights, hidden: Tensor) -> Tensor:
-    """Return the change of the state (B, 6, h, w)."""
-    depth = weights.conv("conv2d", weights.conv("conv1d", hidden).relu(), channels=(2,))
-    normal = weights.conv("conv2n", weights.conv("conv1n", hidden).relu(), channels=(4,))
-    return torch.cat([depth, normal], 1)
 
 
 def convex_upsample(

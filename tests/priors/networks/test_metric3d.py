@@ -9,7 +9,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.metric3d import Metric3D, Metric3DDepth, fit
+from minislam.priors.networks.metric3d import Metric3DDepth, fit
 from minislam.priors.networks.vit import normalise
 from minislam.records import Frame
 from tests.priors.networks import rebuilt
@@ -30,7 +30,7 @@ def weights() -> Weights:
 @cache
 def output(height: int, width: int) -> torch.Tensor:
     with torch.inference_mode():
-        return Metric3D(weights())(normalise(rebuilt.image(height, width), CPU))
+        return Metric3DDepth(weights()).network(normalise(rebuilt.image(height, width), CPU))
 
 
 def stored(name: str) -> torch.Tensor:
@@ -47,8 +47,8 @@ def test_the_depth_is_that_of_the_official_code(size: tuple[int, int]):
 
 def test_the_finest_map_is_that_of_the_official_code():
     with torch.inference_mode():
-        pyramid = Metric3D(weights()).pyramid(normalise(rebuilt.image(56, 84), CPU))
-    rebuilt.assert_close(pyramid.fine[0, ::16], stored("56x84/read_0_every16ch"), REST)
+        fine, *_ = Metric3DDepth(weights()).maps(normalise(rebuilt.image(56, 84), CPU))
+    rebuilt.assert_close(fine[0, ::16], stored("56x84/read_0_every16ch"), REST)
 
 
 def test_the_whole_box_is_that_of_the_official_slam():
