@@ -27,8 +27,8 @@ _TRAINED_GRID = 37  # patches per side of the 518 px images of the training
 # with antialiasing (registers, FiT3D), or by (n + _OFFSET) / 37 (DINOv2, the depth networks).
 _OFFSET = 0.1  # patches
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)  # RGB, of the images all these networks were trained on
-IMAGENET_STD = (0.229, 0.224, 0.225)
+_IMAGENET_MEAN = (0.485, 0.456, 0.406)  # RGB, of the images all these networks were trained on
+_IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 @dataclass(frozen=True)
@@ -83,23 +83,20 @@ class VisionTransformer:
             return self._tokens(image, (self.depth - 1,) if taps is None else taps)
 
     def _tokens(self, image: Tensor, taps: tuple[int, ...]) -> list[Tokens]:
+        count = self._leading.shape[1]
         patches = self.weights.conv("patch_embed.proj", image, stride=PATCH, padding=0)
         rows, cols = patches.shape[-2:]
         patches = patches + self._resized_positions(rows, cols)
         leading = self._leading.expand(len(image), -1, -1)
-        tokens = torch.cat([leading, patches.flatten(2).mT], 1)
+        x = torch.cat([leading, patches.flatten(2).mT], 1)
         readings = {}
         for index in range(self.depth):
-            tokens = _transformer_block(self.weights.below(self._block.format(index)), tokens)
+            x = _transformer_block(self.weights.below(self._block.format(index)), x)
             if index in taps:
-                readings[index] = self._read(tokens, rows, cols)
+                normed = self.weights.layer_norm("norm", x, _EPSILON).float()
+                grid = normed[:, count:].mT.unflatten(2, (rows, cols))
+                readings[index] = Tokens(normed[:, :count], grid)
         return [readings[index] for index in taps]
-
-    def _read(self, tokens: Tensor, rows: int, cols: int) -> Tokens:
-        normed = self.weights.layer_norm("norm", tokens, _EPSILON).float()
-        count = self._leading.shape[1]
-        patches = normed[:, count:].mT.unflatten(2, (rows, cols))
-        return Tokens(normed[:, :count], patches)
 
     def _resized_positions(self, rows: int, cols: int) -> Tensor:
         """Return the positions (1, C, rows, cols)."""
@@ -114,18 +111,14 @@ class VisionTransformer:
 
 def _transformer_block(weights: Weights, x: Tensor) -> Tensor:
     """Apply one block to tokens (B, N, C)."""
-    attended = _attention(weights, weights.layer_norm("norm1", x, _EPSILON))
+    # Every token reads from all: softmax(q k^T / sqrt(64)) v, per head of 64 channels.
+    qkv = weights.linear("attn.qkv", weights.layer_norm("norm1", x, _EPSILON))
+    q, k, v = qkv.unflatten(-1, (3, -1, _HEAD_WIDTH)).permute(2, 0, 3, 1, 4)  # (B, heads, N, 64)
+    read = functional.scaled_dot_product_attention(q, k, v, scale=1 / math.sqrt(_HEAD_WIDTH))
+    attended = weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
     x = x + weights["ls1.gamma"] * attended
     hidden = weights.linear("mlp.fc1", weights.layer_norm("norm2", x, _EPSILON))
     return x + weights["ls2.gamma"] * weights.linear("mlp.fc2", functional.gelu(hidden))
-
-
-def _attention(weights: Weights, x: Tensor) -> Tensor:
-    """Let every token read from all: softmax(q k^T / sqrt(64)) v, per head of 64 channels."""
-    qkv = weights.linear("attn.qkv", x).unflatten(-1, (3, -1, _HEAD_WIDTH))  # (B, N, 3, heads, 64)
-    q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, heads, N, 64)
-    read = functional.scaled_dot_product_attention(q, k, v, scale=1 / math.sqrt(_HEAD_WIDTH))
-    return weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
 
 
 def normalise(
@@ -133,6 +126,5 @@ def normalise(
     device: torch.device,
 ) -> Tensor:  # (1, 3, H, W)
     """Return an image as these networks expect it: batch and channels first, ImageNet's scale."""
-    mean = torch.tensor(IMAGENET_MEAN, device=device)
-    std = torch.tensor(IMAGENET_STD, device=device)
+    mean, std = (torch.tensor(part, device=device) for part in (_IMAGENET_MEAN, _IMAGENET_STD))
     return ((image.to(device) - mean) / std).permute(2, 0, 1)[None]
