@@ -1,6 +1,6 @@
 """Whether an object is what an interface asks for, found out on two small images.
 
-`plugins.py` asks before a run begins, and `minislam.checks` gives the same checks to authors: each
+`choice.py` asks before a run begins, and `minislam.checks` gives the same checks to authors: each
 returns nothing, or raises InputError with a sentence that says what is wrong.
 """
 
