@@ -41,8 +41,7 @@ class MeasuredEdge:
 class ClassicalFlow(Stateful):
     """DIS flow between registered keyframes, started from a predicted reprojection.
 
-    The flow takes half the time of tracking, and the same start gives the same result. So the
-    result of an edge is kept, and measured again only if its start has moved.
+    It takes half the time of tracking. So an edge is measured again only if its start has moved.
     """
 
     learned_confidence = False
@@ -149,8 +148,8 @@ class FlowChain(Stateful):
     """The flow from one reference frame to the newest frame, updated frame by frame.
 
     The flow to the previous frame predicts the flow to the next one, so that long displacements
-    are followed as long as each step is short. No pose is needed; the pose is started from this
-    flow. A chain is never changed: the next frame gives a new one, so a bad frame can be skipped.
+    are followed as long as each step is short. The pose is started from this flow. A chain is never
+    changed: the next frame gives a new one, so a bad frame can be skipped.
     """
 
     _reference: np.ndarray  # (H, W) uint8

@@ -63,13 +63,6 @@ class Weights:
         part._used, part.precision = self._used, self.precision
         return part
 
-    def count(self, pattern: str) -> int:
-        """Return how many of pattern.format(0), pattern.format(1), ... are there in a row."""
-        number = 0
-        while any(name.startswith(pattern.format(number)) for name in self):
-            number += 1
-        return number
-
     def unused(self) -> list[str]:
         """Return the names of the tensors that no function has read so far."""
         return sorted(name for name in self._tensors if name not in self._used)

@@ -5,9 +5,14 @@ the network answers as if every image came from one "canonical" camera of 1000 p
 is scaled by the true focal length: that of the image the network SAW, after resizing.
 
     tokens of the ViT -> 4 maps at 3 resolutions -> fused coarse to fine -> first estimate
-    -> a few rounds of recurrent refinement (metric3d_refinement.py) -> 4x upsampling
+    -> a few rounds of recurrent refinement -> 4x upsampling
+
+In the refinement three gated recurrent units (GRU) at three resolutions read the present estimate
+and propose a change to it, several times, as in RAFT. The estimate ("state") has six channels:
+scaled depth, depth confidence, normal (3), normal confidence.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +23,6 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
 from minislam.priors.networks.checkpoints import Weights, resize
-from minislam.priors.networks.metric3d_refinement import refine
 from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
 from minislam.records import Frame
 
@@ -27,6 +31,15 @@ FARTHEST = 300.0  # world units (metre); the official cut of the scaled depth
 NETWORK_SIZE = (616, 1064)  # px (height, width), as in the training
 _SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling of the coarsest map needs an even grid
 _ROUNDS = {384: 4, 1024: 8}  # of refinement, by the width of the ViT (S, L)
+_NEAREST, _FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
+_BINS = 256  # of depth, between the two on a logarithmic scale
+_STATE_UNIT = 100.0  # metre per unit of the state's depth channel
+_EPSILON = 1e-5  # of the layer norms in the convolutional part
+_UPSAMPLING = 4
+_MASK_SCALE = 0.25  # of the upsampling logits, as in RAFT
+# From fine to coarse; the GRUs are called by twice their level's stride.
+_CONTEXT_NAMES = ("outputs04", "outputs08", "outputs16")
+_GRU_NAMES = ("gru08", "gru16", "gru32")
 
 
 @dataclass(frozen=True)
@@ -73,9 +86,8 @@ class Metric3DDepth:
     def canonical_depth(self, image: Tensor) -> tuple[Tensor, float]:
         """Return the depth of a 1000 px camera at the network's scale, and that scale."""
         with torch.no_grad():
-            fitted = fit(image, self.network_size, self.device)
-            depth = self.network(fitted.image)[0, fitted.rows, fitted.cols]
-        return depth, fitted.scale
+            padded, inside, scale = fit(image, self.network_size, self.device)
+            return self.network(padded)[0][inside], scale
 
     def network(
         self,
@@ -98,7 +110,7 @@ class Metric3DDepth:
             fused = (fused + level.below("way_branch.").residual_unit(branch)).relu()
             fused = resize(level.below("way_trunk.").residual_unit(fused), size)
             fused = level.conv("out_conv", fused)
-        return refine(self._decoder, fused, [fine, middle, coarse], self._rounds)
+        return _refine(self._decoder, fused, [fine, middle, coarse], self._rounds)
 
     def maps(
         self,
@@ -118,18 +130,12 @@ class Metric3DDepth:
         return fine, weights.upconv("read_1.sample", readings[1]), readings[2], readings[3]
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """How an image was brought to the network's size."""
-
-    image: Tensor  # (1, 3, H_net, W_net) normalised
-    rows: slice  # where the image lies; the rest has the mean colour
-    cols: slice
-    scale: float  # network px per image px
-
-
-def fit(image: Tensor, size: tuple[int, int], device: torch.device) -> Fitted:
-    """Resize an image (H, W, 3) with its aspect kept; pad it to the network's size."""
+def fit(
+    image: Tensor,  # (H, W, 3)
+    size: tuple[int, int],  # px
+    device: torch.device,
+) -> tuple[Tensor, tuple[slice, slice], float]:  # (1, 3, *size) normalised, network px per px
+    """Return an image padded to a size, its aspect kept; the part where it lies; its scale."""
     scale = min(size[0] / image.shape[0], size[1] / image.shape[1])
     # The small number protects from 616 * (1 - 1e-16) being cut to 615.
     rows, cols = (max(1, int(side * scale + 1e-6)) for side in image.shape[:2])
@@ -137,4 +143,93 @@ def fit(image: Tensor, size: tuple[int, int], device: torch.device) -> Fitted:
     top, left = (size[0] - rows) // 2, (size[1] - cols) // 2
     padding = (left, size[1] - cols - left, top, size[0] - rows - top)
     padded = functional.pad(resized, padding)  # 0 is the mean colour of a normalised image
-    return Fitted(padded, slice(top, top + rows), slice(left, left + cols), scale)
+    return padded, (slice(top, top + rows), slice(left, left + cols)), scale
+
+
+def _refine(
+    weights: Weights,  # of the decoder
+    features: Tensor,  # (B, c0 + 2, h, w), the last two channels are confidences
+    context: list[Tensor],  # three maps (B, c, h_l, w_l), from fine to coarse
+    rounds: int,
+) -> Tensor:  # (B, H, W) metre
+    """Return the refined and upsampled depth for the canonical camera."""
+    state = _first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
+    hidden, gates = [], []  # of the units; what the context adds to their three gates
+    for level, (name, seen) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
+        encoder = weights.below(f"context_feature_encoder.{name}.")
+        hidden.append(_context_head(encoder.below("0."), seen).tanh())
+        offsets = _context_head(encoder.below("1."), seen).relu()
+        gates.append(weights.conv(f"context_zqr_convs.{level}", offsets).chunk(3, 1))
+    update = weights.below("update_block.")
+    for _ in range(rounds):
+        hidden = _recurrent_round(update, hidden, gates, state)
+        head = update.below("flow_head.")
+        depth = head.conv("conv2d", head.conv("conv1d", hidden[0]).relu(), channels=(2,))
+        normal = head.conv("conv2n", head.conv("conv1n", hidden[0]).relu(), channels=(4,))
+        state = state + torch.cat([depth, normal], 1)
+    mask = update.below("mask.").convs(hidden[0])
+    fine = convex_upsample(state[:, :1], _MASK_SCALE * mask, _UPSAMPLING)[:, 0]
+    return (_STATE_UNIT * fine + _FARTHEST).clamp(_NEAREST, _FARTHEST)
+
+
+def _first_estimate(
+    weights: Weights, features: Tensor, depth_confidence: Tensor, normal_confidence: Tensor
+) -> Tensor:  # (B, 6, h, w)
+    """Return the state before refinement: depth is an expectation over logarithmic bins."""
+    logits = weights.below("depth_regressor.").convs(features, channels=(_BINS,))
+    bins = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _BINS, device=features.device)
+    depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
+    depth = depth.clamp(_NEAREST, _FARTHEST)
+    normal = weights.below("normal_predictor.").convs(features, layers=4, channels=(3,))
+    unit = normal / (normal.norm(dim=1, keepdim=True) + 1e-10)
+    positive = functional.elu(normal_confidence) + 1.01
+    return torch.cat([(depth - _FARTHEST) / _STATE_UNIT, depth_confidence, unit, positive], 1)
+
+
+def _context_head(weights: Weights, x: Tensor) -> Tensor:
+    unit = weights.below("0.")
+    y = _channel_norm(unit, "norm1", unit.conv("conv1", x)).relu()
+    y = _channel_norm(unit, "norm2", unit.conv("conv2", y)).relu()
+    skip = _channel_norm(unit, "downsample.1", unit.conv("downsample.0", x))
+    return weights.conv("1", (skip + y).relu())
+
+
+def _channel_norm(weights: Weights, name: str, x: Tensor) -> Tensor:
+    """Normalise over the channels of each pixel of (B, C, h, w)."""
+    return weights.layer_norm(name, x.movedim(1, -1), _EPSILON).movedim(-1, 1)
+
+
+def _recurrent_round(
+    weights: Weights, hidden: list[Tensor], gates: list[tuple[Tensor, ...]], state: Tensor
+) -> list[Tensor]:
+    """Update the coarsest unit three times, the middle one twice, the finest once."""
+    fine, middle, coarse = hidden
+    size = middle.shape[-2:]
+
+    def gru(level: int, h: Tensor, *inputs: Tensor) -> Tensor:
+        unit = weights.below(f"{_GRU_NAMES[level]}.")
+        return unit.gru(h, torch.cat(inputs, 1), gates[level])
+
+    coarse = gru(2, coarse, _halved(middle))
+    for _ in range(2):
+        coarse = gru(2, coarse, _halved(middle))
+        middle = gru(1, middle, resize(_halved(fine), size), resize(coarse, size))
+    fine = gru(0, fine, state, resize(middle, fine.shape[-2:]))
+    return [fine, middle, coarse]
+
+
+def _halved(x: Tensor) -> Tensor:
+    return functional.avg_pool2d(x, 3, stride=2, padding=1)  # counts the padding as zeros
+
+
+def convex_upsample(
+    coarse: Tensor,  # (B, C, h, w)
+    logits: Tensor,  # (B, 9 * factor^2, h, w)
+    factor: int,
+) -> Tensor:  # (B, C, factor * h, factor * w)
+    """Upsample: each fine pixel is a convex combination of the 3x3 coarse ones around it (RAFT)."""
+    batch, channels, height, width = coarse.shape
+    weight = logits.view(batch, 1, 9, factor, factor, height, width).softmax(2)
+    around = functional.unfold(coarse, 3, padding=1).view(batch, channels, 9, 1, 1, height, width)
+    fine = (weight * around).sum(2)  # (B, C, factor, factor, h, w)
+    return fine.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, factor * height, factor * width)

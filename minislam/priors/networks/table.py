@@ -16,9 +16,9 @@ import torch
 from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights, load_checkpoint
 from minislam.priors.networks.depth_anything import DepthAnything, DepthAnythingConfig
-from minislam.priors.networks.dinov2 import DinoFeatures
 from minislam.priors.networks.droid import DroidFlow, DroidFlowConfig
 from minislam.priors.networks.metric3d import Metric3DConfig, Metric3DDepth
+from minislam.priors.networks.vit import DinoFeatures
 from minislam.records import Frame
 
 
