@@ -21,7 +21,7 @@ from minislam.errors import InputError, MinislamError, TrackingLost
 from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
-from minislam.priors.high_resolution import with_finer_grid
+from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful

@@ -23,8 +23,8 @@ from minislam.priors.depth import NoDepth, SimulatedDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.dinov2 import DinoFeatures
 from minislam.priors.networks.droid import DroidFlow
+from minislam.priors.networks.vit import DinoFeatures
 from minislam.runs import run
 from minislam.runs.facts import measure, run_facts
 from minislam.runs.pictures import write_pictures

@@ -210,8 +210,8 @@ def lpips_of(args: argparse.Namespace) -> Lpips | None:
             f"expected --lpips-{missing} FILE with --lpips-{given}, found none; give both or none"
         )
     from minislam.evaluation.lpips import Lpips
+    from minislam.priors.names import find_weights
     from minislam.priors.networks.checkpoints import load_checkpoint
-    from minislam.priors.networks.published import find_weights
 
     files = find_weights("--lpips-trunk", trunk), find_weights("--lpips-heads", heads)
     return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in files))

@@ -82,8 +82,8 @@ def _kinds(
     """Return for each folder to write: a line that identifies its content, and a function."""
     from minislam.config import as_json
     from minislam.priors.choice import choose_depth, choose_features
+    from minislam.priors.features import with_finer_grid
     from minislam.priors.files import DEPTH, FEATURES
-    from minislam.priors.high_resolution import with_finer_grid
 
     # Everything the result depends on, so that files of another command are not taken for these.
     tree = as_json(config)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from minislam.cli.progress import ProgressLine
 from minislam.errors import InputError, MinislamError
-from minislam.priors.networks.published import PublishedFile, published_files
+from minislam.priors.names import PublishedFile, published_files
 
 if TYPE_CHECKING:
     from minislam.priors.networks.checkpoints import Weights

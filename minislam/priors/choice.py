@@ -1,6 +1,14 @@
-"""Choose flow, features and depth by their names on the command line; load and check them."""
+"""Choose flow, features and depth by their names on the command line; load and check them.
 
+Priors may also be made elsewhere. `--depth python:MODULE:FACTORY` imports MODULE, also from the
+current folder, and calls FACTORY(device), or FACTORY(device, FILE) with `--depth-weights FILE`. An
+installed package gives its factory a name of its own by an entry point in the group
+`minislam.depth`. The same holds for features and flow.
+"""
+
+import sys
 from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -8,22 +16,22 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.priors.depth import (
-    FileDepth,
-    NoDepth,
-    SensorDepth,
-    SimulatedDepth,
-    SimulatedDepthConfig,
-)
+from minislam.priors import conformance
+from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeatures
-from minislam.priors.files import DEPTH, FEATURES, FileFeatures, folder_of
+from minislam.priors.files import DEPTH, FEATURES, FileDepth, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.priors.names import FILES, FOLDER, PRECISIONS, PriorChoice, require_prior
+from minislam.priors.names import FILES, FOLDER, PRECISIONS, PYTHON, PriorChoice, require_prior
 from minislam.priors.networks.table import NetworksConfig, find_network, load_network
-from minislam.priors.plugins import load_plugin
 from minislam.records import Sequence
+
+_CHECKS = {
+    "flow": conformance.check_flow_estimator,
+    "features": conformance.check_feature_extractor,
+    "depth": conformance.check_depth_prior,
+}
 
 
 def choose_flow(
@@ -78,6 +86,29 @@ def _choose(
     if maker is not None and weights is None:
         return maker()
     return load_plugin(kind, name, choice.device, weights)
+
+
+def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any | None:
+    """Return the prior of a flag --KIND NAME, checked; None if no package has this name."""
+    group = f"minislam.{kind}"
+    found = list(entry_points(group=group, name=name))
+    if name.startswith(PYTHON):
+        if "" not in sys.path:
+            sys.path.append("")  # the current folder, which `minislam` alone does not look into
+        found = [EntryPoint(name, name.removeprefix(PYTHON), group)]
+    if not found:
+        return None
+    try:
+        make = found[0].load()
+        prior = make(device) if weights is None else make(device, weights)
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"expected --{kind} {name} to name a function that makes a prior of a device, found "
+            f"{type(error).__name__}: {str(error).partition(chr(10))[0]}; write it like "
+            f"{PYTHON}MODULE:FUNCTION, see minislam/priors/networks/README.md"
+        ) from error
+    _CHECKS[kind](prior, f"--{kind} {name}")
+    return prior
 
 
 def _sensor_depth(sequence: Sequence) -> SensorDepth:

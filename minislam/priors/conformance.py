@@ -1,6 +1,6 @@
 """Whether an object is what an interface asks for, found out on two small images.
 
-`plugins.py` asks before a run begins, and `minislam.checks` gives the same checks to authors: each
+`choice.py` asks before a run begins, and `minislam.checks` gives the same checks to authors: each
 returns nothing, or raises InputError with a sentence that says what is wrong.
 """
 
@@ -48,7 +48,7 @@ def check_depth_prior(prior: Any, name: str = "the depth prior") -> None:
     depth = _same_answer(name, prior, CAMERA)
     if depth is not None:
         _expect_tensor(name, depth, (CAMERA.height, CAMERA.width))
-        low, high = float(depth.min()), float(depth.max())
+        low, high = map(float, depth.aminmax())
         found = f"{low:g} to {high:g}; return z in world units"
         _expect(low >= 0 and high > 0, f"{name} to return depths > 0 and 0 where unknown", found)
 
@@ -118,7 +118,7 @@ def _expect_matches(name: str, matches: Any, edges: int, stride: int) -> None:
     _expect_tensor(f"{name} (confidences)", matches.confidences, shape)
     _expect_tensor(f"{name} (matched_ratios)", matches.matched_ratios, shape[:1])
     for part in (matches.confidences, matches.matched_ratios):
-        low, high = float(part.min()), float(part.max())
+        low, high = map(float, part.aminmax())
         _expect(low >= 0 and high <= 1, f"{name} to return 0 to 1", f"{low:g} to {high:g}")
     u, v = SHIFT
     mistakes = {"(v, u)": (v, u), "the way back": (-u, -v), "cells": (u / stride, v / stride)}

@@ -36,8 +36,7 @@ def warp(image: np.ndarray, flow: np.ndarray, method: int = cv2.INTER_LINEAR) ->
 
 def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
     """Return the dense flow (H, W, 2) that interpolates grid target positions (h, w, 2) [px]."""
-    cells = np.mgrid[: grid_targets.shape[0], : grid_targets.shape[1]].astype(np.float32)
-    grid_flow = grid_targets - stride * np.stack([cells[1], cells[0]], -1)
+    grid_flow = grid_targets - stride * np.stack(pixel_maps(grid_targets.shape[:2]), -1)
     column, row = pixel_maps(shape)
     return sample(grid_flow, column / stride, row / stride)
 

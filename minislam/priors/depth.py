@@ -1,4 +1,4 @@
-"""Metric depth of single images without a network: simulated, from files, from a sensor, none.
+"""Metric depth of single images without a network: simulated, from a sensor, none.
 
 All are a `DepthPrior`: called with a frame and its camera they return z-depth (H, W) in world
 units, 0 where it is unknown, or None for a frame without depth.
@@ -6,7 +6,6 @@ units, 0 where it is unknown, or None for a frame without depth.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,7 +15,6 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
-from minislam.priors.files import FrameFiles, read_array
 from minislam.records import Frame
 
 _FIELD_CELLS = 4  # bumps of the smooth error along the shorter image side
@@ -44,11 +42,12 @@ class SimulatedDepth:
     """
 
     def __init__(
-        self, truth: DepthReader, seed: int, config: SimulatedDepthConfig | None = None
+        self,
+        truth: DepthReader,
+        seed: int,
+        config: SimulatedDepthConfig = SimulatedDepthConfig(),
     ) -> None:
-        self.truth = truth
-        self.seed = seed
-        self.config = config or SimulatedDepthConfig()
+        self.truth, self.seed, self.config = truth, seed, config
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return the disturbed truth of a frame."""
@@ -62,7 +61,7 @@ class SimulatedDepth:
             + self.config.field_error * _smooth_noise(width, height, source)
             + self._gross(width, height, source)
         )
-        return _as_depth(truth * np.exp(log_factor), frame, "the simulated depth")
+        return as_depth(truth * np.exp(log_factor), frame, "the simulated depth")
 
     def _gross(self, width: int, height: int, source: np.random.Generator) -> np.ndarray:
         """Return the log factor (H, W) of the gross errors."""
@@ -79,38 +78,6 @@ class SimulatedDepth:
         return total
 
 
-class FileDepth:
-    """Depth made elsewhere: a folder of .npy (world units) or 16-bit .png files.
-
-    `FrameFiles` finds the file of a frame.
-    """
-
-    def __init__(
-        self,
-        folder: Path | str,
-        png_unit: float = 1 / 5000,  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
-    ) -> None:
-        self.png_unit = png_unit
-        self._files = FrameFiles(folder, "depth", (".npy", ".png"))
-
-    def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
-        """Read the depth of a frame, resized to its image, or return None if there is no file."""
-        path = self._files.of(frame)
-        if path is None:
-            return None
-        depth = _read_npy(path) if path.suffix.lower() == ".npy" else self._read_png(path)
-        return _as_depth(depth, frame, str(path))
-
-    def _read_png(self, path: Path) -> np.ndarray:
-        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
-            raise InputError(
-                f"expected a single-channel 16-bit .png of depth, found something else in {path}; "
-                "export depth, not its coloured picture"
-            )
-        return counts.astype(np.float32) * self.png_unit
-
-
 class SensorDepth:
     """Depth of an RGB-D camera, as the sequence's own reader returns it."""
 
@@ -120,7 +87,7 @@ class SensorDepth:
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return the sensor's depth of a frame, or None where it has none."""
         depth = self.reader(frame.frame_index)
-        return None if depth is None else _as_depth(depth, frame, "the sensor's depth")
+        return None if depth is None else as_depth(depth, frame, "the sensor's depth")
 
 
 class NoDepth:
@@ -136,21 +103,10 @@ def _smooth_noise(width: int, height: int, source: np.random.Generator) -> np.nd
     cell = min(width, height) / _FIELD_CELLS
     coarse = source.standard_normal((round(height / cell) + 1, round(width / cell) + 1))
     noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    deviation = noise.std()
-    return (noise - noise.mean()) / (deviation if deviation > 0 else 1.0)
+    return (noise - noise.mean()) / (noise.std() or 1.0)
 
 
-def _read_npy(path: Path) -> np.ndarray:
-    depth = np.squeeze(read_array(path, "depth"))
-    if depth.ndim != 2 or depth.size == 0:
-        raise InputError(
-            f"expected depth of shape (H, W) in {path}, found {depth.dtype} of shape "
-            f"{depth.shape}; store one depth map in world units per file"
-        )
-    return depth
-
-
-def _as_depth(depth: np.ndarray, frame: Frame, name: str) -> Tensor:
+def as_depth(depth: np.ndarray, frame: Frame, name: str) -> Tensor:
     """Return depth as (H, W) float32 of the frame's size, with 0 for everything unusable."""
     height, width = frame.image.shape[:2]
     aspect = (depth.shape[1] / depth.shape[0]) / (width / height)

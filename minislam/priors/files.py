@@ -6,12 +6,14 @@ where there is a GPU, and the SLAM runs anywhere.
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.priors.depth import as_depth
 from minislam.priors.names import FILES
 from minislam.records import Frame
 
@@ -27,14 +29,9 @@ class FrameFiles:
     found by its timestamp, so that a run on fewer of the frames finds the right files.
     """
 
-    def __init__(
-        self,
-        folder: Path | str,
-        what: str,  # "depth" or "features", for messages
-        endings: tuple[str, ...],
-    ) -> None:
+    def __init__(self, folder: Path | str, what: str, endings: tuple[str, ...]) -> None:
         self.folder = Path(folder)
-        self.what = what
+        self.what = what  # "depth" or "features", for messages
         if not self.folder.is_dir():
             raise InputError(
                 f"expected a folder of {what} files, found nothing at {self.folder}; check the path"
@@ -47,6 +44,7 @@ class FrameFiles:
                 f"expected {' or '.join(endings)} files named by frame index in {self.folder}, "
                 f"found {len(files)} such files and none that fits; name them like 00017.npy"
             )
+        self.first = self._files[min(self._files)]
         index = self.folder / INDEX
         self._number_of = _read_index(index) if index.is_file() else None
 
@@ -62,17 +60,13 @@ class FrameFiles:
             )
         return self._files.get(self._number_of[moment])
 
-    def any(self) -> Path:
-        """Return one of the files."""
-        return self._files[min(self._files)]
-
 
 class FileFeatures:
     """Features made elsewhere, from .npy files (h', w', C): a `FeatureExtractor`."""
 
     def __init__(self, folder: Path | str, camera: Camera) -> None:
         self._files = FrameFiles(folder, "features", (".npy",))
-        rows, _, self.dimension = _read_features(self._files.any()).shape
+        rows, _, self.dimension = _read_features(self._files.first).shape
         self.stride = max(1, round(camera.height / rows))
 
     def __call__(self, frame: Frame) -> Tensor:  # (h', w', C) float32
@@ -98,6 +92,33 @@ class FileFeatures:
                 f"{cols}x{rows}, of another aspect ratio; crop it like the image"
             )
         return torch.from_numpy(features).to(frame.image.device)
+
+
+class FileDepth:
+    """Depth made elsewhere, from .npy (world units) or 16-bit .png files: a `DepthPrior`."""
+
+    def __init__(
+        self,
+        folder: Path | str,
+        png_unit: float = 1 / 5000,  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
+    ) -> None:
+        self.png_unit = png_unit
+        self._files = FrameFiles(folder, "depth", (".npy", ".png"))
+
+    def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
+        """Read the depth of a frame, resized to its image, or return None if there is no file."""
+        path = self._files.of(frame)
+        if path is None:
+            return None
+        if path.suffix.lower() == ".npy":
+            return as_depth(_read_depth(path), frame, str(path))
+        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
+            raise InputError(
+                f"expected a single-channel 16-bit .png of depth, found something else in {path}; "
+                "export depth, not its coloured picture"
+            )
+        return as_depth(counts.astype(np.float32) * self.png_unit, frame, str(path))
 
 
 def folder_of(name: str, kind: str) -> Path:
@@ -142,6 +163,16 @@ def _read_features(path: Path) -> np.ndarray:
             f"{features.shape}; write it again"
         )
     return features.astype(np.float32)
+
+
+def _read_depth(path: Path) -> np.ndarray:
+    depth = np.squeeze(read_array(path, "depth"))
+    if depth.ndim != 2 or depth.size == 0:
+        raise InputError(
+            f"expected depth of shape (H, W) in {path}, found {depth.dtype} of shape "
+            f"{depth.shape}; store one depth map in world units per file"
+        )
+    return depth
 
 
 def _read_index(path: Path) -> dict[str, int]:

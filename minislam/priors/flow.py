@@ -41,8 +41,7 @@ class MeasuredEdge:
 class ClassicalFlow(Stateful):
     """DIS flow between registered keyframes, started from a predicted reprojection.
 
-    The flow takes half the time of tracking, and the same start gives the same result. So the
-    result of an edge is kept, and measured again only if its start has moved.
+    It takes half the time of tracking. So an edge is measured again only if its start has moved.
     """
 
     learned_confidence = False
@@ -75,14 +74,10 @@ class ClassicalFlow(Stateful):
     def remove_frame(self, keyframe_index: int) -> None:
         """Forget a keyframe."""
         del self._images[keyframe_index], self._textures[keyframe_index]
-        for edge in [edge for edge in self._measured if keyframe_index in edge]:
-            del self._measured[edge]
+        self._measured = {e: flow for e, flow in self._measured.items() if keyframe_index not in e}
 
     def match(
-        self,
-        edges_source: list[int],  # (E,) keyframe index
-        edges_target: list[int],  # (E,) keyframe index
-        predicted_targets: Tensor,  # (E, 2, N) px
+        self, edges_source: list[int], edges_target: list[int], predicted_targets: Tensor
     ) -> FlowMatches:
         """Match every grid cell of each source in its target; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
@@ -133,7 +128,7 @@ class ClassicalFlow(Stateful):
         return MeasuredEdge(*edge, start.copy(), *on_grid)
 
     def _edge_flow(self, edge: Edge, start: np.ndarray) -> np.ndarray:
-        source, target = self._images[edge[0]], self._images[edge[1]]
+        source, target = (self._images[end] for end in edge)
         on_grid = np.ascontiguousarray(start.T).reshape(*self._textures[edge[0]].shape, 2)
         return composed_flow(source, target, dense_from_grid(on_grid, source.shape, self.stride))
 
@@ -153,8 +148,8 @@ class FlowChain(Stateful):
     """The flow from one reference frame to the newest frame, updated frame by frame.
 
     The flow to the previous frame predicts the flow to the next one, so that long displacements
-    are followed as long as each step is short. No pose is needed; the pose is started from this
-    flow. A chain is never changed: the next frame gives a new one, so a bad frame can be skipped.
+    are followed as long as each step is short. The pose is started from this flow. A chain is never
+    changed: the next frame gives a new one, so a bad frame can be skipped.
     """
 
     _reference: np.ndarray  # (H, W) uint8
@@ -170,28 +165,23 @@ class FlowChain(Stateful):
         increment: np.ndarray,
         config: ClassicalFlowConfig,
     ) -> None:
-        self._reference = reference
-        self._newest = newest
-        self._flow = flow
-        self._increment = increment
-        self._config = config
+        self._reference, self._newest = reference, newest
+        self._flow, self._increment, self._config = flow, increment, config
 
     def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
-        gray = grayscale(image)
-        stride = self._config.stride
+        gray, stride = grayscale(image), self._config.stride
         texture = texture_confidence(self._reference, stride)
 
         def follow(start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            flow = composed_flow(self._reference, gray, start)
-            backward = reverse_flow(self._reference, gray, flow)
             images = self._reference, gray
+            flow = composed_flow(*images, start)
+            backward = reverse_flow(*images, flow)
             return flow, *measure_on_grid(*images, flow, backward, texture, stride)
 
         # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
         # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
-        starts = (self._flow, self._flow + self._increment)
-        measured = _threads().map(follow, starts)
+        measured = _threads().map(follow, (self._flow, self._flow + self._increment))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
         return chain, as_matches([targets], [confidence], [texture], image)

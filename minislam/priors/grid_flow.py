@@ -62,22 +62,16 @@ def measure_on_grid(
 def windows_of(source: np.ndarray, warped: np.ndarray, stride: int) -> Windows:
     """Return means, variances and covariance of two images (H, W) uint8 around each cell."""
 
-    def at_cells(image: np.ndarray) -> np.ndarray:
-        return image[::stride, ::stride]
+    def mean_around(image: np.ndarray) -> np.ndarray:
+        return cv2.boxFilter(image, cv2.CV_32F, SIMILARITY_WINDOW)[::stride, ::stride]
 
-    mean, warped_mean = (
-        at_cells(cv2.boxFilter(image, cv2.CV_32F, SIMILARITY_WINDOW)) / 255
-        for image in (source, warped)
-    )
-    square, warped_square, product = (
-        at_cells(cv2.boxFilter(cv2.multiply(*images, dtype=cv2.CV_32F), -1, SIMILARITY_WINDOW))
-        / 255**2
-        for images in ((source, source), (warped, warped), (source, warped))
-    )
-    return Windows(
-        mean, square - mean**2, warped_mean, warped_square - warped_mean**2,
-        product - mean * warped_mean,
-    )  # fmt: skip
+    def covariance(i: int, j: int) -> np.ndarray:
+        product = cv2.multiply(images[i], images[j], dtype=cv2.CV_32F)
+        return mean_around(product) / 255**2 - means[i] * means[j]
+
+    images = source, warped
+    means = [mean_around(image) / 255 for image in images]
+    return Windows(means[0], covariance(0, 0), means[1], covariance(1, 1), covariance(0, 1))
 
 
 def match_exposure(warped: np.ndarray, windows: Windows) -> np.ndarray:
@@ -100,14 +94,14 @@ def lucas_kanade(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndar
     over large parts of an image and so rotate the estimated camera. A least-squares match of one
     window per cell has independent errors, which average out.
     """
-    cells = np.mgrid[: source.shape[0] : stride, : source.shape[1] : stride][::-1]
-    points = cells.reshape(2, -1).T[:, None].astype(np.float32)
+    cells = np.stack(pixel_maps(source.shape), -1)[::stride, ::stride]
+    points = cells.reshape(-1, 1, 2)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         source, warped, points, points.copy(), winSize=LK_WINDOW, maxLevel=0, criteria=LK_STOP,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
-    remainder = (moved - points).reshape(*cells.shape[1:], 2)
-    usable = (found.reshape(cells.shape[1:]) == 1) & (np.abs(remainder).max(-1) < MAX_REMAINDER)
+    remainder = (moved - points).reshape(cells.shape)
+    usable = (found.reshape(cells.shape[:2]) == 1) & (np.abs(remainder).max(-1) < MAX_REMAINDER)
     return remainder * usable[..., None]
 
 
@@ -137,15 +131,13 @@ def grid_matches(
 def texture_confidence(gray: np.ndarray, stride: int) -> np.ndarray:
     """Return how well each grid cell can be located (h, w), in [0, 1).
 
-    On a bare wall forward and backward flow agree although both are wrong, so agreement alone is
-    no confidence. If the smaller eigenvalue of the structure tensor is large, a displacement in
-    any direction changes the image.
+    On a bare wall forward and backward flow agree although both are wrong. If the smaller
+    eigenvalue of the structure tensor is large, a displacement in any direction changes the image.
     """
     scaled = gray.astype(np.float32) / 255
     gx = cv2.Scharr(scaled, cv2.CV_32F, 1, 0) / 32  # 32: sum of the kernel's positive weights x 2
     gy = cv2.Scharr(scaled, cv2.CV_32F, 0, 1) / 32
-    window = (7, 7)
-    xx, yy, xy = (cv2.boxFilter(p, -1, window) for p in (gx * gx, gy * gy, gx * gy))
+    xx, yy, xy = (cv2.boxFilter(p, -1, (7, 7)) for p in (gx * gx, gy * gy, gx * gy))
     smaller = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
     smaller = np.maximum(smaller[::stride, ::stride], 0)
     return smaller / (smaller + TEXTURE_SCALE)
@@ -154,9 +146,8 @@ def texture_confidence(gray: np.ndarray, stride: int) -> np.ndarray:
 def similarity(windows: Windows) -> np.ndarray:
     """Return the similarity of source and warped target around each cell (h, w), in [0, 1].
 
-    It is the squared normalised cross-correlation, which does not depend on the exposure. It is
-    needed because forward and backward flow may agree where the images differ, for instance on a
-    black target.
+    It is the squared normalised cross-correlation, which does not depend on the exposure. Without
+    it a black target would match, since forward and backward flow agree there.
     """
     squared_scale = np.maximum(windows.variance * windows.warped_variance, LEAST_VARIANCE**2)
     return np.clip(windows.covariance / np.sqrt(squared_scale), 0, 1) ** 2

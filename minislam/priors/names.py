@@ -1,10 +1,14 @@
-"""Which priors there are, by the values of --flow, --features and --depth. This needs no torch."""
+"""Which priors there are, by the values of --flow, --features and --depth. This needs no torch.
 
+The official checkpoints are listed in networks/weights.csv; `minislam weights` fetches them.
+"""
+
+import csv
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from minislam.errors import InputError
-from minislam.priors.networks.published import find_weights, published_files
 
 FILES = "files:"  # before the name of a folder of results made elsewhere
 PYTHON = "python:"  # before MODULE:FACTORY
@@ -50,6 +54,42 @@ class PriorChoice:
             )
 
 
+@dataclass(frozen=True)
+class PublishedFile:
+    """A row of weights.csv."""
+
+    name: str  # in `minislam weights fetch NAME`; the one that a run takes is called as its network
+    use: str  # the flag it is for, like "--flow droid"
+    file: str  # its official name
+    megabytes: str
+    sha256: str  # "" where none is published
+    licence: str  # the stricter one where two are stated
+    url: str
+
+    @property
+    def path(self) -> Path:
+        """Return where this file is, or would be, below $MINISLAM_CACHE or ~/.cache/minislam."""
+        root = Path(os.environ.get("MINISLAM_CACHE") or Path.home() / ".cache" / "minislam")
+        return root / "weights" / self.file
+
+
+def published_files() -> dict[str, PublishedFile]:
+    """Return all rows by their names."""
+    text = (Path(__file__).parent / "networks/weights.csv").read_text(encoding="utf-8")
+    return {row["name"]: PublishedFile(**row) for row in csv.DictReader(text.splitlines())}
+
+
+def find_weights(use: str, given: str | None) -> str | None:
+    """Return the path of what a flag like "--flow droid" reads, if it was given or fetched.
+
+    What was given is a path, or the name of a row.
+    """
+    row = published_files().get(given or use.split()[-1])
+    if row is None or row.use != use or not (given or row.path.exists()):
+        return given
+    return str(row.path)
+
+
 def plugin_names(kind: str) -> list[str]:
     """Return the names that installed packages give to priors of a kind."""
     from importlib.metadata import entry_points
@@ -62,8 +102,8 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
 
     Refuse a name that is unknown and weights that are missing, before anything is loaded.
     """
-    uses = [row.use.split() for row in published_files().values()]
-    learned = list(dict.fromkeys(use[-1] for use in uses if use[0] == f"--{kind}"))
+    uses = [row.use for row in published_files().values() if row.use.startswith(f"--{kind} ")]
+    learned = list(dict.fromkeys(use.split()[-1] for use in uses))
     if name in learned:
         file = find_weights(f"--{kind} {name}", weights)
         if file is None:

@@ -18,7 +18,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera, se3_inverse
 from minislam.images import resample
 from minislam.priors.choice import PriorChoice, choose_features
-from minislam.priors.high_resolution import with_finer_grid
+from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
 from minislam.runs.facts import surface_depth, unit_of

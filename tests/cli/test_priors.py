@@ -14,8 +14,8 @@ import torch
 
 from minislam.cli.main import main
 from minislam.data import RunFolder, read_ply
-from minislam.priors.networks.dinov2 import DinoFeatures
 from minislam.priors.networks.metric3d import Metric3DDepth
+from minislam.priors.networks.vit import DinoFeatures
 from tests.checkpoint_files import calm_droid, tiny_fit3d, write_all
 
 pytestmark = pytest.mark.slow

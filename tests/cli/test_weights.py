@@ -9,7 +9,7 @@ import torch
 
 from minislam.cli import weights as module
 from minislam.cli.main import main
-from minislam.priors.networks.published import published_files
+from minislam.priors.names import published_files
 from tests.checkpoint_files import calm_droid, lpips_files, tiny_fit3d, write, write_all
 from tests.loopback import Server, serve
 

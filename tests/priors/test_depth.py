@@ -9,13 +9,8 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.priors.depth import (
-    FileDepth,
-    NoDepth,
-    SensorDepth,
-    SimulatedDepth,
-    SimulatedDepthConfig,
-)
+from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
+from minislam.priors.files import FileDepth
 from minislam.records import Frame
 
 CAMERA = Camera(60.0, 60.0, 39.5, 29.5, 80, 60)

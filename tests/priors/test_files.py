@@ -9,11 +9,11 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.priors.depth import FileDepth
 from minislam.priors.files import (
     DEPTH,
     FEATURES,
     INDEX,
+    FileDepth,
     FileFeatures,
     FrameFiles,
     folder_of,

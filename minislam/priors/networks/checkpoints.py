@@ -63,13 +63,6 @@ class Weights:
         part._used, part.precision = self._used, self.precision
         return part
 
-    def count(self, pattern: str) -> int:
-        """Return how many of pattern.format(0), pattern.format(1), ... are there in a row."""
-        number = 0
-        while any(name.startswith(pattern.format(number)) for name in self):
-            number += 1
-        return number
-
     def unused(self) -> list[str]:
         """Return the names of the tensors that no function has read so far."""
         return sorted(name for name in self._tensors if name not in self._used)
@@ -108,6 +101,16 @@ class Weights:
         padding = weight.shape[-1] // 2 if padding is None else padding
         return functional.conv2d(x, weight, self[f"{name}.bias"] if bias else None, stride, padding)
 
+    def convs(self, x: Tensor, layers: int = 2, channels: tuple[int, ...] = ()) -> Tensor:
+        """Apply the convolutions "0", "2", "4", ... of this part, with ReLUs between them."""
+        for k in range(layers - 1):
+            x = self.conv(f"{2 * k}", x).relu()
+        return self.conv(f"{2 * layers - 2}", x, channels=channels)
+
+    def residual_unit(self, x: Tensor) -> Tensor:
+        """Add to a map what two convolutions, each behind a ReLU, make of it."""
+        return x + self.conv("conv2", self.conv("conv1", x.relu()).relu())
+
     def upconv(self, name: str, x: Tensor) -> Tensor:
         """Apply a transposed convolution whose stride is its kernel's size."""
         weight = self[f"{name}.weight"]
@@ -130,6 +133,11 @@ class Weights:
         r = torch.sigmoid(self.conv("convr", both) + offsets[1])
         q = torch.tanh(self.conv("convq", torch.cat([r * hidden, inputs], 1)) + offsets[2])
         return (1 - z) * hidden + z * q
+
+
+def resize(x: Tensor, size: Sequence[int]) -> Tensor:
+    """Return maps (B, C, h, w) of another size; the centres of the corner cells stay."""
+    return functional.interpolate(x, tuple(size), mode="bilinear", align_corners=True)
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Weights:

@@ -12,18 +12,15 @@ from pathlib import Path
 import cv2
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
-from minislam.priors.networks.checkpoints import Weights
+from minislam.priors.networks.checkpoints import Weights, resize
 from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
 from minislam.records import Frame
 
-SHORTER_SIDE = 518  # px the network sees, as in its training
-INDOOR_LIMIT, OUTDOOR_LIMIT = 20.0, 80.0  # metre; the Hypersim and the Virtual KITTI checkpoints
-_LIMIT_OF_NAME = {"metric_hypersim": INDOOR_LIMIT, "metric_vkitti": OUTDOOR_LIMIT}
+_LIMIT_OF_NAME = {"metric_hypersim": 20.0, "metric_vkitti": 80.0}  # metre; indoors and outdoors
 _TAPS = {12: (2, 5, 8, 11), 24: (4, 11, 17, 23)}  # by the number of blocks: S and B, L
 
 
@@ -31,96 +28,65 @@ _TAPS = {12: (2, 5, 8, 11), 24: (4, 11, 17, 23)}  # by the number of blocks: S a
 class DepthAnythingConfig:
     """Size of the input, and scale of the output."""
 
-    shorter_side: int = parameter(SHORTER_SIDE, "shorter side of what it sees [px], official", 1)
+    shorter_side: int = parameter(518, "shorter side of what it sees [px], official", 1)
     depth_limit: float = parameter(
         0.0, "largest depth of the training [m]; 0: as the official file name says (20 or 80)"
     )
 
 
-class DepthAnythingHead:
-    """The convolutions behind the transformer: tokens in, one number per pixel out."""
+class DepthAnything:
+    """Metric depth by Depth Anything V2: a `DepthPrior`."""
 
-    def __init__(self, weights: Weights) -> None:
-        transformer = VisionTransformer(weights.below("pretrained."))
-        self.transformer, self.weights = transformer, weights.below("depth_head.")
-        self.taps = _TAPS[transformer.depth]
+    def __init__(self, weights: Weights, config: DepthAnythingConfig) -> None:
+        self.depth_limit = config.depth_limit or _limit_of_name(Path(weights.file).name)
+        self.shorter_side = config.shorter_side
+        self.device = weights.device
+        self._transformer = VisionTransformer(weights.below("pretrained."))
+        self._head = weights.below("depth_head.")
 
-    def __call__(
+    def __call__(self, frame: Frame, camera: Camera) -> Tensor:
+        """Return the depth (H, W) in metres that the network sees in an image."""
+        with torch.no_grad():
+            seen = normalise(self._resized(frame.image), self.device)
+            depth = self.depth_limit * torch.sigmoid(self.network(seen))
+            full = resize(depth[None], frame.image.shape[:2])[0, 0]
+        return full.to(frame.image.device)
+
+    def network(
         self,
         image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 14
     ) -> Tensor:  # (B, H, W), before the last activation
         """Return the raw output: its sigmoid is metric depth, its ReLU relative disparity."""
-        weights = self.weights
-        readings = self.transformer(image, self.taps)
-        maps = [weights.conv(f"projects.{k}", tokens.patches) for k, tokens in enumerate(readings)]
+        head, scratch = self._head, self._head.below("scratch.")
+        readings = self._transformer(image, _TAPS[self._transformer.depth])
+        maps = [head.conv(f"projects.{k}", tokens.patches) for k, tokens in enumerate(readings)]
         # Resolutions of 4, 2, 1 and 1/2 cells per patch side.
-        maps[0] = weights.upconv("resize_layers.0", maps[0])
-        maps[1] = weights.upconv("resize_layers.1", maps[1])
-        maps[3] = weights.conv("resize_layers.3", maps[3], stride=2)
-        scratch = weights.below("scratch.")
+        maps[0] = head.upconv("resize_layers.0", maps[0])
+        maps[1] = head.upconv("resize_layers.1", maps[1])
+        maps[3] = head.conv("resize_layers.3", maps[3], stride=2)
         maps = [scratch.conv(f"layer{k + 1}_rn", m, bias=False) for k, m in enumerate(maps)]
 
-        fused = _fuse(scratch.below("refinenet4."), maps[3], None, maps[2].shape[-2:])
-        fused = _fuse(scratch.below("refinenet3."), fused, maps[2], maps[1].shape[-2:])
-        fused = _fuse(scratch.below("refinenet2."), fused, maps[1], maps[0].shape[-2:])
         rows, cols = maps[0].shape[-2:]
-        fused = _fuse(scratch.below("refinenet1."), fused, maps[0], (2 * rows, 2 * cols))
-
-        out = _resize(scratch.conv("output_conv1", fused), image.shape[-2:])
-        out = functional.relu(scratch.conv("output_conv2.0", out))
-        return scratch.conv("output_conv2.2", out, channels=(1,))[:, 0]
-
-
-def _fuse(weights: Weights, coarse: Tensor, fine: Tensor | None, size: tuple[int, ...]) -> Tensor:
-    """Add a finer map to a coarser one and bring the sum to a size."""
-    if fine is not None:
-        coarse = coarse + _residual_unit(weights.below("resConfUnit1."), fine)
-    fused = _resize(_residual_unit(weights.below("resConfUnit2."), coarse), size)
-    return weights.conv("out_conv", fused)
-
-
-def _residual_unit(weights: Weights, x: Tensor) -> Tensor:
-    hidden = weights.conv("conv1", functional.relu(x))
-    return x + weights.conv("conv2", functional.relu(hidden))
-
-
-def _resize(x: Tensor, size: tuple[int, ...]) -> Tensor:
-    return functional.interpolate(x, size, mode="bilinear", align_corners=True)
-
-
-class DepthAnything:
-    """Metric depth by Depth Anything V2: a `DepthPrior`."""
-
-    def __init__(
-        self,
-        weights: Weights,
-        depth_limit: float,  # metre, of the training data: INDOOR_LIMIT or OUTDOOR_LIMIT
-        shorter_side: int = SHORTER_SIDE,
-    ) -> None:
-        self.depth_limit = depth_limit
-        self.shorter_side = shorter_side
-        self.device = weights.device
-        self.network = DepthAnythingHead(weights)
-
-    def __call__(self, frame: Frame, camera: Camera) -> Tensor:
-        """Return the depth (H, W) in metres that the network sees in an image."""
-        size = tuple(frame.image.shape[:2])
-        with torch.no_grad():
-            seen = normalise(self._resized(frame.image), self.device)
-            depth = self.depth_limit * torch.sigmoid(self.network(seen))
-            full = _resize(depth[None], size)[0, 0]
-        return full.to(frame.image.device)
+        sizes = [(2 * rows, 2 * cols), *(m.shape[-2:] for m in maps[:3])]
+        fused = maps[3]
+        for k in (3, 2, 1, 0):  # from coarse to fine
+            unit = scratch.below(f"refinenet{k + 1}.")
+            if k < 3:
+                fused = fused + unit.below("resConfUnit1.").residual_unit(maps[k])
+            fused = resize(unit.below("resConfUnit2.").residual_unit(fused), sizes[k])
+            fused = unit.conv("out_conv", fused)
+        out = resize(scratch.conv("output_conv1", fused), image.shape[-2:])
+        return scratch.below("output_conv2.").convs(out, channels=(1,))[:, 0]
 
     def _resized(self, image: Tensor) -> Tensor:
         """Return the image with sides of whole patches, the shorter one of `shorter_side`."""
-        height, width = image.shape[:2]
-        scale = max(self.shorter_side / height, self.shorter_side / width)
-        rows, cols = (_whole_patches(side * scale, self.shorter_side) for side in (height, width))
+        scale = max(self.shorter_side / side for side in image.shape[:2])
+        rows, cols = (_whole_patches(side * scale, self.shorter_side) for side in image.shape[:2])
         # In float64, as the official code: float32 weights of the cubic differ in the last digits.
-        resized = cv2.resize(
-            image.double().cpu().numpy(), (cols, rows), interpolation=cv2.INTER_CUBIC
-        )
-        return torch.from_numpy(resized).float()
+        pixels = image.double().cpu().numpy()
+        return torch.from_numpy(
+            cv2.resize(pixels, (cols, rows), interpolation=cv2.INTER_CUBIC)
+        ).float()
 
 
 def _whole_patches(side: float, shortest: int) -> int:
@@ -128,23 +94,15 @@ def _whole_patches(side: float, shortest: int) -> int:
     return rounded if rounded >= shortest else math.ceil(side / PATCH) * PATCH
 
 
-def build_depth_anything(weights: Weights, config: DepthAnythingConfig) -> DepthAnything:
-    """Return the prior after one run on a tiny image, which asks for every tensor it needs."""
-    limit = config.depth_limit or limit_of_name(Path(weights.file))
-    prior = DepthAnything(weights, limit, config.shorter_side)
-    prior.network(torch.zeros(1, 3, 2 * PATCH, 2 * PATCH, device=weights.device))
-    return prior
-
-
-def limit_of_name(path: Path) -> float:
+def _limit_of_name(name: str) -> float:
     """Return the largest depth [m] that a checkpoint was trained with, from its official name.
 
     The file itself states neither this depth nor whether its output is metric.
     """
     for part, limit in _LIMIT_OF_NAME.items():
-        if part in path.name:
+        if part in name:
             return limit
     raise InputError(
         f"expected {' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint, found "
-        f"{path.name}, whose output may be no metric depth; keep the official name of the file"
+        f"{name}, whose output may be no metric depth; keep the official name of the file"
     )

@@ -18,7 +18,8 @@ from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.vit import normalise
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 
-_SMALLEST_GRID = 2 ** (net.LEVELS - 1)  # cells; the coarsest correlation level needs one of its own
+# Sides must be longer [px]: of 8 cells, the coarsest level of the correlations has one.
+_TOO_SMALL = net.STRIDE * (2 ** (net.LEVELS - 1) - 1)
 # Least confidence of a matched cell, relative to the mean of its edge: the network learned to weigh
 # cells against each other in a bundle adjustment, so their ratios have a meaning. [-]
 _MATCHED = 0.1
@@ -76,10 +77,10 @@ class DroidFlow(Stateful):
     @torch.no_grad()
     def encode(self, image: Tensor) -> EncodedFrame:
         """Return an image (H, W, 3) encoded; chain and keyframe share the newest one."""
-        if min(image.shape[:2]) <= net.STRIDE * (_SMALLEST_GRID - 1):
+        if min(image.shape[:2]) <= _TOO_SMALL:
             raise InputError(
-                f"expected images of more than {net.STRIDE * (_SMALLEST_GRID - 1)} px per side for "
-                f"DROID, found {image.shape[1]}x{image.shape[0]}; give a larger working size"
+                f"expected images of more than {_TOO_SMALL} px per side for DROID, found "
+                f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
             )
         if self._newest is None or not torch.equal(self._newest.image, image):
             self._newest = EncodedFrame(self.weights, image)
@@ -96,7 +97,7 @@ class DroidFlow(Stateful):
         self._edges = {e: state for e, state in self._edges.items() if keyframe_index not in e}
 
     def saved_state(self) -> Tree:
-        """Return the state: of the edges. The frames are encoded again."""
+        """Return the state of the edges; the frames are encoded again."""
         edges = [[*edge, to_tree(state)] for edge, state in self._edges.items()]
         return {"edges": edges, "dampings": [list(item) for item in self._dampings.items()]}
 
@@ -107,10 +108,7 @@ class DroidFlow(Stateful):
 
     @torch.no_grad()
     def match(
-        self,
-        edges_source: list[int],  # (E,) keyframe index
-        edges_target: list[int],  # (E,) keyframe index
-        predicted_targets: Tensor,  # (E, 2, N) px
+        self, edges_source: list[int], edges_target: list[int], predicted_targets: Tensor
     ) -> FlowMatches:
         """Update the flow of these edges once; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
@@ -121,16 +119,16 @@ class DroidFlow(Stateful):
         confidences = []
         for start in range(0, len(edges), self.config.edges_per_batch):
             batch = edges[start : start + self.config.edges_per_batch]
-            found, confidence = self._update_edges(batch, expected[start : start + len(batch)])
-            states |= dict(zip(batch, found, strict=True))
-            confidences.append(confidence)
+            answer = self._update_edges(batch, expected[start : start + len(batch)])
+            states |= dict(zip(batch, map(_EdgeState, *answer[:2]), strict=True))
+            confidences.append(answer[2])
         others = [(edge, state) for edge, state in self._edges.items() if edge not in states]
         free = max(0, self.config.kept_edges - len(states))
         self._edges = dict(others[max(0, len(others) - free) :]) | states
         for source in dict.fromkeys(edges_source):
             hidden = torch.stack([states[edge].hidden for edge in edges if edge[0] == source])
-            eta = self.damping(hidden).flatten()
-            self._dampings[source] = _DAMPING * eta.to(predicted_targets)
+            eta = self.damping(hidden).flatten().to(predicted_targets)
+            self._dampings[source] = _DAMPING * eta
         targets = torch.stack([states[edge].target for edge in edges])
         return as_matches(targets, torch.cat(confidences), predicted_targets)
 
@@ -140,17 +138,15 @@ class DroidFlow(Stateful):
         return torch.stack([self._dampings.get(k, unknown) for k in range(keyframes)])
 
     def _update_edges(
-        self,
-        edges: list[tuple[int, int]],
-        expected: Tensor,  # (E, h, w, 2) cells
-    ) -> tuple[list[_EdgeState], Tensor]:
-        """Return the new states of a batch of edges and their confidences (E, h, w, 2)."""
+        self, edges: list[tuple[int, int]], expected: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Update a batch of edges once, each from its last state; see update."""
         sources = [self._frames[source] for source, _ in edges]
         known = [
             self._edges.get(edge) or _EdgeState(source.context[0][0], where)
             for edge, source, where in zip(edges, sources, expected, strict=True)
         ]
-        hidden, targets, confidences = self.update(
+        return self.update(
             torch.cat([source.features for source in sources]),
             torch.cat([self._frames[target].features for _, target in edges]),
             torch.stack([state.hidden for state in known]),
@@ -158,7 +154,6 @@ class DroidFlow(Stateful):
             expected,
             torch.stack([state.target for state in known]),
         )
-        return [_EdgeState(h, t) for h, t in zip(hidden, targets, strict=True)], confidences
 
     def start_chain(self, image: Tensor) -> "DroidChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
@@ -177,8 +172,8 @@ class DroidFlow(Stateful):
         context: Tensor,  # (E, 128, h, w)
         expected: Tensor,  # (E, h, w, 2) cells
         last_target: Tensor,  # (E, h, w, 2) cells
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Update edges once; return hidden states, targets [cells] and confidences."""
+    ) -> tuple[Tensor, Tensor, Tensor]:  # (E, 128, h, w), (E, h, w, 2) cells, (E, h, w, 2)
+        """Update edges once; return hidden states, targets and confidences."""
         with self.weights.autocast():
             correlation = net.look_up(net.correlation_pyramid(source, target), expected)
             answer = net.update(self.weights, hidden, context, correlation, expected, last_target)
@@ -199,9 +194,8 @@ class DroidChain(Stateful):
     def __init__(
         self, flow: DroidFlow, reference: EncodedFrame, newest: EncodedFrame, target: Tensor | None
     ) -> None:
-        self._flow, self._reference, self._newest = flow, reference, newest
+        self._flow, self._reference, self._newest, self._target = flow, reference, newest, target
         self._images = [reference.image, newest.image]
-        self._target = target
 
     @torch.no_grad()
     def advance(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
@@ -232,12 +226,3 @@ def as_matches(targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatche
     ratios = matched.float().mean((1, 2))
     targets, confidences = (x.flatten(1, 2).mT.contiguous() for x in (targets, confidences))
     return FlowMatches(*(x.to(like) for x in (net.STRIDE * targets, confidences, ratios)))
-
-
-def build_droid(weights: Weights, config: DroidFlowConfig) -> DroidFlow:
-    """Return the flow after one run on a tiny image, which asks for every tensor it needs."""
-    flow = DroidFlow(weights, config)
-    tiny = torch.zeros(net.STRIDE * _SMALLEST_GRID, net.STRIDE * _SMALLEST_GRID, 3)
-    flow.add_frame(0, tiny)
-    flow.match([0], [0], torch.zeros(1, 2, _SMALLEST_GRID**2))
-    return DroidFlow(weights, config)

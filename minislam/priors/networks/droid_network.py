@@ -7,7 +7,7 @@
 All positions and lengths in this file are in cells (1 cell = 8 px); droid.py converts them to px.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,8 +24,7 @@ _DAMPING_SCALE = 0.01  # of eta, as in the training
 _MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
 
 
-@dataclass(frozen=True)
-class Update:
+class Update(NamedTuple):
     """The result of one update."""
 
     hidden: Tensor  # (E, 128, h, w)
@@ -70,8 +69,7 @@ def correlation_pyramid(
     edges, _, height, width = source.shape
     # Each side is divided by 4, so the product by 16: the scale the network was trained with.
     volume = torch.einsum("ecn,ecm->enm", source.flatten(2) / 4, target.flatten(2) / 4)
-    volume = volume.reshape(edges * height * width, 1, height, width)
-    pyramid = [volume]
+    pyramid = [volume.reshape(edges * height * width, 1, height, width)]
     for _ in range(LEVELS - 1):
         pyramid.append(functional.avg_pool2d(pyramid[-1], 2))
     return pyramid
@@ -111,12 +109,16 @@ def update(
     motion = motion.clamp(-_MOTION_LIMIT, _MOTION_LIMIT).permute(0, 3, 1, 2)
     inputs = [
         context,
-        _two_convs(weights.below("corr_encoder."), correlation).relu(),
-        _two_convs(weights.below("flow_encoder."), motion).relu(),
+        weights.below("corr_encoder.").convs(correlation).relu(),
+        weights.below("flow_encoder.").convs(motion).relu(),
     ]
-    hidden = _gru(weights.below("gru."), hidden, torch.cat(inputs, 1))
-    revision = _two_convs(weights.below("delta."), hidden, _HEAD)[:, :2]
-    confidence = _two_convs(weights.below("weight."), hidden, _HEAD)[:, :2].sigmoid()
+    unit = weights.below("gru.")
+    # Every cell also gets a gated mean over the whole image.
+    whole = (unit.conv("w", hidden).sigmoid() * hidden).mean((2, 3), keepdim=True)
+    offsets = [unit.conv(f"conv{gate}_glo", whole) for gate in "zrq"]  # (E, 128, 1, 1) each
+    hidden = unit.gru(hidden, torch.cat(inputs, 1), offsets)
+    revision = weights.below("delta.").convs(hidden, channels=_HEAD)[:, :2]
+    confidence = weights.below("weight.").convs(hidden, channels=_HEAD)[:, :2].sigmoid()
     return Update(hidden, revision.permute(0, 2, 3, 1), confidence.permute(0, 2, 3, 1))
 
 
@@ -134,17 +136,5 @@ def damping(
 def cell_grid(like: Tensor) -> Tensor:  # (h, w, 2) cells
     """Return the position (u, v) of every cell of a map (E, h, w, 2)."""
     height, width = like.shape[1:3]
-    u = torch.arange(width, dtype=like.dtype, device=like.device)
-    v = torch.arange(height, dtype=like.dtype, device=like.device)
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-
-
-def _two_convs(weights: Weights, x: Tensor, channels: tuple[int, ...] = ()) -> Tensor:
-    return weights.conv("2", weights.conv("0", x).relu(), channels=channels)
-
-
-def _gru(weights: Weights, hidden: Tensor, inputs: Tensor) -> Tensor:
-    """Update the hidden state; every cell also gets a gated mean over the whole image."""
-    gated = weights.conv("w", hidden).sigmoid() * hidden
-    whole = gated.mean((2, 3), keepdim=True)  # (E, 128, 1, 1)
-    return weights.gru(hidden, inputs, [weights.conv(f"conv{gate}_glo", whole) for gate in "zrq"])
+    sides = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (width, height))
+    return torch.stack(torch.meshgrid(*sides, indexing="xy"), -1)

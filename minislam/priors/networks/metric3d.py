@@ -5,9 +5,14 @@ the network answers as if every image came from one "canonical" camera of 1000 p
 is scaled by the true focal length: that of the image the network SAW, after resizing.
 
     tokens of the ViT -> 4 maps at 3 resolutions -> fused coarse to fine -> first estimate
-    -> a few rounds of recurrent refinement (metric3d_refinement.py) -> 4x upsampling
+    -> a few rounds of recurrent refinement -> 4x upsampling
+
+In the refinement three gated recurrent units (GRU) at three resolutions read the present estimate
+and propose a change to it, several times, as in RAFT. The estimate ("state") has six channels:
+scaled depth, depth confidence, normal (3), normal confidence.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -17,8 +22,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.parameters import parameter
-from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.metric3d_refinement import refine
+from minislam.priors.networks.checkpoints import Weights, resize
 from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
 from minislam.records import Frame
 
@@ -26,8 +30,16 @@ CANONICAL_FOCAL = 1000.0  # px, of the camera that all training images were turn
 FARTHEST = 300.0  # world units (metre); the official cut of the scaled depth
 NETWORK_SIZE = (616, 1064)  # px (height, width), as in the training
 _SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling of the coarsest map needs an even grid
-_SMALL, _LARGE = 384, 1024  # width of the ViT
-_ROUNDS = {_SMALL: 4, _LARGE: 8}  # of refinement
+_ROUNDS = {384: 4, 1024: 8}  # of refinement, by the width of the ViT (S, L)
+_NEAREST, _FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
+_BINS = 256  # of depth, between the two on a logarithmic scale
+_STATE_UNIT = 100.0  # metre per unit of the state's depth channel
+_EPSILON = 1e-5  # of the layer norms in the convolutional part
+_UPSAMPLING = 4
+_MASK_SCALE = 0.25  # of the upsampling logits, as in RAFT
+# From fine to coarse; the GRUs are called by twice their level's stride.
+_CONTEXT_NAMES = ("outputs04", "outputs08", "outputs16")
+_GRU_NAMES = ("gru08", "gru16", "gru32")
 
 
 @dataclass(frozen=True)
@@ -41,117 +53,10 @@ class Metric3DConfig:
     )
 
 
-@dataclass(frozen=True)
-class Pyramid:
-    """Feature maps of one image, named by their resolution."""
-
-    fine: Tensor  # (B, c0, 2/7 H, 2/7 W)
-    middle: Tensor  # (B, c1, 1/7 H, 1/7 W)
-    coarse: Tensor  # (B, C, 1/14 H, 1/14 W)
-    coarsest_context: Tensor  # (B, C, 1/14 H, 1/14 W), where the fusion starts
-
-
-class Metric3D:
-    """The network: a normalised image in, depth for the canonical camera out."""
-
-    def __init__(self, weights: Weights) -> None:
-        encoder = weights.below("depth_model.encoder.")
-        # It has registers, yet resizes its positions like the networks without.
-        self.transformer = VisionTransformer(encoder)
-        self.weights = weights.below("depth_model.decoder.")
-        width = self.transformer.width
-        if width not in _ROUNDS:
-            raise InputError(
-                f"expected Metric3D v2 with a ViT of width {_SMALL} or {_LARGE}, found "
-                f"{width} in {weights.file}; give the small or the large one"
-            )
-        self.rounds = _ROUNDS[width]
-
-    def __call__(
-        self,
-        image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 28
-    ) -> Tensor:  # (B, H, W) metre
-        """Return the depth for the canonical camera."""
-        pyramid = self.pyramid(image)
-        features = _fuse(self.weights.below("decoder_mono."), pyramid)
-        # The fusion of the official code rectifies its inputs in place, so its refinement sees
-        # the middle and coarse maps rectified, too. The published weights rely on it.
-        context = [pyramid.fine, pyramid.middle.relu(), pyramid.coarse.relu()]
-        return refine(self.weights, features, context, self.rounds)
-
-    def pyramid(self, image: Tensor) -> Pyramid:
-        """Return the four maps, all computed from the tokens of the last block."""
-        tokens = self.transformer(image)[0]
-        weights = self.weights.below("token2feature.")
-        readings = []
-        for k in range(4):
-            reader = weights.below(f"read_{k}.readoper.")
-            patches = reader.linear("project_patch", tokens.patches.movedim(1, -1))
-            leading = reader.linear("project_learn", tokens.leading.flatten(1), bias=False)
-            readings.append(functional.gelu(patches + leading[:, None, None]).movedim(-1, 1))
-        upsampled = functional.interpolate(readings[0], scale_factor=3.5, mode="nearest")
-        return Pyramid(
-            fine=weights.conv("read_0.sample.0", upsampled),
-            middle=weights.upconv("read_1.sample", readings[1]),
-            coarse=readings[2],
-            coarsest_context=readings[3],
-        )
-
-
-def _fuse(weights: Weights, pyramid: Pyramid) -> Tensor:
-    """Return the fused features and two confidences (B, c0 + 2, 2/7 H, 2/7 W)."""
-    rows, cols = pyramid.coarse.shape[-2:]
-    level = weights.below("upconv_3.")
-    fused = level.conv("out_conv", _unit(level.below("way_trunk."), pyramid.coarsest_context))
-    steps = [
-        ("upconv_2.", pyramid.coarse, (2 * rows, 2 * cols)),
-        ("upconv_1.", pyramid.middle, tuple(pyramid.fine.shape[-2:])),
-    ]
-    for name, branch, size in steps:
-        level = weights.below(name)
-        fused = _unit(level.below("way_trunk."), fused + _unit(level.below("way_branch."), branch))
-        fused = functional.interpolate(fused, size, mode="bilinear", align_corners=True)
-        fused = level.conv("out_conv", fused)
-    return fused
-
-
-def _unit(weights: Weights, x: Tensor) -> Tensor:
-    """Apply a residual unit whose skip is rectified, too (an in-place ReLU in the original)."""
-    x = x.relu()
-    return x + weights.conv("conv2", weights.conv("conv1", x).relu())
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """How an image was brought to the network's size."""
-
-    image: Tensor  # (1, 3, H_net, W_net) normalised
-    rows: slice  # where the image lies; the rest has the mean colour
-    cols: slice
-    scale: float  # network px per image px
-
-
-def fit(image: Tensor, size: tuple[int, int], device: torch.device) -> Fitted:
-    """Resize an image (H, W, 3) with its aspect kept; pad it to the network's size."""
-    height, width = image.shape[:2]
-    scale = min(size[0] / height, size[1] / width)
-    # The small number protects from 616 * (1 - 1e-16) being cut to 615.
-    inner = (max(1, int(height * scale + 1e-6)), max(1, int(width * scale + 1e-6)))
-    resized = functional.interpolate(normalise(image, device), inner, mode="bilinear")
-    top, left = (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2
-    padding = (left, size[1] - inner[1] - left, top, size[0] - inner[0] - top)
-    padded = functional.pad(resized, padding)  # 0 is the mean colour of a normalised image
-    return Fitted(padded, slice(top, top + inner[0]), slice(left, left + inner[1]), scale)
-
-
 class Metric3DDepth:
     """Metric depth by Metric3D v2: a `DepthPrior`."""
 
-    def __init__(
-        self,
-        weights: Weights,
-        network_size: tuple[int, int] = NETWORK_SIZE,  # px; half of it costs a fifth
-    ) -> None:
+    def __init__(self, weights: Weights, network_size: tuple[int, int] = NETWORK_SIZE) -> None:
         if any(side < _SIZE_STEP or side % _SIZE_STEP for side in network_size):
             raise InputError(
                 f"expected a network size of multiples of {_SIZE_STEP} px, found {network_size}; "
@@ -159,7 +64,16 @@ class Metric3DDepth:
             )
         self.network_size = network_size
         self.device = weights.device
-        self.network = Metric3D(weights)
+        # It has registers, yet resizes its positions like the networks without.
+        self._transformer = VisionTransformer(weights.below("depth_model.encoder."))
+        self._decoder = weights.below("depth_model.decoder.")
+        width = self._transformer.width
+        if width not in _ROUNDS:
+            raise InputError(
+                f"expected Metric3D v2 with a ViT of width {' or '.join(map(str, _ROUNDS))}, found "
+                f"{width} in {weights.file}; give the small or the large one"
+            )
+        self._rounds = _ROUNDS[width]
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor:
         """Return the depth (H, W) in metres of an image taken by a camera."""
@@ -172,13 +86,150 @@ class Metric3DDepth:
     def canonical_depth(self, image: Tensor) -> tuple[Tensor, float]:
         """Return the depth of a 1000 px camera at the network's scale, and that scale."""
         with torch.no_grad():
-            fitted = fit(image, self.network_size, self.device)
-            depth = self.network(fitted.image)[0, fitted.rows, fitted.cols]
-        return depth, fitted.scale
+            padded, inside, scale = fit(image, self.network_size, self.device)
+            return self.network(padded)[0][inside], scale
+
+    def network(
+        self,
+        image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 28
+    ) -> Tensor:  # (B, H, W) metre
+        """Return the depth for the canonical camera."""
+        fine, middle, coarse, coarsest = self.maps(image)
+        # The fusion of the official code rectifies its inputs in place: the skip of each unit, and
+        # the middle and coarse maps that the refinement sees. The published weights rely on it.
+        middle, coarse, coarsest = middle.relu(), coarse.relu(), coarsest.relu()
+        weights = self._decoder.below("decoder_mono.")
+        level = weights.below("upconv_3.")
+        fused = level.conv("out_conv", level.below("way_trunk.").residual_unit(coarsest))
+        doubled = [2 * side for side in coarse.shape[-2:]]
+        for name, branch, size in (
+            ("upconv_2.", coarse, doubled),
+            ("upconv_1.", middle, fine.shape[-2:]),
+        ):
+            level = weights.below(name)
+            fused = (fused + level.below("way_branch.").residual_unit(branch)).relu()
+            fused = resize(level.below("way_trunk.").residual_unit(fused), size)
+            fused = level.conv("out_conv", fused)
+        return _refine(self._decoder, fused, [fine, middle, coarse], self._rounds)
+
+    def maps(
+        self,
+        image: Tensor,  # (B, 3, H, W) normalised
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # (B, C_l, H/s, W/s), s = 3.5, 7, 14 and 14 px
+        """Return maps at three resolutions, all from the last tokens; the fusion starts at two."""
+        tokens = self._transformer(image)[0]
+        weights = self._decoder.below("token2feature.")
+        readings = []
+        for k in range(4):
+            reader = weights.below(f"read_{k}.readoper.")
+            patches = reader.linear("project_patch", tokens.patches.movedim(1, -1))
+            leading = reader.linear("project_learn", tokens.leading.flatten(1), bias=False)
+            readings.append(functional.gelu(patches + leading[:, None, None]).movedim(-1, 1))
+        upsampled = functional.interpolate(readings[0], scale_factor=3.5, mode="nearest")
+        fine = weights.conv("read_0.sample.0", upsampled)
+        return fine, weights.upconv("read_1.sample", readings[1]), readings[2], readings[3]
 
 
-def build_metric3d(weights: Weights, config: Metric3DConfig) -> Metric3DDepth:
-    """Return the prior after one run on a tiny image, which asks for every tensor it needs."""
-    prior = Metric3DDepth(weights, config.size)
-    prior.network(torch.zeros(1, 3, _SIZE_STEP, _SIZE_STEP, device=weights.device))
-    return prior
+def fit(
+    image: Tensor,  # (H, W, 3)
+    size: tuple[int, int],  # px
+    device: torch.device,
+) -> tuple[Tensor, tuple[slice, slice], float]:  # (1, 3, *size) normalised, network px per px
+    """Return an image padded to a size, its aspect kept; the part where it lies; its scale."""
+    scale = min(size[0] / image.shape[0], size[1] / image.shape[1])
+    # The small number protects from 616 * (1 - 1e-16) being cut to 615.
+    rows, cols = (max(1, int(side * scale + 1e-6)) for side in image.shape[:2])
+    resized = functional.interpolate(normalise(image, device), (rows, cols), mode="bilinear")
+    top, left = (size[0] - rows) // 2, (size[1] - cols) // 2
+    padding = (left, size[1] - cols - left, top, size[0] - rows - top)
+    padded = functional.pad(resized, padding)  # 0 is the mean colour of a normalised image
+    return padded, (slice(top, top + rows), slice(left, left + cols)), scale
+
+
+def _refine(
+    weights: Weights,  # of the decoder
+    features: Tensor,  # (B, c0 + 2, h, w), the last two channels are confidences
+    context: list[Tensor],  # three maps (B, c, h_l, w_l), from fine to coarse
+    rounds: int,
+) -> Tensor:  # (B, H, W) metre
+    """Return the refined and upsampled depth for the canonical camera."""
+    state = _first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
+    hidden, gates = [], []  # of the units; what the context adds to their three gates
+    for level, (name, seen) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
+        encoder = weights.below(f"context_feature_encoder.{name}.")
+        hidden.append(_context_head(encoder.below("0."), seen).tanh())
+        offsets = _context_head(encoder.below("1."), seen).relu()
+        gates.append(weights.conv(f"context_zqr_convs.{level}", offsets).chunk(3, 1))
+    update = weights.below("update_block.")
+    for _ in range(rounds):
+        hidden = _recurrent_round(update, hidden, gates, state)
+        head = update.below("flow_head.")
+        depth = head.conv("conv2d", head.conv("conv1d", hidden[0]).relu(), channels=(2,))
+        normal = head.conv("conv2n", head.conv("conv1n", hidden[0]).relu(), channels=(4,))
+        state = state + torch.cat([depth, normal], 1)
+    mask = update.below("mask.").convs(hidden[0])
+    fine = convex_upsample(state[:, :1], _MASK_SCALE * mask, _UPSAMPLING)[:, 0]
+    return (_STATE_UNIT * fine + _FARTHEST).clamp(_NEAREST, _FARTHEST)
+
+
+def _first_estimate(
+    weights: Weights, features: Tensor, depth_confidence: Tensor, normal_confidence: Tensor
+) -> Tensor:  # (B, 6, h, w)
+    """Return the state before refinement: depth is an expectation over logarithmic bins."""
+    logits = weights.below("depth_regressor.").convs(features, channels=(_BINS,))
+    bins = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _BINS, device=features.device)
+    depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
+    depth = depth.clamp(_NEAREST, _FARTHEST)
+    normal = weights.below("normal_predictor.").convs(features, layers=4, channels=(3,))
+    unit = normal / (normal.norm(dim=1, keepdim=True) + 1e-10)
+    positive = functional.elu(normal_confidence) + 1.01
+    return torch.cat([(depth - _FARTHEST) / _STATE_UNIT, depth_confidence, unit, positive], 1)
+
+
+def _context_head(weights: Weights, x: Tensor) -> Tensor:
+    unit = weights.below("0.")
+    y = _channel_norm(unit, "norm1", unit.conv("conv1", x)).relu()
+    y = _channel_norm(unit, "norm2", unit.conv("conv2", y)).relu()
+    skip = _channel_norm(unit, "downsample.1", unit.conv("downsample.0", x))
+    return weights.conv("1", (skip + y).relu())
+
+
+def _channel_norm(weights: Weights, name: str, x: Tensor) -> Tensor:
+    """Normalise over the channels of each pixel of (B, C, h, w)."""
+    return weights.layer_norm(name, x.movedim(1, -1), _EPSILON).movedim(-1, 1)
+
+
+def _recurrent_round(
+    weights: Weights, hidden: list[Tensor], gates: list[tuple[Tensor, ...]], state: Tensor
+) -> list[Tensor]:
+    """Update the coarsest unit three times, the middle one twice, the finest once."""
+    fine, middle, coarse = hidden
+    size = middle.shape[-2:]
+
+    def gru(level: int, h: Tensor, *inputs: Tensor) -> Tensor:
+        unit = weights.below(f"{_GRU_NAMES[level]}.")
+        return unit.gru(h, torch.cat(inputs, 1), gates[level])
+
+    coarse = gru(2, coarse, _halved(middle))
+    for _ in range(2):
+        coarse = gru(2, coarse, _halved(middle))
+        middle = gru(1, middle, resize(_halved(fine), size), resize(coarse, size))
+    fine = gru(0, fine, state, resize(middle, fine.shape[-2:]))
+    return [fine, middle, coarse]
+
+
+def _halved(x: Tensor) -> Tensor:
+    return functional.avg_pool2d(x, 3, stride=2, padding=1)  # counts the padding as zeros
+
+
+def convex_upsample(
+    coarse: Tensor,  # (B, C, h, w)
+    logits: Tensor,  # (B, 9 * factor^2, h, w)
+    factor: int,
+) -> Tensor:  # (B, C, factor * h, factor * w)
+    """Upsample: each fine pixel is a convex combination of the 3x3 coarse ones around it (RAFT)."""
+    batch, channels, height, width = coarse.shape
+    weight = logits.view(batch, 1, 9, factor, factor, height, width).softmax(2)
+    around = functional.unfold(coarse, 3, padding=1).view(batch, channels, 9, 1, 1, height, width)
+    fine = (weight * around).sum(2)  # (B, C, factor, factor, h, w)
+    return fine.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, factor * height, factor * width)

@@ -1,8 +1,8 @@
 """The table of pretrained networks, read by `choice.py` and `minislam doctor`.
 
-To add a network, write its module: a class that is a `FlowEstimator`, a `FeatureExtractor` or a
-`DepthPrior`, and a function that builds it and runs it once on a tiny image. Then add its row to
-NETWORKS below and to weights.csv, and a field to NetworksConfig if it has settings.
+To add a network, write a class that is a `FlowEstimator`, a `FeatureExtractor`, or a `DepthPrior`
+with a method `network` behind its resizing. Then add its row to NETWORKS below and to weights.csv,
+and a field to NetworksConfig if it has settings.
 """
 
 import warnings
@@ -15,10 +15,11 @@ import torch
 
 from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights, load_checkpoint
-from minislam.priors.networks.depth_anything import DepthAnythingConfig, build_depth_anything
-from minislam.priors.networks.dinov2 import build_dino_features
-from minislam.priors.networks.droid import DroidFlowConfig, build_droid
-from minislam.priors.networks.metric3d import Metric3DConfig, build_metric3d
+from minislam.priors.networks.depth_anything import DepthAnything, DepthAnythingConfig
+from minislam.priors.networks.droid import DroidFlow, DroidFlowConfig
+from minislam.priors.networks.metric3d import Metric3DConfig, Metric3DDepth
+from minislam.priors.networks.vit import DinoFeatures
+from minislam.records import Frame
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Network:
     name: str  # the value of the flag --KIND
     title: str  # what messages call it
     marks: tuple[str, ...]  # tensors by which its checkpoint is recognised
-    build: Callable[[Weights, NetworksConfig], Any]  # makes it and runs it on a tiny image
+    make: Callable[[Weights, NetworksConfig], Any]
     unneeded: tuple[str, ...] = ()  # parts of names that are stored in its files but not used
     transformer: str | None = None  # prefix of the names of its vision transformer, if it has one
     is_strict: bool = True  # its official loader refuses further tensors, as we do; else we warn
@@ -48,32 +49,32 @@ class Network:
 NETWORKS = (
     Network(
         "flow", "droid", "DROID-SLAM", ("update.gru.convz.weight",),
-        lambda weights, config: build_droid(weights, config.droid),
+        lambda weights, config: DroidFlow(weights, config.droid),
         # Upsampling of disparities, since the map takes denser depth; MegaSaM's own.
         unneeded=("update.agg.upmask.", "update.agg_motion."),
     ),
     Network(
         "features", "dinov2", "DINOv2", ("blocks.0.ls1.gamma", "mask_token"),
-        lambda weights, config: build_dino_features(weights),
+        lambda weights, config: DinoFeatures(weights),
         unneeded=("mask_token",),  # used in training only, here and below
         transformer="",
     ),
     Network(
         "features", "fit3d", "FiT3D", ("blocks.0.ls1.gamma", "patch_embed.proj.weight"),
-        lambda weights, config: build_dino_features(weights),
+        lambda weights, config: DinoFeatures(weights),
         transformer="",
     ),
     Network(
         "depth", "metric3d", "Metric3D v2",
         ("depth_model.decoder.token2feature.read_0.readoper.project_patch.weight",),
-        lambda weights, config: build_metric3d(weights, config.metric3d),
+        lambda weights, config: Metric3DDepth(weights, config.metric3d.size),
         unneeded=("mask_token", "norm3."),  # norm3 is another norm under a second name
         transformer="depth_model.encoder.",
         is_strict=False,
     ),
     Network(
         "depth", "depth-anything", "Depth Anything V2", ("depth_head.scratch.output_conv1.weight",),
-        lambda weights, config: build_depth_anything(weights, config.depth_anything),
+        lambda weights, config: DepthAnything(weights, config.depth_anything),
         # The first unit of the coarsest level has nothing to add, yet it is stored.
         unneeded=("mask_token", "refinenet4.resConfUnit1."),
         transformer="pretrained.",
@@ -133,7 +134,8 @@ def build_checked(
     """Return a network whose tensors are checked: all are there, fit together, and are needed."""
     try:
         with torch.no_grad():
-            built = network.build(weights, config)
+            built = network.make(weights, config)
+            _run_once(built, network.kind)
     except (RuntimeError, IndexError, ValueError) as error:
         raise InputError(
             f"expected the shapes of {network.title} in {weights.file}, found tensors that do "
@@ -149,3 +151,16 @@ def build_checked(
             raise InputError(f"{found}; it is another version of the network")
         warnings.warn(f"{found}; they are not used", stacklevel=2)
     return built
+
+
+def _run_once(built: Any, kind: str) -> None:
+    """Run a network on a tiny image, so that it asks for every tensor it needs."""
+    image = torch.zeros(64, 64, 3)  # px; DROID's coarsest correlation needs that many
+    if kind == "flow":
+        built.add_frame(0, image)
+        built.match([0], [0], torch.zeros(1, 2, 8 * 8))
+        built.remove_frame(0)
+    elif kind == "features":
+        built(Frame(0, 0.0, image))
+    else:
+        built.network(torch.zeros(1, 3, 28, 28, device=built.device))

@@ -1,4 +1,7 @@
-"""The vision transformer of DINOv2, on which FiT3D and both depth networks are built.
+"""The vision transformer of DINOv2, and the features of the paper's uncertainty MLP.
+
+FiT3D is DINOv2 made consistent across views; its files come in the layout of the timm library. Both
+depth networks are built on the same transformer.
 
 Patches of 14x14 px become tokens; one class token, and in some checkpoints four "registers", stand
 before them. A block adds to each token first what it reads from all tokens (attention), then the
@@ -10,13 +13,16 @@ output of an MLP on the token itself:
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from minislam.errors import InputError
+from minislam.priors.features import grid_size
 from minislam.priors.networks.checkpoints import Weights
+from minislam.records import Frame
 
 PATCH = 14  # px
 _BLOCKS = {384: 12, 768: 12, 1024: 24}  # by the width of ViT-S, -B and -L
@@ -27,8 +33,8 @@ _TRAINED_GRID = 37  # patches per side of the 518 px images of the training
 # with antialiasing (registers, FiT3D), or by (n + _OFFSET) / 37 (DINOv2, the depth networks).
 _OFFSET = 0.1  # patches
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)  # RGB, of the images all these networks were trained on
-IMAGENET_STD = (0.229, 0.224, 0.225)
+_IMAGENET_MEAN = (0.485, 0.456, 0.406)  # RGB, of the images all these networks were trained on
+_IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,9 @@ class VisionTransformer:
                 f"expected a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in "
                 f"{weights.file}, found one of width {self.width}; give another size of the network"
             )
-        self.depth = weights.count(self._block)
+        self.depth = 0  # blocks, those that are there in a row
+        while any(name.startswith(self._block.format(self.depth)) for name in weights):
+            self.depth += 1
         if self.depth != _BLOCKS[self.width]:
             raise InputError(
                 f"expected {_BLOCKS[self.width]} blocks of a ViT of width {self.width} in "
@@ -83,23 +91,20 @@ class VisionTransformer:
             return self._tokens(image, (self.depth - 1,) if taps is None else taps)
 
     def _tokens(self, image: Tensor, taps: tuple[int, ...]) -> list[Tokens]:
+        count = self._leading.shape[1]
         patches = self.weights.conv("patch_embed.proj", image, stride=PATCH, padding=0)
         rows, cols = patches.shape[-2:]
         patches = patches + self._resized_positions(rows, cols)
         leading = self._leading.expand(len(image), -1, -1)
-        tokens = torch.cat([leading, patches.flatten(2).mT], 1)
+        x = torch.cat([leading, patches.flatten(2).mT], 1)
         readings = {}
         for index in range(self.depth):
-            tokens = _transformer_block(self.weights.below(self._block.format(index)), tokens)
+            x = _transformer_block(self.weights.below(self._block.format(index)), x)
             if index in taps:
-                readings[index] = self._read(tokens, rows, cols)
+                normed = self.weights.layer_norm("norm", x, _EPSILON).float()
+                grid = normed[:, count:].mT.unflatten(2, (rows, cols))
+                readings[index] = Tokens(normed[:, :count], grid)
         return [readings[index] for index in taps]
-
-    def _read(self, tokens: Tensor, rows: int, cols: int) -> Tokens:
-        normed = self.weights.layer_norm("norm", tokens, _EPSILON).float()
-        count = self._leading.shape[1]
-        patches = normed[:, count:].mT.unflatten(2, (rows, cols))
-        return Tokens(normed[:, :count], patches)
 
     def _resized_positions(self, rows: int, cols: int) -> Tensor:
         """Return the positions (1, C, rows, cols)."""
@@ -114,18 +119,14 @@ class VisionTransformer:
 
 def _transformer_block(weights: Weights, x: Tensor) -> Tensor:
     """Apply one block to tokens (B, N, C)."""
-    attended = _attention(weights, weights.layer_norm("norm1", x, _EPSILON))
+    # Every token reads from all: softmax(q k^T / sqrt(64)) v, per head of 64 channels.
+    qkv = weights.linear("attn.qkv", weights.layer_norm("norm1", x, _EPSILON))
+    q, k, v = qkv.unflatten(-1, (3, -1, _HEAD_WIDTH)).permute(2, 0, 3, 1, 4)  # (B, heads, N, 64)
+    read = functional.scaled_dot_product_attention(q, k, v, scale=1 / math.sqrt(_HEAD_WIDTH))
+    attended = weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
     x = x + weights["ls1.gamma"] * attended
     hidden = weights.linear("mlp.fc1", weights.layer_norm("norm2", x, _EPSILON))
     return x + weights["ls2.gamma"] * weights.linear("mlp.fc2", functional.gelu(hidden))
-
-
-def _attention(weights: Weights, x: Tensor) -> Tensor:
-    """Let every token read from all: softmax(q k^T / sqrt(64)) v, per head of 64 channels."""
-    qkv = weights.linear("attn.qkv", x).unflatten(-1, (3, -1, _HEAD_WIDTH))  # (B, N, 3, heads, 64)
-    q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, heads, N, 64)
-    read = functional.scaled_dot_product_attention(q, k, v, scale=1 / math.sqrt(_HEAD_WIDTH))
-    return weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
 
 
 def normalise(
@@ -133,6 +134,43 @@ def normalise(
     device: torch.device,
 ) -> Tensor:  # (1, 3, H, W)
     """Return an image as these networks expect it: batch and channels first, ImageNet's scale."""
-    mean = torch.tensor(IMAGENET_MEAN, device=device)
-    std = torch.tensor(IMAGENET_STD, device=device)
+    mean, std = (torch.tensor(part, device=device) for part in (_IMAGENET_MEAN, _IMAGENET_STD))
     return ((image.to(device) - mean) / std).permute(2, 0, 1)[None]
+
+
+class DinoFeatures:
+    """The patch tokens of the last block, after the final norm: a `FeatureExtractor`."""
+
+    stride = PATCH
+
+    def __init__(self, weights: Weights) -> None:
+        self.device = weights.device
+        self._transformer = VisionTransformer(weights, is_antialiased(weights))
+        self.dimension = self._transformer.width
+
+    def __call__(self, frame: Frame) -> Tensor:  # (H // 14, W // 14, C) float32
+        """Return one feature per patch of 14 px; the image is stretched to whole patches."""
+        image = frame.image
+        rows, cols = grid_size(image, PATCH)
+        with torch.no_grad():
+            size = (PATCH * rows, PATCH * cols)
+            whole = functional.interpolate(normalise(image, self.device), size, mode="bilinear")
+            patches = self._transformer(whole)[0].patches[0]
+        return patches.permute(1, 2, 0).to(image.device)
+
+
+def is_antialiased(weights: Weights) -> bool:
+    """Tell whether a features checkpoint was trained with antialiased positions.
+
+    The file does not state it, but the three published kinds differ in what they contain: FiT3D
+    alone lacks the mask token of the training, and DINOv2 has registers or not. A file that has
+    lost such a tensor looks like another kind; then its official name tells.
+    """
+    name = Path(weights.file).name
+    is_fit3d = "mask_token" not in weights
+    has_registers = "register_tokens" in weights or "reg_token" in weights
+    lacks_mask = is_fit3d and ("dinov2_vit" in name or "register_tokens" in weights)
+    if lacks_mask or ("_reg" in name and not has_registers):
+        lost = "mask_token" if lacks_mask else "register tokens"
+        raise InputError(f"expected {lost} in {weights.file}, found none; the file is not complete")
+    return is_fit3d or has_registers

@@ -9,7 +9,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.metric3d import Metric3D, Metric3DDepth, fit
+from minislam.priors.networks.metric3d import Metric3DDepth, fit
 from minislam.priors.networks.vit import normalise
 from minislam.records import Frame
 from tests.priors.networks import rebuilt
@@ -30,7 +30,7 @@ def weights() -> Weights:
 @cache
 def output(height: int, width: int) -> torch.Tensor:
     with torch.inference_mode():
-        return Metric3D(weights())(normalise(rebuilt.image(height, width), CPU))
+        return Metric3DDepth(weights()).network(normalise(rebuilt.image(height, width), CPU))
 
 
 def stored(name: str) -> torch.Tensor:
@@ -47,8 +47,8 @@ def test_the_depth_is_that_of_the_official_code(size: tuple[int, int]):
 
 def test_the_finest_map_is_that_of_the_official_code():
     with torch.inference_mode():
-        pyramid = Metric3D(weights()).pyramid(normalise(rebuilt.image(56, 84), CPU))
-    rebuilt.assert_close(pyramid.fine[0, ::16], stored("56x84/read_0_every16ch"), REST)
+        fine, *_ = Metric3DDepth(weights()).maps(normalise(rebuilt.image(56, 84), CPU))
+    rebuilt.assert_close(fine[0, ::16], stored("56x84/read_0_every16ch"), REST)
 
 
 def test_the_whole_box_is_that_of_the_official_slam():
@@ -80,14 +80,14 @@ def test_depth_is_scaled_by_the_focal_length_of_the_image_the_network_saw():
 
 @pytest.mark.parametrize("size", [(240, 320), (320, 240), (289, 300), (17, 400), (720, 1280)])
 def test_an_image_is_fitted_without_changing_its_aspect(size: tuple[int, int]):
-    fitted = fit(torch.ones(*size, 3), (616, 1064), CPU)
-    assert fitted.image.shape == (1, 3, 616, 1064)
-    inner = fitted.image[0, :, fitted.rows, fitted.cols]
+    image, inside, scale = fit(torch.ones(*size, 3), (616, 1064), CPU)
+    assert image.shape == (1, 3, 616, 1064)
+    inner = image[0, :, *inside]
     assert inner.shape[1] == 616 or inner.shape[2] == 1064
     assert (inner > 1).all()  # white, normalised
-    assert abs(inner.shape[1] - size[0] * fitted.scale) < 1
-    assert abs(inner.shape[2] - size[1] * fitted.scale) < 1
-    outside = fitted.image.sum() - inner.sum()
+    assert abs(inner.shape[1] - size[0] * scale) < 1
+    assert abs(inner.shape[2] - size[1] * scale) < 1
+    outside = image.sum() - inner.sum()
     assert abs(float(outside)) < 1e-2 * float(inner.sum())  # only the mean colour around it
 
 

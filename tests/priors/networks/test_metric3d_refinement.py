@@ -6,7 +6,7 @@ That its results are those of the official code is tested with the whole network
 import torch
 from torch.nn import functional
 
-from minislam.priors.networks.metric3d_refinement import convex_upsample
+from minislam.priors.networks.metric3d import convex_upsample
 from tests.helpers import generator
 
 

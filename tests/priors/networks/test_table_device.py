@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.depth_anything import DepthAnythingHead
-from minislam.priors.networks.dinov2 import is_antialiased
+from minislam.priors.networks.depth_anything import DepthAnything, DepthAnythingConfig
 from minislam.priors.networks.droid import DroidFlow
 from minislam.priors.networks.droid_network import cell_grid
-from minislam.priors.networks.metric3d import Metric3D, fit
-from minislam.priors.networks.vit import VisionTransformer, normalise
+from minislam.priors.networks.metric3d import Metric3DDepth, fit
+from minislam.priors.networks.vit import VisionTransformer, is_antialiased, normalise
 from tests.priors.networks import rebuilt
 
 pytestmark = pytest.mark.slow
@@ -37,10 +36,11 @@ def test_vision_transformers():
 
 def test_depth_networks_of_both_sizes():
     for network in ("depth_anything_v2_vits", "depth_anything_v2_vitl"):
-        head = DepthAnythingHead(meta_weights(network))
-        assert head(normalise(IMAGE, META)).shape == (1, 56, 84)
+        prior = DepthAnything(meta_weights(network), DepthAnythingConfig(depth_limit=20.0))
+        assert prior.network(normalise(IMAGE, META)).shape == (1, 56, 84)
     for network in ("metric3d_vit_small", "metric3d_vit_large"):
-        found = Metric3D(meta_weights(network))(fit(IMAGE, (112, 168), META).image)
+        prior = Metric3DDepth(meta_weights(network), (112, 168))
+        found = prior.network(fit(IMAGE, prior.network_size, META)[0])
         assert found.shape == (1, 112, 168) and found.device == META
 
 

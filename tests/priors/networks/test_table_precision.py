@@ -12,9 +12,9 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.priors.networks import droid_network
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.dinov2 import DinoFeatures
 from minislam.priors.networks.droid import DroidFlow
 from minislam.priors.networks.metric3d import Metric3DDepth
+from minislam.priors.networks.vit import DinoFeatures
 from minislam.records import Frame
 from minislam.state.stateful import Tree
 from tests.checkpoint_files import calm_droid, tiny_fit3d

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from minislam.errors import InputError
+from minislam.priors.choice import load_plugin
 from minislam.priors.depth import NoDepth
 from minislam.priors.names import plugin_names
-from minislam.priors.plugins import load_plugin
 
 MODULE = """\
 class Plane:

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from minislam.priors.features import ClassicalFeatures
-from minislam.priors.high_resolution import HighResolutionFeatures, shift_image
+from minislam.priors.features import ClassicalFeatures, HighResolutionFeatures, shift_image
 from minislam.records import Frame
 from tests.helpers import generator
 

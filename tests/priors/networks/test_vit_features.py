@@ -7,7 +7,7 @@ import torch
 
 from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights
-from minislam.priors.networks.dinov2 import DinoFeatures, is_antialiased
+from minislam.priors.networks.vit import DinoFeatures, is_antialiased
 from tests.helpers import frame_of
 from tests.priors.networks import rebuilt
 

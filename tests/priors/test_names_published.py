@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from minislam.priors.networks.published import find_weights, published_files
+from minislam.priors.names import find_weights, published_files
 from minislam.priors.networks.table import NETWORKS
 
 ROWS = published_files()
