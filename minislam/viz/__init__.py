@@ -10,8 +10,7 @@ from minislam.viz.figures import (
     trajectory_plot,
 )
 from minislam.viz.flipbook import figure_picture, flipbook
-from minislam.viz.notebook import Page, summary_html
-from minislam.viz.report import Report, build_report
+from minislam.viz.report import Report, build_report, summary_html
 from minislam.viz.style import (
     beta_limits,
     beta_to_rgb,
@@ -25,4 +24,4 @@ from minislam.viz.style import (
     show_image,
     show_map,
 )
-from minislam.viz.viewer import build_viewer
+from minislam.viz.viewer import Page, build_viewer

@@ -7,6 +7,7 @@ many flip books on one page do not meet. Where a page runs no scripts, the first
 import json
 from collections.abc import Sequence as Series
 from html import escape
+from itertools import product
 
 import cv2
 import numpy as np
@@ -64,14 +65,13 @@ def flipbook(
     texts = [f"{n + 1} of {count}" for n in range(count)] if captions is None else list(captions)
     if len(texts) != count:
         raise InputError(f"expected one caption for each of {count} pictures, found {len(texts)}")
-    for scale in _SCALES:
-        for quality in _QUALITIES:
-            urls: list[str] = []
-            while len(urls) < count and sum(map(len, urls)) < LARGEST:
-                urls.append(_url(images[len(urls)], scale, quality))
-            html = _player(urls, texts, max(images[0].shape[1], _LEAST_WIDTH), frames_per_second)
-            if len(urls) == count and len(html.encode()) < LARGEST:
-                return FlipBook(html)
+    for scale, quality in product(_SCALES, _QUALITIES):
+        urls: list[str] = []
+        while len(urls) < count and sum(map(len, urls)) < LARGEST:
+            urls.append(_url(images[len(urls)], scale, quality))
+        html = _player(urls, texts, max(images[0].shape[1], _LEAST_WIDTH), frames_per_second)
+        if len(urls) == count and len(html.encode()) < LARGEST:
+            return FlipBook(html)
     raise InputError(f"expected pictures that fit into 400 kB, found {count}: show fewer of them")
 
 
