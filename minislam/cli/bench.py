@@ -23,9 +23,9 @@ RMSE of the ATE over all frames, for minislam after a Sim(3) alignment. F: faile
 *: frames were lost or the geometry broke (minislam), run by the authors of the paper (others)."""
 
 
-def add_bench_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `bench` to the sub-commands of a parser."""
-    parser = subparsers.add_parser(
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `bench` to the commands."""
+    parser = commands.add_parser(
         "bench",
         help="run the sequences of benchmarks, and compare with the published errors",
         usage=USAGE,

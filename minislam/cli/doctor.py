@@ -13,11 +13,10 @@ from minislam.errors import MinislamError
 MAX_SELF_TEST_ERROR = 0.1  # px
 
 
-def add_doctor_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
-    """Add `doctor` to the sub-commands of a parser."""
-    parser = subparsers.add_parser("doctor", help="show what is installed and check that it works")
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `doctor` to the commands."""
+    parser = commands.add_parser("doctor", help="show what is installed and check that it works")
     parser.set_defaults(run=run_doctor)
-    return parser
 
 
 def run_doctor(args: argparse.Namespace) -> int:

@@ -16,43 +16,33 @@ if TYPE_CHECKING:
     from minislam.evaluation import Alignment, TrajectoryError
 
 
-def add_eval_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
-    """Add `eval` to the sub-commands of a parser."""
-    parser = subparsers.add_parser(
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `eval` to the commands."""
+    parser = commands.add_parser(
         "eval",
         help="compare an estimated trajectory with the truth",
         description="Absolute trajectory error (ATE) of an estimate, or with --rpe its relative "
         "pose error (RPE); both files in TUM format. Without -a, -s and --no_align a Sim(3) is "
         "fitted first, since a monocular estimate has no scale of its own.",
     )
-    parser.add_argument("format", nargs="?", choices=["tum"], help="as evo asks for, or nothing")
-    parser.add_argument("reference", help="ground truth, TUM format")
-    parser.add_argument("estimate", help="estimated trajectory, TUM format, or a run folder")
-    parser.add_argument("-a", "--align", action="store_true", help="fit rotation and translation")
-    parser.add_argument("-s", "--correct_scale", action="store_true", help="fit the scale")
-    parser.add_argument("--no_align", action="store_true", help="fit nothing")
-    parser.add_argument(
-        "--t_max_diff", type=float, default=0.01, help="largest difference of timestamps [s], 0.01"
-    )
-    parser.add_argument(
-        "--t_offset", type=float, default=0.0, help="added to the estimate's timestamps [s], 0"
-    )
-    parser.add_argument(
-        "--rpe", action="store_true", help="relative pose error: the drift over --delta"
-    )
-    parser.add_argument(
-        "--delta", type=float, default=1.0, help="length of each motion for --rpe, 1"
-    )
-    parser.add_argument(
-        "--delta_unit", choices=("s", "f"), default="s", help="of --delta: seconds or frames, s"
-    )
-    parser.add_argument("-p", "--plot", action="store_true", help="show the trajectories")
-    parser.add_argument("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
-    parser.add_argument("--save_results", metavar="FILE.json", help="write the numbers to a file")
-    parser.add_argument("-v", "--verbose", action="store_true", help="say more")
-    parser.add_argument("--silent", action="store_true", help="print nothing")
+    add = parser.add_argument
+    add("format", nargs="?", choices=["tum"], help="as evo asks for, or nothing")
+    add("reference", help="ground truth, TUM format")
+    add("estimate", help="estimated trajectory, TUM format, or a run folder")
+    add("-a", "--align", action="store_true", help="fit rotation and translation")
+    add("-s", "--correct_scale", action="store_true", help="fit the scale")
+    add("--no_align", action="store_true", help="fit nothing")
+    add("--t_max_diff", type=float, default=0.01, help="largest difference of timestamps [s], 0.01")
+    add("--t_offset", type=float, default=0.0, help="added to the estimate's timestamps [s], 0")
+    add("--rpe", action="store_true", help="relative pose error: the drift over --delta")
+    add("--delta", type=float, default=1.0, help="length of each motion for --rpe, 1")
+    add("--delta_unit", choices=("s", "f"), default="s", help="of --delta: seconds or frames, s")
+    add("-p", "--plot", action="store_true", help="show the trajectories")
+    add("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
+    add("--save_results", metavar="FILE.json", help="write the numbers to a file")
+    add("-v", "--verbose", action="store_true", help="say more")
+    add("--silent", action="store_true", help="print nothing")
     parser.set_defaults(run=run_eval)
-    return parser
 
 
 def run_eval(args: argparse.Namespace) -> int:

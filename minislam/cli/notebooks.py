@@ -13,9 +13,9 @@ from minislam.errors import InputError
 SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
 
 
-def add_notebooks_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `notebooks` to the sub-commands of a parser."""
-    parser = subparsers.add_parser("notebooks", help="copy the course's notebooks into a folder")
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `notebooks` to the commands."""
+    parser = commands.add_parser("notebooks", help="copy the course's notebooks into a folder")
     parser.add_argument("folder", metavar="DIR", help="where to; made if it does not exist")
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--student", action="store_true", help="without solutions and outputs")

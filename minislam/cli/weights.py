@@ -17,12 +17,11 @@ if TYPE_CHECKING:
     from minislam.priors.networks.checkpoints import Weights
 
 CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
-BYTES_PER_MEGABYTE = 1e6
 
 
-def add_weights_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `weights` to the sub-commands of a parser."""
-    parser = subparsers.add_parser("weights", help="list, fetch or check official checkpoints")
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `weights` to the commands."""
+    parser = commands.add_parser("weights", help="list, fetch or check official checkpoints")
     actions = parser.add_subparsers(required=True, metavar="list | fetch | check")
     actions.add_parser("list", help="what there is").set_defaults(run=run_list)
     fetch = actions.add_parser("fetch", help="fetch files of the list from their makers' sites")
@@ -82,7 +81,7 @@ def run_check(args: argparse.Namespace) -> int:
         row, verdict = rows.get(file.name), _verdict(file)
         if row and row.sha256 and row.sha256 != _sha256(file):
             verdict += f"; NOT the published {row.name}, its sha256 is another"
-        size = file.stat().st_size / BYTES_PER_MEGABYTE
+        size = file.stat().st_size / 1e6  # MB
         width = max(len(file.name) for file in files)
         print(f"{file.name:{width}s}  {size:7.1f} MB  {verdict}", flush=True)
     return 0
@@ -126,8 +125,10 @@ def _use_of(weights: Weights, title: str) -> str:
     if network is not None:
         build_checked(network, weights)
         return f"--{network.kind} {network.name}"
-    if title not in (LPIPS_HEADS, CLASSIFIER):
-        return ""
-    is_heads = title == LPIPS_HEADS
-    (recognise_heads if is_heads else recognise_trunk)(weights.as_dict())
-    return "--lpips-heads" if is_heads else "--lpips-trunk"
+    if title == LPIPS_HEADS:
+        recognise_heads(weights.as_dict())
+        return "--lpips-heads"
+    if title == CLASSIFIER:
+        recognise_trunk(weights.as_dict())
+        return "--lpips-trunk"
+    return ""
