@@ -61,12 +61,28 @@ def run_eval(args: argparse.Namespace) -> int:
     tables = {"APE w.r.t. translation part (m)": result.statistics}
     if args.rpe:
         tables = _relative_errors(args, result)
-    if args.verbose and not args.silent:
-        print(_fit(result, len(estimate), len(truth)))
     if not args.silent:
-        print("\n\n".join(_table(args, alignment, title, tables[title]) for title in tables))
+        by_default = not (args.align or args.correct_scale or args.no_align)
+        reason = ", the default for monocular estimates" if by_default else ""
+        fitted = f"(with {alignment.value}{reason})"
+        if args.verbose:
+            print(_fit(result, len(estimate), len(truth)))
+        print("\n\n".join(_table(title, fitted, tables[title]) for title in tables))
     if args.save_results:
-        _save_results(args, result, alignment, tables)
+        numbers = {
+            "reference": args.reference,
+            "estimate": args.estimate,
+            "alignment": alignment.value,
+            "pairs": len(result.errors),
+            "scale": result.similarity.scale,
+            "rotation": result.similarity.rotation.tolist(),
+            "translation": result.similarity.translation.tolist(),
+            "ate_translation": result.statistics,
+            "rpe": tables if args.rpe else None,
+            "timestamps_seconds": result.truth.timestamps.tolist(),
+            "errors": result.errors.tolist(),
+        }
+        write_json(args.save_results, numbers)
     if args.plot or args.save_plot:
         _plot(args, result)
     return 0
@@ -122,38 +138,10 @@ def _fit(result: TrajectoryError, estimate_poses: int, truth_poses: int) -> str:
     )
 
 
-def _table(
-    args: argparse.Namespace, alignment: Alignment, title: str, statistics: dict[str, float]
-) -> str:
+def _table(title: str, fitted: str, statistics: dict[str, float]) -> str:
     """Return one table as evo prints it, with the alignment named above it."""
-    by_default = not (args.align or args.correct_scale or args.no_align)
-    reason = ", the default for monocular estimates" if by_default else ""
     rows = [f"{name:>10}\t{statistics[name]:.6f}" for name in sorted(statistics)]
-    return "\n".join([title, f"(with {alignment.value}{reason})", "", *rows])
-
-
-def _save_results(
-    args: argparse.Namespace,
-    result: TrajectoryError,
-    alignment: Alignment,
-    tables: dict[str, dict[str, float]],
-) -> None:
-    write_json(
-        args.save_results,
-        {
-            "reference": args.reference,
-            "estimate": args.estimate,
-            "alignment": alignment.value,
-            "pairs": len(result.errors),
-            "scale": result.similarity.scale,
-            "rotation": result.similarity.rotation.tolist(),
-            "translation": result.similarity.translation.tolist(),
-            "ate_translation": result.statistics,
-            "rpe": tables if args.rpe else None,
-            "timestamps_seconds": result.truth.timestamps.tolist(),
-            "errors": result.errors.tolist(),
-        },
-    )
+    return "\n".join([title, fitted, "", *rows])
 
 
 def _plot(args: argparse.Namespace, result: TrajectoryError) -> None:

@@ -199,20 +199,19 @@ def _converted(value: Any, kind: type) -> Any:
 
 def lpips_of(args: argparse.Namespace) -> Lpips | None:
     """Return the measure whose files were given, as paths or by their names in the list."""
-    trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
-    if trunk is None and heads is None:
+    files = {f"--lpips-{name}": getattr(args, f"lpips_{name}", None) for name in ("trunk", "heads")}
+    missing = [flag for flag, file in files.items() if file is None]
+    if len(missing) == 2:
         return None
-    if trunk is None or heads is None:
-        missing, given = ("heads", "trunk") if heads is None else ("trunk", "heads")
-        raise InputError(
-            f"expected --lpips-{missing} FILE with --lpips-{given}, found none; give both or none"
-        )
+    if missing:
+        [given] = files.keys() - missing
+        raise InputError(f"expected {missing[0]} FILE with {given}, found none; give both or none")
     from minislam.evaluation.lpips import Lpips
     from minislam.priors.networks.checkpoints import load_checkpoint
     from minislam.priors.networks.published import find_weights
 
-    files = find_weights("--lpips-trunk", trunk), find_weights("--lpips-heads", heads)
-    return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in files))
+    paths = [Path(str(find_weights(flag, file))).expanduser() for flag, file in files.items()]
+    return Lpips(*(load_checkpoint(path).as_dict() for path in paths))
 
 
 def settings(args: argparse.Namespace) -> SlamConfig:

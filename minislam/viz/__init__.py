@@ -9,7 +9,7 @@ from minislam.viz.figures import (
     overview,
     trajectory_plot,
 )
-from minislam.viz.flipbook import figure_picture, flipbook
+from minislam.viz.flipbook import flipbook
 from minislam.viz.report import Report, build_report, summary_html
 from minislam.viz.style import (
     beta_limits,
@@ -17,6 +17,7 @@ from minislam.viz.style import (
     colour_bar,
     depth_limits,
     depth_to_rgb,
+    figure_picture,
     figure_png,
     new_figure,
     set_notebook_style,

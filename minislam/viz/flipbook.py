@@ -11,10 +11,8 @@ from itertools import product
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 
 from minislam.errors import InputError
-from minislam.viz.style import figure_png
 from minislam.viz.viewer import picture_url
 
 LARGEST = 400_000  # bytes of a flip book
@@ -73,12 +71,6 @@ def flipbook(
         if len(urls) == count and len(html.encode()) < LARGEST:
             return FlipBook(html)
     raise InputError(f"expected pictures that fit into 400 kB, found {count}: show fewer of them")
-
-
-def figure_picture(figure: Figure) -> np.ndarray:  # (H, W, 3) uint8
-    """Turn a figure into a picture; one of `new_figure` is shown nowhere else."""
-    png = np.frombuffer(figure_png(figure, figure.dpi), np.uint8)
-    return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR_RGB))
 
 
 def _bytes_of(picture: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8

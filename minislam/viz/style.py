@@ -4,6 +4,7 @@ import io
 from collections.abc import Sequence as Series
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
@@ -49,6 +50,12 @@ def figure_png(figure: Figure, dpi: float = _DPI) -> bytes:
     return buffer.getvalue()
 
 
+def figure_picture(figure: Figure) -> np.ndarray:  # (H, W, 3) uint8
+    """Turn a figure into a picture; one of `new_figure` is shown nowhere else."""
+    png = np.frombuffer(figure_png(figure, figure.dpi), np.uint8)
+    return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR_RGB))
+
+
 def show_figure(figure: Figure) -> None:
     """Open a window with a figure and wait until it is closed."""
     from matplotlib import pyplot  # only here: pyplot looks for a screen when it is imported
@@ -62,9 +69,7 @@ def show_figure(figure: Figure) -> None:
             "--save_plot FILE"
         )
     window = pyplot.figure(figsize=figure.get_size_inches(), dpi=figure.dpi)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    window.figimage(canvas.buffer_rgba())
+    window.figimage(figure_picture(figure))
     pyplot.show()
 
 
