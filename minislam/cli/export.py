@@ -51,10 +51,8 @@ def run_export(args: argparse.Namespace) -> int:
     for folder in filter(None, folders):
         require_free(folder, args.overwrite)
     padded = Path(args.folder) / SH_MAP
-    files = [Path(args.points)] if args.points else []
-    files += [padded] if args.sh_degree else []
-    for file in files:
-        if file.exists() and not args.overwrite:
+    for file in (args.points and Path(args.points), args.sh_degree and padded):
+        if file and file.exists() and not args.overwrite:
             raise InputError(
                 f"expected a new file, but {file} exists; choose another name or add --overwrite"
             )

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -83,9 +84,9 @@ class ProgressLine:
     def __init__(self, is_quiet: bool = False, is_verbose: bool = False) -> None:
         self.plan: list[dict[str, float]] = []  # see `plan_of`; without it, no time of the whole
         self._begun: dict[str, tuple[float, int]] = {}  # stage: time [s] and steps when first shown
-        self._shown: dict[str, float] = {}  # stage: fraction done in the last plain line
+        self._shown: dict[str, float] = defaultdict(float)  # stage: done in the last plain line
         self._stage = 0  # of the plan
-        self._fractions: dict[tuple[int, str], float] = {}  # done of each part of a stage
+        self._done: dict[tuple[int, str], float] = defaultdict(float)  # of each part of a stage
         self._start: tuple[float, float] | None = None  # time [s] and planned seconds done then
         self._stream = "stdout" if is_quiet else "stderr"  # a quiet stdout still reaches log.txt
         self._terminal = sys.stderr.isatty() and not (is_quiet or is_verbose)
@@ -112,7 +113,7 @@ class ProgressLine:
             text += ", stopping after this step; Ctrl-C again stops at once"
         if self._terminal:
             say(f"\r\033[K{text}", "stderr", end="\n" if fraction >= 1 else "")
-        elif fraction >= 1 or fraction >= self._shown.get(stage, 0.0) + self._plain_step:
+        elif fraction >= 1 or fraction >= self._shown[stage] + self._plain_step:
             self._shown[stage] = fraction % 1  # 0 when it is done, since it may come again
             say(text, self._stream)
 
@@ -126,14 +127,14 @@ class ProgressLine:
         if not self.plan:
             return "", ""
         for index in range(self._stage, len(self.plan)):
-            if self._fractions.get((index, name), 0.0) < 1 and name in self.plan[index]:
+            if name in self.plan[index] and self._done[index, name] < 1:
                 self._stage = index
-                self._fractions[index, name] = fraction
+                self._done[index, name] = fraction
                 break
         planned = [sum(stage.values()) for stage in self.plan]
         present = self.plan[self._stage].items()
         done = sum(planned[: self._stage])
-        done += sum(cost * self._fractions.get((self._stage, part), 0.0) for part, cost in present)
+        done += sum(cost * self._done[self._stage, part] for part, cost in present)
         self._start = self._start or (now, done)
         taken, trusted = now - self._start[0], TRUST * sum(planned)
         slowness = (taken + trusted) / (done - self._start[1] + trusted)

@@ -1,20 +1,14 @@
 """The sub-command `minislam weights`: list, fetch and check official checkpoint files."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import hashlib
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from minislam.cli.progress import ProgressLine
 from minislam.errors import InputError, MinislamError
 from minislam.priors.networks.published import PublishedFile, published_files
-
-if TYPE_CHECKING:
-    from minislam.priors.networks.checkpoints import Weights
 
 CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
 
@@ -102,33 +96,25 @@ def _sha256(path: Path) -> str:
 
 
 def _verdict(file: Path) -> str:
-    """Return which network a file belongs to, and whether it is complete."""
+    """Return which network a file belongs to, whether it is complete, and the flag that uses it."""
+    from minislam.evaluation.lpips import recognise_heads, recognise_trunk
+    from minislam.priors.networks import table
     from minislam.priors.networks.checkpoints import load_checkpoint
-    from minislam.priors.networks.table import describe
 
     title = "unreadable"
     try:
         weights = load_checkpoint(file)
-        title = describe(weights)
-        use = _use_of(weights, title)
+        title = table.describe(weights)
+        network = table.recognise(weights)
+        if network is not None:
+            table.build_checked(network, weights)
+            return f"{title}, complete: --{network.kind} {network.name}"
+        if title == table.LPIPS_HEADS:
+            recognise_heads(weights.as_dict())
+            return f"{title}, complete: --lpips-heads"
+        if title == table.CLASSIFIER:
+            recognise_trunk(weights.as_dict())
+            return f"{title}, complete: --lpips-trunk"
+        return f"{title}, of no use here"
     except MinislamError as error:
         return f"{title}, NOT usable: {error}"
-    return f"{title}, complete: {use}" if use else f"{title}, of no use here"
-
-
-def _use_of(weights: Weights, title: str) -> str:
-    """Check a checkpoint; return the flag that uses it, "" if none does."""
-    from minislam.evaluation.lpips import recognise_heads, recognise_trunk
-    from minislam.priors.networks.table import CLASSIFIER, LPIPS_HEADS, build_checked, recognise
-
-    network = recognise(weights)
-    if network is not None:
-        build_checked(network, weights)
-        return f"--{network.kind} {network.name}"
-    if title == LPIPS_HEADS:
-        recognise_heads(weights.as_dict())
-        return "--lpips-heads"
-    if title == CLASSIFIER:
-        recognise_trunk(weights.as_dict())
-        return "--lpips-trunk"
-    return ""
