@@ -1,7 +1,4 @@
-"""The sub-command `minislam eval`, in the grammar of `evo_ape tum`.
-
-Heavy modules are imported only for a comparison: `--help` answers at once.
-"""
+"""The sub-command `minislam eval`, in the grammar of `evo_ape tum`."""
 
 from __future__ import annotations
 

@@ -78,12 +78,10 @@ def run_grade(args: argparse.Namespace) -> int:
 
 def _show(graded: dict[str, Any]) -> None:
     print(graded["file"])
-    if "error" in graded:
-        print(f"  {graded['error']}")
-        return
     for row in graded["exercises"]:
         print(f"  {row['key']:7} {row['points']}/{row['of']}  {row['status']:7}  {row['sentence']}")
-    print(f"  {graded['points']} of {graded['of']} points")
+    total = f"{graded['points']} of {graded['of']} points"
+    print(f"  {graded.get('error', total)}")
 
 
 def _graded(path: Path, seed: int | None, without_package: bool) -> dict[str, Any]:

@@ -36,9 +36,8 @@ def run_notebooks(args: argparse.Namespace) -> int:
     if args.student:
         for name, content in copies.items():
             copies[name] = as_text(without_solutions(json.loads(content))).encode()
-    for path in sorted(source.glob("*/*.*")):
-        if path.relative_to(source).as_posix().encode() in texts:
-            copies[path.relative_to(source).as_posix()] = read_bytes(path)
+    beside = {path.relative_to(source).as_posix(): path for path in sorted(source.glob("*/*.*"))}
+    copies |= {name: read_bytes(path) for name, path in beside.items() if name.encode() in texts}
     for path in (source / "SYLLABUS.md", source / "LICENSE", source.parent / "LICENSE"):
         if path.is_file():
             copies[path.name] = read_bytes(path)
