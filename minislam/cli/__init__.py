@@ -1,1 +1,1 @@
-"""The commands, one file each: `demo`, `run`, `priors`, `weights`, `eval`, `doctor`."""
+"""The commands, one file each; `main` lists them."""

@@ -23,9 +23,9 @@ RMSE of the ATE over all frames, for minislam after a Sim(3) alignment. F: faile
 *: frames were lost or the geometry broke (minislam), run by the authors of the paper (others)."""
 
 
-def add_bench_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `bench` to the sub-commands of a parser."""
-    parser = subparsers.add_parser(
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `bench` to the commands."""
+    parser = commands.add_parser(
         "bench",
         help="run the sequences of benchmarks, and compare with the published errors",
         usage=USAGE,
@@ -74,19 +74,19 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
     for folder in map(Path, folders):
         inside = [folder, *sorted(folder.glob("*")), *sorted(folder.glob("*/*"))]
         paths = [path for path in inside if path.is_dir() and is_tum_folder(path)]
-        names = [path.resolve().name for path in paths]
         if not paths:
             raise InputError(
                 f"expected sequences (folders with rgb.txt, or rgb/ with times as names) in "
                 f"{folder}, found none; check the path"
             )
-        twice = next((name for name in names if names.count(name) > 1 or name in found), None)
-        if twice:
-            raise InputError(
-                f"expected sequences of different names, found two called {twice}; bench them in "
-                "two commands, each with its own -o"
-            )
-        found |= dict(zip(names, paths, strict=True))
+        for path in paths:
+            name = path.resolve().name
+            if name in found:
+                raise InputError(
+                    f"expected sequences of different names, found two called {name}; bench them "
+                    "in two commands, each with its own -o"
+                )
+            found[name] = path
     return found
 
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Iterator
 
 import minislam
 from minislam.errors import MinislamError
@@ -13,11 +14,10 @@ from minislam.errors import MinislamError
 MAX_SELF_TEST_ERROR = 0.1  # px
 
 
-def add_doctor_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
-    """Add `doctor` to the sub-commands of a parser."""
-    parser = subparsers.add_parser("doctor", help="show what is installed and check that it works")
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `doctor` to the commands."""
+    parser = commands.add_parser("doctor", help="show what is installed and check that it works")
     parser.set_defaults(run=run_doctor)
-    return parser
 
 
 def run_doctor(args: argparse.Namespace) -> int:
@@ -34,7 +34,7 @@ def run_doctor(args: argparse.Namespace) -> int:
         print(f"  {name:11s} {importlib.import_module(name).__version__}")
     print(f"  processors  {os.cpu_count()}, torch uses {torch.get_num_threads()} threads")
     print(f"  CUDA        {torch.cuda.get_device_name() if torch.cuda.is_available() else 'none'}")
-    for warning in [*opencv_warnings(), *gpu_warnings(torch.cuda.is_available())]:
+    for warning in installation_warnings(torch.cuda.is_available()):
         print(f"  WARNING: {warning}")
     start = time.perf_counter()
     flow, (first, second) = ClassicalFlow(), shifted_images()
@@ -49,23 +49,16 @@ def run_doctor(args: argparse.Namespace) -> int:
     return 0
 
 
-def opencv_warnings() -> list[str]:
-    """Say if several OpenCV packages are installed, which overwrite each other's files."""
+def installation_warnings(torch_sees_a_gpu: bool) -> Iterator[str]:
+    """Say if packages of OpenCV overwrite each other's files, and if torch misses a GPU."""
     from importlib.metadata import distributions
 
     names = {str(found.metadata["Name"]).lower() for found in distributions()}
-    found = sorted(name for name in names if name.startswith("opencv-"))
-    if len(found) < 2:
-        return []
-    return [f"{', '.join(found)} share one folder: uninstall all, install one of them again"]
-
-
-def gpu_warnings(torch_sees_one: bool) -> list[str]:
-    """Say if there is an NVIDIA GPU that this torch does not see."""
-    if torch_sees_one or not shutil.which("nvidia-smi"):
-        return []
-    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
-    gpus = [line.split(" (UUID")[0] for line in listed.stdout.splitlines() if "GPU" in line]
-    if listed.returncode or not gpus:
-        return []
-    return [f"torch sees no {gpus[0]}: install a torch with CUDA that fits the driver"]
+    packages = sorted(name for name in names if name.startswith("opencv-"))
+    if len(packages) > 1:
+        yield f"{', '.join(packages)} share one folder: uninstall all, install one of them again"
+    if not torch_sees_a_gpu and shutil.which("nvidia-smi"):
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
+        gpus = [line.split(" (UUID")[0] for line in listed.stdout.splitlines() if "GPU" in line]
+        if gpus and not listed.returncode:
+            yield f"torch sees no {gpus[0]}: install a torch with CUDA that fits the driver"

@@ -1,7 +1,4 @@
-"""The sub-command `minislam eval`, in the grammar of `evo_ape tum`.
-
-Heavy modules are imported only for a comparison: `--help` answers at once.
-"""
+"""The sub-command `minislam eval`, in the grammar of `evo_ape tum`."""
 
 from __future__ import annotations
 
@@ -16,43 +13,33 @@ if TYPE_CHECKING:
     from minislam.evaluation import Alignment, TrajectoryError
 
 
-def add_eval_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
-    """Add `eval` to the sub-commands of a parser."""
-    parser = subparsers.add_parser(
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `eval` to the commands."""
+    parser = commands.add_parser(
         "eval",
         help="compare an estimated trajectory with the truth",
         description="Absolute trajectory error (ATE) of an estimate, or with --rpe its relative "
         "pose error (RPE); both files in TUM format. Without -a, -s and --no_align a Sim(3) is "
         "fitted first, since a monocular estimate has no scale of its own.",
     )
-    parser.add_argument("format", nargs="?", choices=["tum"], help="as evo asks for, or nothing")
-    parser.add_argument("reference", help="ground truth, TUM format")
-    parser.add_argument("estimate", help="estimated trajectory, TUM format, or a run folder")
-    parser.add_argument("-a", "--align", action="store_true", help="fit rotation and translation")
-    parser.add_argument("-s", "--correct_scale", action="store_true", help="fit the scale")
-    parser.add_argument("--no_align", action="store_true", help="fit nothing")
-    parser.add_argument(
-        "--t_max_diff", type=float, default=0.01, help="largest difference of timestamps [s], 0.01"
-    )
-    parser.add_argument(
-        "--t_offset", type=float, default=0.0, help="added to the estimate's timestamps [s], 0"
-    )
-    parser.add_argument(
-        "--rpe", action="store_true", help="relative pose error: the drift over --delta"
-    )
-    parser.add_argument(
-        "--delta", type=float, default=1.0, help="length of each motion for --rpe, 1"
-    )
-    parser.add_argument(
-        "--delta_unit", choices=("s", "f"), default="s", help="of --delta: seconds or frames, s"
-    )
-    parser.add_argument("-p", "--plot", action="store_true", help="show the trajectories")
-    parser.add_argument("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
-    parser.add_argument("--save_results", metavar="FILE.json", help="write the numbers to a file")
-    parser.add_argument("-v", "--verbose", action="store_true", help="say more")
-    parser.add_argument("--silent", action="store_true", help="print nothing")
+    add = parser.add_argument
+    add("format", nargs="?", choices=["tum"], help="as evo asks for, or nothing")
+    add("reference", help="ground truth, TUM format")
+    add("estimate", help="estimated trajectory, TUM format, or a run folder")
+    add("-a", "--align", action="store_true", help="fit rotation and translation")
+    add("-s", "--correct_scale", action="store_true", help="fit the scale")
+    add("--no_align", action="store_true", help="fit nothing")
+    add("--t_max_diff", type=float, default=0.01, help="largest difference of timestamps [s], 0.01")
+    add("--t_offset", type=float, default=0.0, help="added to the estimate's timestamps [s], 0")
+    add("--rpe", action="store_true", help="relative pose error: the drift over --delta")
+    add("--delta", type=float, default=1.0, help="length of each motion for --rpe, 1")
+    add("--delta_unit", choices=("s", "f"), default="s", help="of --delta: seconds or frames, s")
+    add("-p", "--plot", action="store_true", help="show the trajectories")
+    add("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
+    add("--save_results", metavar="FILE.json", help="write the numbers to a file")
+    add("-v", "--verbose", action="store_true", help="say more")
+    add("--silent", action="store_true", help="print nothing")
     parser.set_defaults(run=run_eval)
-    return parser
 
 
 def run_eval(args: argparse.Namespace) -> int:
@@ -71,12 +58,28 @@ def run_eval(args: argparse.Namespace) -> int:
     tables = {"APE w.r.t. translation part (m)": result.statistics}
     if args.rpe:
         tables = _relative_errors(args, result)
-    if args.verbose and not args.silent:
-        print(_fit(result, len(estimate), len(truth)))
     if not args.silent:
-        print("\n\n".join(_table(args, alignment, title, tables[title]) for title in tables))
+        by_default = not (args.align or args.correct_scale or args.no_align)
+        reason = ", the default for monocular estimates" if by_default else ""
+        fitted = f"(with {alignment.value}{reason})"
+        if args.verbose:
+            print(_fit(result, len(estimate), len(truth)))
+        print("\n\n".join(_table(title, fitted, tables[title]) for title in tables))
     if args.save_results:
-        _save_results(args, result, alignment, tables)
+        numbers = {
+            "reference": args.reference,
+            "estimate": args.estimate,
+            "alignment": alignment.value,
+            "pairs": len(result.errors),
+            "scale": result.similarity.scale,
+            "rotation": result.similarity.rotation.tolist(),
+            "translation": result.similarity.translation.tolist(),
+            "ate_translation": result.statistics,
+            "rpe": tables if args.rpe else None,
+            "timestamps_seconds": result.truth.timestamps.tolist(),
+            "errors": result.errors.tolist(),
+        }
+        write_json(args.save_results, numbers)
     if args.plot or args.save_plot:
         _plot(args, result)
     return 0
@@ -132,38 +135,10 @@ def _fit(result: TrajectoryError, estimate_poses: int, truth_poses: int) -> str:
     )
 
 
-def _table(
-    args: argparse.Namespace, alignment: Alignment, title: str, statistics: dict[str, float]
-) -> str:
+def _table(title: str, fitted: str, statistics: dict[str, float]) -> str:
     """Return one table as evo prints it, with the alignment named above it."""
-    by_default = not (args.align or args.correct_scale or args.no_align)
-    reason = ", the default for monocular estimates" if by_default else ""
     rows = [f"{name:>10}\t{statistics[name]:.6f}" for name in sorted(statistics)]
-    return "\n".join([title, f"(with {alignment.value}{reason})", "", *rows])
-
-
-def _save_results(
-    args: argparse.Namespace,
-    result: TrajectoryError,
-    alignment: Alignment,
-    tables: dict[str, dict[str, float]],
-) -> None:
-    write_json(
-        args.save_results,
-        {
-            "reference": args.reference,
-            "estimate": args.estimate,
-            "alignment": alignment.value,
-            "pairs": len(result.errors),
-            "scale": result.similarity.scale,
-            "rotation": result.similarity.rotation.tolist(),
-            "translation": result.similarity.translation.tolist(),
-            "ate_translation": result.statistics,
-            "rpe": tables if args.rpe else None,
-            "timestamps_seconds": result.truth.timestamps.tolist(),
-            "errors": result.errors.tolist(),
-        },
-    )
+    return "\n".join([title, fitted, "", *rows])
 
 
 def _plot(args: argparse.Namespace, result: TrajectoryError) -> None:

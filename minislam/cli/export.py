@@ -19,25 +19,24 @@ Beside poses, both are as a global shutter would have seen them; --masks alone f
 """
 
 
-def add_export_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `export` to the sub-commands of a parser."""
-    parser = subparsers.add_parser(
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `export` to the commands."""
+    parser = commands.add_parser(
         "export",
         help="write a run for COLMAP, nerfstudio and other programs",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=EPILOG,
     )
-    parser.add_argument("folder", metavar="RUN", help="folder of a finished run")
-    parser.add_argument("--colmap", metavar="DIR", help="images, masks, COLMAP's sparse model")
-    parser.add_argument("--nerfstudio", metavar="DIR", help="images, masks, transforms.json")
-    parser.add_argument("--points", metavar="FILE.ply", help="the map as a plain point cloud")
-    parser.add_argument("--depth", metavar="DIR", help="rendered z-depth, .npy at the working size")
-    parser.add_argument("--masks", metavar="DIR", help="255 where static, 0 where it moves")
-    parser.add_argument(
-        "--sh-degree", type=int, choices=(1, 2, 3), help="map with zeros up to this degree, in RUN"
-    )
-    parser.add_argument("--keyframes", action="store_true", help="only keyframes, not all frames")
-    parser.add_argument("--overwrite", action="store_true", help="replace files of these names")
+    add = parser.add_argument
+    add("folder", metavar="RUN", help="folder of a finished run")
+    add("--colmap", metavar="DIR", help="images, masks, COLMAP's sparse model")
+    add("--nerfstudio", metavar="DIR", help="images, masks, transforms.json")
+    add("--points", metavar="FILE.ply", help="the map as a plain point cloud")
+    add("--depth", metavar="DIR", help="rendered z-depth, .npy at the working size")
+    add("--masks", metavar="DIR", help="255 where static, 0 where it moves")
+    add("--sh-degree", type=int, choices=(1, 2, 3), help="map with zeros up to this degree, in RUN")
+    add("--keyframes", action="store_true", help="only keyframes, not all frames")
+    add("--overwrite", action="store_true", help="replace files of these names")
     parser.set_defaults(run=run_export)
 
 
@@ -52,10 +51,8 @@ def run_export(args: argparse.Namespace) -> int:
     for folder in filter(None, folders):
         require_free(folder, args.overwrite)
     padded = Path(args.folder) / SH_MAP
-    files = [Path(args.points)] if args.points else []
-    files += [padded] if args.sh_degree else []
-    for file in files:
-        if file.exists() and not args.overwrite:
+    for file in (args.points and Path(args.points), args.sh_degree and padded):
+        if file and file.exists() and not args.overwrite:
             raise InputError(
                 f"expected a new file, but {file} exists; choose another name or add --overwrite"
             )

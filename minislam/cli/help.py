@@ -2,7 +2,7 @@
 
 import argparse
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from minislam.errors import InputError
@@ -61,15 +61,9 @@ class UsageError(InputError):
 class Help(argparse.Action):
     """`-h` shows what most people need, `--help` everything."""
 
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: str | Sequence[Any] | None,
-        option_string: str | None = None,
-    ) -> None:
+    def __call__(self, parser: argparse.ArgumentParser, *rest: Any) -> None:
         """Print the help and end the program."""
-        if option_string == "-h":
+        if rest[-1] == "-h":  # what was typed
             parser.epilog = SHORT_EPILOG
             for action in parser._actions:
                 if action.option_strings and not set(action.option_strings) & set(ESSENTIAL):
@@ -81,10 +75,10 @@ class Help(argparse.Action):
 
 
 def add_command(
-    subparsers: argparse._SubParsersAction, name: str, what: str, usage: str, epilog: str | None
+    commands: argparse._SubParsersAction, name: str, what: str, usage: str, epilog: str | None
 ) -> argparse.ArgumentParser:
     """Add a command with many options, hence with a short help as -h and a long one as --help."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=what,
         usage=f"minislam {name} {usage} [options]",
@@ -107,18 +101,19 @@ def unknown_option(found: str, parser: argparse.ArgumentParser) -> UsageError:
             "with spaces in quotes"
         )
     name = found.partition("=")[0]
-    near = nearest(name, parser._option_string_actions)
-    if near is None and parser.get_default("takes_settings"):
+    known = {option: option for option in parser._option_string_actions}
+    if parser.get_default("takes_settings") and not difflib.get_close_matches(name, known):
         from minislam.config import SlamConfig, settings_of
 
         # A name without dots may be the end of a setting's; the first setting with it comes last.
-        known = [f"--{setting}" for setting in reversed(settings_of(SlamConfig()))]
-        by_end = {k if "." in name else f"--{k.rpartition('.')[2]}": k for k in known}
-        near = by_end.get(nearest(name, by_end) or "")
-    hint = f"the nearest is {near}" if near else f"see {parser.prog} --help"
+        settings = [f"--{setting}" for setting in reversed(settings_of(SlamConfig()))]
+        known = {s if "." in name else f"--{s.rpartition('.')[2]}": s for s in settings}
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"the nearest is {known[near[0]]}" if near else f"see {parser.prog} --help"
     return UsageError(f"expected a known option, found {name}; {hint}")
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Return the most similar of the known names, None if none is similar."""
-    return next(iter(difflib.get_close_matches(name, known, n=1)), None)
+def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return a hint at the most similar of the known names, or what else to say."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"the nearest is {near[0]}" if near else otherwise

@@ -6,31 +6,18 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from importlib import import_module
 
 import minislam
-from minislam.cli.bench import add_bench_parser
-from minislam.cli.doctor import add_doctor_parser
-from minislam.cli.evaluate import add_eval_parser
-from minislam.cli.export import add_export_parser
-from minislam.cli.grade import add_grade_parser
 from minislam.cli.help import UsageError, nearest, unknown_option
-from minislam.cli.notebooks import add_notebooks_parser
 from minislam.cli.options import take_settings
-from minislam.cli.priors import add_priors_parser
 from minislam.cli.progress import ending_signals, say
-from minislam.cli.render import add_render_parser
-from minislam.cli.run import add_demo_parser, add_run_parser
-from minislam.cli.settings import add_settings_parser
-from minislam.cli.weights import add_weights_parser
 from minislam.errors import MinislamError
 
-ADD_PARSERS: list[Callable[[argparse._SubParsersAction], object]] = [
-    add_demo_parser, add_run_parser, add_render_parser, add_export_parser, add_eval_parser,
-    add_settings_parser, add_weights_parser, add_priors_parser, add_bench_parser,
-    add_notebooks_parser, add_grade_parser, add_doctor_parser,
-]  # fmt: skip
+# The modules of minislam.cli that add the commands, in the order of the help.
+COMMANDS = "run render export evaluate settings weights priors bench notebooks grade doctor".split()
 FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
 # Settings of glibc's malloc and their values: one arena for all threads, and blocks of 4 MB and
 # more mapped one by one. Otherwise freed images leave holes that later ones do not fit.
@@ -47,10 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     warnings.formatwarning = lambda message, *_, **__: f"WARNING: {message}\n"
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by the caller
-            setattr(sys, name, open(os.devnull, "w"))
-        if hasattr(getattr(sys, name), "reconfigure"):  # so that every file name can be printed
-            getattr(sys, name).reconfigure(errors="backslashreplace")
+        stream = getattr(sys, name) or open(os.devnull, "w")  # None: closed by the caller
+        if hasattr(stream, "reconfigure"):  # so that every file name can be printed
+            stream.reconfigure(errors="backslashreplace")
+        setattr(sys, name, stream)
     try:
         with ending_signals(signal.default_int_handler):
             exit_code = _command(sys.argv[1:] if arguments is None else list(arguments))
@@ -86,11 +73,8 @@ def _command(arguments: list[str]) -> int:
         parser.print_help()
         return USAGE_EXIT
     if not arguments[0].startswith("-") and arguments[0] not in commands:
-        near = nearest(arguments[0], commands)
-        raise UsageError(
-            f"expected a command, found {arguments[0]!r}; "
-            + (f"the nearest is {near}" if near else f"choose one of {', '.join(commands)}")
-        )
+        hint = nearest(arguments[0], commands, f"choose one of {', '.join(commands)}")
+        raise UsageError(f"expected a command, found {arguments[0]!r}; {hint}")
     given: dict[str, str | None] = {}
     if arguments[0] in commands and commands[arguments[0]].get_default("takes_settings"):
         arguments, given = take_settings(arguments)
@@ -109,8 +93,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"minislam {minislam.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add_parser in ADD_PARSERS:
-        add_parser(commands)
+    for name in COMMANDS:
+        import_module(f"minislam.cli.{name}").add_parser(commands)
     for command in commands.choices.values():
         command.set_defaults(parser=command)
     parser.set_defaults(commands=commands.choices)

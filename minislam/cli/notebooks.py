@@ -13,9 +13,9 @@ from minislam.errors import InputError
 SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
 
 
-def add_notebooks_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `notebooks` to the sub-commands of a parser."""
-    parser = subparsers.add_parser("notebooks", help="copy the course's notebooks into a folder")
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `notebooks` to the commands."""
+    parser = commands.add_parser("notebooks", help="copy the course's notebooks into a folder")
     parser.add_argument("folder", metavar="DIR", help="where to; made if it does not exist")
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--student", action="store_true", help="without solutions and outputs")
@@ -36,9 +36,8 @@ def run_notebooks(args: argparse.Namespace) -> int:
     if args.student:
         for name, content in copies.items():
             copies[name] = as_text(without_solutions(json.loads(content))).encode()
-    for path in sorted(source.glob("*/*.*")):
-        if path.relative_to(source).as_posix().encode() in texts:
-            copies[path.relative_to(source).as_posix()] = read_bytes(path)
+    beside = {path.relative_to(source).as_posix(): path for path in sorted(source.glob("*/*.*"))}
+    copies |= {name: read_bytes(path) for name, path in beside.items() if name.encode() in texts}
     for path in (source / "SYLLABUS.md", source / "LICENSE", source.parent / "LICENSE"):
         if path.is_file():
             copies[path.name] = read_bytes(path)

@@ -53,24 +53,23 @@ def add_priors(
         "networks need their official checkpoints: minislam weights list\n"
         "FILE: a path, or a name of that list; without it the file called like the network",
     )
-    group.add_argument(
+    add = group.add_argument
+    add(
         "--features",
         help="classical, dinov2, fit3d, files:FOLDER or python:MODULE:FUNCTION; default classical",
     )
-    group.add_argument("--features-weights", metavar="FILE", help="checkpoint of dinov2 or fit3d")
-    group.add_argument(
+    add("--features-weights", metavar="FILE", help="checkpoint of dinov2 or fit3d")
+    add(
         "--depth",
         help="none, simulated (synthetic sequences), sensor, metric3d, depth-anything, "
         f"files:FOLDER or python:MODULE:FUNCTION; default {default_depth}",
     )
-    group.add_argument(
-        "--depth-weights", metavar="FILE", help="checkpoint of metric3d or depth-anything"
-    )
-    group.add_argument("--device", help="where everything runs: cpu or cuda; cpu")
-    group.add_argument("--precision", help="of the networks: fp32, bf16 or fp16 (cuda); fp32")
+    add("--depth-weights", metavar="FILE", help="checkpoint of metric3d or depth-anything")
+    add("--device", help="where everything runs: cpu or cuda; cpu")
+    add("--precision", help="of the networks: fp32, bf16 or fp16 (cuda); fp32")
     if with_flow:
-        group.add_argument("--flow", help="classical, droid or python:MODULE:FUNCTION; classical")
-        group.add_argument("--flow-weights", metavar="FILE", help="checkpoint of droid")
+        add("--flow", help="classical, droid or python:MODULE:FUNCTION; classical")
+        add("--flow-weights", metavar="FILE", help="checkpoint of droid")
 
 
 def add_talk(parser: argparse.ArgumentParser) -> None:
@@ -90,14 +89,13 @@ def add_talk(parser: argparse.ArgumentParser) -> None:
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Add the presets and what stands over them. `take_settings` finds names with a dot."""
     parser.set_defaults(takes_settings=True)
-    parser.add_argument("--preset", help=f"{', '.join(PRESETS)}; laptop")
-    parser.add_argument("--config", help="JSON file of settings; config.json of a run repeats it")
-    parser.add_argument("--seed", type=int, help="seed of every random draw, 0")
-    parser.add_argument("--threads", help="threads of torch, 1")
-    parser.add_argument("--checkpoint_fraction", help="see minislam settings checkpoint; 0.01")
-    parser.add_argument(
-        "--no-uncertainty", action="store_true", help="give every pixel the same weight (ablation)"
-    )
+    add = parser.add_argument
+    add("--preset", help=f"{', '.join(PRESETS)}; laptop")
+    add("--config", help="JSON file of settings; config.json of a run repeats it")
+    add("--seed", type=int, help="seed of every random draw, 0")
+    add("--threads", help="threads of torch, 1")
+    add("--checkpoint_fraction", help="see minislam settings checkpoint; 0.01")
+    add("--no-uncertainty", action="store_true", help="give every pixel the same weight (ablation)")
 
 
 def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str | None]]:
@@ -201,20 +199,19 @@ def _converted(value: Any, kind: type) -> Any:
 
 def lpips_of(args: argparse.Namespace) -> Lpips | None:
     """Return the measure whose files were given, as paths or by their names in the list."""
-    trunk, heads = getattr(args, "lpips_trunk", None), getattr(args, "lpips_heads", None)
-    if trunk is None and heads is None:
+    files = {f"--lpips-{name}": getattr(args, f"lpips_{name}", None) for name in ("trunk", "heads")}
+    missing = [flag for flag, file in files.items() if file is None]
+    if len(missing) == 2:
         return None
-    if trunk is None or heads is None:
-        missing, given = ("heads", "trunk") if heads is None else ("trunk", "heads")
-        raise InputError(
-            f"expected --lpips-{missing} FILE with --lpips-{given}, found none; give both or none"
-        )
+    if missing:
+        [given] = files.keys() - missing
+        raise InputError(f"expected {missing[0]} FILE with {given}, found none; give both or none")
     from minislam.evaluation.lpips import Lpips
     from minislam.priors.names import find_weights
     from minislam.priors.networks.checkpoints import load_checkpoint
 
-    files = find_weights("--lpips-trunk", trunk), find_weights("--lpips-heads", heads)
-    return Lpips(*(load_checkpoint(Path(str(file)).expanduser()).as_dict() for file in files))
+    paths = [Path(str(find_weights(flag, file))).expanduser() for flag, file in files.items()]
+    return Lpips(*(load_checkpoint(path).as_dict() for path in paths))
 
 
 def settings(args: argparse.Namespace) -> SlamConfig:

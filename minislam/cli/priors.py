@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 FRAME_DIGITS = 5  # of the file names, as WildGS-SLAM names its own
 
 
-def add_priors_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
-    """Add `priors` to the sub-commands of a parser."""
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `priors` to the commands."""
     what = "write features and depth of every frame to files, to run SLAM on elsewhere"
     usage = "SEQUENCE --out DIR [--features NAME] [--depth NAME]"
-    parser = add_command(subparsers, "priors", what, usage, epilog=None)
+    parser = add_command(commands, "priors", what, usage, epilog=None)
     parser.add_argument(
         "--out", required=True, metavar="DIR", help="gets the folders features and depth"
     )
@@ -44,16 +44,12 @@ def add_priors_parser(subparsers: argparse._SubParsersAction) -> argparse.Argume
     options.add_input(parser)
     options.add_priors(parser, default_depth="none")
     parser.set_defaults(run=run_priors)
-    return parser
 
 
 def run_priors(args: argparse.Namespace) -> int:
     """Write the priors that are asked for; return the exit code."""
-    source, inputs, choice = (
-        options.source_of(args),
-        options.input_options(args),
-        options.prior_choice(args, "none"),
-    )
+    source, inputs = options.source_of(args), options.input_options(args)
+    choice = options.prior_choice(args, "none")
     require_source(source)
     require_priors(choice)
     if args.features is None and choice.depth == "none":
@@ -71,7 +67,7 @@ def run_priors(args: argparse.Namespace) -> int:
     out = Path(args.out).expanduser()
     kinds = _kinds(choice, args.features is not None, sequence, config)
     for kind, (origin, compute) in kinds.items():
-        write_kind(out / kind, origin, sequence, compute, progress.show)
+        _write_kind(out / kind, origin, sequence, compute, progress.show)
     print(f"use them with {' '.join(f'--{kind} files:{out}' for kind in kinds)}")
     return 0
 
@@ -102,7 +98,7 @@ def _kinds(
     return kinds
 
 
-def write_kind(
+def _write_kind(
     folder: Path,
     origin: str,  # one line
     sequence: RecordedSequence,
@@ -112,24 +108,9 @@ def write_kind(
     """Write one .npy file per frame. Files of an interrupted call are kept and not made again."""
     import numpy as np
 
-    from minislam.priors.files import index_text
+    from minislam.priors.files import INDEX, index_text
 
-    stamps = [(frame.frame_index, frame.timestamp) for frame in sequence]
-    _claim(folder, index_text(origin, stamps))
-    for frame in sequence:
-        path = folder / f"{frame.frame_index:0{FRAME_DIGITS}d}.npy"
-        values = None if path.exists() else compute(frame)
-        if values is not None:
-            buffer = io.BytesIO()
-            np.save(buffer, values.float().cpu().numpy())
-            atomic_write(path, buffer.getvalue())
-        show(f"writing {folder.name}", frame.frame_index + 1, len(sequence))
-
-
-def _claim(folder: Path, index: str) -> None:
-    """Make a folder and write its index, unless it holds something else."""
-    from minislam.priors.files import INDEX
-
+    index = index_text(origin, [(frame.frame_index, frame.timestamp) for frame in sequence])
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / INDEX
     if any(folder.iterdir()) and not (path.exists() and read_text(path) == index):
@@ -138,3 +119,11 @@ def _claim(folder: Path, index: str) -> None:
             "files; choose another --out"
         )
     write_text(path, index)
+    for frame in sequence:
+        path = folder / f"{frame.frame_index:0{FRAME_DIGITS}d}.npy"
+        values = None if path.exists() else compute(frame)
+        if values is not None:
+            buffer = io.BytesIO()
+            np.save(buffer, values.float().cpu().numpy())
+            atomic_write(path, buffer.getvalue())
+        show(f"writing {folder.name}", frame.frame_index + 1, len(sequence))

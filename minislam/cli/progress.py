@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -20,8 +21,7 @@ PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not 
 REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
 TRUST = 0.1  # fraction of the plan by which it resists the first measurements
 
-# What asks a program to end: Ctrl-C, a scheduler or `docker stop`, a closed terminal (not Windows).
-ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
+ENDING = ("SIGINT", "SIGTERM", "SIGHUP")  # Ctrl-C, a scheduler, a closed terminal (not Windows)
 
 
 def say(text: str, stream: str = "stdout", end: str = "\n") -> None:
@@ -58,14 +58,13 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
     first_map = {"first map": iteration * mapping.init_iterations}
     late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
     online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
-    posing = {"posing all frames": 0.12 * per_frame}
     coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}
     again = {**coarse, "second adjustment": 0.06 * per_frame}
     stages = [
         {"tracking and mapping": 0.25 * per_frame + online} | (first_map if has_prior else {}),
         {"final adjustment": 0.05 * per_frame},
         again if config.uncertainty.enabled else {},
-        posing,
+        {"posing all frames": 0.12 * per_frame},
         {"dense depth": 0.25 * per_frame} | first_map,
         {"refining the map": iteration * mapping.refine_iterations},
         {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
@@ -85,9 +84,9 @@ class ProgressLine:
     def __init__(self, is_quiet: bool = False, is_verbose: bool = False) -> None:
         self.plan: list[dict[str, float]] = []  # see `plan_of`; without it, no time of the whole
         self._begun: dict[str, tuple[float, int]] = {}  # stage: time [s] and steps when first shown
-        self._shown: dict[str, float] = {}  # stage: fraction done in the last plain line
+        self._shown: dict[str, float] = defaultdict(float)  # stage: done in the last plain line
         self._stage = 0  # of the plan
-        self._fractions: dict[tuple[int, str], float] = {}  # done of each part of a stage
+        self._done: dict[tuple[int, str], float] = defaultdict(float)  # of each part of a stage
         self._start: tuple[float, float] | None = None  # time [s] and planned seconds done then
         self._stream = "stdout" if is_quiet else "stderr"  # a quiet stdout still reaches log.txt
         self._terminal = sys.stderr.isatty() and not (is_quiet or is_verbose)
@@ -112,7 +111,11 @@ class ProgressLine:
         text += in_all
         if self._should_stop:
             text += ", stopping after this step; Ctrl-C again stops at once"
-        self._print(stage, text, fraction)
+        if self._terminal:
+            say(f"\r\033[K{text}", "stderr", end="\n" if fraction >= 1 else "")
+        elif fraction >= 1 or fraction >= self._shown[stage] + self._plain_step:
+            self._shown[stage] = fraction % 1  # 0 when it is done, since it may come again
+            say(text, self._stream)
 
     def _whole(self, name: str, fraction: float, now: float) -> tuple[str, str]:
         """Return which stage of the plan this is, and how long the run takes in all.
@@ -124,14 +127,14 @@ class ProgressLine:
         if not self.plan:
             return "", ""
         for index in range(self._stage, len(self.plan)):
-            if self._fractions.get((index, name), 0.0) < 1 and name in self.plan[index]:
+            if name in self.plan[index] and self._done[index, name] < 1:
                 self._stage = index
-                self._fractions[index, name] = fraction
+                self._done[index, name] = fraction
                 break
         planned = [sum(stage.values()) for stage in self.plan]
         present = self.plan[self._stage].items()
         done = sum(planned[: self._stage])
-        done += sum(cost * self._fractions.get((self._stage, part), 0.0) for part, cost in present)
+        done += sum(cost * self._done[self._stage, part] for part, cost in present)
         self._start = self._start or (now, done)
         taken, trusted = now - self._start[0], TRUST * sum(planned)
         slowness = (taken + trusted) / (done - self._start[1] + trusted)
@@ -147,14 +150,6 @@ class ProgressLine:
     def should_stop(self) -> bool:
         """Tell whether Ctrl-C was pressed."""
         return self._should_stop
-
-    def _print(self, stage: str, text: str, fraction: float) -> None:
-        if self._terminal:
-            end = "\n" if fraction >= 1 else ""
-            say(f"\r\033[K{text}", "stderr", end)
-        elif fraction >= 1 or fraction >= self._shown.get(stage, 0.0) + self._plain_step:
-            self._shown[stage] = fraction % 1  # 0 when it is done, since it may come again
-            say(text, self._stream)
 
     def interrupt(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal."""

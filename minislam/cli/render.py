@@ -12,29 +12,26 @@ from minislam.cli.progress import ProgressLine, say
 if TYPE_CHECKING:
     import numpy as np
 
-TRAJECTORY, ORBIT, BESIDE = "trajectory", "orbit", "side-by-side"
 
-
-def add_render_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `render` to the commands."""
     parser = commands.add_parser(
         "render",
         help="film the static map of a finished run",
         description="Film the static map of a finished run, as .webm (video) or .webp (picture).",
         allow_abbrev=False,
     )
-    parser.add_argument("folder", metavar="RUN", help="run folder")
-    parser.add_argument("-o", "--output", required=True, help="file to write: .webm or .webp")
-    parser.add_argument(
+    add = parser.add_argument
+    add("folder", metavar="RUN", help="run folder")
+    add("-o", "--output", required=True, help="file to write: .webm or .webp")
+    add(
         "--path",
-        choices=(TRAJECTORY, ORBIT, BESIDE),
-        default=TRAJECTORY,
+        choices=("trajectory", "orbit", "side-by-side"),
+        default="trajectory",
         help="along the camera's trajectory, in a circle around the middle keyframe, or along the "
         "trajectory beside input and uncertainty; default trajectory",
     )
-    parser.add_argument(
-        "--size", type=size_of, metavar="WIDTHxHEIGHT", help="of the images, default as in the run"
-    )
+    add("--size", type=size_of, metavar="WIDTHxHEIGHT", help="of the images, default as in the run")
     parser.set_defaults(run=_render)
 
 
@@ -49,14 +46,14 @@ def _render(args: argparse.Namespace) -> int:
     require_bounds("--size", args.size, MINIMUM_SIDE, 16384)
     camera = run.camera.resized(*args.size) if args.size else run.camera
     rate, count = flythrough.frame_rate(run), len(run.poses)
-    if args.path == ORBIT:
-        images = flythrough.fly_around(run, camera)
+    if args.path == "orbit":
         rate, count = flythrough.ORBIT_RATE, flythrough.ORBIT_IMAGES
-    elif args.path == BESIDE:
-        images = flythrough.side_by_side(run, camera)
-    else:
-        images = flythrough.fly_along(run, camera)
-    write_animation(args.output, _shown(images, count), rate)
+    film = {
+        "trajectory": flythrough.fly_along,
+        "orbit": flythrough.fly_around,
+        "side-by-side": flythrough.side_by_side,
+    }[args.path]
+    write_animation(args.output, _shown(film(run, camera), count), rate)
     say(f"{count} images at {rate:.0f} per second in {args.output}")
     return 0
 

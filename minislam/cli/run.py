@@ -17,20 +17,17 @@ from minislam.priors.names import require_priors
 DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
 
 
-def add_demo_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `demo` to the sub-commands of a parser."""
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `demo` and `run` to the commands."""
     what = "make a synthetic clip with moving people and run everything on it"
-    demo = add_command(subparsers, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
+    demo = add_command(commands, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
     demo.add_argument("-o", "--output", metavar="DIR", help="run folder, output/demo")
     options.add_talk(demo)
     options.add_settings(demo)
     demo.set_defaults(run=_run, overwrite=True, resume=False, **DEMO)
 
-
-def add_run_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `run` to the sub-commands of a parser."""
     what = "run SLAM on a video, an image folder or a benchmark"
-    run = add_command(subparsers, "run", what, "SEQUENCE [-o OUTPUT]", RUN_EPILOG)
+    run = add_command(commands, "run", what, "SEQUENCE [-o OUTPUT]", RUN_EPILOG)
     run.add_argument("-o", "--output", metavar="DIR", help="run folder, default output/NAME_TIME")
     earlier = run.add_mutually_exclusive_group()
     earlier.add_argument("--overwrite", action="store_true", help="replace an earlier run")

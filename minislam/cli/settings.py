@@ -11,9 +11,9 @@ from minislam.errors import InputError
 MAX_WIDTH = 100  # characters of a line
 
 
-def add_settings_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `settings` to the sub-commands of a parser."""
-    parser = subparsers.add_parser(
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `settings` to the commands."""
+    parser = commands.add_parser(
         "settings",
         help="list the constants, each of which is an option of run",
         description="Every constant with its default, its bounds, its meaning and [its unit]. "
@@ -34,11 +34,8 @@ def run_settings(args: argparse.Namespace) -> int:
     pattern: str = args.pattern
     found = fnmatch.filter(values, f"*{pattern}*")
     if not found:
-        near = nearest(pattern, values)
-        raise InputError(
-            f"expected part of a setting's name, found {pattern!r} in none; "
-            + (f"the nearest is {near}" if near else "minislam settings lists all of them")
-        )
+        hint = nearest(pattern, values, "minislam settings lists all of them")
+        raise InputError(f"expected part of a setting's name, found {pattern!r} in none; {hint}")
     width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
     for name in found:
         least, most = metadata[name]["least"], metadata[name]["most"]

@@ -1,28 +1,21 @@
 """The sub-command `minislam weights`: list, fetch and check official checkpoint files."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import hashlib
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from minislam.cli.progress import ProgressLine
 from minislam.errors import InputError, MinislamError
 from minislam.priors.names import PublishedFile, published_files
 
-if TYPE_CHECKING:
-    from minislam.priors.networks.checkpoints import Weights
-
 CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
-BYTES_PER_MEGABYTE = 1e6
 
 
-def add_weights_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add `weights` to the sub-commands of a parser."""
-    parser = subparsers.add_parser("weights", help="list, fetch or check official checkpoints")
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add `weights` to the commands."""
+    parser = commands.add_parser("weights", help="list, fetch or check official checkpoints")
     actions = parser.add_subparsers(required=True, metavar="list | fetch | check")
     actions.add_parser("list", help="what there is").set_defaults(run=run_list)
     fetch = actions.add_parser("fetch", help="fetch files of the list from their makers' sites")
@@ -82,7 +75,7 @@ def run_check(args: argparse.Namespace) -> int:
         row, verdict = rows.get(file.name), _verdict(file)
         if row and row.sha256 and row.sha256 != _sha256(file):
             verdict += f"; NOT the published {row.name}, its sha256 is another"
-        size = file.stat().st_size / BYTES_PER_MEGABYTE
+        size = file.stat().st_size / 1e6  # MB
         width = max(len(file.name) for file in files)
         print(f"{file.name:{width}s}  {size:7.1f} MB  {verdict}", flush=True)
     return 0
@@ -103,31 +96,25 @@ def _sha256(path: Path) -> str:
 
 
 def _verdict(file: Path) -> str:
-    """Return which network a file belongs to, and whether it is complete."""
+    """Return which network a file belongs to, whether it is complete, and the flag that uses it."""
+    from minislam.evaluation.lpips import recognise_heads, recognise_trunk
+    from minislam.priors.networks import table
     from minislam.priors.networks.checkpoints import load_checkpoint
-    from minislam.priors.networks.table import describe
 
     title = "unreadable"
     try:
         weights = load_checkpoint(file)
-        title = describe(weights)
-        use = _use_of(weights, title)
+        title = table.describe(weights)
+        network = table.recognise(weights)
+        if network is not None:
+            table.build_checked(network, weights)
+            return f"{title}, complete: --{network.kind} {network.name}"
+        if title == table.LPIPS_HEADS:
+            recognise_heads(weights.as_dict())
+            return f"{title}, complete: --lpips-heads"
+        if title == table.CLASSIFIER:
+            recognise_trunk(weights.as_dict())
+            return f"{title}, complete: --lpips-trunk"
+        return f"{title}, of no use here"
     except MinislamError as error:
         return f"{title}, NOT usable: {error}"
-    return f"{title}, complete: {use}" if use else f"{title}, of no use here"
-
-
-def _use_of(weights: Weights, title: str) -> str:
-    """Check a checkpoint; return the flag that uses it, "" if none does."""
-    from minislam.evaluation.lpips import recognise_heads, recognise_trunk
-    from minislam.priors.networks.table import CLASSIFIER, LPIPS_HEADS, build_checked, recognise
-
-    network = recognise(weights)
-    if network is not None:
-        build_checked(network, weights)
-        return f"--{network.kind} {network.name}"
-    if title not in (LPIPS_HEADS, CLASSIFIER):
-        return ""
-    is_heads = title == LPIPS_HEADS
-    (recognise_heads if is_heads else recognise_trunk)(weights.as_dict())
-    return "--lpips-heads" if is_heads else "--lpips-trunk"

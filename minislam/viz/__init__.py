@@ -9,15 +9,15 @@ from minislam.viz.figures import (
     overview,
     trajectory_plot,
 )
-from minislam.viz.flipbook import figure_picture, flipbook
-from minislam.viz.notebook import Page, summary_html
-from minislam.viz.report import Report, build_report
+from minislam.viz.flipbook import flipbook
+from minislam.viz.report import Report, build_report, summary_html
 from minislam.viz.style import (
     beta_limits,
     beta_to_rgb,
     colour_bar,
     depth_limits,
     depth_to_rgb,
+    figure_picture,
     figure_png,
     new_figure,
     set_notebook_style,
@@ -25,4 +25,4 @@ from minislam.viz.style import (
     show_image,
     show_map,
 )
-from minislam.viz.viewer import build_viewer
+from minislam.viz.viewer import Page, build_viewer

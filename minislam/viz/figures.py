@@ -37,14 +37,11 @@ def ate_over_time(
     unit: str = "world units",
 ) -> Figure:
     """Draw the distance between estimated and true camera centre over time."""
-    figure = new_figure(WIDE)
-    axes = figure.subplots()
+    figure, axes = _one_panel("time [s]", f"position error [{unit}]")
     axes.plot(timestamps - timestamps[0], errors, color=ESTIMATE_STYLE["color"])
     rmse = float(np.sqrt(np.mean(np.square(errors))))
     axes.axhline(rmse, color="tab:red", linewidth=1, label=f"rmse {rmse:.4g}")
-    axes.set(xlabel="time [s]", ylabel=f"position error [{unit}]")
     axes.set_ylim(0, 1.1 * float(np.max(errors, initial=np.finfo(float).eps)))
-    axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     return figure
 
@@ -85,12 +82,9 @@ def _running_mean(values: np.ndarray) -> np.ndarray:
 
 def map_growth(gaussians: Series[int]) -> Figure:
     """Draw the number of Gaussians in the map over the iterations."""
-    figure = new_figure(WIDE)
-    axes = figure.subplots()
+    figure, axes = _one_panel("iteration", "Gaussians in the map")
     axes.plot(np.arange(len(gaussians)), gaussians, color=ESTIMATE_STYLE["color"])
-    top = 1.1 * max([1, *gaussians])
-    axes.set(xlabel="iteration", ylabel="Gaussians in the map", ylim=(0, top))
-    axes.grid(alpha=0.3)
+    axes.set_ylim(0, 1.1 * max([1, *gaussians]))
     return figure
 
 
@@ -102,8 +96,7 @@ def keyframe_health(
     lost: Series[int],  # frame_index
 ) -> Figure:
     """Draw how well poses and depths explain the flow, and where the run is broken or lost."""
-    figure = new_figure((WIDE[0], 2.2))
-    axes = figure.subplots()
+    figure, axes = _one_panel("frame", "explained flow", height=2.2)
     axes.plot(frames, [np.nan if e is None else e for e in explained], marker=".", **ESTIMATE_STYLE)
     axes.axhline(least, color="gray", linestyle=":", label="least of a healthy keyframe")
     for position, (first, last) in enumerate(broken):
@@ -111,10 +104,8 @@ def keyframe_health(
         axes.axvspan(first - 0.5, last + 0.5, color="tab:red", alpha=0.25, label=label)
     mark: dict[str, Any] = {"color": "tab:red", "markersize": 14, "markeredgewidth": 3}
     axes.plot(lost, np.zeros(len(lost)), "|", label="lost" if len(lost) else None, **mark)
-    axes.set(xlabel="frame", ylabel="explained flow", ylim=(-0.05, 1.05))
-    axes.set_xlim(-0.5, max([1, *frames, *lost]) + 0.5)
+    axes.set(xlim=(-0.5, max([1, *frames, *lost]) + 0.5), ylim=(-0.05, 1.05))
     axes.legend(loc="lower left")
-    axes.grid(alpha=0.3)
     return figure
 
 
@@ -136,15 +127,23 @@ def overview(
     return figure
 
 
+def _one_panel(xlabel: str, ylabel: str, height: float = WIDE[1]) -> tuple[Figure, Axes]:
+    figure = new_figure((WIDE[0], height))
+    axes = figure.subplots()
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(alpha=0.3)
+    return figure, axes
+
+
 def _draw_path(
     axes: Axes, estimate: Trajectory, truth: Trajectory | None, second: int, unit: str
 ) -> None:
     """Draw coordinate x against y (second = 1) or z (second = 2), both at one scale."""
-    if truth is not None:
-        centres = truth.T_world_camera[:, :3, 3]
-        axes.plot(centres[:, 0], centres[:, second], label="ground truth", **TRUTH_STYLE)
-    centres = estimate.T_world_camera[:, :3, 3]
-    axes.plot(centres[:, 0], centres[:, second], label="estimate", **ESTIMATE_STYLE)
+    paths = [(truth, "ground truth", TRUTH_STYLE), (estimate, "estimate", ESTIMATE_STYLE)]
+    for path, label, style in paths:
+        if path is not None:
+            centres = path.T_world_camera[:, :3, 3]
+            axes.plot(centres[:, 0], centres[:, second], label=label, **style)
     axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[second]} [{unit}]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)

@@ -7,13 +7,12 @@ many flip books on one page do not meet. Where a page runs no scripts, the first
 import json
 from collections.abc import Sequence as Series
 from html import escape
+from itertools import product
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 
 from minislam.errors import InputError
-from minislam.viz.style import figure_png
 from minislam.viz.viewer import picture_url
 
 LARGEST = 400_000  # bytes of a flip book
@@ -64,21 +63,14 @@ def flipbook(
     texts = [f"{n + 1} of {count}" for n in range(count)] if captions is None else list(captions)
     if len(texts) != count:
         raise InputError(f"expected one caption for each of {count} pictures, found {len(texts)}")
-    for scale in _SCALES:
-        for quality in _QUALITIES:
-            urls: list[str] = []
-            while len(urls) < count and sum(map(len, urls)) < LARGEST:
-                urls.append(_url(images[len(urls)], scale, quality))
-            html = _player(urls, texts, max(images[0].shape[1], _LEAST_WIDTH), frames_per_second)
-            if len(urls) == count and len(html.encode()) < LARGEST:
-                return FlipBook(html)
+    for scale, quality in product(_SCALES, _QUALITIES):
+        urls: list[str] = []
+        while len(urls) < count and sum(map(len, urls)) < LARGEST:
+            urls.append(_url(images[len(urls)], scale, quality))
+        html = _player(urls, texts, max(images[0].shape[1], _LEAST_WIDTH), frames_per_second)
+        if len(urls) == count and len(html.encode()) < LARGEST:
+            return FlipBook(html)
     raise InputError(f"expected pictures that fit into 400 kB, found {count}: show fewer of them")
-
-
-def figure_picture(figure: Figure) -> np.ndarray:  # (H, W, 3) uint8
-    """Turn a figure into a picture; one of `new_figure` is shown nowhere else."""
-    png = np.frombuffer(figure_png(figure, figure.dpi), np.uint8)
-    return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR_RGB))
 
 
 def _bytes_of(picture: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8

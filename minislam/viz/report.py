@@ -1,4 +1,4 @@
-"""The report of a run: one HTML page with its pictures inside; report.html is its frame."""
+"""The report of a run: one HTML page, report.html its frame; and a summary for a notebook."""
 
 import json
 from collections.abc import Mapping
@@ -14,6 +14,7 @@ from minislam.viz.style import beta_to_rgb, depth_to_rgb
 from minislam.viz.viewer import picture_url
 
 _STOPS = 9  # colours of a colour bar
+_TEXTS = "title folder state description command settings".split()  # of a report
 
 
 @dataclass(frozen=True)
@@ -41,19 +42,32 @@ def build_report(report: Report) -> str:
     """Return the HTML of a report."""
     template = files("minislam.viz").joinpath("report.html").read_text(encoding="utf-8")
     return Template(template).substitute(
-        title=escape(report.title),
-        folder=escape(report.folder),
-        state=escape(report.state),
+        {name: escape(getattr(report, name)) for name in _TEXTS},
         kind=report.state.partition(":")[0].replace(",", ""),
-        description=escape(report.description),
         warnings="\n".join(f'<p class="warning">{escape(text)}</p>' for text in report.warnings),
         overview=picture_url(report.overview),
         summary="\n".join(_row(*line) for line in report.summary),
         keyframes=_keyframes(report) if report.keyframes else "",
         figures="\n".join(_figure(caption, png) for caption, png in report.figures),
-        command=escape(report.command),
-        settings=escape(report.settings),
     )
+
+
+def summary_html(
+    title: str,
+    lines: Mapping[str, tuple[str, str]],  # what -> its value, and whether that is good
+    warnings: Series[str],
+    png: bytes,
+) -> str:
+    """Return the HTML of a small summary for a notebook: title, lines, warnings, one picture."""
+    left = 'style="text-align: left"'
+    rows = "".join(
+        f"<tr><th {left}>{escape(what)}</th><td {left}>{escape(value)}</td>"
+        f"<td {left}>{escape(verdict)}</td></tr>"
+        for what, (value, verdict) in lines.items()
+    )
+    notes = "".join(f"<p><b>Warning:</b> {escape(warning)}</p>" for warning in warnings)
+    picture = f'<img src="{picture_url(png)}" alt="input, uncertainty, map, path">'
+    return f"<h4>{escape(title)}</h4><table>{rows}</table>{notes}{picture}"
 
 
 def _row(what: str, value: str, verdict: str, meaning: str) -> str:
@@ -69,12 +83,12 @@ def _keyframes(report: Report) -> str:
     pages = [(frame, list(map(picture_url, jpegs))) for frame, jpegs in report.keyframes.items()]
     low, high = report.beta_limits
     depths, betas = np.linspace(*report.depth_limits, _STOPS), np.geomspace(low, high, _STOPS)
+    depth_rgb = depth_to_rgb(depths[None], report.depth_limits)
+    beta_rgb = beta_to_rgb(betas[None], report.beta_limits)
     scales = {
         "input": "",
-        "depth of the map": _scale(
-            depth_to_rgb(depths[None], report.depth_limits), depths, report.unit
-        ),
-        "uncertainty \u03b2": _scale(beta_to_rgb(betas[None], report.beta_limits), betas, ""),
+        "depth of the map": _scale(depth_rgb, depths, report.unit),
+        "uncertainty \u03b2": _scale(beta_rgb, betas, ""),
         "static map": "",
     }
     pictures = "".join(
@@ -103,6 +117,6 @@ def _scale(colors: np.ndarray, values: np.ndarray, unit: str) -> str:
 
 
 def _figure(caption: str, png: bytes) -> str:
-    text = escape(caption, quote=True)
+    text = escape(caption)
     image = f'<img src="{picture_url(png)}" alt="{text}">'
     return f"<figure>{image}<figcaption>{text}</figcaption></figure>"

@@ -4,6 +4,7 @@ import io
 from collections.abc import Sequence as Series
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
@@ -49,6 +50,12 @@ def figure_png(figure: Figure, dpi: float = _DPI) -> bytes:
     return buffer.getvalue()
 
 
+def figure_picture(figure: Figure) -> np.ndarray:  # (H, W, 3) uint8
+    """Turn a figure into a picture; one of `new_figure` is shown nowhere else."""
+    png = np.frombuffer(figure_png(figure, figure.dpi), np.uint8)
+    return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR_RGB))
+
+
 def show_figure(figure: Figure) -> None:
     """Open a window with a figure and wait until it is closed."""
     from matplotlib import pyplot  # only here: pyplot looks for a screen when it is imported
@@ -62,9 +69,7 @@ def show_figure(figure: Figure) -> None:
             "--save_plot FILE"
         )
     window = pyplot.figure(figsize=figure.get_size_inches(), dpi=figure.dpi)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    window.figimage(canvas.buffer_rgba())
+    window.figimage(figure_picture(figure))
     pyplot.show()
 
 
@@ -93,13 +98,16 @@ def show_map(
 ) -> None:
     """Draw a map of numbers with the colours of its kind, and their colour bar beside it."""
     values = np.asarray(values, dtype=np.float64)
-    limits = limits or _limits(values, kind)
     if kind == "depth":
+        limits = limits or depth_limits(values)
         picture = depth_to_rgb(values, limits)
     elif kind == "beta":
+        limits = limits or beta_limits(values)
         picture = beta_to_rgb(values, limits)
     else:
-        picture = _mapped(values, *limits, _COLORMAPS[kind])
+        largest = float(np.nanmax(np.abs(values), initial=1e-12))
+        limits = limits or ((-largest, largest) if kind == "error" else (0.0, 1.0))
+        picture = _mapped(values, *limits, kind)
     show_image(axes, picture, title, size)
     colour_bar(axes, kind, limits, label)
 
@@ -124,13 +132,6 @@ def colour_bar(
         bar.minorticks_off()
 
 
-def _limits(values: np.ndarray, kind: str) -> tuple[float, float]:
-    if kind in ("beta", "depth"):
-        return (beta_limits if kind == "beta" else depth_limits)(values)
-    largest = float(np.nanmax(np.abs(values), initial=1e-12))
-    return (-largest, largest) if kind == "error" else (0.0, 1.0)
-
-
 def depth_to_rgb(
     depth: np.ndarray,  # (H, W) world units, 0 where unknown
     limits: tuple[float, float] | None = None,  # world units; None: from the values
@@ -139,7 +140,7 @@ def depth_to_rgb(
     depth = np.asarray(depth, dtype=np.float64)
     known = np.isfinite(depth) & (depth > 0)
     low, high = limits or depth_limits(depth)
-    colored = _mapped(np.where(known, depth, low), low, high, _COLORMAPS["depth"])
+    colored = _mapped(np.where(known, depth, low), low, high, "depth")
     colored[~known] = _UNKNOWN_RGB
     return colored
 
@@ -158,7 +159,7 @@ def beta_to_rgb(
     """Colour an uncertainty map: magma over log beta, dark is certain."""
     beta = np.asarray(beta, dtype=np.float64)
     low, high = limits or beta_limits(beta)
-    return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), _COLORMAPS["beta"])
+    return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), "beta")
 
 
 def beta_limits(beta: np.ndarray) -> tuple[float, float]:
@@ -168,6 +169,6 @@ def beta_limits(beta: np.ndarray) -> tuple[float, float]:
     return low, max(high, _LEAST_BETA_RATIO * low)
 
 
-def _mapped(values: np.ndarray, low: float, high: float, colormap: str) -> np.ndarray:
+def _mapped(values: np.ndarray, low: float, high: float, kind: str) -> np.ndarray:
     scaled = np.clip((values - low) / max(high - low, 1e-12), 0, 1)
-    return colormaps[colormap](scaled)[..., :3]
+    return colormaps[_COLORMAPS[kind]](scaled)[..., :3]

@@ -7,6 +7,7 @@ loads nothing: the map and the pictures stand in the page itself.
 import base64
 import json
 from collections.abc import Mapping
+from html import escape
 from importlib.resources import files
 
 import numpy as np
@@ -55,6 +56,21 @@ def build_viewer(
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     template = files("minislam.viz").joinpath("viewer.html").read_text(encoding="utf-8")
     return template.replace(_PLACE_OF_THE_DATA, text)
+
+
+class Page:
+    """A whole HTML page, shown inside a notebook's cell."""
+
+    def __init__(self, html: str, height: int) -> None:
+        self.html = html
+        self.height = height  # px
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame of its own, so that its styles stay inside."""
+        return (
+            f'<iframe srcdoc="{escape(self.html)}" width="100%" height="{self.height}" '
+            'style="border: 0"></iframe>'
+        )
 
 
 def picture_url(picture: bytes) -> str:

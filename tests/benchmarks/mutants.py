@@ -159,7 +159,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),
     ],
     ("viz/report.py", "viz/test_report.py"): [
-        ("title=escape(report.title)", "title=report.title"),
+        ("name: escape(getattr(report, name))", "name: getattr(report, name)"),
         ('class="warning">{escape(text)}', 'class="warning">{text}'),
     ],
 }  # fmt: skip

@@ -38,7 +38,7 @@ class Package:
 )
 def test_two_packages_of_opencv_are_warned_of(monkeypatch, names: list[str], warned: bool):
     monkeypatch.setattr("importlib.metadata.distributions", lambda: map(Package, names))
-    found = doctor.opencv_warnings()
+    found = list(doctor.installation_warnings(torch_sees_a_gpu=True))
     assert bool(found) == warned
     assert not warned or "opencv-python, opencv-python-headless share one folder" in found[0]
 
@@ -49,9 +49,11 @@ def test_a_gpu_that_torch_does_not_see_is_warned_of(tmp_path: Path, monkeypatch)
     tool.write_text("#!/bin/sh\necho 'GPU 0: NVIDIA A100 (UUID: GPU-1)'\n")
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert doctor.gpu_warnings(torch_sees_one=True) == []
-    assert "torch sees no GPU 0: NVIDIA A100: install" in doctor.gpu_warnings(False)[0]
+    monkeypatch.setattr("importlib.metadata.distributions", lambda: [])
+    assert list(doctor.installation_warnings(torch_sees_a_gpu=True)) == []
+    [warning] = doctor.installation_warnings(torch_sees_a_gpu=False)
+    assert "torch sees no GPU 0: NVIDIA A100: install" in warning
     tool.write_text("#!/bin/sh\necho 'No devices were found'; exit 6\n")
-    assert doctor.gpu_warnings(False) == []
+    assert list(doctor.installation_warnings(torch_sees_a_gpu=False)) == []
     tool.unlink()
-    assert doctor.gpu_warnings(False) == []
+    assert list(doctor.installation_warnings(torch_sees_a_gpu=False)) == []

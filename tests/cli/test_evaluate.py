@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minislam.cli.evaluate import add_eval_parser, run_eval
+from minislam.cli.evaluate import add_parser, run_eval
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity
@@ -36,7 +36,7 @@ def files(tmp_path: Path) -> tuple[str, str]:
 
 def parse(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="minislam")
-    add_eval_parser(parser.add_subparsers())
+    add_parser(parser.add_subparsers())
     return parser.parse_args(["eval", *arguments])
 
 
@@ -160,8 +160,8 @@ def test_contradicting_flags_and_strange_clocks(files):
 def test_help_does_not_wait_for_torch():
     program = (
         "import argparse, sys\n"
-        "from minislam.cli.evaluate import add_eval_parser\n"
-        "add_eval_parser(argparse.ArgumentParser().add_subparsers())\n"
+        "from minislam.cli.evaluate import add_parser\n"
+        "add_parser(argparse.ArgumentParser().add_subparsers())\n"
         "assert not {'torch', 'numpy', 'matplotlib'} & set(sys.modules)\n"
     )
     root = str(Path(__file__).parents[2])

@@ -35,8 +35,8 @@ def test_every_essential_option_exists(monkeypatch, capsys):
 
 
 def test_the_nearest_name_is_similar_or_none():
-    assert nearest("--strid", ["--stride", "--start"]) == "--stride"
-    assert nearest("--zoom", ["--stride", "--start"]) is None
+    assert nearest("--strid", ["--stride", "--start"], "none") == "the nearest is --stride"
+    assert nearest("--zoom", ["--stride", "--start"], "none") == "none"
 
 
 def test_a_name_too_many_is_no_option():

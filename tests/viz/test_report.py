@@ -5,7 +5,14 @@ import re
 
 import numpy as np
 
-from minislam.viz import Report, build_report, depth_to_rgb, figure_png, new_figure
+from minislam.viz import (
+    Report,
+    build_report,
+    depth_to_rgb,
+    figure_png,
+    new_figure,
+    summary_html,
+)
 
 PNG = figure_png(new_figure((2, 2)), dpi=20)
 JPEGS = {0: [b"input", b"depth", b"beta", b"map"], 7: [b"i", b"d", b"b", b"m"]}
@@ -79,3 +86,9 @@ def test_the_end_of_the_run_decides_what_is_shown():
         html = report(state=state)
         assert f'<main class="{kind}">' in html and f'<span class="state">{state}</span>' in html
     assert ".running .ended, .failed .ended" in html and ".failed .resume" in html
+
+
+def test_a_summary_escapes_whatever_it_is_given():
+    shown = summary_html("a<b", {"frames": ("3 & 4", "good")}, ["x > y"], b"\x89PNG\r\n")
+    assert "a&lt;b" in shown and "3 &amp; 4" in shown and "x &gt; y" in shown and "good" in shown
+    assert "iVBOR" in shown

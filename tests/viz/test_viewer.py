@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from html import unescape
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ import torch
 from minislam.data import GaussianArrays
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.splatting import GaussianMap, constants, render
-from minislam.viz import build_viewer
+from minislam.viz import Page, build_viewer
 
 CAMERA = Camera(80.0, 82.0, 47.0, 36.5, 96, 72)
 BACKGROUND = np.array([0.4, 0.5, 0.3])
@@ -94,6 +95,14 @@ def test_the_path_and_the_pictures_come_back_and_lost_frames_have_no_pose():
 
 def test_a_name_cannot_break_out_of_the_data():
     assert data_of(viewer("</script><b>"))["title"] == "</script><b>"
+
+
+def test_a_page_survives_its_frame():
+    page = "<p title=\"a & b\">'x'</p><script>if (1 < 2) {}</script>"
+    shown = Page(page, 300)._repr_html_()
+    start = shown.index('srcdoc="') + len('srcdoc="')
+    assert unescape(shown[start : shown.index('"', start)]) == page
+    assert 'height="300"' in shown
 
 
 @pytest.mark.parametrize(
