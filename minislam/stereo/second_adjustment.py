@@ -15,13 +15,17 @@ from minislam.records import Progress, Sequence
 from minislam.stereo.dense_structure import WIDTH, dense_depths, swept_frames
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import final_global_ba
-from minislam.tracking.safeguards.structure import agreed_disparities
+from minislam.tracking.safeguards.diagnostics import seen_and_expected
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.workers import Workers
 
 # Static weight of a cell that nothing confirms: where no cell is confirmed, all count alike. [-]
 UNCONFIRMED_WEIGHT = 0.02
+# Relative disagreement of two views of a point that still counts as agreement. [-]
+MAX_DISPARITY_ERROR = 0.05
+MIN_AGREEING_VIEWS = 2  # other keyframes that must see a point at the same depth
+NEIGHBOURS = 4  # keyframes on either side that are compared
 COARSE_WIDTH = 80  # px of the images that are swept: a weight per grid cell needs no more
 
 
@@ -67,6 +71,32 @@ def sweep_keyframes(
     )  # fmt: skip
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return [(depth.to(device), confirmation.to(device)) for depth, confirmation in swept]
+
+
+def agreed_disparities(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (n,)
+    """Return the disparities of a keyframe on which enough others agree; all, if none is."""
+    needed = min(MIN_AGREEING_VIEWS, len(graph.keyframes) - 1)
+    agreed = agreeing_views(graph, keyframe) >= needed
+    disparities = graph.keyframes.disparities[keyframe]
+    return disparities[agreed] if bool(agreed.any()) else disparities
+
+
+def agreeing_views(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) int
+    """Count for each cell the other keyframes that agree on its depth.
+
+    A cell's point is projected into the other keyframe; they agree if the disparity found there
+    differs by less than MAX_DISPARITY_ERROR, relative.
+    """
+    near = range(len(graph.keyframes))[max(0, keyframe - NEIGHBOURS) : keyframe + NEIGHBOURS + 1]
+    others = [other for other in near if other != keyframe]
+    if not others:
+        return torch.zeros_like(graph.grid.rays[:, 0], dtype=torch.int64)
+    sources = [keyframe] * len(others)
+    positions, valid = graph.reproject(sources, others)
+    seen, expected = seen_and_expected(graph, sources, others, positions.mT)
+    visible = valid & graph.grid.camera.contains(positions.mT)
+    error = (seen - expected).abs() / expected
+    return (visible & (error < MAX_DISPARITY_ERROR)).sum(0)
 
 
 def adjust_confirmed(

@@ -21,8 +21,7 @@ from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
 from minislam.tracking.safeguards.first_depth import essential_disparities
 from minislam.tracking.safeguards.focal_length import seek_focal_length
-from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
-from minislam.tracking.safeguards.overlay import overlay_weights
+from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 

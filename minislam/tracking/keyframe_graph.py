@@ -32,12 +32,12 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.pose_from_flow import (
     compose_matches,
+    inverted_targets,
     motion_only_problem,
     start_pose,
     warp_disparities,
 )
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
-from minislam.tracking.safeguards.inverse_flow import inverted_targets
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.tracking.safeguards.rolling_shutter import RollingShutter
 
@@ -223,10 +223,7 @@ class KeyframeGraph(Stateful):
     def _flow_from_geometry(self, edges: list[Edge]) -> FlowMatches:
         """Return the flow of these edges, started from what the present geometry predicts."""
         sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
-        transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
-        predicted, _ = reproject(
-            transforms, self.keyframes.disparities[sources], self.grid.rays, self.grid.camera
-        )
+        predicted, _ = self.reproject(sources, targets)
         # Points near the camera plane project to anywhere; a flow started there finds nothing.
         size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
         predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
@@ -287,6 +284,16 @@ class KeyframeGraph(Stateful):
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""
+        return mean_parallax(*self._geometry(sources, targets))
+
+    def reproject(self, sources: list[int], targets: list[int]) -> tuple[Tensor, Tensor]:
+        """Return where the cells of edges are seen, (E, 2, N) [px], and whether it is valid."""
+        return reproject(*self._geometry(sources, targets))
+
+    def _geometry(
+        self, sources: Tensor | list[int], targets: Tensor | list[int]
+    ) -> tuple[Tensor, Tensor, Tensor, Camera]:
+        """Return what a reprojection along edges takes: present poses, disparities and cells."""
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         disparities = self.keyframes.disparities[sources]
-        return mean_parallax(transforms, disparities, self.grid.rays, self.grid.camera)
+        return transforms, disparities, self.grid.rays, self.grid.camera

@@ -15,11 +15,12 @@ from minislam.tracking.bundle_adjustment import (
 )
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
-from minislam.tracking.safeguards.touched import adjust_touched
+from minislam.tracking.safeguards.parts import of_rows
 
 # A new keyframe may have so large an error that the robust weight takes its cells for outliers and
 # the error stays. So the weight is wide at first. [-]
 FIRST_WIDENING = 8.0
+FEW_KEYFRAMES = 100  # so few are not worth a selection
 
 
 def local_ba(graph: KeyframeGraph) -> None:
@@ -101,6 +102,27 @@ def adjust(
     graph.grid.zoom(state.log_focal)
     graph.shutter.lengthen(state.readout)
     graph.count_adjustment(report)
+
+
+def adjust_touched(
+    problem: BundleProblem, state: BundleState, iterations: int
+) -> tuple[BundleState, BundleReport]:
+    """Return what `bundle_adjust` does, from the keyframes that it moves or sees alone.
+
+    So a local adjustment costs the same however many keyframes there are.
+    """
+    rows = touched_rows(problem)
+    found, report = bundle_adjust(*of_rows(problem, state, rows), iterations)
+    poses, disparities = state.T_camera_world.clone(), state.disparities.clone()
+    poses[rows], disparities[rows] = found.T_camera_world, found.disparities
+    return replace(found, T_camera_world=poses, disparities=disparities), report
+
+
+def touched_rows(problem: BundleProblem) -> Tensor:  # (K',) keyframe index
+    """Return the keyframes that a problem moves or has an edge to; all, if there are few."""
+    is_touched = problem.free_disparities.clone()
+    is_touched[problem.edges_source] = is_touched[problem.edges_target] = True
+    return (is_touched | (len(is_touched) <= FEW_KEYFRAMES)).nonzero()[:, 0]
 
 
 def adjust_narrowing(

@@ -15,6 +15,7 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.reprojection import splat_disparities
 from minislam.tracking.safeguards.robust import RobustKernel
 
+INVERSION_STEPS = 4  # of a fixed point; the flow estimator corrects what is left
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
 # A start with an error of 10 degrees has residuals of 50 px, all outliers for a narrow robust
 # weight. So the weight is narrowed step by step.
@@ -28,6 +29,19 @@ def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> Flow
     targets = first.targets + grid.sample(flow, middle).mT
     confidences = first.confidences * grid.sample(second.confidences.mT, middle).mT
     return FlowMatches(targets, confidences, first.matched_ratios * second.matched_ratios)
+
+
+def inverted_targets(targets: Tensor, grid: Grid) -> Tensor:  # (1, 2, N) px -> (1, 2, N) px
+    """Return where the cells of the target lie in the source, from the targets of the source.
+
+    With the flow f, that is q + b(q) for the fixed point b(q) = -f(q + b(q)). Flow back from a new
+    keyframe starts there: it owes nothing to the disparities, which are those of its predecessor.
+    """
+    flow = targets.mT - grid.pixels
+    inverse = torch.zeros_like(flow)
+    for _ in range(INVERSION_STEPS):
+        inverse = -grid.sample(flow, grid.pixels + inverse)
+    return (grid.pixels + inverse).mT
 
 
 def motion_only_problem(

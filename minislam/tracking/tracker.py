@@ -26,9 +26,9 @@ from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards.diagnostics import Watch
+from minislam.tracking.safeguards.focal_length import seek_readouts
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
-from minislam.tracking.safeguards.readout import seek_readouts
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.settling import SETTLED, Settling
 from minislam.workers import Workers

@@ -118,7 +118,7 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     positions = [p for p, edge in enumerate(edges) if edge in near]
     if not positions:
         return None, None
-    problem, keyframes, grid = bundle_problem(graph, positions, 0, 0.0), graph.keyframes, graph.grid
+    problem = bundle_problem(graph, positions, 0, 0.0)
     residual, robust_weights = residuals(problem, graph.state)
     fits = lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
     sources, targets = problem.edges_source, problem.edges_target
@@ -127,13 +127,25 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     weights *= (targets == keyframe)[:, None]
     explained = float((weights * fits).sum() / weights.sum().clamp_min(1e-6))
 
+    positions_seen = (problem.targets - residual).mT
+    seen, expected = seen_and_expected(graph, sources, targets, positions_seen)
+    counted = robust_weights[:, 0] * graph.grid.camera.contains(positions_seen)
+    return explained, weighted_median((seen / expected).log().abs(), counted)
+
+
+def seen_and_expected(
+    graph: KeyframeGraph,
+    sources: Tensor | list[int],  # (E,) keyframe index
+    targets: Tensor | list[int],  # (E,)
+    positions: Tensor,  # (E, N, 2) px, where the targets see the cells of the sources
+) -> tuple[Tensor, Tensor]:  # 2 x (E, N) 1/world unit
+    """Return the disparities that the targets have there, and those that the sources expect."""
+    keyframes, grid = graph.keyframes, graph.grid
     transforms = relative_transforms(keyframes.T_camera_world, sources, targets).float()
     disparities = keyframes.disparities[sources]
     expected = disparities / scaled_points(transforms, disparities, grid.rays)[:, 2].clamp_min(1e-6)
-    positions_seen = (problem.targets - residual).mT
-    seen = grid.sample(keyframes.disparities[targets][..., None], positions_seen)[..., 0]
-    counted = robust_weights[:, 0] * grid.camera.contains(positions_seen)
-    return explained, weighted_median((seen / expected).log().abs(), counted)
+    seen = grid.sample(keyframes.disparities[targets][..., None], positions)[..., 0]
+    return seen, expected
 
 
 def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
