@@ -1,9 +1,8 @@
 """The second adjustment: bundle adjustment again, on what several views confirm to stand still.
 
-Residuals alone do not tell all that moves. A dynamic object that fills much of the view, or moves
-along the epipolar lines, keeps a part of its weight and bends the poses. But it is swept to depths
-on which no two views agree, even while the poses are a little wrong. So confirmation multiplies
-the static weight of each cell, and swept depth is the start, of one more final BA.
+A dynamic object that fills much of the view, or moves along the epipolar lines, has small residuals
+and bends the poses. But it is swept to depths on which no two views agree. So confirmation
+multiplies the static weight of each cell, and swept depth is the start, of one more final BA.
 """
 
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from minislam.records import Progress, Sequence
 from minislam.stereo.dense_structure import WIDTH, dense_depths, swept_frames
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import final_global_ba
+from minislam.tracking.reprojection import reproject
 from minislam.tracking.safeguards.diagnostics import seen_and_expected
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
@@ -64,11 +64,8 @@ def sweep_keyframes(
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of the tracker's keyframes."""
     frames = [frame.frame_index for frame in graph.keyframes.frames]
     known = [agreed_disparities(graph, index).cpu().numpy() for index in range(len(frames))]
-    how = progress, workers, width
-    swept = dense_depths(
-        lambda index: graph.shutter.undone(sequence.frame(index)),
-        graph.grid.camera, poses, frames, known, *how,
-    )  # fmt: skip
+    inputs = graph.grid.camera, poses, frames, known, progress, workers, width
+    swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return [(depth.to(device), confirmation.to(device)) for depth, confirmation in swept]
 
@@ -82,17 +79,13 @@ def agreed_disparities(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (n,)
 
 
 def agreeing_views(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) int
-    """Count for each cell the other keyframes that agree on its depth.
-
-    A cell's point is projected into the other keyframe; they agree if the disparity found there
-    differs by less than MAX_DISPARITY_ERROR, relative.
-    """
+    """Count for each cell the other keyframes that have its disparity where they see it."""
     near = range(len(graph.keyframes))[max(0, keyframe - NEIGHBOURS) : keyframe + NEIGHBOURS + 1]
     others = [other for other in near if other != keyframe]
     if not others:
         return torch.zeros_like(graph.grid.rays[:, 0], dtype=torch.int64)
     sources = [keyframe] * len(others)
-    positions, valid = graph.reproject(sources, others)
+    positions, valid = reproject(*graph.geometry(sources, others))
     seen, expected = seen_and_expected(graph, sources, others, positions.mT)
     visible = valid & graph.grid.camera.contains(positions.mT)
     error = (seen - expected).abs() / expected

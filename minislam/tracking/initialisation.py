@@ -36,9 +36,8 @@ def first_disparity_hypotheses(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
-    They are the depth prior, if there is one, a wall, and essential matrices, which know nothing of
-    the other keyframes. A prior with holes in the distance is a bad guess, so it is not the only
-    one. It comes first, because of equal costs the first wins, as where no flow tells any depth.
+    They are the depth prior, if there is one, a wall, and essential matrices. The prior comes
+    first, because of equal costs the first wins, as where no flow tells any depth.
     """
     triangulated = [essential_disparities(grid, *measured) for measured in from_first]
     alone = [torch.ones_like(known_disparities[0]), *(d for d in triangulated if d is not None)]
@@ -82,11 +81,9 @@ def best_hypothesis(
 ) -> tuple[BundleState, BundleReport]:
     """Adjust every hypothesis on the same measurements and return the one of lowest cost.
 
-    No threshold is used, because a wrong minimum can have small residuals too. A wide robust weight
-    lets a bad guess leave its wrong minimum, but under the widest one a large dynamic object may
-    outvote the room. So every hypothesis starts from the two widest, and the costs are compared
-    under a narrow one: there the room fits, and a compromise between room and dynamic object does
-    not.
+    A wide robust weight lets a bad guess leave its wrong minimum, but under the widest one a large
+    dynamic object may outvote the room. So every hypothesis starts from the two widest. Costs are
+    compared under a narrow one, which a compromise between room and dynamic object does not fit.
     """
     widenings = [*ROBUST_WIDENING, *ROBUST_NARROWING]
     starts = [widenings, widenings[1:]] if problem.robust else [[1.0]]

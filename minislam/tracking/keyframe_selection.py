@@ -32,11 +32,7 @@ def needs_keyframe(
     matches: FlowMatches,  # E = 1, newest keyframe to this frame
     is_initialised: bool,
 ) -> bool:
-    """Tell whether a frame should become a keyframe.
-
-    It should if the mean flow is large, if few cells are matched, or if the last keyframe was
-    `keyframe_interval` frames ago.
-    """
+    """Tell whether a frame moved far, is hardly matched, or is `keyframe_interval` frames away."""
     flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
     if flow > enough or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True

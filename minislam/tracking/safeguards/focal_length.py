@@ -2,16 +2,13 @@
 
 A focal length is estimated where it is unknown and checked where it is given.
 
-Tracking hides a wrong focal length, because wrong rotations and depths can explain most of the
-flow. The part that they cannot explain is in the residuals of the bundle adjustment. There the
-focal length is one more unknown (focal_column.py), which converges from 0.7 to 1.4 times the truth.
+It is one more unknown of the bundle adjustment (focal_column.py), which converges from 0.7 to 1.4
+times the truth. A camera that does not turn fits its flow with any focal length. So an estimate
+counts only if the cost of the adjusted keyframes rises on both sides of it, and either rises much
+or is much lower than with the present focal length.
 
-A camera that does not turn fits its flow with any focal length. So an estimate counts only if the
-cost of the adjusted keyframes rises on both sides of it, and either rises much or is much lower
-than with the present focal length.
-
-If the lens zooms while it films, no focal length fits, and the best one may be the present one. So
-each half of the keyframes is fitted alone, too: where all say 1.04, the halves say 1.00 and 1.40.
+If the lens zooms while it films, each half of the keyframes fits another focal length than the
+whole: where all say 1.04, the halves say 1.00 and 1.40.
 """
 
 import math
@@ -65,10 +62,9 @@ class FocalLengthFit:
 def check_focal_length(
     graph: KeyframeGraph, workers: Workers | None = None
 ) -> FocalLengthFit | None:
-    """Fit a given focal length to all links, after the final global BA; nothing is changed.
+    """Fit a given focal length to all links, or to half of them if another one fits there.
 
-    If it fits, but in one half of the keyframes another one does, the fit of that half is returned.
-    A focal length that was found, not given, is checked in the halves alone.
+    Nothing is changed. A focal length that was found, not given, is checked in the halves alone.
     """
     every = range(len(graph.keyframes))
     whole = None if graph.seeks_focal else _fit_among(graph, every[:MOST_KEYFRAMES], workers)

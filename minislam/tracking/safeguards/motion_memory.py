@@ -1,8 +1,7 @@
 """Motion memory: the motion weight of each cell, passed on along the flow.
 
 While a dynamic object is small, the robust weight alone excludes it. Once it fills half of the
-image, the pose follows the object instead of the static scene, and beta, which learns from the
-poses, learns the wrong thing. But the object was seen to move while it was still small. Therefore
+image, the pose follows it instead of the static scene, and beta learns from wrong poses. Therefore
 each cell has a motion weight: how well its flow has fitted the camera motion so far. The cell that
 it flows to inherits that weight.
 
@@ -42,10 +41,7 @@ class MotionMemory:
         self.scale = scale or None  # px, of the residuals that still count; None: no memory
 
     def judge_all(self, flow_to_next: list[FlowMatches | None]) -> None:
-        """Set all motion weights anew, by the present poses and disparities.
-
-        Where there is no flow to a keyframe, the camera was relocalised, and memory begins anew.
-        """
+        """Set all weights by the present geometry; after a lost camera memory begins anew."""
         keyframes = self._keyframes
         for index, matches in enumerate([None, *flow_to_next]):
             if matches is None:
@@ -105,8 +101,7 @@ def update_motion_weight(
 def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> Tensor:  # (N,)
     """Return the motion weight of the target cells: that of the source cells that flow there.
 
-    If several source cells flow to one cell, the lowest weight counts. If none does, the weight of
-    the nearest cell that has one is taken.
+    Of several source cells the lowest weight counts; without any, that of the nearest cell.
     """
     cells = (matches.targets[0].mT / grid.stride).round().long()
     height, width = grid.shape

@@ -71,8 +71,8 @@ class ShownImages:
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
     """Return a learned flow (E = 1) from the newest keyframe, judged by the best pose for it.
 
-    Its matched ratio is the part of its weight that the pose explains beyond chance. How high a
-    learned confidence is says nothing, because the network learned only to weigh cells by it.
+    Its matched ratio is the part of its weight that the pose explains beyond chance, because a
+    network learned only to weigh cells by its confidence.
     """
     pose = graph.start_pose(matches, torch.ones_like(graph.grid.rays[:, 0]))
     ends = torch.stack([graph.keyframes.T_camera_world[-1], pose])

@@ -12,9 +12,9 @@ becomes that of a global shutter by
     p~ + rho c,    c = s(x) u_i(x) - s(p~) u_j(p~).
 
 The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
-rho, which is one more unknown with the column c. A phone held upright reads its columns one after
-the other instead. So there are two readouts, one along x and one along y, each with its column; the
-one that displaces the flow less is held at zero once a readout is found.
+rho, which is one more unknown with the column c. A phone held upright reads columns of the image.
+So there are two readouts, along x and y; the one that displaces the flow less is held at zero once
+a readout is found.
 """
 
 import math
