@@ -35,10 +35,7 @@ def adjust_again(
     on_progress: Callable[[str], Progress | None] = lambda stage: None,
     workers: Workers | None = None,  # sweep side by side
 ) -> None:
-    """Sweep the keyframes, then adjust them on what is confirmed, and judge them again.
-
-    A frame that finds no pose now may find one afterwards, so it is not yet logged as lost.
-    """
+    """Sweep the keyframes, adjust them on what is confirmed, and judge them; lose no frame yet."""
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
     followed = [frame.frame_index for frame in tracked if frame.status.is_followed]

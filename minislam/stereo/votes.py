@@ -57,9 +57,9 @@ def keep_what_stays(
     views: list[SweptView],  # in the order of time
     depths: list[ConfirmedDepth],  # of the views
 ) -> list[ConfirmedDepth]:
-    """Drop what views of other times look through, though the views near in time confirm it.
+    """Drop, by confirmed depths alone, what views of other times look through.
 
-    Only confirmed depths vote here. Around a dropped pixel the confirmation fades too.
+    Around a dropped pixel the confirmation fades too.
     """
     known_only = [
         replace(

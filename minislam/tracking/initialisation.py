@@ -1,10 +1,9 @@
 """The first geometry: poses and disparities of the warm-up keyframes, from flow alone.
 
 A hypothesis is a guess of the first keyframe's disparities. It fixes the pose of the second
-keyframe, whose disparities follow, and so on from keyframe to keyframe. Rotation and sideways
-translation look alike in a small field of view, so a bad guess can end in a wrong minimum with
-small residuals. Therefore several hypotheses go through the same bundle adjustment, and the one of
-lowest cost is kept.
+keyframe, whose disparities follow, and so on. Rotation and sideways translation look alike in a
+small field of view, so a bad guess can end in a wrong minimum with small residuals. Therefore the
+hypothesis of lowest cost after bundle adjustment is kept.
 """
 
 import itertools
@@ -93,10 +92,9 @@ def best_hypothesis(
 
 
 def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None:
-    """Estimate poses and disparities of all keyframes of the warm-up, beta unknown.
+    """Estimate poses and disparities of all keyframes of the warm-up, and an unknown focal length.
 
-    Flow alone decides, because a wrong depth prior would bend them: it is one start of the search
-    and gives the unit of length. A focal length that nobody gave is estimated as well.
+    Flow alone decides: a depth prior is one start of the search and gives the unit of length.
     """
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]

@@ -1,8 +1,7 @@
 """The keyframe graph: which keyframes are linked, and the optical flow along each link.
 
-The links of a new keyframe lead to its predecessors (neighbourhood) and to older keyframes that
-see the same place (covisibility, measured by the flow distance). A link that spans more than the
-neighbourhood is added only if the flow confirms it in both directions.
+The links of a new keyframe lead to its predecessors (neighbourhood) and, if the flow confirms it in
+both directions, to older keyframes that see the same place (covisibility, by the flow distance).
 """
 
 import torch

@@ -11,8 +11,8 @@ KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyfram
 def keyframe_flow(graph: KeyframeGraph, is_initialised: bool) -> float:
     """Return the mean flow that makes a keyframe [px].
 
-    The start needs parallax even with a depth prior: over short baselines a dynamic object that
-    fills much of the view fits the motion of the camera as well as the room does.
+    The start needs parallax even with a depth prior: over short baselines a large dynamic object
+    fits the motion of the camera as well as the room does.
     """
     config, may_be_near = graph.config, is_initialised and graph.keyframes.has_prior
     flow = config.keyframe_flow if may_be_near else config.keyframe_flow_without_prior

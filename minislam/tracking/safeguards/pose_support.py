@@ -1,7 +1,7 @@
 """Poses that little of the flow supports: other starts, or the frame is lost.
 
-In a wide gap between keyframes the interpolated pose may be too far off for the flow to find the
-true one. The pose of a neighbouring frame is a nearer start, once that frame is right itself.
+In a wide gap between keyframes the interpolated pose may be too far off. The pose of a neighbouring
+frame is a nearer start, once that frame is right itself.
 """
 
 from collections.abc import Callable

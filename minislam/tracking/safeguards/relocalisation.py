@@ -115,7 +115,7 @@ def _keypoints(image: Tensor) -> Keypoints:
 
 
 def _keypoint_matches(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of keypoints whose best match is clearly better than the second."""
+    """Return 2 x (M, 2) px, where the best match is clearly better than the second."""
     if first[1] is None or second[1] is None or min(len(first[1]), len(second[1])) < 2:
         return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first[1], second[1], k=2)
