@@ -26,7 +26,7 @@ from minislam.runs.summary import Line, summarise
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.tracking.grid import Grid
-from minislam.tracking.safeguards.image_motion import ImageMotion
+from minislam.tracking.safeguards.rolling_shutter import ImageMotion
 from minislam.uncertainty import UncertaintyMLP, beta_of_mask
 from minislam.uncertainty.weights import MAPPING_CUT
 from minislam.viz import Figure, Page, overview, summary_html

@@ -5,8 +5,7 @@ image adds, at each pixel p and plane d, what the best path before it has cost:
 
     L(p, d) = C(p, d) + min(L(p', d), L(p', d +- 1) + step, min_k L(p', k) + jump) - min_k L(p', k).
 
-A jump is cheaper where the image has an edge. Each pixel takes the plane of the least sum of L over
-eight directions.
+A jump is cheaper at an image edge. Each pixel takes the plane of the least sum over 8 directions.
 """
 
 import numpy as np

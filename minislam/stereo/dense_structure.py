@@ -47,9 +47,8 @@ def with_swept_depth(
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth, where nothing was swept with their own, and confirmed.
 
-    What several views measure was better than a simulated or noisy prior (RESULTS.md). The prior of
-    each keyframe is scaled to what was swept there, because a network errs image by image.
-    Where other keyframes look through it, it is of something that moves, and left out.
+    The depth of each keyframe is scaled to what was swept there, because a network errs image by
+    image. Where other keyframes look through it, it is of something that moves, and left out.
     """
     small, result = _small(camera, WIDTH), []
     views = [_view(small, k, *found) for k, found in zip(keyframes, swept, strict=True)]
@@ -87,15 +86,12 @@ def dense_depths(
     camera: Camera,  # of its images
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
     keyframes: list[int],  # K frame indices, increasing
-    disparities: list[np.ndarray],  # K x (n,) known inverse depths of the scene [1/world unit]
+    disparities: list[np.ndarray],  # K x (n,) 1/world unit, known; they place the nearest plane
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
 ) -> list[tuple[Tensor, Tensor]]:
-    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe.
-
-    The known inverse depths of a keyframe and its neighbours say how near the nearest plane is.
-    """
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     frames = swept_frames(keyframes, list(poses))
     swept: list[SweptView] = []
@@ -200,14 +196,11 @@ def full_size(depth: ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:
     Inverse depth is interpolated on a surface; at its edge each pixel takes the nearest value.
     """
     size = (camera.width, camera.height)
-    known = (depth.inverse_depth > 0).astype(np.uint8)
-    smooth = cv2.resize(depth.inverse_depth, size, None, 0, 0, cv2.INTER_LINEAR)
-    nearest = cv2.resize(depth.inverse_depth, size, None, 0, 0, cv2.INTER_NEAREST)
-    square = np.ones((3, 3), np.uint8)
-    largest = cv2.dilate(depth.inverse_depth, square)
-    smallest = cv2.erode(depth.inverse_depth, square)
-    surface = ((largest < EDGE_RATIO * smallest) & (known > 0)).astype(np.uint8)
-    inside = cv2.resize(surface, size, None, 0, 0, cv2.INTER_NEAREST) > 0
+    methods, square = (cv2.INTER_LINEAR, cv2.INTER_NEAREST), np.ones((3, 3), np.uint8)
+    smooth, nearest = (cv2.resize(depth.inverse_depth, size, None, 0, 0, m) for m in methods)
+    largest, smallest = (f(depth.inverse_depth, square) for f in (cv2.dilate, cv2.erode))
+    surface = (largest < EDGE_RATIO * smallest) & (depth.inverse_depth > 0)
+    inside = cv2.resize(surface.astype(np.uint8), size, None, 0, 0, cv2.INTER_NEAREST) > 0
     inverse = np.where(inside, smooth, nearest)
     full = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-6), 0).astype(np.float32)
     confirmation = cv2.resize(depth.confirmation, size, None, 0, 0, cv2.INTER_LINEAR)

@@ -1,7 +1,6 @@
 """How much brighter a keyframe is than the map: automatic exposure and white balance.
 
-A camera adapts to the light, so one wall is brighter in one image than in the next. Flow is
-measured in spite of it, so matched cells that stand still tell the factors a_k of each colour:
+A camera adapts to the light. Matched cells that stand still tell the factors a_k of each colour:
 
     log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of a link.
 

@@ -5,10 +5,9 @@ homography
 
     H(q) = K (R + q t e3^T) K^-1,        with T_other_this = (R, t).
 
-Where the plane lies on the surface that a pixel shows, the warped image equals this one around the
-pixel. So the cost of a pixel over all planes has its minimum at the depth of the pixel. That holds
-for what stands still. A moving object matches at a depth that differs from view to view, or
-nowhere.
+Where the plane lies on the surface that a pixel shows, the warped image equals this one. So the
+cost of a pixel over all planes has its minimum at its depth. A moving object matches at a depth
+that differs from view to view, or nowhere.
 """
 
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 
 from minislam.geometry import Camera
+from minislam.geometry.distortion import camera_matrix
 
 NCC_WINDOW = 5  # px, side of the window that is correlated
 NCC_VARIANCE = 4e-4  # of grey values in [0, 1]: contrast below its root does not count
@@ -42,7 +42,7 @@ def plane_homographies(
     inverse_depths: np.ndarray,  # (D,) 1/world unit
 ) -> np.ndarray:  # (D, 3, 3)
     """Return H(q): where a pixel of this image, lying on plane q, is seen in the other image."""
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    K = camera_matrix(camera)
     rotation, translation = T_other_this[:3, :3], T_other_this[:3, 3]
     motion = np.repeat(rotation[None], len(inverse_depths), 0)
     motion[:, :, 2] += inverse_depths[:, None] * translation

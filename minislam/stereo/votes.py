@@ -2,13 +2,11 @@
 
 The point of a pixel is projected into another swept view. If the depth found there is the depth of
 the point, the view agrees. If the view has a good match behind the point, it looks through it, and
-the point is refuted. A moving object is swept to a depth with which no other view agrees.
-
-What stands still for a while is agreed upon by the views of that while. Views of all times refute
-it, because before it came or after it left they look through it.
+the point is refuted. With a moving object no other view agrees. What stands still for a while is
+refuted by views of all times, which look through it before it came or after it left.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -59,16 +57,15 @@ def keep_what_stays(
     views: list[SweptView],  # in the order of time
     depths: list[ConfirmedDepth],  # of the views
 ) -> list[ConfirmedDepth]:
-    """Drop what views of other times look through, though the views near in time confirm it.
+    """Drop, by confirmed depths alone, what views of other times look through.
 
-    Only confirmed depths vote here. Around a dropped pixel the confirmation fades too.
+    Around a dropped pixel the confirmation fades too.
     """
     known_only = [
-        SweptView(
-            np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
-            1 - depth.confirmation,
-            view.plane_step,
-            view.T_camera_world,
+        replace(
+            view,
+            inverse_depth=np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
+            cost=1 - depth.confirmation,
         )
         for view, depth in zip(views, depths, strict=True)
     ]

@@ -27,9 +27,7 @@ class LearnedFlowConfig:
     motion_memory: float = parameter(0.0, "as tracking.motion_memory: none is needed [px]")
     lambda_disparity_prior: float = parameter(0.02, "lambda_4, near the official code's [-]")
     final_rounds: int = parameter(4, "turns of the final global BA")
-    pose_rounds: int = parameter(
-        6, "turns per frame between keyframes, and before one is linked", 1
-    )
+    pose_rounds: int = parameter(6, "turns per frame between keyframes, or before it is linked", 1)
     pose_iterations: int = parameter(2, "Gauss-Newton steps per turn of such a frame", 1)
 
 
@@ -38,66 +36,40 @@ class TrackingConfig:
     """Settings of the tracker. Lengths in px hold for 320x240 and grow with the image diagonal."""
 
     keyframe_flow: float = parameter(10.0, "mean flow since the last keyframe that makes one [px]")
-    keyframe_flow_without_prior: float = parameter(
-        18.0, "the same where depth needs parallax: without depth prior, and in the start [px]"
-    )
-    keyframe_interval: int = parameter(
-        8, "a keyframe at the latest after so many frames [frames], paper supplement", 1
-    )
-    recently_lost_frames: int = parameter(
-        15, "a camera lost for longer counts as lost, no longer as recently lost [frames]"
-    )
+    keyframe_flow_without_prior: float = parameter(18.0, "without prior, and in the start [px]")
+    keyframe_interval: int = parameter(8, "most frames to the next keyframe, paper supplement", 1)
+    recently_lost_frames: int = parameter(15, "frames for which it is recently lost, then lost")
     warmup_keyframes: int = parameter(6, "keyframes of the start; the paper takes 12", 1)
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up", 1)
     window: int = parameter(10, "newest keyframes that the local BA moves", 1)
-    active_edges: int = parameter(
-        0, "older edges are measured again up to this number, with those of a new keyframe"
-    )
-    min_link_ratio: float = parameter(
-        0.1, "a link beyond the neighbourhood needs this much of its flow confirmed [-]", most=1
-    )
+    active_edges: int = parameter(0, "edges measured again with a new keyframe's, at most in all")
+    min_link_ratio: float = parameter(0.1, "least matched ratio of a far link [-]", most=1)
     rounds: int = parameter(2, "rounds of flow and BA per keyframe", 1)
     iterations: int = parameter(3, "Gauss-Newton steps per round", 1)
     global_iterations: int = parameter(4, "Gauss-Newton steps per round of a global BA", 1)
-    robust_scale: float = parameter(
-        1.0,
-        "c: width of the robust weight inside Sigma, also in smaller images [px]; 0: least squares",
-    )
-    robust_power: float = parameter(
-        2.0, "k of that weight (1 + r^2/c^2)^-k; 1: Cauchy, 2: Geman-McClure [-]"
-    )
+    # Matching is no more precise in a smaller image, so there c does not shrink.
+    robust_scale: float = parameter(1.0, "c: width of the robust weight [px]; 0: least squares")
+    robust_power: float = parameter(2.0, "k of (1 + r^2/c^2)^-k; 1: Cauchy, 2: Geman-McClure [-]")
     motion_memory: float = parameter(
-        3.0,
-        "residual at which a cell no longer follows the camera; its motion weight falls and is "
-        "handed on along the flow; 0: off [px]",
+        3.0, "residual that lowers a cell's motion weight, handed on along the flow [px]; 0: off"
     )
+    # Times fx^2, so a disparity error weighs as the pixels that a unit baseline turns it into.
     lambda_disparity_prior: float = parameter(
-        0.0,
-        "lambda_4: disparity prior, times fx^2, so that it weighs a disparity error by the pixels "
-        "that a unit baseline would turn it into; 0: it is a start and the unit [-], Eq. (5)",
+        0.0, "lambda_4: disparity prior, times fx^2; 0: it is a start and the unit [-], Eq. (5)"
     )
-    prior_mask: bool = parameter(
-        True,
-        "mask M: no disparity prior where other views contradict it, Eq. (8); off: an ablation",
-    )
+    prior_mask: bool = parameter(True, "mask M: no prior that other views contradict, Eq. (8)")
     mask_max_depth_error: float = parameter(
         0.02, "epsilon: relative difference of depths that still agree [-], Eq. (8)"
     )
     mask_min_similarity: float = parameter(
         0.9, "gamma: cosine of features that show the same thing [-], Eq. (8)", most=1
     )
-    mask_min_corresponding: int = parameter(
-        2, "views that must see a cell to judge it: more than one, paper supplement"
-    )
+    mask_min_corresponding: int = parameter(2, "views that must see a cell, paper supplement")
     mask_min_consistent: int = parameter(2, "of which this many must agree, official code")
-    min_parallax: float = parameter(
-        2.0, "a keyframe with less to all it is linked with keeps its disparities [px]"
-    )
-    global_interval: int = parameter(
-        20, "keyframes between two online global BAs; 0: none [keyframes], paper supplement"
-    )
+    min_parallax: float = parameter(2.0, "with less on all links, disparities are kept [px]")
+    global_interval: int = parameter(20, "keyframes between global BAs; 0: none, paper supplement")
     loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
     loop_min_gap: int = parameter(20, "keyframes between the ends of a loop, official code", 1)
     loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")

@@ -1,10 +1,9 @@
 """The first geometry: poses and disparities of the warm-up keyframes, from flow alone.
 
 A hypothesis is a guess of the first keyframe's disparities. It fixes the pose of the second
-keyframe, whose disparities follow, and so on from keyframe to keyframe. Rotation and sideways
-translation look alike in a small field of view, so a bad guess can end in a wrong minimum with
-small residuals. Therefore several hypotheses go through the same bundle adjustment, and the one of
-lowest cost is kept.
+keyframe, whose disparities follow, and so on. Rotation and sideways translation look alike in a
+small field of view, so a bad guess can end in a wrong minimum with small residuals. Therefore the
+hypothesis of lowest cost after bundle adjustment is kept.
 """
 
 import itertools
@@ -21,8 +20,7 @@ from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
 from minislam.tracking.safeguards.first_depth import essential_disparities
 from minislam.tracking.safeguards.focal_length import seek_focal_length
-from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
-from minislam.tracking.safeguards.overlay import overlay_weights
+from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 
@@ -37,9 +35,8 @@ def first_disparity_hypotheses(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
-    They are the depth prior, if there is one, a wall, and essential matrices, which know nothing of
-    the other keyframes. A prior with holes in the distance is a bad guess, so it is not the only
-    one. It comes first, because of equal costs the first wins, as where no flow tells any depth.
+    They are the depth prior, if there is one, a wall, and essential matrices. The prior comes
+    first, because of equal costs the first wins, as where no flow tells any depth.
     """
     triangulated = [essential_disparities(grid, *measured) for measured in from_first]
     alone = [torch.ones_like(known_disparities[0]), *(d for d in triangulated if d is not None)]
@@ -83,11 +80,9 @@ def best_hypothesis(
 ) -> tuple[BundleState, BundleReport]:
     """Adjust every hypothesis on the same measurements and return the one of lowest cost.
 
-    No threshold is used, because a wrong minimum can have small residuals too. A wide robust weight
-    lets a bad guess leave its wrong minimum, but under the widest one a large dynamic object may
-    outvote the room. So every hypothesis starts from the two widest, and the costs are compared
-    under a narrow one: there the room fits, and a compromise between room and dynamic object does
-    not.
+    A wide robust weight lets a bad guess leave its wrong minimum, but under the widest one a large
+    dynamic object may outvote the room. So every hypothesis starts from the two widest. Costs are
+    compared under a narrow one, which a compromise between room and dynamic object does not fit.
     """
     widenings = [*ROBUST_WIDENING, *ROBUST_NARROWING]
     starts = [widenings, widenings[1:]] if problem.robust else [[1.0]]
@@ -97,10 +92,9 @@ def best_hypothesis(
 
 
 def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None:
-    """Estimate poses and disparities of all keyframes of the warm-up, beta unknown.
+    """Estimate poses and disparities of all keyframes of the warm-up, and an unknown focal length.
 
-    Flow alone decides, because a wrong depth prior would bend them: it is one start of the search
-    and gives the unit of length. A focal length that nobody gave is estimated as well.
+    Flow alone decides: a depth prior is one start of the search and gives the unit of length.
     """
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]

@@ -1,8 +1,7 @@
 """The keyframe graph: which keyframes are linked, and the optical flow along each link.
 
-The links of a new keyframe lead to its predecessors (neighbourhood) and to older keyframes that
-see the same place (covisibility, measured by the flow distance). A link that spans more than the
-neighbourhood is added only if the flow confirms it in both directions.
+The links of a new keyframe lead to its predecessors (neighbourhood) and, if the flow confirms it in
+both directions, to older keyframes that see the same place (covisibility, by the flow distance).
 """
 
 import torch
@@ -13,12 +12,7 @@ from minislam.geometry.camera import pixel_scale
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
 from minislam.records import AdjustmentCount, Frame
 from minislam.state.stateful import Stateful
-from minislam.tracking.bundle_adjustment import (
-    BundleReport,
-    BundleState,
-    bundle_adjust,
-    residuals,
-)
+from minislam.tracking.bundle_adjustment import BundleReport, BundleState, bundle_adjust, residuals
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import (
     FAR,
@@ -32,12 +26,12 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.pose_from_flow import (
     compose_matches,
+    inverted_targets,
     motion_only_problem,
     start_pose,
     warp_disparities,
 )
 from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
-from minislam.tracking.safeguards.inverse_flow import inverted_targets
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.tracking.safeguards.rolling_shutter import RollingShutter
 
@@ -85,7 +79,6 @@ class KeyframeGraph(Stateful):
     def robust(self) -> RobustKernel | None:
         """Return the robust weight inside Sigma, None for plain least squares."""
         scale, power = self.config.robust_scale, self.config.robust_power
-        # Matching is no more precise in a smaller image: there the scale stays as it is.
         return RobustKernel(scale * max(self.pixel_scale, 1.0), power) if scale > 0 else None
 
     @property
@@ -99,8 +92,6 @@ class KeyframeGraph(Stateful):
         failed = before.failed + (not report.converged)
         reason = before.last_reason if report.converged else report.reason
         self.adjustments = AdjustmentCount(before.count + 1, failed, reason)
-
-    # The newest keyframe ------------------------------------------------------------------------
 
     def append(
         self,
@@ -132,8 +123,7 @@ class KeyframeGraph(Stateful):
     def start_pose(self, matches: FlowMatches, trust: Tensor) -> Tensor:  # (4, 4)
         """Return T_camera_world of a frame from its flow (E = 1) from the newest keyframe.
 
-        Each cell counts as far as it is trusted (N,). Two starts are tried: the pose of that
-        keyframe, and its last motion repeated from there.
+        It starts from the pose there, and from the last motion repeated; `trust` weighs cells (N,).
         """
         keyframes, newest = self.keyframes, len(self.keyframes) - 1
         last = keyframes.T_camera_world[newest]
@@ -150,10 +140,7 @@ class KeyframeGraph(Stateful):
         around: list[int],  # keyframes that may show the same
         start: Tensor,  # (4, 4)
     ) -> tuple[Tensor, float]:
-        """Return the pose T_camera_world (4, 4) of an image, and its support, the mean weight.
-
-        Flow and pose take turns. The disparities are held.
-        """
+        """Return T_camera_world (4, 4) of an image, in turns with its flow, and the mean weight."""
         keyframes, grid, newest, count = self.keyframes, self.grid, len(self.keyframes), len(around)
         known, weights = keyframes.T_camera_world[around], keyframes.cell_weights[around]
         robust = self.robust and self.robust.widened(ROBUST_NARROWING)
@@ -186,8 +173,6 @@ class KeyframeGraph(Stateful):
         motion = T_camera_world @ se3_inverse(self.keyframes.T_camera_world[keyframe])
         return warp_disparities(self.grid, motion, self.keyframes.disparities[keyframe])
 
-    # Flow along links ---------------------------------------------------------------------------
-
     def match(self, edges: list[Edge]) -> None:
         """Measure the flow of these edges, started from the present geometry, and store it."""
         self.links.record(edges, self._flow_from_geometry(edges))
@@ -195,8 +180,7 @@ class KeyframeGraph(Stateful):
     def match_composed(self, target: int) -> None:
         """Measure the flow between a keyframe and its predecessors, since the last loss.
 
-        It starts from the flow between neighbours, composed. Neither poses nor disparities are
-        needed, so wrong ones do no harm.
+        It starts from the composed flow between neighbours, so a wrong geometry does no harm.
         """
         edges: list[Edge] = []
         predictions, composed = [], None
@@ -212,7 +196,11 @@ class KeyframeGraph(Stateful):
         self.links.record(edges, self.shutter.corrected(matches, edges))
 
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
-        """Return those of these new edges whose flow is matched in both directions."""
+        """Return those of these new edges whose flow is matched in both directions.
+
+        The flow of a far link starts from poses that may have drifted, and one wrong link can
+        outweigh all right ones.
+        """
         if not edges:
             return []
         matches = self._flow_from_geometry(edges)
@@ -223,16 +211,11 @@ class KeyframeGraph(Stateful):
     def _flow_from_geometry(self, edges: list[Edge]) -> FlowMatches:
         """Return the flow of these edges, started from what the present geometry predicts."""
         sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
-        transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
-        predicted, _ = reproject(
-            transforms, self.keyframes.disparities[sources], self.grid.rays, self.grid.camera
-        )
+        predicted, _ = reproject(*self.geometry(sources, targets))
         # Points near the camera plane project to anywhere; a flow started there finds nothing.
         size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
         predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
         return self.shutter.corrected(self.flow.match(sources, targets, predicted), edges)
-
-    # Which keyframes to link --------------------------------------------------------------------
 
     def neighbour_edges(self, keyframe: int) -> list[Edge]:
         """Return the edges to the predecessors since the camera was last lost."""
@@ -241,42 +224,33 @@ class KeyframeGraph(Stateful):
         return [edge for edge in edges if min(edge) >= since]
 
     def proximity_edges(self, keyframe: int) -> list[Edge]:
-        """Return edges from a new keyframe to covisible older ones, if the flow confirms them.
-
-        The flow of a far link starts from poses that may have drifted. One wrong link can outweigh
-        all right ones, so its flow must be confirmed before the link is added.
-        """
+        """Return edges from a new keyframe to covisible older ones."""
         start = max(0, keyframe + 1 - HORIZON * self.config.window)
-        limit = PROXIMITY_DISTANCE * self.pixel_scale
-        near = neighbourhood_edges(keyframe, keyframe + 1, NEIGHBOURHOOD)
         newest = range(keyframe, keyframe + 1)
-        pairs = self._proximity_pairs(start, newest, near, limit, PROXIMITY_EDGES)
-        return self.filter_confirmed(both_directions(pairs))
+        near = neighbourhood_edges(keyframe, keyframe + 1, NEIGHBOURHOOD)
+        return self._covisible_edges(start, newest, near, PROXIMITY_DISTANCE, PROXIMITY_EDGES)
 
     def global_edges(self) -> list[Edge]:
         """Return further edges among all keyframes, over many baselines."""
         all_keyframes = range(len(self.keyframes))
-        limit = GLOBAL_DISTANCE * self.pixel_scale
-        pairs = self._proximity_pairs(0, all_keyframes, [], limit, GLOBAL_EDGES)
-        return self.filter_confirmed(both_directions(pairs))
+        return self._covisible_edges(0, all_keyframes, [], GLOBAL_DISTANCE, GLOBAL_EDGES)
 
-    def _proximity_pairs(
+    def _covisible_edges(
         self,
         start: int,  # first keyframe to look at
         newer: range,  # keyframes that get links
         planned: list[Edge],  # edges about to be added, treated as existing
-        limit: float,  # px
+        limit: float,  # px at 320x240, largest flow distance
         links: int,  # per keyframe
     ) -> list[Edge]:
-        """Return pairs of covisible keyframes, by increasing flow distance."""
+        """Return confirmed edges between covisible keyframes, by increasing flow distance."""
+        limit *= self.pixel_scale
         shifted = range(newer.start - start, newer.stop - start)
         distances = self.distances(start, shifted, limit)
         existing = self.links.edges() + planned
         taken = [(i - start, j - start) for i, j in existing if min(i, j) >= start]
         pairs = proximity_pairs(distances, taken, shifted, limit, links)
-        return [(i + start, j + start) for i, j in pairs]
-
-    # How far apart keyframes are ----------------------------------------------------------------
+        return self.filter_confirmed(both_directions([(i + start, j + start) for i, j in pairs]))
 
     def distances(self, start: int = 0, rows: range | None = None, limit: float = FAR) -> Tensor:
         """Return the flow distances (K', K') [px] of the keyframes from `start` on."""
@@ -287,6 +261,12 @@ class KeyframeGraph(Stateful):
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""
+        return mean_parallax(*self.geometry(sources, targets))
+
+    def geometry(
+        self, sources: Tensor | list[int], targets: Tensor | list[int]
+    ) -> tuple[Tensor, Tensor, Tensor, Camera]:
+        """Return what a reprojection along edges takes: present poses, disparities and cells."""
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         disparities = self.keyframes.disparities[sources]
-        return mean_parallax(transforms, disparities, self.grid.rays, self.grid.camera)
+        return transforms, disparities, self.grid.rays, self.grid.camera

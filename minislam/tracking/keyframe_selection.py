@@ -11,8 +11,8 @@ KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyfram
 def keyframe_flow(graph: KeyframeGraph, is_initialised: bool) -> float:
     """Return the mean flow that makes a keyframe [px].
 
-    The start needs parallax even with a depth prior: over short baselines a dynamic object that
-    fills much of the view fits the motion of the camera as well as the room does.
+    The start needs parallax even with a depth prior: over short baselines a large dynamic object
+    fits the motion of the camera as well as the room does.
     """
     config, may_be_near = graph.config, is_initialised and graph.keyframes.has_prior
     flow = config.keyframe_flow if may_be_near else config.keyframe_flow_without_prior
@@ -32,11 +32,7 @@ def needs_keyframe(
     matches: FlowMatches,  # E = 1, newest keyframe to this frame
     is_initialised: bool,
 ) -> bool:
-    """Tell whether a frame should become a keyframe.
-
-    It should if the mean flow is large, if few cells are matched, or if the last keyframe was
-    `keyframe_interval` frames ago.
-    """
+    """Tell whether a frame moved far, is hardly matched, or is `keyframe_interval` frames away."""
     flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
     if flow > enough or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True

@@ -6,6 +6,11 @@ from torch import Tensor
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
 
+COLUMNS = (
+    "frames features metric_depths T_camera_world disparities prior_disparities prior_masks"
+    " static_weights motion_weights"
+)
+
 
 class KeyframeStore(Stateful):
     """All data of the tracker's keyframes. Only the methods of this class change the columns."""
@@ -68,14 +73,8 @@ class KeyframeStore(Stateful):
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
-        for column in (self.frames, self.features, self.metric_depths):
-            column.pop()
-        self.T_camera_world = self.T_camera_world[:-1]
-        self.disparities = self.disparities[:-1]
-        self.prior_disparities = self.prior_disparities[:-1]
-        self.prior_masks = self.prior_masks[:-1]
-        self.static_weights = self.static_weights[:-1]
-        self.motion_weights = self.motion_weights[:-1]
+        for column in COLUMNS.split():
+            setattr(self, column, getattr(self, column)[:-1])
 
     def set_geometry(self, T_camera_world: Tensor, disparities: Tensor) -> None:
         """Replace the poses (K, 4, 4) and disparities (K, N) of all keyframes."""

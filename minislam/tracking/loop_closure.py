@@ -1,8 +1,7 @@
 """Loop closure: when the camera is back at a place, the drift since then is corrected.
 
-A loop is searched where the present geometry predicts it (as in the paper), so it is found while
-the drift is small against the image. Its flow must be matched in both directions, and the global
-BA must bring its residuals down; otherwise the BA is undone.
+A loop is searched where the present geometry predicts it, as in the paper. Its flow must match in
+both directions, and the global BA must bring its residuals down; otherwise the BA is undone.
 """
 
 import torch

@@ -15,19 +15,18 @@ from minislam.tracking.bundle_adjustment import (
 )
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
-from minislam.tracking.safeguards.touched import adjust_touched
+from minislam.tracking.safeguards.parts import of_rows
 
-# A new keyframe may have so large an error that the robust weight takes its cells for outliers and
-# the error stays. So the weight is wide at first. [-]
+# Of the robust weight: else it takes the cells of a new keyframe with a large error for outliers.
 FIRST_WIDENING = 8.0
+FEW_KEYFRAMES = 100  # so few are not worth a selection
 
 
 def local_ba(graph: KeyframeGraph) -> None:
     """Link the newest keyframe, then adjust the newest `window` keyframes together.
 
-    First comes a BA on flow from and to its predecessors that was found without its pose, because
-    that pose may still be wrong. Then edges to its neighbourhood and to nearby older keyframes are
-    added, and flow and BA alternate for some rounds.
+    First comes a BA on flow that was found without its pose, because that pose may be wrong. Then
+    further edges are added, and flow and BA take turns.
     """
     config, newest = graph.config, len(graph.keyframes) - 1
     first_free = max(0, newest + 1 - config.window)
@@ -43,10 +42,7 @@ def local_ba(graph: KeyframeGraph) -> None:
 
 
 def online_global_ba(graph: KeyframeGraph) -> None:
-    """Adjust all keyframes together while the sequence goes on.
-
-    Stored flow is used again; only the flow of new links is measured.
-    """
+    """Adjust all keyframes while the sequence goes on; only the flow of new links is measured."""
     edges = graph.global_edges()
     if edges:
         graph.match(edges)
@@ -54,11 +50,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
 
 
 def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:
-    """Adjust all keyframes together on fresh flow, after the last frame.
-
-    The disparity prior is off, because the depth of a single image is worse than that of many
-    views.
-    """
+    """Adjust all keyframes on fresh flow, without the prior: many views know depth better."""
     config = graph.config
     edges = graph.links.edges() + graph.global_edges()
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
@@ -101,6 +93,27 @@ def adjust(
     graph.grid.zoom(state.log_focal)
     graph.shutter.lengthen(state.readout)
     graph.count_adjustment(report)
+
+
+def adjust_touched(
+    problem: BundleProblem, state: BundleState, iterations: int
+) -> tuple[BundleState, BundleReport]:
+    """Return what `bundle_adjust` does, from the keyframes that it moves or sees alone.
+
+    So a local adjustment costs the same however many keyframes there are.
+    """
+    rows = touched_rows(problem)
+    found, report = bundle_adjust(*of_rows(problem, state, rows), iterations)
+    poses, disparities = state.T_camera_world.clone(), state.disparities.clone()
+    poses[rows], disparities[rows] = found.T_camera_world, found.disparities
+    return replace(found, T_camera_world=poses, disparities=disparities), report
+
+
+def touched_rows(problem: BundleProblem) -> Tensor:  # (K',) keyframe index
+    """Return the keyframes that a problem moves or has an edge to; all, if there are few."""
+    is_touched = problem.free_disparities.clone()
+    is_touched[problem.edges_source] = is_touched[problem.edges_target] = True
+    return (is_touched | (len(is_touched) <= FEW_KEYFRAMES)).nonzero()[:, 0]
 
 
 def adjust_narrowing(

@@ -15,10 +15,10 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.reprojection import splat_disparities
 from minislam.tracking.safeguards.robust import RobustKernel
 
+INVERSION_STEPS = 4  # of a fixed point; the flow estimator corrects what is left
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
-# A start with an error of 10 degrees has residuals of 50 px, all outliers for a narrow robust
-# weight. So the weight is narrowed step by step.
-ROBUST_WIDENING = (16.0, 4.0, 1.0)  # [-], times the final width
+# Times the final width: 50 px, those of a start off by 10 degrees, are outliers for a narrow one.
+ROBUST_WIDENING = (16.0, 4.0, 1.0)
 
 
 def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> FlowMatches:
@@ -28,6 +28,19 @@ def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> Flow
     targets = first.targets + grid.sample(flow, middle).mT
     confidences = first.confidences * grid.sample(second.confidences.mT, middle).mT
     return FlowMatches(targets, confidences, first.matched_ratios * second.matched_ratios)
+
+
+def inverted_targets(targets: Tensor, grid: Grid) -> Tensor:  # (1, 2, N) px -> (1, 2, N) px
+    """Return where the cells of the target lie in the source, from the targets of the source.
+
+    With the flow f, that is q + b(q) for the fixed point b(q) = -f(q + b(q)). Flow back from a new
+    keyframe starts there: it owes nothing to the disparities, which are those of its predecessor.
+    """
+    flow = targets.mT - grid.pixels
+    inverse = torch.zeros_like(flow)
+    for _ in range(INVERSION_STEPS):
+        inverse = -grid.sample(flow, grid.pixels + inverse)
+    return (grid.pixels + inverse).mT
 
 
 def motion_only_problem(
@@ -61,10 +74,9 @@ def start_pose(
 ) -> Tensor:
     """Return T_target_world (4, 4) that explains the flow best.
 
-    Each start is optimised by Gauss-Newton with the robust scale shrunk from 16 c, from 4 c and
-    at c; the pose of lowest final cost is returned. A wide scale converges from far, but it can
-    lock onto a near dynamic object with long residuals. A narrow one cannot converge from far.
-    All candidates are solved together, as the target poses of one problem with one source.
+    Each start is optimised with the robust scale shrunk from 16 c, from 4 c and at c; the pose of
+    lowest final cost is returned. A wide scale converges from far, but it can lock onto a near
+    dynamic object. All candidates are solved together, as the target poses of one problem.
     """
     candidates: list[Tensor] = []
     for widening in ROBUST_WIDENING if robust else (1.0,):
@@ -88,8 +100,7 @@ def warp_disparities(
 ) -> Tensor:  # (N,) of the target
     """Warp the disparities (N,) of a source to the target.
 
-    A cell to which no point is warped takes the value of the nearest cell that has one. A cell of
-    disparity zero is not warped.
+    A cell that no point reaches takes the nearest cell's value; disparity zero is not warped.
     """
     warped = splat_disparities(
         T_target_source, disparities, grid.rays, grid.camera, grid.shape, grid.stride

@@ -26,9 +26,9 @@ from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards.diagnostics import Watch
+from minislam.tracking.safeguards.focal_length import seek_readouts
 from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
-from minislam.tracking.safeguards.readout import seek_readouts
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.settling import SETTLED, Settling
 from minislam.workers import Workers
@@ -77,11 +77,7 @@ class Tracker(Stateful):
         predict_static_weight: Callable[[int], Tensor],  # keyframe index -> (h, w) in [0, 1]
         device: str = "cpu",  # of all tensors; frames must be there, too
     ) -> None:
-        """Start without any frame.
-
-        `predict_static_weight` is called for a new keyframe, and for all of them at the end of the
-        warm-up and in the final adjustment. So online a keyframe keeps the beta that it came with.
-        """
+        """Start without any frame. Online a keyframe keeps the static weight it came with."""
         self.graph = KeyframeGraph(camera, config, flow, device)
         self.config = config = self.graph.config  # for this kind of flow
         self.keyframes = self.graph.keyframes
@@ -112,8 +108,6 @@ class Tracker(Stateful):
     def initialised(self) -> bool:
         """Tell whether the warm-up is over: there are poses to start from."""
         return self.mode in (Mode.TRACKING, Mode.LOST)
-
-    # One frame ----------------------------------------------------------------------------------
 
     def track(self, frame: Frame) -> bool:
         """Follow the camera into the next frame; tell whether there are new keyframes."""
@@ -146,8 +140,7 @@ class Tracker(Stateful):
         chain, matches = self._advance(frame)
         ratio = float(matches.matched_ratios)
         if ratio < MIN_MATCHED_RATIO and self.last_non_keyframe is not None:
-            # Too far from the last keyframe, but perhaps not from the last frame: make the last
-            # frame a keyframe and match with it.
+            # Too far from the last keyframe, but perhaps not from the last frame.
             self._insert(*self.last_non_keyframe)
             chain, matches = self._advance(frame)
             ratio = float(matches.matched_ratios)
@@ -173,13 +166,8 @@ class Tracker(Stateful):
         status = TrackingStatus.OK if self.initialised else TrackingStatus.INITIALISING
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
 
-    # Keyframes ----------------------------------------------------------------------------------
-
     def _insert(self, frame: Frame, matches: FlowMatches) -> None:
-        """Make a frame a keyframe, and adjust the graph around it.
-
-        Its pose comes from its flow, its disparities from its predecessor.
-        """
+        """Make a frame a keyframe: its pose from its flow, its disparities from the last one's."""
         pose, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
         edge = len(self.keyframes) - 1, len(self.keyframes)
         matches = self.graph.shutter.corrected(matches, [edge], frame.frame_index)
@@ -221,13 +209,8 @@ class Tracker(Stateful):
         if is_due or closed:
             self._last_global = count
 
-    # Losing and finding the camera --------------------------------------------------------------
-
     def _handle_loss(self, frame: Frame, ratio: float) -> None:
-        """Look for the camera among all keyframes; log the frame as lost if it is not found.
-
-        The chain is kept, so that tracking resumes if the old view returns.
-        """
+        """Look for the camera among all keyframes; keep the chain, should the old view return."""
         self._lost_in_a_row += 1
         if self.initialised:
             self.mode = Mode.LOST
@@ -252,8 +235,6 @@ class Tracker(Stateful):
         self.last_non_keyframe = None
         self._log_followed(frame, 1.0)
         return True
-
-    # The stages ---------------------------------------------------------------------------------
 
     def initialise(self, workers: Workers | None = None) -> None:
         """Estimate the warm-up keyframes together, beta unknown (first of the two stages)."""

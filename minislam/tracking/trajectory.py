@@ -17,8 +17,8 @@ def pose_all_frames(
     """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
 
     A keyframe keeps its pose. Another frame starts from the interpolated pose and is adjusted on
-    the flow from the keyframes around it, whose disparities are held. A pose that little of the
-    flow supports starts again from its neighbours; a frame that stays without support is lost.
+    the flow from the keyframes around it; with little support it starts again from its neighbours,
+    and a frame that stays without support is lost.
     """
     graph, frames = tracker.graph, tracker.keyframes.frames
     poses = tracker.keyframes.T_camera_world

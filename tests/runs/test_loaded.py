@@ -15,7 +15,7 @@ from minislam.data.files import write_json
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.tracking.grid import Grid
-from minislam.tracking.safeguards.image_motion import ImageMotion
+from minislam.tracking.safeguards.rolling_shutter import ImageMotion
 
 pytestmark = pytest.mark.slow
 

@@ -1,18 +1,15 @@
 """What real footage needs and the paper does not have.
 
 robust           the robust weight inside Sigma, for a flow without a learned confidence
+parts            a bundle problem of some edges, keyframes or cells alone
 motion_memory    remembers which cells have moved, so that a growing dynamic object stays excluded
 settling         which disparities parallax has measured; only these are handed on to a new keyframe
-inverse_flow     flow back from a new keyframe that does not start from its own disparities
 relocalisation   finds a lost camera among the keyframes
 pose_support     tries other starts for poses between keyframes that little of the flow supports
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
 first_depth      depth of the first keyframe from matches alone
-structure        which disparities several keyframes agree on
 diagnostics      how well each keyframe is tied to the others
-focal_length     estimates an unknown focal length, tells whether a given one was wrong
+focal_length     estimates an unknown focal length, tells whether a given one was wrong; the readout
 focal_column     the focal length as one more unknown of the bundle adjustment
-image_motion     how fast the image moves, and how far a rolling shutter displaces it
 rolling_shutter  the time to read an image as two more, and images as a global shutter sees them
-readout          tells whether the camera has a rolling shutter at all
 """

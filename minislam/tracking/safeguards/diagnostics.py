@@ -1,11 +1,9 @@
 """How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
 
-Where the camera turns but hardly moves, or where little can be matched, the scale can drift while
-all residuals stay small. A low matched ratio and little parallax are the signs.
-
-A run may also go wrong where everything is matched. Two measurements tell broken keyframes from
-healthy ones (tests/benchmarks/bench_broken.py has the table). A wrong pose does not explain the
-flow of the keyframes before it. After a wrong scale two keyframes see a thing at different depths.
+With a low matched ratio or little parallax the scale can drift while all residuals stay small.
+Where everything is matched, two measurements tell broken keyframes from healthy ones
+(tests/benchmarks/bench_broken.py has the table): a wrong pose does not explain the flow of the
+keyframes before it, and after a wrong scale two keyframes see a thing at different depths.
 """
 
 from collections.abc import Sequence
@@ -19,7 +17,7 @@ from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.reprojection import lengths, relative_transforms, scaled_points
+from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
@@ -98,27 +96,25 @@ def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
     edges = graph.links.edges()
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]
     explained, depth_error = tie_to_predecessors(graph, keyframe)
-    if not positions:
-        return KeyframeDiagnostics(frame_index, 0.0, 0.0, explained, depth_error)
     sources, targets = ([edges[p][end] for p in positions] for end in (0, 1))
-    ratio = max(graph.links.matched_ratios[p] for p in positions)
-    parallax = float(graph.parallaxes(sources, targets).max())
+    ratio = max((graph.links.matched_ratios[p] for p in positions), default=0.0)
+    parallax = float(graph.parallaxes(sources, targets).max()) if positions else 0.0
     return KeyframeDiagnostics(frame_index, ratio, parallax, explained, depth_error)
 
 
 def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
     """Return how a keyframe agrees with the keyframes before it, over the links between them.
 
-    First the part of the flow from there, of what was static so far, that poses and disparities
-    explain [-]. Then the median relative difference of the depths that the two ends of a link see,
-    over the cells that count in the adjustment; a dynamic object does not. None: no link.
+    First the part of the flow from there, of what was static so far, that the geometry explains
+    [-]. Then the median relative difference of the depths that the two ends of a link see, over the
+    cells that count in the adjustment. None: no link.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
     edges = graph.links.edges()
     positions = [p for p, edge in enumerate(edges) if edge in near]
     if not positions:
         return None, None
-    problem, keyframes, grid = bundle_problem(graph, positions, 0, 0.0), graph.keyframes, graph.grid
+    problem = bundle_problem(graph, positions, 0, 0.0)
     residual, robust_weights = residuals(problem, graph.state)
     fits = lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
     sources, targets = problem.edges_source, problem.edges_target
@@ -127,13 +123,23 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     weights *= (targets == keyframe)[:, None]
     explained = float((weights * fits).sum() / weights.sum().clamp_min(1e-6))
 
-    transforms = relative_transforms(keyframes.T_camera_world, sources, targets).float()
-    disparities = keyframes.disparities[sources]
-    expected = disparities / scaled_points(transforms, disparities, grid.rays)[:, 2].clamp_min(1e-6)
     positions_seen = (problem.targets - residual).mT
-    seen = grid.sample(keyframes.disparities[targets][..., None], positions_seen)[..., 0]
-    counted = robust_weights[:, 0] * grid.camera.contains(positions_seen)
+    seen, expected = seen_and_expected(graph, sources, targets, positions_seen)
+    counted = robust_weights[:, 0] * graph.grid.camera.contains(positions_seen)
     return explained, weighted_median((seen / expected).log().abs(), counted)
+
+
+def seen_and_expected(
+    graph: KeyframeGraph,
+    sources: Tensor | list[int],  # (E,) keyframe index
+    targets: Tensor | list[int],  # (E,)
+    positions: Tensor,  # (E, N, 2) px, where the targets see the cells of the sources
+) -> tuple[Tensor, Tensor]:  # 2 x (E, N) 1/world unit
+    """Return the disparities that the targets have there, and those that the sources expect."""
+    transforms, disparities, rays, _ = graph.geometry(sources, targets)
+    expected = disparities / scaled_points(transforms, disparities, rays)[:, 2].clamp_min(1e-6)
+    there = graph.keyframes.disparities[targets][..., None]
+    return graph.grid.sample(there, positions)[..., 0], expected
 
 
 def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
@@ -166,8 +172,8 @@ def is_unexplained(newest: KeyframeDiagnostics) -> bool:
 def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
-    One keyframe is a break if it explains very little of its flow or sees other depths than those
-    before it. LONG keyframes in a row need to explain less than they should by a little.
+    One keyframe is a break if it explains very little or sees other depths; LONG in a row are one
+    if they explain a little too little.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little

@@ -24,8 +24,7 @@ def triangulate(
 ) -> Tensor:  # (N,)
     """Return the disparities that best explain matches under a known motion.
 
-    With the matched ray (a, b, 1), (R rho + d t) must be parallel to it: two equations that are
-    linear in d, solved by least squares.
+    R rho + d t must be parallel to the matched ray: two equations linear in d, by least squares.
     """
     T_target_source = T_target_source.to(grid.rays)
     rotated, t = grid.rays @ T_target_source[:3, :3].T, T_target_source[:3, 3]

@@ -1,9 +1,8 @@
 """Which frame the warm-up begins with, and when it is over.
 
-A black first frame, a slate or a jump cut must not end the run. During the warm-up a lost camera
-cannot be found again. So the warm-up begins anew with the first lost frame, once as many frames
-were lost as were followed before. If the sequence ends before any start has made enough keyframes,
-the best of all starts is repeated.
+After a black first frame, a slate or a jump cut, the warm-up begins anew with the first lost frame,
+once as many frames were lost as were followed before. If the sequence ends before any start has
+made enough keyframes, the best of all starts is repeated.
 """
 
 from dataclasses import replace
@@ -41,11 +40,7 @@ class FirstFrame(Stateful):
 
 
 def has_warmed_up(tracker: Tracker) -> bool:
-    """Tell whether the warm-up has its keyframes.
-
-    They are few, because it must be over before a dynamic object fills the view: motion is
-    remembered from then on only.
-    """
+    """Tell whether the warm-up has its few keyframes: motion is remembered only from then on."""
     return len(tracker.keyframes) >= tracker.config.warmup_keyframes
 
 

@@ -1,27 +1,36 @@
 """Motion memory: the motion weight of each cell, passed on along the flow.
 
 While a dynamic object is small, the robust weight alone excludes it. Once it fills half of the
-image, the pose follows the object instead of the static scene, and beta, which learns from the
-poses, learns the wrong thing. But the object was seen to move while it was still small. Therefore
+image, the pose follows it instead of the static scene, and beta learns from wrong poses. Therefore
 each cell has a motion weight: how well its flow has fitted the camera motion so far. The cell that
 it flows to inherits that weight.
+
+What stands still in every image while the camera moves is no part of the scene either.
 """
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from minislam.geometry import se3_inverse
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.pose_from_flow import filled_from_nearest
-from minislam.tracking.reprojection import reproject
+from minislam.tracking.reprojection import lengths, reproject
 
 MIN_CONFIDENCE = 0.1  # of a match that counts [-]
 # Smoothing factors: the weight falls fast and recovers slowly, since a moving object may pause. [-]
 LOSS_RATE = 0.9
 RECOVERY_RATE = 0.1
 DEPTH_ERROR = 0.1  # of a depth prior, relative: so much of the parallax is no motion [-]
+STANDS, MOVES = 0.3, 5.0  # px: flow of a cell that stands, median flow where the camera moves
+CONFIRMED = 0.2  # confidence of a flow that counts [-]
+ALWAYS = 0.8  # of the pairs in which a cell of an overlay stands [-]
+MIN_PAIRS = 2  # pairs of keyframes in which the camera moves; fewer tell nothing
+MIN_CELLS = 4
 
 
 class MotionMemory:
@@ -32,10 +41,7 @@ class MotionMemory:
         self.scale = scale or None  # px, of the residuals that still count; None: no memory
 
     def judge_all(self, flow_to_next: list[FlowMatches | None]) -> None:
-        """Set all motion weights anew, by the present poses and disparities.
-
-        Where there is no flow to a keyframe, the camera was relocalised, and memory begins anew.
-        """
+        """Set all weights by the present geometry; after a lost camera memory begins anew."""
         keyframes = self._keyframes
         for index, matches in enumerate([None, *flow_to_next]):
             if matches is None:
@@ -95,8 +101,7 @@ def update_motion_weight(
 def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> Tensor:  # (N,)
     """Return the motion weight of the target cells: that of the source cells that flow there.
 
-    If several source cells flow to one cell, the lowest weight counts. If none does, the weight of
-    the nearest cell that has one is taken.
+    Of several source cells the lowest weight counts; without any, that of the nearest cell.
     """
     cells = (matches.targets[0].mT / grid.stride).round().long()
     height, width = grid.shape
@@ -112,3 +117,24 @@ def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> T
 
 def _is_matched(matches: FlowMatches) -> Tensor:  # (N,) bool
     return matches.confidences[0].mean(0) > MIN_CONFIDENCE
+
+
+def overlay_weights(flow_to_next: Sequence[FlowMatches], grid: Grid) -> Tensor | None:
+    """Return a weight (N,) per cell, 0 on an overlay and beside it; None if there is none.
+
+    An overlay is a logo, a dashboard, black bars: its flow, exactly zero, is well confirmed. A cell
+    of the scene stands still only now and then. The flow of a cell is that of the patch around it.
+    """
+    still = []
+    for matches in flow_to_next:
+        flow = lengths(matches.targets - grid.pixels.T)[0]
+        counts = matches.confidences[0].mean(0) > CONFIRMED
+        if bool(counts.any()) and float(flow[counts].median()) > MOVES:
+            still.append(counts & (flow < STANDS))
+    if len(still) < MIN_PAIRS:
+        return None
+    is_fixed = torch.stack(still).float().mean(0) >= ALWAYS
+    if int(is_fixed.sum()) < MIN_CELLS:
+        return None
+    covered = max_pool2d(is_fixed.float().reshape(1, 1, *grid.shape), 3, 1, 1).reshape(-1)
+    return 1 - covered

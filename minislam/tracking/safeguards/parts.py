@@ -1,4 +1,7 @@
-"""Edges in parts: the derivatives of thousands of edges at once would take gigabytes."""
+"""A bundle problem of some edges, keyframes or cells alone.
+
+Edges in parts, because the derivatives of thousands of edges at once would take gigabytes.
+"""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -8,10 +11,12 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from minislam.tracking.bundle_adjustment import BundleProblem
+    from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 
 CELLS_AT_ONCE = 300_000  # of all edges of a part: 200 bytes a cell
-_OF_EDGES = "edges_source", "edges_target", "targets", "weights", "shutter"
+_OF_EDGES = "edges_source edges_target targets weights shutter"
+_OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
+_OF_CELLS = "targets weights prior_disparities prior_weights disparity_damping"
 
 
 def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"]]:
@@ -23,12 +28,8 @@ def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"
     number = ((counts - 1) * len(problem.rays) // CELLS_AT_ONCE)[problem.edges_source]
     for part in number.unique():
         edges = (number == part).nonzero()[:, 0]
-        if len(edges) < len(number):
-            values: dict[str, Any] = {name: getattr(problem, name) for name in _OF_EDGES}
-            values = {n: None if column is None else column[edges] for n, column in values.items()}
-            yield edges, replace(problem, **values)
-        else:
-            yield edges, problem
+        is_whole = len(edges) == len(number)
+        yield edges, problem if is_whole else replace(problem, **_chosen(problem, _OF_EDGES, edges))
 
 
 def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:
@@ -36,3 +37,30 @@ def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:
     edges, *columns = zip(*parts, strict=True)
     order = torch.cat(edges).argsort()
     return [torch.cat(column)[order] for column in columns]
+
+
+def of_rows(
+    problem: "BundleProblem", state: "BundleState", rows: Tensor
+) -> tuple["BundleProblem", "BundleState"]:
+    """Return problem and state of some keyframes (K',) alone; all edges must be among them."""
+    values = _chosen(problem, _OF_KEYFRAMES, rows)
+    for name in ("edges_source", "edges_target"):
+        values[name] = torch.searchsorted(rows, getattr(problem, name).contiguous())
+    poses, disparities = state.T_camera_world[rows], state.disparities[rows]
+    state = replace(state, T_camera_world=poses, disparities=disparities)
+    return replace(problem, **values), state
+
+
+def of_cells(
+    problem: "BundleProblem", state: "BundleState", cells: Tensor
+) -> tuple["BundleProblem", "BundleState"]:
+    """Return problem and state of some cells (N',) of the grid alone."""
+    values = _chosen(problem, _OF_CELLS, (..., cells))
+    problem = replace(problem, rays=problem.rays[cells], **values)
+    return problem, replace(state, disparities=state.disparities[:, cells])
+
+
+def _chosen(problem: "BundleProblem", names: str, index: Any) -> dict[str, Any]:
+    """Return these columns of a problem at an index; one that is None stays None."""
+    columns = {name: getattr(problem, name) for name in names.split()}
+    return {name: None if column is None else column[index] for name, column in columns.items()}

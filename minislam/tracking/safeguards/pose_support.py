@@ -1,7 +1,7 @@
 """Poses that little of the flow supports: other starts, or the frame is lost.
 
-In a wide gap between keyframes the interpolated pose may be too far off for the flow to find the
-true one. The pose of a neighbouring frame is a nearer start, once that frame is right itself.
+In a wide gap between keyframes the interpolated pose may be too far off. The pose of a neighbouring
+frame is a nearer start, once that frame is right itself.
 """
 
 from collections.abc import Callable
@@ -71,8 +71,8 @@ class ShownImages:
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
     """Return a learned flow (E = 1) from the newest keyframe, judged by the best pose for it.
 
-    Its matched ratio is the part of its weight that the pose explains beyond chance. How high a
-    learned confidence is says nothing, because the network learned only to weigh cells by it.
+    Its matched ratio is the part of its weight that the pose explains beyond chance, because a
+    network learned only to weigh cells by its confidence.
     """
     pose = graph.start_pose(matches, torch.ones_like(graph.grid.rays[:, 0]))
     ends = torch.stack([graph.keyframes.T_camera_world[-1], pose])

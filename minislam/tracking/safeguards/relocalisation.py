@@ -28,6 +28,8 @@ PNP_ITERATIONS = 300
 MIN_INLIERS = 20
 MIN_STATIC_WEIGHT = 0.5  # a point on a dynamic object gives a wrong pose
 
+Keypoints = tuple[np.ndarray, np.ndarray | None]  # (P, 2) px, (P, 128); None: no descriptors
+
 
 @dataclass(frozen=True)
 class Place:
@@ -44,21 +46,19 @@ class Relocaliser:
     def __init__(self, grid: Grid, keyframes: KeyframeStore, pixel_scale: float) -> None:
         self._grid, self._keyframes = grid, keyframes
         self._error = PNP_ERROR * pixel_scale
-        self._keypoints: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
+        self._keypoints: dict[int, Keypoints] = {}
 
     def find(self, image: Tensor, features: Tensor) -> Place | None:
         """Return the place with most inliers: image (H, W, 3), features (h', w', C); or None."""
         seen = _keypoints(image)
-        places = [self._place(seen, index) for index in self._most_similar(features)]
+        known = torch.stack([_summary(f) for f in self._keyframes.features])
+        similarity = known @ _summary(features)
+        most_similar = similarity.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
+        places = [self._place(seen, index) for index in most_similar]
         found = [place for place in places if place is not None]
         return max(found, key=lambda place: place.inliers, default=None)
 
-    def _most_similar(self, features: Tensor) -> list[int]:
-        known = torch.stack([_summary(f) for f in self._keyframes.features])
-        similarity = known @ _summary(features)
-        return similarity.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
-
-    def _place(self, seen: tuple[np.ndarray, np.ndarray | None], index: int) -> Place | None:
+    def _place(self, seen: Keypoints, index: int) -> Place | None:
         """Return the pose from keypoint matches with one keyframe, if there are enough."""
         if index not in self._keypoints:
             self._keypoints[index] = _keypoints(self._keyframes.frames[index].image)
@@ -107,32 +107,27 @@ def _summary(features: Tensor) -> Tensor:  # (h', w', C) -> (C,)
     return normalize(features.flatten(0, 1).mean(0), dim=0)
 
 
-def _keypoints(image: Tensor) -> tuple[np.ndarray, np.ndarray | None]:
+def _keypoints(image: Tensor) -> Keypoints:
     """Return SIFT positions (P, 2) [px] and descriptors (P, 128) of an image (H, W, 3)."""
     keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grayscale(image), None)
     positions = np.array([keypoint.pt for keypoint in keypoints], np.float32)
     return positions.reshape(-1, 2), descriptors
 
 
-def _keypoint_matches(
-    first: tuple[np.ndarray, np.ndarray | None], second: tuple[np.ndarray, np.ndarray | None]
-) -> tuple[np.ndarray, np.ndarray]:  # (M, 2) and (M, 2) px
-    """Return the positions of keypoints whose best match is clearly better than the second."""
+def _keypoint_matches(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.ndarray]:
+    """Return 2 x (M, 2) px, where the best match is clearly better than the second."""
     if first[1] is None or second[1] is None or min(len(first[1]), len(second[1])) < 2:
         return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first[1], second[1], k=2)
     clear = [best for best, other in pairs if best.distance < MAX_RATIO * other.distance]
-    return (
-        first[0][[match.queryIdx for match in clear]],
-        second[0][[match.trainIdx for match in clear]],
-    )
+    in_first, in_second = ([getattr(m, end) for m in clear] for end in ("queryIdx", "trainIdx"))
+    return first[0][in_first], second[0][in_second]
 
 
 def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
-    """Link a relocalised keyframe, the newest, with a similar one and the neighbours of that one.
+    """Link a relocalised keyframe, the newest, with those around a similar one, and move it.
 
-    Only the newest keyframe moves. Return False, and link nothing, if the flow does not confirm
-    that both show the same place.
+    Return False, and link nothing, if the flow does not confirm that both show the same place.
     """
     newest = len(graph.keyframes) - 1
     around = range(max(0, similar - NEIGHBOURHOOD), min(newest, similar + NEIGHBOURHOOD + 1))

@@ -1,18 +1,14 @@
 """Settled disparities: those that parallax has measured, of this keyframe or of one before it.
 
-Where no depth prior is known, a new keyframe gets its disparities from its predecessor; where its
-view is new, they are filled in from the nearest cells. If one of those is an outlier, a whole strip
-of the image is wrong, its residuals are so long that the robust weight takes the cells for outliers
-for ever, and the next keyframe fills a wider strip from it, until the poses follow. Therefore only
-settled cells are handed on, and the pose of a new frame trusts a cell as far as it is settled.
+Without a depth prior, a new keyframe gets its disparities from its predecessor; where its view is
+new, they are filled in from the nearest cells. If one of those is an outlier, a whole strip of the
+image is wrong, the robust weight takes it for outliers for ever, and the next keyframe fills in a
+wider strip. Therefore only settled cells are handed on, and the pose of a new frame trusts a cell
+as far as it is settled. A depth prior settles nothing: it may be wrong by a tenth.
 
-A depth prior settles nothing: it is a start. Were the motion memory to judge cells by a prior that
-is wrong by a tenth, it would take half of a static room for moving where parallax is large.
-
-By its edges e a disparity d has the information sum_e w_e |J_e|^2 (its entry of C in Eq. (5); w_e
-with the robust weight, J_e the derivative of the reprojection). So its relative standard deviation
-is 1 / sqrt(I) with I = d^2 sum_e w_e |J_e|^2 [px^2], which is about sum_e w_e parallax_e^2. I does
-not depend on the unit of length, so it can be handed on from keyframe to keyframe.
+By its edges e a disparity d has the information sum_e w_e |J_e|^2 (its entry of C in Eq. (5)). So
+its relative standard deviation is 1 / sqrt(I) with I = d^2 sum_e w_e |J_e|^2 [px^2], about
+sum_e w_e parallax_e^2, which does not depend on the unit of length.
 """
 
 import torch
@@ -24,7 +20,7 @@ from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.pose_from_flow import warp_disparities
-from minislam.tracking.reprojection import relative_transforms, reproject, reproject_with_jacobians
+from minislam.tracking.reprojection import reproject, reproject_with_jacobians
 
 SETTLED = 25.0  # px^2, information of a disparity that is known to a fifth of itself
 # Neighbouring keyframes see much of the same flow, so information is handed on in part. [-]
@@ -49,10 +45,7 @@ class Settling(Stateful):
         return information if graph.follows_a_loss(newest) else information + self.handed_on
 
     def certainty(self, information: Tensor) -> Tensor:  # (N,) px^2 -> (N,) in (0, 1]
-        """Return the weight of the newest keyframe's cells in a pose estimate.
-
-        It is one half where a cell is just settled, and one where there is a depth prior.
-        """
+        """Return the weight of cells in a pose: 1/2 if just settled, 1 with a depth prior."""
         settled = (1 / (1 + SETTLED / information)).clamp_min(LEAST)
         return torch.where(self._has_prior, 1.0, settled)
 
@@ -61,10 +54,7 @@ class Settling(Stateful):
         return self._graph.keyframes.prior_disparities[-1] > 0
 
     def fall_back_on_prior(self) -> None:
-        """Take the prior of all keyframes where flow has not settled a disparity.
-
-        Where the camera only turns, a start by flow alone ends with any depths.
-        """
+        """Take the prior where flow has settled nothing, as where the camera only turns."""
         for index in range(len(self._graph.keyframes)):
             unsettled = measured_information(self._graph, index) <= SETTLED
             self._graph.keyframes.take_prior(index, unsettled)
@@ -72,9 +62,9 @@ class Settling(Stateful):
     def hand_on(self, information: Tensor, T_camera_world: Tensor) -> Tensor:  # (N,)
         """Return the disparities of the next keyframe, warped from settled cells of the newest.
 
-        Those with a depth prior are warped, too. The camera moves on to `T_camera_world` (4, 4).
-        Each cell is handed the information (N,) at the point of the newest keyframe that is seen
-        there. If no cell is settled, all are warped.
+        Those with a depth prior are warped, too; if there is none of either, all are. The camera
+        moves on to `T_camera_world` (4, 4). Each cell is handed the information (N,) of the point
+        that is seen there.
         """
         grid, keyframes = self._graph.grid, self._graph.keyframes
         settled = information > SETTLED
@@ -99,8 +89,5 @@ def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
         return torch.zeros_like(disparities)
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     _, weights = residuals(problem, graph.state)
-    ends = problem.edges_source, problem.edges_target
-    transforms = relative_transforms(graph.keyframes.T_camera_world, *ends).to(disparities.dtype)
-    repeated = disparities.expand(len(positions), -1)
-    at = reproject_with_jacobians(transforms, repeated, graph.grid.rays, graph.grid.camera)
+    at = reproject_with_jacobians(*graph.geometry(problem.edges_source, problem.edges_target))
     return disparities.square() * (weights * at.J_disparity.square()).sum((0, 1))

@@ -1,11 +1,15 @@
-"""Edges in parts: the same numbers as with all at once."""
+"""A problem in parts or of a part: the same numbers as with all at once."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 
+from minislam.tracking import optimisation
 from minislam.tracking.bundle_adjustment import bundle_adjust, edge_costs, residuals
+from minislam.tracking.optimisation import adjust_touched, touched_rows
 from minislam.tracking.safeguards import parts
-from minislam.tracking.safeguards.parts import in_parts
+from minislam.tracking.safeguards.parts import in_parts, of_cells
 from tests.tracking.scene import CELLS, known_problem, noisy, perturbed
 
 
@@ -40,3 +44,49 @@ def test_an_adjustment_in_parts_is_that_of_all_edges(monkeypatch: pytest.MonkeyP
     assert again.cost_after == pytest.approx(report.cost_after, rel=1e-12)
     assert torch.equal(edge_costs(problem, start), costs)
     assert all(torch.equal(a, b) for a, b in zip(residuals(problem, start), rest, strict=True))
+
+
+def test_rows_that_nothing_touches_stay_and_the_others_move_as_in_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    known = known_problem(5)
+    problem, start = noisy(known, 1.0), perturbed(known, 0.02)
+    chosen = ((problem.edges_source != 1) & (problem.edges_target != 1)).nonzero()[:, 0]
+    ends = problem.edges_source[chosen], problem.edges_target[chosen]
+    free = problem.free_disparities & (torch.arange(5) != 1)
+    problem = replace(
+        problem,
+        edges_source=ends[0],
+        edges_target=ends[1],
+        targets=problem.targets[chosen],
+        weights=problem.weights[chosen],
+        free_poses=problem.free_poses & free,
+        free_disparities=free,
+    )
+    assert touched_rows(problem).tolist() == [0, 1, 2, 3, 4]  # so few are not selected
+    monkeypatch.setattr(optimisation, "FEW_KEYFRAMES", 4)
+    assert touched_rows(problem).tolist() == [0, 2, 3, 4]
+    (state, _), (whole, _) = (f(problem, start, 3) for f in (adjust_touched, bundle_adjust))
+    torch.testing.assert_close(state.T_camera_world, whole.T_camera_world, rtol=0, atol=1e-12)
+    torch.testing.assert_close(state.disparities, whole.disparities, rtol=0, atol=1e-12)
+    assert torch.equal(state.disparities[1], start.disparities[1])
+
+
+def test_cells_alone_are_adjusted_as_if_the_others_weighed_nothing():
+    known = known_problem(3)
+    problem, start = noisy(known, 1.0), perturbed(known, 0.02)
+    cells = torch.arange(0, len(problem.rays), 3)
+    others = torch.ones(len(problem.rays), dtype=torch.bool)
+    others[cells] = False
+    problem = replace(problem, robust=None)
+    weights = torch.where(others, 0, problem.weights)
+    priors = torch.where(others, 0, problem.prior_weights)
+    whole = replace(problem, weights=weights, prior_weights=priors)
+    damping = torch.full_like(start.disparities, 1e-3)  # else it is a fraction of the mean cell's
+    part, whole = (replace(p, disparity_damping=damping) for p in (problem, whole))
+    (state, report), (expected, _) = (
+        bundle_adjust(*some, 3) for some in (of_cells(part, start, cells), (whole, start))
+    )
+    assert report.iterations == 3
+    torch.testing.assert_close(state.T_camera_world, expected.T_camera_world, rtol=0, atol=1e-6)
+    torch.testing.assert_close(state.disparities, expected.disparities[:, cells])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from minislam.tracking.safeguards.image_motion import ImageMotion
+from minislam.tracking.safeguards.rolling_shutter import ImageMotion
 from tests.tracking.safeguards.moving_cloth import GRID, RATE, WIDE, picture
 
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.safeguards.overlay import overlay_weights
+from minislam.tracking.safeguards.motion_memory import overlay_weights
 from tests.tracking.wall import GRID
 
 HEIGHT, WIDTH = GRID.shape
