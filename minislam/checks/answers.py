@@ -57,40 +57,32 @@ def difference(
     smallest: float = SMALLEST,
 ) -> str:
     """Return "" if the answer is right, else what is wrong with it."""
-    if not isinstance(expected, tuple):
-        return _difference(answer, expected, tolerance, smallest)
-    count = len(answer) if isinstance(answer, list | tuple) else 1
-    if count != len(expected):
-        values = "value" if count == 1 else "values"
-        wanted = f"{len(expected)}: {', '.join(names)}" if names else f"{len(expected)}"
-        return f"it returns {count} {values}, expected {wanted}"
-    for place, (part, right) in enumerate(zip(answer, expected, strict=True)):
-        found = _difference(part, right, tolerance, smallest)
-        if found:
-            return f"in {names[place] if names else f'value {place + 1}'} {found}"
-    return ""
-
-
-def _difference(answer: Any, expected: Any, tolerance: float, smallest: float) -> str:
+    if isinstance(expected, tuple):
+        count = len(answer) if isinstance(answer, list | tuple) else 1
+        if count != len(expected):
+            wanted = f"{len(expected)}: {', '.join(names)}" if names else len(expected)
+            return f"it returns {count} value{'s' * (count != 1)}, expected {wanted}"
+        for place, (part, right) in enumerate(zip(answer, expected, strict=True)):
+            if found := difference(part, right, tolerance, smallest=smallest):
+                return f"in {names[place] if names else f'value {place + 1}'} {found}"
+        return ""
     try:
-        numbers = as_numbers(answer)
+        numbers, right = as_numbers(answer), as_numbers(expected)
     except (TypeError, ValueError) as error:
         return f"it returns {error}, expected a tensor"
-    right = as_numbers(expected)
     if numbers.shape != right.shape:
         if numbers.numel() != 1 or right.numel() != 1:
             return f"the shape is {tuple(numbers.shape)}, expected {tuple(right.shape)}"
         numbers = numbers.view(right.shape)  # (1,) for () and the like
-    allowed = tolerance * max(largest(right), smallest)
-    wrong = ~((numbers - right).abs() <= allowed)  # the negation catches NaN
+    wrong = ~((numbers - right).abs() <= tolerance * max(largest(right), smallest))  # also of NaN
     if not wrong.any():
         return ""
     index = tuple(wrong.nonzero()[0].tolist())
     where = f"element {list(index)}" if index else "the value"
-    found, wanted = float(numbers[index]), float(right[index])
-    if f"{found:.6g}" == f"{wanted:.6g}":
-        return f"{where} is {abs(found - wanted):.2g} off the expected {wanted:.6g}"
-    return f"{where} is {found:.6g}, expected {wanted:.6g}"
+    found, wanted = f"{numbers[index]:.6g}", f"{right[index]:.6g}"
+    if found == wanted:
+        return f"{where} is {abs(numbers[index] - right[index]):.2g} off the expected {wanted}"
+    return f"{where} is {found}, expected {wanted}"
 
 
 def relation(answer: Any, expected: Any, tolerance: float) -> str:

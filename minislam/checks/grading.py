@@ -51,52 +51,42 @@ def check_function(
     nbgrader see it.
     """
     known = [(partial(reference, flaw=flaw), hint) for flaw, hint in (flaws or {}).items()]
-    known.extend(hints)
-    verdict, seconds = None, SECONDS
-    for case in cases:
-        begin = time.process_time()
-        verdict = _grade_case(student, reference, case, tolerance, known, returns, seconds)
-        if verdict is not None:
-            break
-        seconds = max(seconds - (time.process_time() - begin), 1.0)
-    if verdict is None:
-        verdict = Verdict(PASSED, f"{len(cases)} of {len(cases)} cases agree with the package.")
+    verdict = _graded(student, reference, cases, tolerance, [*known, *hints], returns)
     if verdict.status != PASSED and os.environ.get("MINISLAM_STRICT", "0") not in ("", "0"):
         raise WrongAnswer(repr(verdict))
     return verdict
 
 
-def _grade_case(
+def _graded(
     student: Function,
     reference: Function,
-    case: Case,
+    cases: list[Case],
     tolerance: float,
     hints: Hints,
     returns: tuple[str, ...],
-    seconds: float,
-) -> Verdict | None:
-    """Return None where the answer is right."""
-    try:
-        answer, given = call(student, case.arguments, seconds)
-    except NotImplementedError:
-        return Verdict(NOT_YET, "write the body of the function and run both cells again.")
-    except Stopped as stop:
-        return Verdict(WRONG, f"for {case.description} it {stop}.")
-    if answer is None:
-        return Verdict(NOT_YET, f"for {case.description} the function returns nothing.")
-    expected, smallest = reference(*case.arguments), SMALLEST
-    if is_single((answer, given)):  # rounding errors are those of the largest number
-        tolerance, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
-    found = difference(answer, expected, tolerance, returns, smallest)
-    if not found:
-        return None
-    smallest = max(smallest, largest(expected))
-    others = ((mistake(*case.arguments), hint) for mistake, hint in hints)
-    known = (
-        hint for other, hint in others if not difference(answer, other, tolerance, (), smallest)
-    )
-    hint = next(known, "") or relation(answer, expected, tolerance)
-    return Verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)
+) -> Verdict:
+    seconds = SECONDS
+    for case in cases:
+        begin = time.process_time()
+        try:
+            answer, given = call(student, case.arguments, seconds)
+        except NotImplementedError:
+            return Verdict(NOT_YET, "write the body of the function and run both cells again.")
+        except Stopped as stop:
+            return Verdict(WRONG, f"for {case.description} it {stop}.")
+        if answer is None:
+            return Verdict(NOT_YET, f"for {case.description} the function returns nothing.")
+        expected, smallest, allowed = reference(*case.arguments), SMALLEST, tolerance
+        if is_single((answer, given)):  # rounding errors are those of the largest number
+            allowed, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
+        if found := difference(answer, expected, allowed, returns, smallest):
+            smallest = max(smallest, largest(expected))
+            others = ((mistake(*case.arguments), hint) for mistake, hint in hints)
+            known = (h for x, h in others if not difference(answer, x, allowed, (), smallest))
+            hint = next(known, "") or relation(answer, expected, allowed)
+            return Verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)
+        seconds = max(seconds - (time.process_time() - begin), 1.0)
+    return Verdict(PASSED, f"{len(cases)} of {len(cases)} cases agree with the package.")
 
 
 def is_written(function: Function) -> bool:
