@@ -23,6 +23,11 @@ from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.robust import RobustKernel
 
 
+def any_twist(seed: int, turn: float) -> list[float]:
+    """Return a drawn motion (rho, phi) of about 0.1 units and `turn` radians about each axis."""
+    return (normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[turn] * 3)).tolist()
+
+
 def check_flow_distance(student: Function) -> Verdict:
     """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, beta) -> distance [px]."""
     pixels = CAMERA.pixel_grid(10, torch.float64).flatten(0, 1)
@@ -49,15 +54,11 @@ def check_flow_distance(student: Function) -> Verdict:
         poses, rays = se3_exp(doubles([0.0] * 6, twist)), CAMERA.rays(pixels)
         return Case((poses, disparities, rays, pixels, CAMERA, beta), description)
 
-    def draw(seed: int) -> Case:
-        twist = normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[0.03] * 3)
-        return case(twist.tolist(), 0.3, "another motion, beta = 0.3")
-
     cases = [
         case([0.3, -0.1, 0.0, 0.0, 0.0, 0.0], 0.75, "a camera that slides"),
         case([0.0, 0.0, 0.0, 0.02, 0.1, 0.0], 0.75, "a camera that turns"),
         case([0.3, 0.1, 0.2, 0.02, -0.05, 0.03], 0.75, "a camera that does both"),
-        *drawn(draw),
+        *drawn(lambda seed: case(any_twist(seed, 0.03), 0.3, "another motion, beta = 0.3")),
     ]
     hints = [
         (lambda *a: reference(*a[:-1], 1.0), "The flow without rotation has the weight 1 - beta."),
@@ -226,15 +227,11 @@ def check_motion_memory(student: Function) -> Verdict:
         matches = FlowMatches(flow, confidences, torch.ones(1))
         return Case((grid, matches, disparities, motion, random[3], 2.0), what)
 
-    def draw(seed: int) -> Case:
-        twist = normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[0.025] * 3)
-        return case(twist.tolist(), 6.0, 0.8, "a drawn motion", seed)
-
     cases = [
         case([0.0] * 6, 3.0, 1.0, "a camera that stands still"),
         case([0.5, 0.1, 0.0, 0.0, 0.02, 0.0], 5.0, 1.0, "a camera that moves"),
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
-        *drawn(draw),
+        *drawn(lambda seed: case(any_twist(seed, 0.025), 6.0, 0.8, "a drawn motion", seed)),
     ]
     constants: dict[str, dict[str, Any]] = {
         "It falls fast and recovers slowly.": {"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9},
