@@ -49,10 +49,7 @@ def check_target_jacobian(student: Function) -> Verdict:
         (lambda *a: reference(*a, turn=-1), "The rotation is the wrong way round: -hat(X) phi."),
         (lambda *a: -reference(*a), "This is the derivative of the residual p~ - p."),
         (lambda *a: reference(*a).roll(3, -1), "The order is (rho, phi), translation first."),
-        (
-            lambda X, d, c: reference(X, d, c, turn=d[:, None, None]),
-            "A turn moves X by phi x X: no d.",
-        ),
+        (lambda *a: reference(*a, turn=a[1][:, None, None]), "A turn moves X by phi x X: no d."),
         (lambda *a: reference(*a, turn=0), "The rotation is missing: columns 3 to 5."),
         (lambda *a: reference(*a, slide=0), "The translation is missing: columns 0 to 2."),
     ]
@@ -163,11 +160,8 @@ def check_bundle_adjustment(student: Function) -> Verdict:
 def check_robust_weight(student: Function) -> Verdict:
     """Check (residuals (N, 2) [px], scale c [px], power k) -> the weight of each cell (N,)."""
 
-    def squared(r2: Tensor, c: float, k: float) -> Tensor:
-        return RobustKernel(c, k).weight(r2)
-
     def reference(r: Tensor, c: float, k: float) -> Tensor:
-        return squared(r.square().sum(-1), c, k)
+        return RobustKernel(c, k).weight(r.square().sum(-1))
 
     cases = [
         Case((doubles([0, 0], [0.3, 0.4], [3, -4]), 2.0, 1.0), "c = 2 px and k = 1"),
@@ -180,8 +174,8 @@ def check_robust_weight(student: Function) -> Verdict:
         (lambda r, c, k: reference(r, c**0.5, k), "c is squared, like the residual."),
         (lambda r, c, k: 1 / reference(r, c, k), "The power is -k: large residuals count little."),
         (lambda r, c, k: r.norm(dim=1) * reference(r, c, k), "This is the pull, w r."),
-        (lambda r, c, k: squared(r**2, c, k), "A cell has one weight: sum over u, v."),
-        (lambda r, c, k: squared(r.norm(dim=1), c, k), "r is squared, like c."),
+        (lambda r, c, k: RobustKernel(c, k).weight(r**2), "A cell has one weight: sum over u, v."),
+        (lambda r, c, k: RobustKernel(c, k).weight(r.norm(dim=1)), "r is squared, like c."),
     ]
     return check_function(student, reference, cases, 1e-9, hints)
 
@@ -198,9 +192,6 @@ def check_prior_mask(student: Function) -> Verdict:
         counts = depth_consistency(grid, this, views, rest[-1], -2.0)
         trusted = (counts.corresponding < seen) | (counts.consistent >= agree)
         return trusted.double().view(grid.shape)
-
-    def backwards(depth: Tensor, others: list, *rest: Any) -> Tensor:
-        return reference(depth, [(there, se3_inverse(T)) for there, T in others], *rest)
 
     def wall(T_this_other: Tensor) -> Tensor:
         """Return the depth of a wall, 3 m before this view, as another view sees it."""
@@ -222,10 +213,11 @@ def check_prior_mask(student: Function) -> Verdict:
         case(1, 0.7, "a single other view"),
         *drawn(lambda seed: case(3, 0.8, "three drawn views", seed)),
     ]
+    back = "T_this_other takes points of the other view to this one, not back."
     hints = [
         (lambda *a: reference(*a, seen=0), "Where fewer than two views have a depth, M stays 1."),
         (lambda *a: 1 - reference(*a), "M is 1 where the prior counts, 0 where views contradict."),
-        (backwards, "T_this_other takes points of the other view to this one, not back."),
+        (lambda d, o, *a: reference(d, [(x, se3_inverse(T)) for x, T in o], *a), back),
         (lambda *a: reference(*a, agree=1), "Two views must agree, not one."),
         # Where all depths are near 3 m, an absolute error is a third of it, relatively.
         (lambda *a: reference(*a[:2], a[-1] / 3), "Divide the difference by the other's depth."),

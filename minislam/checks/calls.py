@@ -39,24 +39,22 @@ def call(
     It gets copies, in the default dtype of the notebook, and, where it mixes dtypes, the numbers
     as they are. Raises Stopped with the line where it stops, and NotImplementedError from a stub.
     """
-    own = torch.get_default_dtype()
-    attempts = [_copied(arguments, None)]
-    if all(isinstance(argument, PLAIN) for argument in arguments):
-        attempts.insert(0, _copied(arguments, own))
-    for given in attempts:
+    is_plain = all(isinstance(argument, PLAIN) for argument in arguments)
+    dtype = torch.get_default_dtype() if is_plain else None
+    while True:
+        given = _copied(arguments, dtype)
         try:
             with time_limit(seconds):
-                answer = function(*given)
-            return answer, given
+                return function(*given), given
         except NotImplementedError:
             raise
         except TimeoutError:
             raise Stopped(f"has no answer after {seconds:.1f} seconds (an endless loop?)") from None
         except (Exception, SystemExit) as error:  # any mistake is an answer, not a crash
             mixes = isinstance(error, RuntimeError) and "type" in str(error)  # "dtype", "type"
-            if not mixes or given is attempts[-1]:
+            if dtype is None or not mixes:
                 raise Stopped(_story(error)) from None
-    raise AssertionError("the last attempt returns or raises")
+            dtype = None
 
 
 def _copied(value: Any, dtype: torch.dtype | None) -> Any:

@@ -9,11 +9,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from minislam.checks.answers import SMALLEST, difference, is_single, largest, relation
+import numpy as np
+import torch
+from torch import Tensor
+
 from minislam.checks.calls import Stopped, call
 from minislam.checks.cases import Case
 
 PASSED, NOT_YET, WRONG = "passed", "not yet", "wrong"
+SINGLE = (torch.float32, torch.float16, torch.bfloat16)
+SMALLEST = 1e-3  # an expected number below this counts as this: it may be a rounded zero
 SECONDS = 10.0  # of the student's function, all cases together
 
 Function = Callable[..., Any]  # answers with numbers in any form, or with a tuple of such
@@ -52,51 +57,35 @@ def check_function(
     """
     known = [(partial(reference, flaw=flaw), hint) for flaw, hint in (flaws or {}).items()]
     known.extend(hints)
-    verdict, seconds = None, SECONDS
+    seconds = SECONDS
     for case in cases:
         begin = time.process_time()
-        verdict = _grade_case(student, reference, case, tolerance, known, returns, seconds)
-        if verdict is not None:
-            break
+        try:
+            answer, given = call(student, case.arguments, seconds)
+        except NotImplementedError:
+            return _verdict(NOT_YET, "write the body of the function and run both cells again.")
+        except Stopped as stop:
+            return _verdict(WRONG, f"for {case.description} it {stop}.")
+        if answer is None:
+            return _verdict(NOT_YET, f"for {case.description} the function returns nothing.")
+        expected, smallest, allowed = reference(*case.arguments), SMALLEST, tolerance
+        if is_single((answer, given)):  # rounding errors are those of the largest number
+            allowed, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
+        if found := difference(answer, expected, allowed, returns, smallest):
+            smallest = max(smallest, largest(expected))
+            others = ((mistake(*case.arguments), hint) for mistake, hint in known)
+            named = (h for x, h in others if not difference(answer, x, allowed, (), smallest))
+            hint = next(named, "") or relation(answer, expected, allowed)
+            return _verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)
         seconds = max(seconds - (time.process_time() - begin), 1.0)
-    if verdict is None:
-        verdict = Verdict(PASSED, f"{len(cases)} of {len(cases)} cases agree with the package.")
-    if verdict.status != PASSED and os.environ.get("MINISLAM_STRICT", "0") not in ("", "0"):
-        raise WrongAnswer(repr(verdict))
+    return _verdict(PASSED, f"{len(cases)} of {len(cases)} cases agree with the package.")
+
+
+def _verdict(status: str, sentence: str, hint: str = "") -> Verdict:
+    verdict = Verdict(status, sentence, hint)
+    if status != PASSED and os.environ.get("MINISLAM_STRICT", "0") not in ("", "0"):
+        raise WrongAnswer(repr(verdict)) from None
     return verdict
-
-
-def _grade_case(
-    student: Function,
-    reference: Function,
-    case: Case,
-    tolerance: float,
-    hints: Hints,
-    returns: tuple[str, ...],
-    seconds: float,
-) -> Verdict | None:
-    """Return None where the answer is right."""
-    try:
-        answer, given = call(student, case.arguments, seconds)
-    except NotImplementedError:
-        return Verdict(NOT_YET, "write the body of the function and run both cells again.")
-    except Stopped as stop:
-        return Verdict(WRONG, f"for {case.description} it {stop}.")
-    if answer is None:
-        return Verdict(NOT_YET, f"for {case.description} the function returns nothing.")
-    expected, smallest = reference(*case.arguments), SMALLEST
-    if is_single((answer, given)):  # rounding errors are those of the largest number
-        tolerance, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
-    found = difference(answer, expected, tolerance, returns, smallest)
-    if not found:
-        return None
-    smallest = max(smallest, largest(expected))
-    others = ((mistake(*case.arguments), hint) for mistake, hint in hints)
-    known = (
-        hint for other, hint in others if not difference(answer, other, tolerance, (), smallest)
-    )
-    hint = next(known, "") or relation(answer, expected, tolerance)
-    return Verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)
 
 
 def is_written(function: Function) -> bool:
@@ -110,3 +99,100 @@ def is_written(function: Function) -> bool:
     if is_stub or is_empty:
         sys.stdout.write(f"Write {function.__name__} first, then run this cell again.\n")
     return not (is_stub or is_empty)
+
+
+def is_single(value: Any) -> bool:
+    """Say whether some of the numbers have less than double precision."""
+    if isinstance(value, list | tuple):
+        return any(map(is_single, value))
+    if isinstance(value, np.ndarray | np.generic):
+        return value.dtype in (np.float32, np.float16)
+    return isinstance(value, Tensor) and value.dtype in SINGLE
+
+
+def largest(value: Any) -> float:
+    """Return the largest absolute value of all real tensors, 0 if there are none."""
+    if isinstance(value, list | tuple):
+        return max(map(largest, value), default=0.0)
+    if not isinstance(value, Tensor) or not value.is_floating_point() or not value.numel():
+        return 0.0
+    return float(value.abs().max())
+
+
+def as_numbers(answer: Any) -> Tensor:
+    """Return numbers in any form in float64.
+
+    Raises TypeError or ValueError where they are no numbers, or rows of different lengths.
+    """
+    if isinstance(answer, np.ndarray | np.generic):
+        answer = torch.from_numpy(np.array(answer))  # a copy: also of what runs backwards
+    if isinstance(answer, Tensor):
+        if answer.is_complex():
+            raise TypeError("complex numbers")
+        return answer.detach().cpu().double()
+    if isinstance(answer, list | tuple):
+        parts = [as_numbers(part) for part in answer]
+        if len({part.shape for part in parts}) > 1:
+            raise ValueError("rows of different lengths")
+        return torch.stack(parts) if parts else torch.zeros(0, dtype=torch.float64)
+    if not isinstance(answer, bool | int | float):
+        raise TypeError(f"a {type(answer).__name__}")
+    return torch.tensor(answer, dtype=torch.float64)
+
+
+def difference(
+    answer: Any,
+    expected: Any,
+    tolerance: float,  # relative to the largest expected number, or to `smallest`
+    names: tuple[str, ...] = (),  # of the parts, where a tuple is expected
+    smallest: float = SMALLEST,
+) -> str:
+    """Return "" if the answer is right, else what is wrong with it."""
+    if isinstance(expected, tuple):
+        count = len(answer) if isinstance(answer, list | tuple) else 1
+        if count != len(expected):
+            wanted = f"{len(expected)}: {', '.join(names)}" if names else len(expected)
+            return f"it returns {count} value{'s' * (count != 1)}, expected {wanted}"
+        for place, (part, right) in enumerate(zip(answer, expected, strict=True)):
+            if found := difference(part, right, tolerance, smallest=smallest):
+                return f"in {names[place] if names else f'value {place + 1}'} {found}"
+        return ""
+    try:
+        numbers, right = as_numbers(answer), as_numbers(expected)
+    except (TypeError, ValueError) as error:
+        return f"it returns {error}, expected a tensor"
+    if numbers.shape != right.shape:
+        if numbers.numel() != 1 or right.numel() != 1:
+            return f"the shape is {tuple(numbers.shape)}, expected {tuple(right.shape)}"
+        numbers = numbers.view(right.shape)  # (1,) for () and the like
+    wrong = ~((numbers - right).abs() <= tolerance * max(largest(right), smallest))  # also of NaN
+    if not wrong.any():
+        return ""
+    index = tuple(wrong.nonzero()[0].tolist())
+    where = f"element {list(index)}" if index else "the value"
+    found, wanted = f"{numbers[index]:.6g}", f"{right[index]:.6g}"
+    if found == wanted:
+        return f"{where} is {abs(numbers[index] - right[index]):.2g} off the expected {wanted}"
+    return f"{where} is {found}, expected {wanted}"
+
+
+def relation(answer: Any, expected: Any, tolerance: float) -> str:
+    """Return a sentence where one simple change makes the answer right, else ""."""
+    try:
+        numbers, right = as_numbers(answer), as_numbers(expected)
+    except (TypeError, ValueError):
+        return ""
+    if not numbers.isfinite().all():
+        return "A number is NaN or infinite: what is divided by zero, or has no root?"
+    if right.ndim > 1 < numbers.ndim and not difference(numbers.mT, right, tolerance):
+        return "This is the transpose."
+    if numbers.shape != right.shape or not right.numel():
+        return ""
+    if right.ndim and not difference(numbers.flip(0), right, tolerance):
+        return "The order is reversed."
+    factor = float((numbers * right).sum() / right.square().sum().clamp_min(1e-300))
+    if abs(factor) < 1e-6 or difference(numbers / factor, right, tolerance):
+        return ""
+    if abs(factor + 1) < 1e-5:
+        return "The sign is the other one."
+    return f"All of it is {factor:.4g} times what it should be."

@@ -8,8 +8,8 @@ package are noticed, but whoever sets out to deceive Python itself will, so read
 
 from __future__ import annotations
 
-import importlib.util
 import json
+import runpy
 import signal
 import sys
 import time
@@ -45,7 +45,8 @@ def judge(
             report({"key": key})
         begin = time.perf_counter()
         try:
-            namespace = call(lambda p=path, n=namespace: _run(p, n), (), SECONDS)[0]
+            known = {name: value for name, value in namespace.items() if not name.startswith("__")}
+            namespace = call(lambda p=path, k=known: runpy.run_path(p, k), (), SECONDS)[0]
             function, failure = namespace.get(SUBMITTED), ""
         except (Stopped, NotImplementedError) as stop:
             function, failure = None, f"the cell {stop or 'is not written yet'}."
@@ -59,16 +60,6 @@ def judge(
             status, sentence = REFUSED, f"the notebook replaces {changed[0]} of the package."
         row = {"key": key, "status": status, "sentence": sentence, "hint": hint}
         report({**row, "seconds": round(time.perf_counter() - begin, 2)})
-
-
-def _run(path: str, namespace: dict[str, Any]) -> dict[str, Any]:
-    """Run a file with the names of the parts before it; return all names."""
-    specification = importlib.util.spec_from_file_location(Path(path).stem, path)
-    assert specification is not None and specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    vars(module).update({k: v for k, v in namespace.items() if not k.startswith("__")})
-    specification.loader.exec_module(module)
-    return vars(module)
 
 
 def _verdict(exercise: Exercise, function: Any, without_package: bool) -> tuple[str, str, str]:

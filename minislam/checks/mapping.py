@@ -248,11 +248,11 @@ def check_followed_pose(student: Function) -> Verdict:
         return true_pose(*a) @ se3_inverse(a[2])
 
     def unweighted(*a: Any) -> Tensor:
-        gaussians, camera, pose, image, weight, _ = a
+        gaussians, camera, start, image, weight, _ = a
+        settings = PoseRefinementConfig(iterations=30, tolerance=0.0)
         equal, black = torch.ones_like(weight), torch.zeros(3)
-        return refine_pose(gaussians, camera, pose, image, equal, black, settings)
+        return refine_pose(gaussians, camera, start, image, equal, black, settings)
 
-    settings = PoseRefinementConfig(iterations=30, tolerance=0.0)
     mistakes = [
         (lambda *a: a[2], "The pose has not moved: return exp(twist) times the first pose."),
         (lambda *a: se3_inverse(true_pose(*a)), "This is T_world_camera."),

@@ -97,9 +97,9 @@ def check_alignment(student: Function) -> Verdict:
         A[:3, 3] = truth.mean(0) - A[:3, :3] @ estimate.mean(0)
         return A
 
-    def reference(e: np.ndarray, t: np.ndarray, scale: float | None = None) -> np.ndarray:
+    def reference(e: np.ndarray, t: np.ndarray, scale: float = 0.0) -> np.ndarray:
         best = umeyama(e, t)
-        return matrix(best.scale if scale is None else scale, best.rotation, e, t)
+        return matrix(scale or best.scale, best.rotation, e, t)
 
     def mirrored(e: np.ndarray, t: np.ndarray) -> np.ndarray:
         u, d, v = np.linalg.svd((t - t.mean(0)).T @ (e - e.mean(0)))

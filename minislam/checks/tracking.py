@@ -1,8 +1,8 @@
 """Exercises of notebooks 06 and 06b."""
 
-from functools import partial
 from itertools import combinations
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -23,6 +23,11 @@ from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.robust import RobustKernel
 
 
+def any_twist(seed: int, turn: float) -> list[float]:
+    """Return a drawn motion (rho, phi) of about 0.1 units and `turn` radians about each axis."""
+    return (normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[turn] * 3)).tolist()
+
+
 def check_flow_distance(student: Function) -> Verdict:
     """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, beta) -> distance [px]."""
     pixels = CAMERA.pixel_grid(10, torch.float64).flatten(0, 1)
@@ -34,13 +39,14 @@ def check_flow_distance(student: Function) -> Verdict:
     def changed(length: Function, turned: bool = False) -> Function:
         """Return the distance with another mean of the flows (2, 2, N), both directions."""
 
-        def distance(poses: Tensor, d: Tensor, rays: Tensor, pixels: Tensor, *rest: Any) -> Tensor:
+        def distance(*a: Any) -> Tensor:
+            poses, disparities, rays, pixels, camera, beta = a
             whole = relative_transforms(poses, [0, 1], [1, 0])
             part = torch.eye(4, dtype=poses.dtype).repeat(2, 1, 1)
             kept = (slice(None), slice(3), slice(3) if turned else 3)
             part[kept] = whole[kept]
-            flows = [reproject(T, d, rays, rest[0])[0] - pixels.T for T in (whole, part)]
-            return rest[1] * length(flows[0]) + (1 - rest[1]) * length(flows[1])
+            flows = [reproject(T, disparities, rays, camera)[0] - pixels.T for T in (whole, part)]
+            return beta * length(flows[0]) + (1 - beta) * length(flows[1])
 
         return distance
 
@@ -48,15 +54,11 @@ def check_flow_distance(student: Function) -> Verdict:
         poses, rays = se3_exp(doubles([0.0] * 6, twist)), CAMERA.rays(pixels)
         return Case((poses, disparities, rays, pixels, CAMERA, beta), description)
 
-    def draw(seed: int) -> Case:
-        twist = normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[0.03] * 3)
-        return case(twist.tolist(), 0.3, "another motion, beta = 0.3")
-
     cases = [
         case([0.3, -0.1, 0.0, 0.0, 0.0, 0.0], 0.75, "a camera that slides"),
         case([0.0, 0.0, 0.0, 0.02, 0.1, 0.0], 0.75, "a camera that turns"),
         case([0.3, 0.1, 0.2, 0.02, -0.05, 0.03], 0.75, "a camera that does both"),
-        *drawn(draw),
+        *drawn(lambda seed: case(any_twist(seed, 0.03), 0.3, "another motion, beta = 0.3")),
     ]
     hints = [
         (lambda *a: reference(*a[:-1], 1.0), "The flow without rotation has the weight 1 - beta."),
@@ -205,24 +207,15 @@ def check_motion_memory(student: Function) -> Verdict:
     grid = Grid.of(CAMERA, 8)
     grid.rays = grid.rays.to(torch.get_default_dtype())
 
-    def reference(grid: Grid, matches: FlowMatches, *rest: Any, constants: Any = ()) -> Tensor:
-        known = {name: getattr(motion_memory, name) for name, _ in constants}
-        try:
-            vars(motion_memory).update(constants)
-            weight = motion_memory.update_motion_weight(grid, matches, *rest)
-            return motion_memory.inherit_motion_weight(grid, matches, weight)
-        finally:
-            vars(motion_memory).update(known)
-
-    def change(*constants: tuple[str, float]) -> Function:
-        return partial(reference, constants=constants)
+    def reference(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
+        weight = motion_memory.update_motion_weight(grid, matches, *rest)
+        return motion_memory.inherit_motion_weight(grid, matches, weight)
 
     def zeros_left(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
-        rows, columns = (matches.targets[0] / grid.stride).round().long().flip(0)
+        cells = (matches.targets[0] / grid.stride).round().long().flip(0)
+        inside = (cells >= 0).all(0) & (cells < torch.tensor(grid.shape)[:, None]).all(0)
         filled = torch.zeros(grid.shape)
-        for row, column, sure in zip(rows, columns, matches.confidences[0, 0], strict=True):
-            if 0 <= column < grid.shape[1] and 0 <= row < grid.shape[0] and sure > 0.1:
-                filled[row, column] = 1
+        filled[tuple(cells[:, inside & (matches.confidences[0, 0] > 0.1)])] = 1
         return reference(grid, matches, *rest) * filled.flatten()
 
     def case(twist: list[float], aside: float, sure: float, what: str, seed: int = 3) -> Case:
@@ -234,22 +227,21 @@ def check_motion_memory(student: Function) -> Verdict:
         matches = FlowMatches(flow, confidences, torch.ones(1))
         return Case((grid, matches, disparities, motion, random[3], 2.0), what)
 
-    def draw(seed: int) -> Case:
-        twist = normals(seed, 6).clamp(-2, 2) * doubles(*[0.1] * 3, *[0.025] * 3)
-        return case(twist.tolist(), 6.0, 0.8, "a drawn motion", seed)
-
     cases = [
         case([0.0] * 6, 3.0, 1.0, "a camera that stands still"),
         case([0.5, 0.1, 0.0, 0.0, 0.02, 0.0], 5.0, 1.0, "a camera that moves"),
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
-        *drawn(draw),
+        *drawn(lambda seed: case(any_twist(seed, 0.025), 6.0, 0.8, "a drawn motion", seed)),
     ]
+    constants: dict[str, dict[str, Any]] = {
+        "It falls fast and recovers slowly.": {"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9},
+        "The rate is 0.9 only where the weight falls.": {"RECOVERY_RATE": 0.9},
+        "c_m^2 also holds a hundredth of the squared parallax.": {"DEPTH_ERROR": 0.0},
+        "Cells with a confidence of at most 0.1 say nothing.": {"MIN_CONFIDENCE": -1.0},
+    }
     handed_on = "These are the weights of the source cells: hand them on along the flow."
     hints = [
-        (change(("LOSS_RATE", 0.1), ("RECOVERY_RATE", 0.9)), "It falls fast and recovers slowly."),
-        (change(("RECOVERY_RATE", 0.9)), "The rate is 0.9 only where the weight falls."),
-        (change(("DEPTH_ERROR", 0.0)), "c_m^2 also holds a hundredth of the squared parallax."),
-        (change(("MIN_CONFIDENCE", -1.0)), "Cells with a confidence of at most 0.1 say nothing."),
+        *((patch.multiple(motion_memory, **c)(reference), hint) for hint, c in constants.items()),
         (motion_memory.update_motion_weight, handed_on),
         (zeros_left, "A cell to which nothing flows takes the weight of the nearest one."),
     ]

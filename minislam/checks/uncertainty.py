@@ -73,8 +73,8 @@ def check_feature_variance(student: Function) -> Verdict:
     config = UncertaintyConfig()
 
     def masked(beta: Tensor, near: Tensor, lost: int = 0) -> Tensor:
-        mean, count = near @ beta / near.sum(1), near.sum(1)
-        squares = (beta[None] - mean[:, None]) ** 2
+        count = near.sum(1)
+        squares = (beta - (near @ beta / count)[:, None]) ** 2
         return (near * squares).sum(1) / (count - lost).clamp_min(lost)
 
     def near(features: Tensor) -> Tensor:
