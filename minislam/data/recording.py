@@ -1,14 +1,12 @@
-"""What lies in a recording, before any frame is chosen or resized, and the truth beside it."""
+"""What lies in a recording, before any frame is chosen or resized."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from minislam.data.calibration import Calibration
-from minislam.data.images import list_images, read_color, read_mask
-from minislam.data.preparation import ImagePreparation
+from minislam.data.images import list_images
 from minislam.data.sources import FileImages, ImageSource
 from minislam.errors import InputError
 from minislam.records import Trajectory
@@ -44,47 +42,6 @@ class Recording:
         return self.trajectory is not None or any(view is not None for view in views)
 
 
-def path_of(paths: list[Path | None], index: int) -> Path | None:
-    """Return the file that belongs to an image; see `Recording` for the lists."""
-    return paths[index] if paths else None
-
-
-class RecordedTruth:
-    """The ground truth of a recording, which the system must not see: a `GroundTruth`."""
-
-    def __init__(
-        self,
-        recording: Recording,
-        prepare: ImagePreparation,
-        source_index: Callable[[int], int],  # of a frame: its position in the recording
-        sensor_depth: Callable[[int], np.ndarray | None],  # of a frame
-    ) -> None:
-        self.trajectory = recording.trajectory
-        self._recording = recording
-        self._prepare = prepare
-        self._source_index = source_index
-        self._sensor_depth = sensor_depth
-
-    def moving_mask(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) bool, True where a dynamic object is seen."""
-        path = path_of(self._recording.mask_paths, self._source_index(frame_index))
-        return None if path is None else self._prepare.nearest(read_mask(path), str(path))
-
-    def static_image(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
-        path = path_of(self._recording.static_paths, self._source_index(frame_index))
-        return None if path is None else self._prepare.color(read_color(path), str(path))
-
-    def depth(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
-        return self._sensor_depth(frame_index)
-
-    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
-        views = self._recording.novel_views
-        return [(pose, self._prepare.color(read_color(path), str(path))) for pose, path in views]
-
-
 def mask_files(images: ImageSource, masks: str, chosen: range) -> list[Path | None]:
     """Return the mask of each image in files:FOLDER: of the image's name, or of its number."""
     folder = Path(masks.removeprefix(FILES)).expanduser()
@@ -97,7 +54,7 @@ def mask_files(images: ImageSource, masks: str, chosen: range) -> list[Path | No
     found = [numbered.get(index) for index in range(len(images))]
     if isinstance(images, FileImages) and any(path.stem in files for path in images.paths):
         found = [files.get(path.stem) for path in images.paths]
-    missing = [images.label(index) for index in chosen if found[index] is None]
+    missing = [images.labels[index] for index in chosen if found[index] is None]
     if missing:
         raise InputError(
             f"expected a mask of every frame in {folder}, found none for {len(missing)} of "

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from zlib import crc32
 
@@ -10,11 +11,10 @@ import torch
 
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.folder import read_image_folder, read_video
-from minislam.data.images import read_depth, read_mask
-from minislam.data.kept_images import KeptImages
+from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
-from minislam.data.preparation import ImagePreparation
-from minislam.data.recording import RecordedTruth, Recording, mask_files, path_of
+from minislam.data.preparation import ImagePreparation, KeptImages
+from minislam.data.recording import Recording, mask_files
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.geometry import Camera
@@ -104,9 +104,7 @@ class RecordedSequence:
         self.description = f"{recording.kind}: {', '.join(parts)}"
         self.ground_truth: GroundTruth | None = None
         if recording.has_truth():
-            self.ground_truth = RecordedTruth(
-                recording, self._prepare, self.source_index, self.sensor_depth
-            )
+            self.ground_truth = RecordedTruth(self, recording, self._prepare)
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -121,7 +119,7 @@ class RecordedSequence:
         def prepare() -> np.ndarray:
             raw = self._recording.images.read(index)
             self.checksums[frame_index] = crc32(raw.tobytes())
-            return self._prepare.pixels(raw, self._recording.images.label(index))
+            return self._prepare.pixels(raw, self._recording.images.labels[index])
 
         pixels = torch.from_numpy(self._kept.get(frame_index, prepare))
         return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
@@ -130,7 +128,7 @@ class RecordedSequence:
         """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""
         index = self.source_index(frame_index)
         images = self._recording.images
-        return self._prepare.full_color(images.read(index), images.label(index))
+        return self._prepare.full_color(images.read(index), images.labels[index])
 
     def full_camera(self, camera: Camera) -> Camera:
         """Return the camera of `full_image` from that of the working images."""
@@ -144,19 +142,60 @@ class RecordedSequence:
 
     def source_name(self, frame_index: int) -> str:
         """Return the name of a frame's image file, or of its video with the number in it."""
-        return self._recording.images.name(self.source_index(frame_index))
+        return self._recording.images.names[self.source_index(frame_index)]
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
-        path = path_of(self._masks, self.source_index(frame_index))
-        return None if path is None else self._prepare.nearest(read_mask(path), str(path))
+        return self.picture(self._masks, frame_index, read_mask, self._prepare.nearest)
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        path = path_of(self._recording.depth_paths, self.source_index(frame_index))
-        if path is None:
-            return None
-        return self._prepare.nearest(read_depth(path, self.depth_scale), str(path))
+        paths, read = (
+            self._recording.depth_paths,
+            partial(read_depth, units_per_metre=self.depth_scale),
+        )
+        return self.picture(paths, frame_index, read, self._prepare.nearest)
+
+    def picture(
+        self,
+        paths: list[Path | None],  # as in `Recording`
+        frame_index: int,
+        read: Callable[[Path], np.ndarray],
+        prepare: Callable[[np.ndarray, str], np.ndarray],
+    ) -> np.ndarray | None:
+        """Return what is in the file that belongs to a frame, None if there is no such file."""
+        index = self.source_index(frame_index)
+        path = paths[index] if paths else None
+        return None if path is None else prepare(read(path), str(path))
+
+
+class RecordedTruth:
+    """The ground truth of a recording, which the system must not see: a `GroundTruth`."""
+
+    def __init__(
+        self, sequence: RecordedSequence, recording: Recording, prepare: ImagePreparation
+    ) -> None:
+        self.trajectory = recording.trajectory
+        self._sequence, self._recording, self._prepare = sequence, recording, prepare
+
+    def moving_mask(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) bool, True where a dynamic object is seen."""
+        paths, prepare = self._recording.mask_paths, self._prepare.nearest
+        return self._sequence.picture(paths, frame_index, read_mask, prepare)
+
+    def static_image(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
+        paths, prepare = self._recording.static_paths, self._prepare.color
+        return self._sequence.picture(paths, frame_index, read_color, prepare)
+
+    def depth(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
+        return self._sequence.sensor_depth(frame_index)
+
+    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
+        views = self._recording.novel_views
+        return [(pose, self._prepare.color(read_color(path), str(path))) for pose, path in views]
 
 
 def _calibration(
@@ -167,21 +206,26 @@ def _calibration(
     The options come before files, files before known cameras, known cameras before what the
     camera noted in its files, that before the guess.
     """
-    found = read_calibration(Path(options.calibration)) if options.calibration else None
-    found = found or recording.calibration
+    found = recording.calibration
+    if options.calibration:
+        found = read_calibration(Path(options.calibration))
     calibration = found or rough_calibration(width, height, recording.noted_focal_length)
     fy = options.fx if options.fy is None else options.fy
     given = {"fx": options.fx, "fy": fy, "cx": options.cx, "cy": options.cy}
     given = {name: value for name, value in given.items() if value is not None}
-    if given:
-        scaled = calibration.camera_for(width, height)
-        base = {name: getattr(scaled, name) for name in ("fx", "fy", "cx", "cy")}
-        origin = f"{' '.join(given)} given, {calibration.origin}"
-        if found is None and options.fx is not None:
-            origin = "intrinsics given"
-        calibration = replace(calibration, **(base | given), size=(width, height), origin=origin)
-        calibration = replace(calibration, is_rough=calibration.is_rough and options.fx is None)
-    return calibration
+    if not given:
+        return calibration
+    camera = calibration.camera_for(width, height)
+    origin = f"{' '.join(given)} given, {calibration.origin}"
+    if found is None and options.fx is not None:
+        origin = "intrinsics given"
+    return replace(
+        calibration,
+        **{name: given.get(name, getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")},
+        size=(width, height),
+        origin=origin,
+        is_rough=calibration.is_rough and options.fx is None,
+    )
 
 
 def _open_synthetic(

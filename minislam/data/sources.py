@@ -1,6 +1,5 @@
 """Sources of raw images: files in a folder, or a video."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,11 +14,13 @@ _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looke
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
 
-@dataclass
 class FileImages:
     """Images that are files."""
 
-    paths: list[Path]
+    def __init__(self, paths: list[Path]) -> None:
+        self.paths = paths
+        self.labels = [str(path) for path in paths]  # how to call the images in a message
+        self.names = [path.name for path in paths]
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -27,14 +28,6 @@ class FileImages:
     def read(self, index: int) -> np.ndarray:
         """Return a raw image (H, W, 3) uint8 RGB."""
         return read_color(self.paths[index])
-
-    def label(self, index: int) -> str:
-        """Return the path of an image."""
-        return str(self.paths[index])
-
-    def name(self, index: int) -> str:
-        """Return the name of the file."""
-        return self.paths[index].name
 
 
 class VideoImages:
@@ -61,6 +54,8 @@ class VideoImages:
                 self._calls.append(self._grabbed)
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
+        self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
+        self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]
         self._rewind()
 
     def __len__(self) -> int:
@@ -78,14 +73,6 @@ class VideoImages:
             self._grabbed += 1
         _, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-    def label(self, index: int) -> str:
-        """Return how to call this frame in a message."""
-        return f"frame {index} of {self.path}"
-
-    def name(self, index: int) -> str:
-        """Return the name of the video with the number of the frame."""
-        return f"{self.path.stem}_{index:06d}"
 
     def lost(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing: gaps of a constant rate, or calls that failed."""
