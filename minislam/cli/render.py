@@ -39,7 +39,7 @@ def add_render_parser(commands: argparse._SubParsersAction[argparse.ArgumentPars
 
 
 def _render(args: argparse.Namespace) -> int:
-    from minislam.data.animation import write_animation
+    from minislam.data.images import write_animation
     from minislam.data.options import MINIMUM_SIDE
     from minislam.parameters import require_bounds
     from minislam.runs import flythrough

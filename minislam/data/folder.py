@@ -9,8 +9,7 @@ import numpy as np
 from minislam.data.calibration import Calibration, read_calibration
 from minislam.data.images import is_image, list_images
 from minislam.data.metadata import noted_focal_length
-from minislam.data.recording import Recording
-from minislam.data.sources import ASSUMED_FRAME_RATE, FileImages, VideoImages
+from minislam.data.sources import ASSUMED_FRAME_RATE, FileImages, Recording, VideoImages
 from minislam.errors import InputError
 
 _IMAGE_FOLDERS = ("images", "rgb")

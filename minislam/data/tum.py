@@ -1,4 +1,4 @@
-"""TUM RGB-D folders, and the ground truth that synthetic sequences add to them."""
+"""TUM RGB-D folders, their known cameras, and the truth that synthetic sequences add to them."""
 
 import os
 import re
@@ -10,14 +10,42 @@ from minislam.data.calibration import Calibration
 from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
 from minislam.data.folder import calibration_beside, folder_name, stamps_of_names
 from minislam.data.images import list_images, read_color
-from minislam.data.known_cameras import bonn_camera_trajectory, is_bonn, known_camera
-from minislam.data.recording import Recording
-from minislam.data.sources import FileImages
+from minislam.data.sources import FileImages, Recording
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
+from minislam.geometry import BrownDistortion
+from minislam.records import Trajectory
 
 _TRUTH_NAMES = ("groundtruth.txt", "pose.txt")  # TUM and Bonn; Wild-SLAM
 _DEPTH_MAX_DIFFERENCE = 0.02  # second between a colour and its depth image, as TUM's associate.py
+
+_TUM_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)[_ -]?([123])(?!\d)", re.IGNORECASE)
+_BONN_NAME = re.compile(r"(?<![a-z])rgbd_bonn(?![a-z])", re.IGNORECASE)
+
+# Intrinsics of images of 640x480 px, given by the makers of the TUM RGB-D benchmark (Sturm et al.,
+# IROS 2012) and of the Bonn RGB-D Dynamic Dataset (Palazzolo et al., IROS 2019).
+_INTRINSICS = {
+    "TUM fr1": (517.3, 516.5, 318.6, 255.3),
+    "TUM fr2": (520.9, 521.0, 325.1, 249.7),
+    "TUM fr3": (535.4, 539.2, 320.1, 247.6),
+    "Bonn": (542.822841, 542.576870, 315.593520, 237.756098),
+}
+_DISTORTIONS = {
+    "TUM fr1": BrownDistortion(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "TUM fr2": BrownDistortion(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "TUM fr3": BrownDistortion(),
+    "Bonn": BrownDistortion(0.039903, -0.099343, -0.000730, -0.000144),
+}
+
+# Bonn's ground truth is the pose of a plate of markers in the axes of ROS. The makers give the
+# camera in the frame of the plate; its block is a rotation only up to a few per cent.
+_BONN_T_marker_camera = np.array([
+    [ 1.0157,  0.1828, -0.2389,  0.0113],
+    [ 0.0009, -0.8431, -0.6413, -0.0098],
+    [-0.3009,  0.6147, -0.8085,  0.0111],
+    [ 0.0,     0.0,     0.0,     1.0   ],
+])  # fmt: skip
+_BONN_T_ros = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def is_tum_folder(folder: Path) -> bool:
@@ -36,7 +64,7 @@ def read_tum_folder(folder: Path) -> Recording:
     depth_stamps, depths = _images(folder, "depth")
     truth_path = next((folder / name for name in _TRUTH_NAMES if (folder / name).is_file()), None)
     trajectory = read_trajectory(truth_path) if truth_path else None
-    if trajectory is not None and is_bonn(folder.resolve().name):
+    if trajectory is not None and _BONN_NAME.search(folder.resolve().name):
         trajectory = bonn_camera_trajectory(trajectory)
     notes = [f"{len(depths)} depth"] if depths else []
     if trajectory is not None:
@@ -113,6 +141,25 @@ def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
     found = next(filter(None, map(known_camera, notes)), None)
     height, width = read_color(image).shape[:2]
     return found if found is not None and found.fits(width, height) else None
+
+
+def known_camera(text: str) -> Calibration | None:
+    """Return the intrinsics of the camera that a text names: freiburg1, fr3, rgbd_bonn."""
+    tum = _TUM_NAME.search(text)
+    name = f"TUM fr{tum[1]}" if tum else "Bonn"
+    if not tum and not _BONN_NAME.search(text):
+        return None
+    size, origin = (640, 480), f"{name} intrinsics"
+    return Calibration(*_INTRINSICS[name], size, _DISTORTIONS[name], origin)
+
+
+def bonn_camera_trajectory(markers: Trajectory) -> Trajectory:
+    """Return the camera's poses from the published poses of Bonn's marker plate."""
+    poses = _BONN_T_ros @ markers.T_world_camera @ _BONN_T_ros @ _BONN_T_marker_camera
+    # The nearest rotation to each block: what follows relies on poses being rigid.
+    u, _, v_transposed = np.linalg.svd(poses[:, :3, :3])
+    poses[:, :3, :3] = u @ v_transposed
+    return Trajectory(markers.timestamps, poses)
 
 
 def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[Path | None]:
