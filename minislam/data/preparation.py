@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from typing import IO
 
@@ -175,12 +176,10 @@ class KeptImages:
             return image
         image = prepare()
         self._shape = image.shape
-        try:
+        with suppress(OSError):  # the image is prepared again next time
             self._file = self._file or tempfile.TemporaryFile()
             self._file.seek(len(self._slots) * image.nbytes)
             self._file.write(image.tobytes())
             self._file.flush()
             self._slots[number] = len(self._slots)
-        except OSError:  # the image is prepared again next time
-            pass
         return image

@@ -10,11 +10,10 @@ import numpy as np
 import torch
 
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
-from minislam.data.folder import read_image_folder, read_video
 from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
 from minislam.data.preparation import ImagePreparation, KeptImages
-from minislam.data.sources import Recording, mask_files
+from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.geometry import Camera

@@ -8,9 +8,14 @@ import numpy as np
 
 from minislam.data.calibration import Calibration
 from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
-from minislam.data.folder import calibration_beside, folder_name, stamps_of_names
 from minislam.data.images import list_images, read_color
-from minislam.data.sources import FileImages, Recording
+from minislam.data.sources import (
+    FileImages,
+    Recording,
+    calibration_beside,
+    folder_name,
+    stamps_of_names,
+)
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion
@@ -85,15 +90,15 @@ def read_tum_folder(folder: Path) -> Recording:
     )
 
 
-def parse_image_list(text: str, name: str) -> tuple[np.ndarray, list[str]]:
-    """Parse lines of `timestamp filename`; `name` goes into the errors.
-
-    Returns the timestamps (N,) in seconds and the N file names.
-    """
+def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
+    """Return timestamps and paths of the images in `kind`.txt, or else in the folder `kind`."""
+    list_path = folder / f"{kind}.txt"
+    if not list_path.is_file():
+        paths = list_images(folder / kind) if (folder / kind).is_dir() else []
+        return (stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
     stamps: list[float] = []
-    names: list[str] = []
-    for number, row in data_rows(text):
-        where = f"line {number} of {name}"
+    paths = []
+    for where, row in data_rows(read_text(list_path), str(list_path)):
         fields = row.split(maxsplit=1)
         if len(fields) != 2:
             raise InputError(
@@ -106,25 +111,14 @@ def parse_image_list(text: str, name: str) -> tuple[np.ndarray, list[str]]:
                 f"{where}; sort the list and remove double entries"
             )
         stamps.append(stamp)
-        names.append(fields[1])
-    return np.array(stamps), names
-
-
-def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
-    """Return timestamps and paths of the images in `kind`.txt, or else in the folder `kind`."""
-    list_path = folder / f"{kind}.txt"
-    if not list_path.is_file():
-        paths = list_images(folder / kind) if (folder / kind).is_dir() else []
-        return (stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
-    stamps, names = parse_image_list(read_text(list_path), str(list_path))
-    paths = [folder / name for name in names]
+        paths.append(folder / fields[1])
     missing = next((path for path in paths if not os.path.isfile(path)), None)
     if missing is not None:
         raise InputError(
             f"expected all images of {list_path}, but {missing} does not exist; complete the "
             "folder or remove the line"
         )
-    return stamps, paths
+    return np.array(stamps), paths
 
 
 def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
