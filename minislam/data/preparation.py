@@ -31,15 +31,14 @@ class ImagePreparation:
         size: tuple[int, int] | None,  # (width, height) px of the working image, None: choose
         pixels: int,  # about width * height of the working image when it is chosen
     ) -> None:
-        self.raw_camera, self.distortion = raw_camera, distortion
-        self.raw_size = (raw_camera.width, raw_camera.height)
-        if min(self.raw_size) < MINIMUM_SIDE:
+        self._raw_size = (raw_camera.width, raw_camera.height)
+        if min(self._raw_size) < MINIMUM_SIDE:
             raise InputError(
                 f"expected images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px, found "
                 f"{raw_camera.width}x{raw_camera.height}; use larger images"
             )
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
-        self._window = (0, 0, *self.raw_size)
+        self._window = (0, 0, *self._raw_size)
         if np.any(distortion.coefficients):
             self._maps = distortion.undistortion_maps(raw_camera)
             self._window = seen_window(*self._maps)
@@ -57,12 +56,9 @@ class ImagePreparation:
             .resized(*self._resized)
             .cropped(*self._crop, width, height)
         )
-
-    def steps(self) -> dict[str, object]:
-        """Return how raw images become working images, in order, in pixels."""
-        return {
-            "raw_camera": asdict(self.raw_camera),
-            "distortion": asdict(self.distortion),
+        self.steps: dict[str, object] = {  # from raw to working images, in order, in pixels
+            "raw_camera": asdict(raw_camera),
+            "distortion": asdict(distortion),
             "window": self._window,  # left, top, width, height of the undistorted image
             "resized": self._resized,  # width, height
             "crop": self._crop,  # left, top
@@ -100,7 +96,7 @@ class ImagePreparation:
         return np.ascontiguousarray(self._cropped(image[rows][:, columns])).astype(raw.dtype)
 
     def _undistorted(self, raw: np.ndarray, label: str, interpolation: int) -> np.ndarray:
-        width, height = self.raw_size
+        width, height = self._raw_size
         if raw.shape[:2] != (height, width):
             raise InputError(
                 f"expected images of one size, {width}x{height} as the first, found "

@@ -17,19 +17,17 @@ from minislam.data.sources import Recording, mask_files, read_image_folder, read
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.records import Frame, GroundTruth
+from minislam.records import Frame, GroundTruth, Progress
 
 _SYNTHETIC_SIZE = (320, 240)  # px
 
 
 def open_sequence(
-    source: str,
-    options: InputOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,  # (done, of all) while rendering synth:
+    source: str, options: InputOptions | None = None, progress: Progress | None = None
 ) -> "RecordedSequence":
     """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED][?phone]`.
 
-    A folder is recognised by its content, not by its name.
+    A folder is recognised by its content. `progress` is called while a scene is rendered.
     """
     options = options or InputOptions()
     require_source(source)
@@ -40,8 +38,9 @@ def open_sequence(
         last = None
         if options.max_frames is not None:
             last = options.start + options.stride * (options.max_frames - 1) + 1
-        return RecordedSequence(read_video(path, last), options, source)
-    recording = read_tum_folder(path) if is_tum_folder(path) else read_image_folder(path)
+        recording = read_video(path, last)
+    else:
+        recording = read_tum_folder(path) if is_tum_folder(path) else read_image_folder(path)
     return RecordedSequence(recording, options, source)
 
 
@@ -51,7 +50,7 @@ class RecordedSequence:
     def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
         self._recording = recording
         self.depth_scale = options.depth_scale
-        if not source.startswith("synth:"):  # so that it is found again from any folder
+        if not source.startswith(SYNTHETIC):  # so that it is found again from any folder
             source = str(Path(source).expanduser().absolute())
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
@@ -76,17 +75,14 @@ class RecordedSequence:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
         height, width = recording.images.read(self._chosen[0]).shape[:2]
         calibration = _calibration(recording, options, width, height)
-        raw_camera = calibration.camera_for(width, height)
-        self._prepare = ImagePreparation(
-            raw_camera, calibration.distortion, options.size, options.pixels
-        )
+        camera, distortion = calibration.camera_for(width, height), calibration.distortion
+        self._prepare = ImagePreparation(camera, distortion, options.size, options.pixels)
         self.name = recording.name
         self.camera = self._prepare.camera
-        self.preparation = self._prepare.steps()
+        self.preparation = self._prepare.steps
         self.warnings = list(recording.warnings)
-        self.refines_focal = options.focal == "refine"
-        if options.focal == "auto":
-            self.refines_focal = calibration.is_rough
+        refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
+        self.refines_focal = refines[options.focal]
         if calibration.is_rough and not self.refines_focal:
             self.warnings.append(
                 f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}, for "
@@ -101,9 +97,8 @@ class RecordedSequence:
         if self.refines_focal:
             parts.append("focal length to be refined")
         self.description = f"{recording.kind}: {', '.join(parts)}"
-        self.ground_truth: GroundTruth | None = None
-        if recording.has_truth():
-            self.ground_truth = RecordedTruth(self, recording, self._prepare)
+        truth = RecordedTruth(self, recording, self._prepare)
+        self.ground_truth: GroundTruth | None = truth if recording.has_truth() else None
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -228,7 +223,7 @@ def _calibration(
 
 
 def _open_synthetic(
-    source: str, options: InputOptions, progress: Callable[[int, int], None] | None
+    source: str, options: InputOptions, progress: Progress | None
 ) -> RecordedSequence:
     """Render a synthetic sequence, or take it from the cache, and open it."""
     import data_synth  # only here: real footage needs no scene generator

@@ -18,8 +18,7 @@ FILES = "files:"  # before the name of a folder
 _IMAGE_FOLDERS = ("images", "rgb")
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
-# Assumed when neither the file names nor the container state the frame rate.
-_ASSUMED_FRAME_RATE = 30.0  # frames per second
+_ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
@@ -186,15 +185,11 @@ def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
 
     Names that are all numbers are the timestamps; otherwise the images are counted.
     """
-    names = [path.stem for path in paths]
-    if not all(re.fullmatch(r"\d+(\.\d+)?", name, re.ASCII) for name in names):
-        return (
-            np.arange(len(names)) / _ASSUMED_FRAME_RATE,
-            f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second",
-        )
-    stamps = np.array([float(name) for name in names])
-    same = np.flatnonzero(~(np.diff(stamps) > 0))
-    if len(same):
+    if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
+        note = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
+        return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, note
+    stamps = np.array([float(path.stem) for path in paths])
+    if len(same := np.flatnonzero(~(np.diff(stamps) > 0))):
         first, second = paths[same[0]], paths[same[0] + 1]
         raise InputError(
             f"expected file names that are increasing timestamps, found {first.name} and "
@@ -217,11 +212,9 @@ def folder_name(path: Path) -> str:
 def _hint(folder: Path) -> str:
     """Say what the user may have meant: often the video or data set lies one level deeper."""
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    videos = [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]
-    if videos:
+    if videos := [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]:
         return f"give the video itself, {videos[0]}"
-    folders = [path for path in entries if path.is_dir()]
-    if folders:
+    if folders := [path for path in entries if path.is_dir()]:
         return f"perhaps you mean {folders[0]}"
     return "give a folder that holds images, a video file, or synth:NAME"
 
@@ -238,8 +231,7 @@ def mask_files(images: ImageSource, masks: str, chosen: range) -> list[Path | No
     found = [numbered.get(index) for index in range(len(images))]
     if isinstance(images, FileImages) and any(path.stem in files for path in images.paths):
         found = [files.get(path.stem) for path in images.paths]
-    missing = [images.labels[index] for index in chosen if found[index] is None]
-    if missing:
+    if missing := [images.labels[index] for index in chosen if found[index] is None]:
         raise InputError(
             f"expected a mask of every frame in {folder}, found none for {len(missing)} of "
             f"{len(chosen)}, such as {missing[0]}; name them like the images or by number from 0, "

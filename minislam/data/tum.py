@@ -6,16 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from minislam.data import sources
 from minislam.data.calibration import Calibration
 from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
 from minislam.data.images import list_images, read_color
-from minislam.data.sources import (
-    FileImages,
-    Recording,
-    calibration_beside,
-    folder_name,
-    stamps_of_names,
-)
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion
@@ -61,26 +55,27 @@ def is_tum_folder(folder: Path) -> bool:
     return bool(images) and all(re.fullmatch(r"\d+\.\d+", path.stem) for path in images)
 
 
-def read_tum_folder(folder: Path) -> Recording:
+def read_tum_folder(folder: Path) -> sources.Recording:
     """Read a TUM RGB-D folder; everything but the colour images is optional."""
     stamps, paths = _images(folder, "rgb")
     if len(paths) == 0:
         raise InputError(f"expected images in {folder}/rgb.txt, found none; check the list")
     depth_stamps, depths = _images(folder, "depth")
     truth_path = next((folder / name for name in _TRUTH_NAMES if (folder / name).is_file()), None)
-    trajectory = read_trajectory(truth_path) if truth_path else None
-    if trajectory is not None and _BONN_NAME.search(folder.resolve().name):
-        trajectory = bonn_camera_trajectory(trajectory)
+    trajectory = None
     notes = [f"{len(depths)} depth"] if depths else []
-    if trajectory is not None:
+    if truth_path is not None:
+        trajectory = read_trajectory(truth_path)
+        if _BONN_NAME.search(folder.resolve().name):
+            trajectory = bonn_camera_trajectory(trajectory)
         seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
         notes.append(f"ground truth {seconds:.3g} s")
-    return Recording(
-        name=folder_name(folder),
+    return sources.Recording(
+        name=sources.folder_name(folder),
         kind="TUM RGB-D folder",
-        images=FileImages(paths),
+        images=sources.FileImages(paths),
         timestamps=stamps,
-        calibration=calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
+        calibration=sources.calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
         trajectory=trajectory,
         depth_paths=_nearest(stamps, depth_stamps, depths),
         mask_paths=_beside(folder / "masks", paths),
@@ -95,7 +90,7 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
     list_path = folder / f"{kind}.txt"
     if not list_path.is_file():
         paths = list_images(folder / kind) if (folder / kind).is_dir() else []
-        return (stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
+        return (sources.stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
     stamps: list[float] = []
     paths = []
     for where, row in data_rows(read_text(list_path), str(list_path)):
@@ -160,9 +155,8 @@ def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[
     """Return for each timestamp the path whose own timestamp is nearest, None if none is near."""
     if len(others) == 0:
         return [None] * len(stamps)
-    after = np.searchsorted(others, stamps).clip(1, max(len(others) - 1, 1))
-    before = after - 1
-    after = after.clip(max=len(others) - 1)
+    after = np.searchsorted(others, stamps).clip(max=len(others) - 1)
+    before = (after - 1).clip(0)
     nearest = np.where(stamps - others[before] <= others[after] - stamps, before, after)
     near = np.abs(others[nearest] - stamps) <= _DEPTH_MAX_DIFFERENCE
     return [paths[index] if ok else None for index, ok in zip(nearest, near, strict=True)]
