@@ -58,24 +58,19 @@ def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
     try:
         with np.load(content, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        tree = json.loads(arrays.pop(_TREE).tobytes())
         tensors: dict[str, Tensor] = {}
 
-        def whole(value: Any) -> Any:
-            if isinstance(value, list):
-                return [whole(item) for item in value]
-            if not isinstance(value, dict):
-                return value
+        def whole(value: dict[str, Any]) -> Any:
             if _ARRAY in value:
                 return arrays[value[_ARRAY]]
             if _TENSOR not in value:
-                return {key: whole(item) for key, item in value.items()}
+                return value
             name, *layout = value[_TENSOR]
             if name not in tensors:
                 tensors[name] = _strided(arrays[name], gpu, *layout)
             return tensors[name]
 
-        return whole(tree)
+        return json.loads(arrays.pop(_TREE).tobytes(), object_hook=whole)
     except Exception as error:  # damaged bytes fail inside zipfile and numpy in many ways
         raise InputError(
             f"expected a checkpoint in {path}, but the file cannot be read; it is damaged or from "

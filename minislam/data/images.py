@@ -93,10 +93,9 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
     encoders = {".webm": _write_webm, ".webp": _write_webp}
     if kind not in encoders:
         raise InputError(f"expected a file that ends in .webm or .webp, found {kind or 'neither'}")
-    frames = map(_bgr, images)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"animation{kind}"
-        encoders[kind](file, frames, rate)
+        encoders[kind](file, map(_bgr, images), rate)
         if not file.is_file() or not (content := file.read_bytes()):
             raise InputError(
                 f"expected this OpenCV ({cv2.__version__}) to write {kind}, but it does not; "
@@ -132,13 +131,12 @@ def _bgr(image: np.ndarray) -> np.ndarray:
 
 
 def _decode(path: Path, mode: int) -> np.ndarray:
-    content, decoded = read_bytes(path), None
-    if _is_complete(content):
-        decoded, said = _decoded(content, mode)
-        if b"extraneous" in said:  # cameras pad some files so, and damage looks like it, too
-            warnings.warn(f"{path} may be damaged: {said.decode().strip()}", stacklevel=1)
-        elif said:
-            decoded = None  # libjpeg has filled the rest with grey
+    content = read_bytes(path)
+    decoded, said = _decoded(content, mode) if _is_complete(content) else (None, b"")
+    if b"extraneous" in said:  # cameras pad some files so, and damage looks like it, too
+        warnings.warn(f"{path} may be damaged: {said.decode().strip()}", stacklevel=1)
+    elif said:
+        decoded = None  # libjpeg has filled the rest with grey
     if decoded is not None:
         return decoded
     raise InputError(

@@ -113,15 +113,14 @@ def read_ply(path: Path | str) -> GaussianArrays:
 def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
     """Return the number of Gaussians, the property names and where the values start."""
     end = content.find(b"end_header\n", 0, _MAX_HEADER)
-    lines = content[: max(end, 0)].decode("ascii", errors="replace").splitlines()
-    lines = [line for line in lines if not line.startswith(("comment", "obj_info"))]
+    header = content[: max(end, 0)].decode("ascii", errors="replace").splitlines()
+    lines = [line for line in header if not line.startswith(("comment", "obj_info"))]
     if lines[:2] != _FORMAT or len(lines) < 3:
         raise InputError(
             f"expected a binary little-endian PLY file with Gaussians, found another kind of file "
             f"in {name}; give a map.ply"
         )
-    element = lines[2].split()
-    fields = [line.split() for line in lines[3:]]
+    element, *fields = [line.split() for line in lines[2:]]
     plain = all(len(field) == 3 and field[:2] == ["property", "float"] for field in fields)
     names = [field[2] for field in fields] if plain else []
     missing = sorted(set(PROPERTIES) - {"nx", "ny", "nz"} - set(names))

@@ -76,10 +76,10 @@ class RecordedSequence:
         height, width = recording.images.read(self._chosen[0]).shape[:2]
         calibration = _calibration(recording, options, width, height)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
-        self._prepare = ImagePreparation(camera, distortion, options.size, options.pixels)
+        self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels)
         self.name = recording.name
-        self.camera = self._prepare.camera
-        self.preparation = self._prepare.steps
+        self.camera = self.prepare.camera
+        self.preparation = self.prepare.steps
         self.warnings = list(recording.warnings)
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
@@ -97,7 +97,7 @@ class RecordedSequence:
         if self.refines_focal:
             parts.append("focal length to be refined")
         self.description = f"{recording.kind}: {', '.join(parts)}"
-        truth = RecordedTruth(self, recording, self._prepare)
+        truth = RecordedTruth(self, recording)
         self.ground_truth: GroundTruth | None = truth if recording.has_truth() else None
 
     def __len__(self) -> int:
@@ -113,7 +113,7 @@ class RecordedSequence:
         def prepare() -> np.ndarray:
             raw = self._recording.images.read(index)
             self.checksums[frame_index] = crc32(raw.tobytes())
-            return self._prepare.pixels(raw, self._recording.images.labels[index])
+            return self.prepare.pixels(raw, self._recording.images.labels[index])
 
         pixels = torch.from_numpy(self._kept.get(frame_index, prepare))
         return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
@@ -122,11 +122,11 @@ class RecordedSequence:
         """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""
         index = self.source_index(frame_index)
         images = self._recording.images
-        return self._prepare.full_color(images.read(index), images.labels[index])
+        return self.prepare.full_color(images.read(index), images.labels[index])
 
     def full_camera(self, camera: Camera) -> Camera:
         """Return the camera of `full_image` from that of the working images."""
-        return self._prepare.full_camera(camera)
+        return self.prepare.full_camera(camera)
 
     def source_index(self, frame_index: int) -> int:
         """Return the position of a frame in the source, before start and stride."""
@@ -140,47 +140,39 @@ class RecordedSequence:
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
-        return self.picture(self._masks, frame_index, read_mask, self._prepare.nearest)
+        return self.picture(self._masks, frame_index, read_mask)
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        paths, read = (
-            self._recording.depth_paths,
-            partial(read_depth, units_per_metre=self.depth_scale),
-        )
-        return self.picture(paths, frame_index, read, self._prepare.nearest)
+        read = partial(read_depth, units_per_metre=self.depth_scale)
+        return self.picture(self._recording.depth_paths, frame_index, read)
 
     def picture(
-        self,
-        paths: list[Path | None],  # as in `Recording`
-        frame_index: int,
-        read: Callable[[Path], np.ndarray],
-        prepare: Callable[[np.ndarray, str], np.ndarray],
+        self, paths: list[Path | None], frame_index: int, read: Callable[[Path], np.ndarray]
     ) -> np.ndarray | None:
-        """Return what is in the file that belongs to a frame, None if there is no such file."""
+        """Return what the file that belongs to a frame shows, None if there is no such file."""
         index = self.source_index(frame_index)
         path = paths[index] if paths else None
-        return None if path is None else prepare(read(path), str(path))
+        if path is None:
+            return None
+        raw = read(path)
+        return (self.prepare.color if raw.ndim == 3 else self.prepare.nearest)(raw, str(path))
 
 
 class RecordedTruth:
     """The ground truth of a recording, which the system must not see: a `GroundTruth`."""
 
-    def __init__(
-        self, sequence: RecordedSequence, recording: Recording, prepare: ImagePreparation
-    ) -> None:
+    def __init__(self, sequence: RecordedSequence, recording: Recording) -> None:
         self.trajectory = recording.trajectory
-        self._sequence, self._recording, self._prepare = sequence, recording, prepare
+        self._sequence, self._recording = sequence, recording
 
     def moving_mask(self, frame_index: int) -> np.ndarray | None:
         """Return (H, W) bool, True where a dynamic object is seen."""
-        paths, prepare = self._recording.mask_paths, self._prepare.nearest
-        return self._sequence.picture(paths, frame_index, read_mask, prepare)
+        return self._sequence.picture(self._recording.mask_paths, frame_index, read_mask)
 
     def static_image(self, frame_index: int) -> np.ndarray | None:
         """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
-        paths, prepare = self._recording.static_paths, self._prepare.color
-        return self._sequence.picture(paths, frame_index, read_color, prepare)
+        return self._sequence.picture(self._recording.static_paths, frame_index, read_color)
 
     def depth(self, frame_index: int) -> np.ndarray | None:
         """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
@@ -188,8 +180,8 @@ class RecordedTruth:
 
     def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
-        views = self._recording.novel_views
-        return [(pose, self._prepare.color(read_color(path), str(path))) for pose, path in views]
+        views, prepare = self._recording.novel_views, self._sequence.prepare
+        return [(pose, prepare.color(read_color(path), str(path))) for pose, path in views]
 
 
 def _calibration(

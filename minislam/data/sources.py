@@ -200,8 +200,7 @@ def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
 
 def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibration | None:
     """Return the calibration that lies beside the images, if there is one."""
-    path = folder / name
-    return read_calibration(path) if path.is_file() else None
+    return read_calibration(folder / name) if (folder / name).is_file() else None
 
 
 def folder_name(path: Path) -> str:
