@@ -36,7 +36,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from minislam.data.animation import write_animation
+    from minislam.data.images import write_animation
     from minislam.data.options import MINIMUM_SIDE
     from minislam.parameters import require_bounds
     from minislam.runs import flythrough

@@ -1,17 +1,16 @@
 """Camera intrinsics: read from a file, known from a benchmark, or guessed with a warning."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from minislam.data.files import data_rows, finite_numbers, read_text
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
 
-# Focal length over the longer image side when nothing is known. Phone and consumer cameras film
-# with 0.75 to 0.95 (a 26-30 mm equivalent lens, a little cropped by stabilisation); 0.85 is in the
-# middle and gives a field of view of 61 degrees.
-GUESSED_FOCAL_RATIO = 0.85
+# Focal length over the longer image side when nothing is known: phone and consumer cameras film
+# with 0.75 to 0.95 (a 26-30 mm equivalent lens, a little cropped by stabilisation).
+_GUESSED_FOCAL_RATIO = 0.85
 
 # Two aspect ratios closer than this belong to the same picture, resized and rounded to pixels.
 _ASPECT_TOLERANCE = 0.01
@@ -46,18 +45,18 @@ class Calibration:
 
     def fits(self, width: int, height: int) -> bool:
         """Tell whether images of this size have the aspect that the calibration was made for."""
-        if self.size is None:
-            return True
-        return abs(self.size[0] * height / (self.size[1] * width) - 1) <= _ASPECT_TOLERANCE
+        made_for = self.size or (width, height)
+        return abs(made_for[0] * height / (made_for[1] * width) - 1) <= _ASPECT_TOLERANCE
 
 
 def rough_calibration(
-    width: int,
-    height: int,
-    noted: tuple[float, str] | None = None,  # focal length over image diagonal, and its origin
+    width: int, height: int, noted: tuple[float, str] | None = None
 ) -> Calibration:
-    """Return rough intrinsics of images of a size: as noted, or else see GUESSED_FOCAL_RATIO."""
-    focal, origin = GUESSED_FOCAL_RATIO * max(width, height), "guessed intrinsics"
+    """Return rough intrinsics of images of a size: guessed, unless the camera noted its own.
+
+    A note is the focal length over the diagonal of the image, and its origin.
+    """
+    focal, origin = _GUESSED_FOCAL_RATIO * max(width, height), "guessed intrinsics"
     if noted:
         focal, origin = noted[0] * math.hypot(width, height), noted[1]
     centre = (width - 1) / 2, (height - 1) / 2
@@ -66,24 +65,17 @@ def rough_calibration(
 
 def read_calibration(path: Path) -> Calibration:
     """Read `fx fy cx cy [width height [k1 k2 p1 p2 k3]]` from a text file."""
-    return replace(parse_calibration(read_text(path), str(path)), origin=path.name)
-
-
-def parse_calibration(text: str, name: str) -> Calibration:
-    """Parse the content of a calibration file; `name` goes into the errors."""
-    fields = [field for _, row in data_rows(text) for field in row.replace(",", " ").split()]
+    fields = " ".join(row for _, row in data_rows(read_text(path), "")).replace(",", " ").split()
     if len(fields) not in (4, 6, 11):
         raise InputError(
             "expected 4, 6 or 11 numbers, fx fy cx cy [width height [k1 k2 p1 p2 k3]], found "
-            f"{len(fields)} in {name}; add or remove numbers"
+            f"{len(fields)} in {path}; add or remove numbers"
         )
-    fx, fy, cx, cy, *rest = finite_numbers(fields, name)
-    size = None
-    if rest:
-        size = (int(rest[0]), int(rest[1]))
-        if size != (rest[0], rest[1]) or min(size) < 1:
-            raise InputError(
-                f"expected width and height as positive whole numbers, found {fields[4]} and "
-                f"{fields[5]} in {name}; correct them"
-            )
-    return Calibration(fx, fy, cx, cy, size, BrownDistortion(*rest[2:]), name)
+    fx, fy, cx, cy, *rest = finite_numbers(fields, str(path))
+    size = (int(rest[0]), int(rest[1])) if rest else None
+    if size and (size != tuple(rest[:2]) or min(size) < 1):
+        raise InputError(
+            f"expected width and height as positive whole numbers, found {fields[4]} and "
+            f"{fields[5]} in {path}; correct them"
+        )
+    return Calibration(fx, fy, cx, cy, size, BrownDistortion(*rest[2:]), path.name)

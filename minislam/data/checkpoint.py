@@ -39,7 +39,11 @@ def write_checkpoint(path: Path | str, tree: Any) -> None:
         if isinstance(value, np.ndarray):
             arrays[known] = value
             return {_ARRAY: known}
-        arrays[known] = _once(value.detach()).cpu().numpy()
+        once = value.detach()
+        for dimension, stride in enumerate(once.stride()):
+            if stride == 0:  # an expanded tensor: memory holds its rows only once
+                once = once.narrow(dimension, 0, min(1, once.shape[dimension]))
+        arrays[known] = once.cpu().numpy()
         return {_TENSOR: [known, list(value.shape), list(value.stride()), str(value.device)]}
 
     text = json.dumps(plain(tree, "")).encode()
@@ -54,37 +58,24 @@ def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
     try:
         with np.load(content, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        tree = json.loads(arrays.pop(_TREE).tobytes())
         tensors: dict[str, Tensor] = {}
 
-        def whole(value: Any) -> Any:
-            if isinstance(value, list):
-                return [whole(item) for item in value]
-            if not isinstance(value, dict):
-                return value
+        def whole(value: dict[str, Any]) -> Any:
             if _ARRAY in value:
                 return arrays[value[_ARRAY]]
             if _TENSOR not in value:
-                return {key: whole(item) for key, item in value.items()}
+                return value
             name, *layout = value[_TENSOR]
             if name not in tensors:
                 tensors[name] = _strided(arrays[name], gpu, *layout)
             return tensors[name]
 
-        return whole(tree)
+        return json.loads(arrays.pop(_TREE).tobytes(), object_hook=whole)
     except Exception as error:  # damaged bytes fail inside zipfile and numpy in many ways
         raise InputError(
             f"expected a checkpoint in {path}, but the file cannot be read; it is damaged or from "
             "another program: start again with --overwrite"
         ) from error
-
-
-def _once(tensor: Tensor) -> Tensor:
-    """Return an expanded tensor without its repeated rows, which memory holds only once."""
-    for dimension, stride in enumerate(tensor.stride()):
-        if stride == 0 and tensor.shape[dimension] > 1:
-            tensor = tensor.narrow(dimension, 0, 1)
-    return tensor
 
 
 def _strided(

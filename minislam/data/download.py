@@ -43,10 +43,9 @@ def download(
 
 def _append(url: str, part: Path, show: Callable[[int, int], None]) -> None:
     done = part.stat().st_size if part.exists() else 0
+    request = Request(url, headers={"Range": f"bytes={done}-"} if done else {})
     try:
-        answer = urlopen(
-            Request(url, headers={"Range": f"bytes={done}-"} if done else {}), timeout=_TIMEOUT
-        )
+        answer = urlopen(request, timeout=_TIMEOUT)
     except HTTPError as error:
         if error.code == _NOTHING_LEFT and done:
             return

@@ -5,7 +5,7 @@ import math
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,9 +22,9 @@ def atomic_write(path: Path | str, content: bytes) -> None:
 def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
     """Open a file to be written as a whole or not at all.
 
-    The bytes go to a temporary file in the same folder (os.replace is atomic only within one
-    file system), reach the disk (fsync), and then take the final name. What a link
-    points to is replaced, not the link. Devices, pipes and folders are refused.
+    The bytes go to a temporary file in the same folder (os.replace is atomic only within one file
+    system), reach the disk, and then take the final name. What a link points to is replaced, not
+    the link. Devices, pipes and folders are refused.
     """
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"expected a file to write, but {path} is none; choose another name")
@@ -49,8 +49,7 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
 
 def require_free(folder: Path | str, overwrite: bool, also: str = "") -> None:
     """Refuse an output folder that holds files, unless it may be overwritten."""
-    folder = Path(folder)
-    require_no_file(folder)
+    require_no_file(folder := Path(folder))
     if os.path.isdir(folder) and any(folder.iterdir()) and not overwrite:
         raise InputError(
             f"expected a new or empty output folder, but {folder} holds files; choose another name "
@@ -86,10 +85,8 @@ def read_bytes(path: Path | str) -> bytes:
     try:
         return Path(path).read_bytes()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"expected a readable file {path}, but the system says: {reason}; check the path"
-        ) from error
+        reason = f"the system says: {getattr(error, 'strerror', None) or error}; check the path"
+        raise InputError(f"expected a readable file {path}, but {reason}") from error
 
 
 def read_text(path: Path | str) -> str:
@@ -113,19 +110,17 @@ def read_json(path: Path | str) -> Any:
         ) from error
 
 
-def data_rows(text: str) -> list[tuple[int, str]]:
-    """Return (line number, content) of the lines that are neither empty nor comments (#)."""
-    stripped = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
-    return [(number, line) for number, line in stripped if line and not line.startswith("#")]
+def data_rows(text: str, name: str) -> list[tuple[str, str]]:
+    """Return ("line 7 of NAME", content) of the lines that are neither empty nor comments (#)."""
+    rows = [(f"line {n} of {name}", row.strip()) for n, row in enumerate(text.splitlines(), 1)]
+    return [(where, row) for where, row in rows if row and not row.startswith("#")]
 
 
 def finite_numbers(fields: list[str], where: str) -> list[float]:
     """Return the fields as finite numbers; `where` (file and line) goes into the error."""
-    try:
+    with suppress(ValueError):
         numbers = [float(field) for field in fields]
-    except ValueError:
-        numbers = [math.nan]
-    if not all(math.isfinite(number) for number in numbers):
-        shown = " ".join(fields)[:80]
-        raise InputError(f"expected finite numbers in {where}, found '{shown}'; correct this line")
-    return numbers
+        if all(map(math.isfinite, numbers)):
+            return numbers
+    shown = " ".join(fields)[:80]
+    raise InputError(f"expected finite numbers in {where}, found '{shown}'; correct this line")

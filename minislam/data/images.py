@@ -1,19 +1,22 @@
-"""Decode the image files that cameras write, and encode PNG."""
+"""Decode the image files that cameras write; encode PNG, JPEG and moving pictures."""
 
 import os
 import re
+import tempfile
 import warnings
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from minislam.data.files import read_bytes
+from minislam.data.files import atomic_write, read_bytes
 from minislam.errors import InputError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
+_WEBP_QUALITY = 75  # of 100
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
 _JPEG_QUALITY = 85  # of 100: without visible blocks, a tenth of the bytes of a PNG
@@ -69,32 +72,71 @@ def read_depth(path: Path, units_per_metre: float) -> np.ndarray:  # (H, W) floa
 
 def encode_png(image: np.ndarray) -> bytes:
     """Return PNG bytes of (H, W, 3) RGB or (H, W), either float in [0, 1], uint8 or uint16."""
-    if image.dtype.kind == "f":
-        image = np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, png = cv2.imencode(".png", image)
-    return png.tobytes()
+    return cv2.imencode(".png", _bgr(image))[1].tobytes()
 
 
 def encode_jpeg(image: np.ndarray, longest: int) -> bytes:
     """Return JPEG bytes of (H, W, 3) RGB in [0, 1], made smaller if a side exceeds `longest` px."""
-    image = np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
+    image = _bgr(image)
     scale = longest / max(image.shape[:2])
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+
+
+def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float) -> None:
+    """Write images (H, W, 3) RGB in [0, 1], `rate` per second, as .webm or .webp.
+
+    The images may come one by one: a video holds only one of them in memory.
+    """
+    kind = Path(path).suffix.lower()
+    encoders = {".webm": _write_webm, ".webp": _write_webp}
+    if kind not in encoders:
+        raise InputError(f"expected a file that ends in .webm or .webp, found {kind or 'neither'}")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"animation{kind}"
+        encoders[kind](file, map(_bgr, images), rate)
+        if not file.is_file() or not (content := file.read_bytes()):
+            raise InputError(
+                f"expected this OpenCV ({cv2.__version__}) to write {kind}, but it does not; "
+                "choose the other kind, .webm or .webp, or install a newer one"
+            )
+    atomic_write(path, content)
+
+
+def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    writer = None
+    for frame in frames:
+        if writer is None:
+            code = cv2.VideoWriter.fourcc(*"VP80")
+            writer = cv2.VideoWriter(str(file), code, rate, (frame.shape[1], frame.shape[0]))
+        writer.write(frame)
+    if writer is not None:
+        writer.release()
+
+
+def _write_webp(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    animation = cv2.Animation()
+    animation.frames = list(frames)
+    animation.durations = [round(1000 / rate)] * len(animation.frames)  # ms
+    if len(animation.frames):
+        cv2.imwriteanimation(str(file), animation, [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
+
+
+def _bgr(image: np.ndarray) -> np.ndarray:
+    """Return an image as OpenCV encodes it; floats in [0, 1] become bytes, NaN becomes 0."""
+    if image.dtype.kind == "f":
+        image = np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
 
 
 def _decode(path: Path, mode: int) -> np.ndarray:
-    content, decoded = read_bytes(path), None
-    if _is_complete(content):
-        decoded, said = _decoded(content, mode)
-        if b"extraneous" in said:  # cameras pad some files so, and damage looks like it, too
-            warnings.warn(f"{path} may be damaged: {said.decode().strip()}", stacklevel=1)
-        elif said:
-            decoded = None  # libjpeg has filled the rest with grey
+    content = read_bytes(path)
+    decoded, said = _decoded(content, mode) if _is_complete(content) else (None, b"")
+    if b"extraneous" in said:  # cameras pad some files so, and damage looks like it, too
+        warnings.warn(f"{path} may be damaged: {said.decode().strip()}", stacklevel=1)
+    elif said:
+        decoded = None  # libjpeg has filled the rest with grey
     if decoded is not None:
         return decoded
     raise InputError(

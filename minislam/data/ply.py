@@ -1,8 +1,7 @@
 """Gaussian maps as PLY files in the layout that 3D Gaussian viewers agree on.
 
-The values are raw: opacity is a logit, scales are natural logarithms of the standard deviations
-in world units, rotations are quaternions w x y z, and colours are the zeroth coefficient of a
-spherical-harmonics expansion. Activated values would make viewers show fog, or nothing.
+The values are raw, and colours are the zeroth coefficient of spherical harmonics. Activated values
+would make viewers show fog, or nothing.
 """
 
 from dataclasses import dataclass
@@ -17,13 +16,14 @@ _SH_C0 = 0.28209479177387814  # Y_00 = 1 / (2 sqrt(pi)): colour = 0.5 + Y_00 * f
 
 # exp(20) world units is larger than any scene, exp(-20) smaller than any surface; values beyond
 # are mistakes (scales that were not logarithms), and some viewers hang on them.
-MAX_LOG_SCALE = 20.0
+_MAX_LOG_SCALE = 20.0
 # In the order of the original implementation; other files may hold f_rest_0, ... as well.
 PROPERTIES = (
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
     "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 )  # fmt: skip
 _MAX_HEADER = 65536  # byte
+_FORMAT = ["ply", "format binary_little_endian 1.0"]  # the first two lines
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class GaussianArrays:
     """The raw values of N Gaussians, as plain arrays."""
 
     means: np.ndarray  # (N, 3) world units
-    log_scales: np.ndarray  # (N, 3) natural logarithm of world units
+    log_scales: np.ndarray  # (N, 3) natural logarithm of standard deviations in world units
     quats_wxyz: np.ndarray  # (N, 4) need not be normalised
     opacity_logits: np.ndarray  # (N,)
     colors: np.ndarray  # (N, 3) RGB in [0, 1]
@@ -45,22 +45,16 @@ def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
     atomic_write(path, encode_ply(gaussians))
 
 
-def read_ply(path: Path | str) -> GaussianArrays:
-    """Read a Gaussian map; of spherical harmonics only the mean colour is kept."""
-    return decode_ply(read_bytes(path), str(path))
-
-
 def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
     """Return the bytes of a PLY file of a Gaussian map.
 
-    Some viewers insist on spherical harmonics of degree 3. Ours are of degree 0, so the
-    coefficients above are zeros.
+    Some viewers insist on spherical harmonics of degree 3; coefficients above degree 0 are zeros.
     """
     _validate(gaussians, "the map")
     quats = gaussians.quats_wxyz.astype(np.float64)
     zeros = np.zeros((len(gaussians), 3 * ((sh_degree + 1) ** 2 - 1)))
-    before, after = PROPERTIES[:9], PROPERTIES[9:]
-    names = [*before, *(f"f_rest_{index}" for index in range(zeros.shape[1])), *after]
+    rest = [f"f_rest_{index}" for index in range(zeros.shape[1])]
+    names = [*PROPERTIES[:9], *rest, *PROPERTIES[9:]]
     columns = [
         gaussians.means,
         np.zeros_like(gaussians.means),  # normals, which no viewer reads
@@ -72,26 +66,26 @@ def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
         quats / np.linalg.norm(quats, axis=1, keepdims=True),
     ]
     table = np.concatenate([column.astype("<f4") for column in columns], axis=1)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
-    lines += [f"property float {name}" for name in names] + ["end_header"]
-    return ("\n".join(lines) + "\n").encode("ascii") + table.tobytes()
+    return _encoded(table, [f"float {name}" for name in names])
 
 
-def encode_points(
-    points: np.ndarray,  # (N, 3) world units
-    colors: np.ndarray,  # (N, 3) uint8 RGB
-) -> bytes:
-    """Return the bytes of a PLY file of a plain coloured point cloud."""
+def encode_points(points: np.ndarray, colors: np.ndarray) -> bytes:
+    """Return the bytes of a PLY file of points (N, 3) in world units, coloured (N, 3) uint8 RGB."""
     table = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     table["xyz"], table["rgb"] = points, colors
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    lines += [f"property float {name}" for name in "xyz"]
-    lines += [f"property uchar {name}" for name in ("red", "green", "blue")] + ["end_header"]
-    return ("\n".join(lines) + "\n").encode("ascii") + table.tobytes()
+    names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"]
+    return _encoded(table, names)
 
 
-def decode_ply(content: bytes, name: str) -> GaussianArrays:
-    """Return the Gaussians in the bytes of a PLY file; `name` goes into the errors."""
+def _encoded(table: np.ndarray, properties: list[str]) -> bytes:
+    lines = [*_FORMAT, f"element vertex {len(table)}"]
+    lines += [f"property {name}" for name in properties] + ["end_header\n"]
+    return "\n".join(lines).encode("ascii") + table.tobytes()
+
+
+def read_ply(path: Path | str) -> GaussianArrays:
+    """Read a Gaussian map; of spherical harmonics only the mean colour is kept."""
+    content, name = read_bytes(path), str(path)
     count, names, start = _parse_header(content, name)
     body = content[start:]
     if len(body) != 4 * count * len(names):
@@ -119,16 +113,14 @@ def decode_ply(content: bytes, name: str) -> GaussianArrays:
 def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
     """Return the number of Gaussians, the property names and where the values start."""
     end = content.find(b"end_header\n", 0, _MAX_HEADER)
-    lines = content[: max(end, 0)].decode("ascii", errors="replace").splitlines()
-    wanted = ["ply", "format binary_little_endian 1.0"]
-    lines = [line for line in lines if not line.startswith(("comment", "obj_info"))]
-    if lines[:2] != wanted or len(lines) < 3:
+    header = content[: max(end, 0)].decode("ascii", errors="replace").splitlines()
+    lines = [line for line in header if not line.startswith(("comment", "obj_info"))]
+    if lines[:2] != _FORMAT or len(lines) < 3:
         raise InputError(
             f"expected a binary little-endian PLY file with Gaussians, found another kind of file "
             f"in {name}; give a map.ply"
         )
-    element = lines[2].split()
-    fields = [line.split() for line in lines[3:]]
+    element, *fields = [line.split() for line in lines[2:]]
     plain = all(len(field) == 3 and field[:2] == ["property", "float"] for field in fields)
     names = [field[2] for field in fields] if plain else []
     missing = sorted(set(PROPERTIES) - {"nx", "ny", "nz"} - set(names))
@@ -145,16 +137,14 @@ def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
 def _validate(gaussians: GaussianArrays, name: str) -> None:
     """Refuse values that would hang or blind a viewer."""
     for what, values in vars(gaussians).items():
-        bad = int((~np.isfinite(values)).sum())
-        if bad:
+        if bad := int((~np.isfinite(values)).sum()):
             raise InputError(
                 f"expected finite {what} in {name}, found {bad} values that are NaN or infinite; "
                 "remove these Gaussians"
             )
-    if np.any(np.abs(gaussians.log_scales) >= MAX_LOG_SCALE):
-        worst = float(np.abs(gaussians.log_scales).max())
+    if (worst := np.abs(gaussians.log_scales).max(initial=0)) >= _MAX_LOG_SCALE:
         raise InputError(
-            f"expected |log scale| < {MAX_LOG_SCALE:g} in {name}, found {worst:.3g}; store scales "
+            f"expected |log scale| < {_MAX_LOG_SCALE:g} in {name}, found {worst:.3g}; store scales "
             "as natural logarithms"
         )
     if len(gaussians) and np.linalg.norm(gaussians.quats_wxyz.astype(float), axis=1).min() < 1e-12:

@@ -1,6 +1,10 @@
-"""From the raw image to the working image: undistort, cut unseen borders, resize, crop."""
+"""From the raw image to the working image: undistort, cut unseen borders, resize, crop, keep."""
 
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
+from typing import IO
 
 import cv2
 import numpy as np
@@ -27,36 +31,34 @@ class ImagePreparation:
         size: tuple[int, int] | None,  # (width, height) px of the working image, None: choose
         pixels: int,  # about width * height of the working image when it is chosen
     ) -> None:
-        self.raw_camera, self.distortion = raw_camera, distortion
-        self.raw_size = (raw_camera.width, raw_camera.height)
-        if min(self.raw_size) < MINIMUM_SIDE:
+        self._raw_size = (raw_camera.width, raw_camera.height)
+        if min(self._raw_size) < MINIMUM_SIDE:
             raise InputError(
                 f"expected images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px, found "
                 f"{raw_camera.width}x{raw_camera.height}; use larger images"
             )
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
-        self._window = (0, 0, *self.raw_size)
+        self._window = (0, 0, *self._raw_size)
         if np.any(distortion.coefficients):
             self._maps = distortion.undistortion_maps(raw_camera)
-            self._window = seen_window(*self._maps, self.raw_size)
-        seen_size = self._window[2:]
-        size = size or working_size(*seen_size, pixels)
+            self._window = seen_window(*self._maps)
+        seen_width, seen_height = self._window[2:]
+        width, height = size or working_size(seen_width, seen_height, pixels)
         # The smallest scale at which the image covers the wanted size; the rest is cropped.
-        scale = max(size[0] / seen_size[0], size[1] / seen_size[1])
+        scale = max(width / seen_width, height / seen_height)
         self._resized = (
-            max(round(scale * seen_size[0]), size[0]),
-            max(round(scale * seen_size[1]), size[1]),
+            max(round(scale * seen_width), width),
+            max(round(scale * seen_height), height),
         )
-        self._crop = ((self._resized[0] - size[0]) // 2, (self._resized[1] - size[1]) // 2)
+        self._crop = (self._resized[0] - width) // 2, (self._resized[1] - height) // 2
         self.camera = (
-            raw_camera.cropped(*self._window).resized(*self._resized).cropped(*self._crop, *size)
+            raw_camera.cropped(*self._window)
+            .resized(*self._resized)
+            .cropped(*self._crop, width, height)
         )
-
-    def steps(self) -> dict[str, object]:
-        """Return how raw images become working images, in order, in pixels."""
-        return {
-            "raw_camera": asdict(self.raw_camera),
-            "distortion": asdict(self.distortion),
+        self.steps: dict[str, object] = {  # from raw to working images, in order, in pixels
+            "raw_camera": asdict(raw_camera),
+            "distortion": asdict(distortion),
             "window": self._window,  # left, top, width, height of the undistorted image
             "resized": self._resized,  # width, height
             "crop": self._crop,  # left, top
@@ -66,37 +68,26 @@ class ImagePreparation:
         """Prepare a colour image: values in [0, 1]."""
         return self.pixels(raw, label).astype(np.float32) / np.float32(255)
 
-    def pixels(
-        self,
-        raw: np.ndarray,  # (H, W, 3) uint8
-        label: str = "an image",  # how to call it in an error
-    ) -> np.ndarray:  # (H', W', 3) uint8
-        """Prepare a colour image."""
-        self._require_size(raw, label)
-        image = self._undistorted(raw, cv2.INTER_LINEAR)
+    def pixels(self, raw: np.ndarray, label: str) -> np.ndarray:  # (H', W', 3) uint8
+        """Prepare a colour image (H, W, 3) uint8; an error calls it by its label."""
+        image = self._undistorted(raw, label, cv2.INTER_LINEAR)
         if (image.shape[1], image.shape[0]) != self._resized:
             image = cv2.resize(image, self._resized, interpolation=cv2.INTER_AREA)
         return np.ascontiguousarray(self._cropped(image))
 
-    def full_color(self, raw: np.ndarray, label: str = "an image") -> np.ndarray:  # (H, W, 3) uint8
+    def full_color(self, raw: np.ndarray, label: str) -> np.ndarray:  # (H, W, 3) uint8
         """Undistort a colour image and cut unseen borders, at the size of the source."""
-        self._require_size(raw, label)
-        return np.ascontiguousarray(self._undistorted(raw, cv2.INTER_LINEAR))
+        return np.ascontiguousarray(self._undistorted(raw, label, cv2.INTER_LINEAR))
 
     def full_camera(self, camera: Camera) -> Camera:
         """Return the camera of such an image from that of the working image: the steps back."""
         left, top = self._crop
         return camera.cropped(-left, -top, *self._resized).resized(*self._window[2:])
 
-    def nearest(
-        self,
-        raw: np.ndarray,  # (H, W)
-        label: str = "an image",  # how to call it in an error
-    ) -> np.ndarray:  # (H', W'), same type
-        """Prepare a depth image or a mask: every value is one of the raw values."""
-        self._require_size(raw, label)
+    def nearest(self, raw: np.ndarray, label: str = "an image") -> np.ndarray:  # (H', W')
+        """Prepare a depth image or a mask (H, W): every value is one of the raw values."""
         as_numbers = raw.astype(np.uint8) if raw.dtype == bool else raw
-        image = self._undistorted(as_numbers, cv2.INTER_NEAREST)
+        image = self._undistorted(as_numbers, label, cv2.INTER_NEAREST)
         # cv2's nearest neighbour is off by up to half a pixel; these are the true centres.
         columns, rows = (
             ((np.arange(new) + 0.5) * old / new).astype(int)
@@ -104,15 +95,13 @@ class ImagePreparation:
         )
         return np.ascontiguousarray(self._cropped(image[rows][:, columns])).astype(raw.dtype)
 
-    def _require_size(self, raw: np.ndarray, label: str) -> None:
-        width, height = self.raw_size
+    def _undistorted(self, raw: np.ndarray, label: str, interpolation: int) -> np.ndarray:
+        width, height = self._raw_size
         if raw.shape[:2] != (height, width):
             raise InputError(
                 f"expected images of one size, {width}x{height} as the first, found "
                 f"{raw.shape[1]}x{raw.shape[0]} in {label}; remove or resize the odd ones"
             )
-
-    def _undistorted(self, raw: np.ndarray, interpolation: int) -> np.ndarray:
         if self._maps is not None:
             raw = cv2.remap(raw, *self._maps, interpolation)
         left, top, width, height = self._window
@@ -137,14 +126,13 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
 def seen_window(
     map_x: np.ndarray,  # (H, W) px, where each undistorted pixel is taken from
     map_y: np.ndarray,  # (H, W) px
-    raw_size: tuple[int, int],
 ) -> tuple[int, int, int, int]:  # left, top, width, height px
     """Return a window of the undistorted image without pixels that no camera saw.
 
     Such pixels would be a black frame that stands still while the camera moves. The side with
     the largest fraction of such pixels loses one row or column until none is left.
     """
-    width, height = raw_size
+    height, width = map_x.shape
     unseen = (map_x < 0) | (map_x > width - 1) | (map_y < 0) | (map_y > height - 1)
     left, top, right, bottom = 0, 0, width, height
     while right - left >= MINIMUM_SIDE and bottom - top >= MINIMUM_SIDE:
@@ -161,3 +149,33 @@ def seen_window(
         "expected a lens distortion that leaves part of the image visible, but nothing would be "
         "left; check the order k1 k2 p1 p2 k3 and the signs"
     )
+
+
+class KeptImages:
+    """Keeps prepared images of one shape in a temporary file; none more when the disk is full.
+
+    A run looks at every frame about six times, and not in order. In a video a step back takes ten
+    times as long as a step on, because decoding starts again at an earlier complete image.
+    """
+
+    def __init__(self) -> None:
+        self._slots: dict[int, int] = {}  # image number: place in the file
+        self._shape: tuple[int, ...] = ()
+        self._file: IO[bytes] | None = None  # the system removes it, however the program ends
+
+    def get(self, number: int, prepare: Callable[[], np.ndarray]) -> np.ndarray:
+        """Return image `number` (H, W, 3) uint8; `prepare` makes it when it is asked for first."""
+        if number in self._slots and self._file is not None:
+            image = np.empty(self._shape, np.uint8)
+            self._file.seek(self._slots[number] * image.nbytes)
+            image.data.cast("B")[:] = self._file.read(image.nbytes)
+            return image
+        image = prepare()
+        self._shape = image.shape
+        with suppress(OSError):  # the image is prepared again next time
+            self._file = self._file or tempfile.TemporaryFile()
+            self._file.seek(len(self._slots) * image.nbytes)
+            self._file.write(image.tobytes())
+            self._file.flush()
+            self._slots[number] = len(self._slots)
+        return image

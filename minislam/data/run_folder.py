@@ -72,12 +72,12 @@ class RunFolder:
 
     @classmethod
     def create(
-        cls,
-        path: Path | str,
-        overwrite: bool = False,
-        inputs: Sequence[Path] = (),  # images that the new run reads
+        cls, path: Path | str, overwrite: bool = False, inputs: Sequence[Path] = ()
     ) -> "RunFolder":
-        """Make a new run folder; with `overwrite`, remove what an earlier run wrote, only that."""
+        """Make a new run folder for a run that reads the images `inputs`.
+
+        With `overwrite`, what an earlier run wrote is removed, and only that.
+        """
         path = Path(path)
         require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from zlib import crc32
 
@@ -9,28 +10,24 @@ import numpy as np
 import torch
 
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
-from minislam.data.folder import read_image_folder, read_video
-from minislam.data.images import read_depth, read_mask
-from minislam.data.kept_images import KeptImages
+from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
-from minislam.data.preparation import ImagePreparation
-from minislam.data.recording import RecordedTruth, Recording, mask_files, path_of
+from minislam.data.preparation import ImagePreparation, KeptImages
+from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.records import Frame, GroundTruth
+from minislam.records import Frame, GroundTruth, Progress
 
 _SYNTHETIC_SIZE = (320, 240)  # px
 
 
 def open_sequence(
-    source: str,
-    options: InputOptions | None = None,
-    progress: Callable[[int, int], None] | None = None,  # (done, of all) while rendering synth:
+    source: str, options: InputOptions | None = None, progress: Progress | None = None
 ) -> "RecordedSequence":
     """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED][?phone]`.
 
-    A folder is recognised by its content, not by its name.
+    A folder is recognised by its content. `progress` is called while a scene is rendered.
     """
     options = options or InputOptions()
     require_source(source)
@@ -41,8 +38,9 @@ def open_sequence(
         last = None
         if options.max_frames is not None:
             last = options.start + options.stride * (options.max_frames - 1) + 1
-        return RecordedSequence(read_video(path, last), options, source)
-    recording = read_tum_folder(path) if is_tum_folder(path) else read_image_folder(path)
+        recording = read_video(path, last)
+    else:
+        recording = read_tum_folder(path) if is_tum_folder(path) else read_image_folder(path)
     return RecordedSequence(recording, options, source)
 
 
@@ -52,7 +50,7 @@ class RecordedSequence:
     def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
         self._recording = recording
         self.depth_scale = options.depth_scale
-        if not source.startswith("synth:"):  # so that it is found again from any folder
+        if not source.startswith(SYNTHETIC):  # so that it is found again from any folder
             source = str(Path(source).expanduser().absolute())
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
@@ -77,17 +75,14 @@ class RecordedSequence:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
         height, width = recording.images.read(self._chosen[0]).shape[:2]
         calibration = _calibration(recording, options, width, height)
-        raw_camera = calibration.camera_for(width, height)
-        self._prepare = ImagePreparation(
-            raw_camera, calibration.distortion, options.size, options.pixels
-        )
+        camera, distortion = calibration.camera_for(width, height), calibration.distortion
+        self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels)
         self.name = recording.name
-        self.camera = self._prepare.camera
-        self.preparation = self._prepare.steps()
+        self.camera = self.prepare.camera
+        self.preparation = self.prepare.steps
         self.warnings = list(recording.warnings)
-        self.refines_focal = options.focal == "refine"
-        if options.focal == "auto":
-            self.refines_focal = calibration.is_rough
+        refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
+        self.refines_focal = refines[options.focal]
         if calibration.is_rough and not self.refines_focal:
             self.warnings.append(
                 f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}, for "
@@ -102,11 +97,8 @@ class RecordedSequence:
         if self.refines_focal:
             parts.append("focal length to be refined")
         self.description = f"{recording.kind}: {', '.join(parts)}"
-        self.ground_truth: GroundTruth | None = None
-        if recording.has_truth():
-            self.ground_truth = RecordedTruth(
-                recording, self._prepare, self.source_index, self.sensor_depth
-            )
+        truth = RecordedTruth(self, recording)
+        self.ground_truth: GroundTruth | None = truth if recording.has_truth() else None
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -121,7 +113,7 @@ class RecordedSequence:
         def prepare() -> np.ndarray:
             raw = self._recording.images.read(index)
             self.checksums[frame_index] = crc32(raw.tobytes())
-            return self._prepare.pixels(raw, self._recording.images.label(index))
+            return self.prepare.pixels(raw, self._recording.images.labels[index])
 
         pixels = torch.from_numpy(self._kept.get(frame_index, prepare))
         return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
@@ -130,11 +122,11 @@ class RecordedSequence:
         """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""
         index = self.source_index(frame_index)
         images = self._recording.images
-        return self._prepare.full_color(images.read(index), images.label(index))
+        return self.prepare.full_color(images.read(index), images.labels[index])
 
     def full_camera(self, camera: Camera) -> Camera:
         """Return the camera of `full_image` from that of the working images."""
-        return self._prepare.full_camera(camera)
+        return self.prepare.full_camera(camera)
 
     def source_index(self, frame_index: int) -> int:
         """Return the position of a frame in the source, before start and stride."""
@@ -144,19 +136,52 @@ class RecordedSequence:
 
     def source_name(self, frame_index: int) -> str:
         """Return the name of a frame's image file, or of its video with the number in it."""
-        return self._recording.images.name(self.source_index(frame_index))
+        return self._recording.images.names[self.source_index(frame_index)]
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
-        path = path_of(self._masks, self.source_index(frame_index))
-        return None if path is None else self._prepare.nearest(read_mask(path), str(path))
+        return self.picture(self._masks, frame_index, read_mask)
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        path = path_of(self._recording.depth_paths, self.source_index(frame_index))
+        read = partial(read_depth, units_per_metre=self.depth_scale)
+        return self.picture(self._recording.depth_paths, frame_index, read)
+
+    def picture(
+        self, paths: list[Path | None], frame_index: int, read: Callable[[Path], np.ndarray]
+    ) -> np.ndarray | None:
+        """Return what the file that belongs to a frame shows, None if there is no such file."""
+        index = self.source_index(frame_index)
+        path = paths[index] if paths else None
         if path is None:
             return None
-        return self._prepare.nearest(read_depth(path, self.depth_scale), str(path))
+        raw = read(path)
+        return (self.prepare.color if raw.ndim == 3 else self.prepare.nearest)(raw, str(path))
+
+
+class RecordedTruth:
+    """The ground truth of a recording, which the system must not see: a `GroundTruth`."""
+
+    def __init__(self, sequence: RecordedSequence, recording: Recording) -> None:
+        self.trajectory = recording.trajectory
+        self._sequence, self._recording = sequence, recording
+
+    def moving_mask(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) bool, True where a dynamic object is seen."""
+        return self._sequence.picture(self._recording.mask_paths, frame_index, read_mask)
+
+    def static_image(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
+        return self._sequence.picture(self._recording.static_paths, frame_index, read_color)
+
+    def depth(self, frame_index: int) -> np.ndarray | None:
+        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
+        return self._sequence.sensor_depth(frame_index)
+
+    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
+        views, prepare = self._recording.novel_views, self._sequence.prepare
+        return [(pose, prepare.color(read_color(path), str(path))) for pose, path in views]
 
 
 def _calibration(
@@ -167,25 +192,30 @@ def _calibration(
     The options come before files, files before known cameras, known cameras before what the
     camera noted in its files, that before the guess.
     """
-    found = read_calibration(Path(options.calibration)) if options.calibration else None
-    found = found or recording.calibration
+    found = recording.calibration
+    if options.calibration:
+        found = read_calibration(Path(options.calibration))
     calibration = found or rough_calibration(width, height, recording.noted_focal_length)
     fy = options.fx if options.fy is None else options.fy
     given = {"fx": options.fx, "fy": fy, "cx": options.cx, "cy": options.cy}
     given = {name: value for name, value in given.items() if value is not None}
-    if given:
-        scaled = calibration.camera_for(width, height)
-        base = {name: getattr(scaled, name) for name in ("fx", "fy", "cx", "cy")}
-        origin = f"{' '.join(given)} given, {calibration.origin}"
-        if found is None and options.fx is not None:
-            origin = "intrinsics given"
-        calibration = replace(calibration, **(base | given), size=(width, height), origin=origin)
-        calibration = replace(calibration, is_rough=calibration.is_rough and options.fx is None)
-    return calibration
+    if not given:
+        return calibration
+    camera = calibration.camera_for(width, height)
+    origin = f"{' '.join(given)} given, {calibration.origin}"
+    if found is None and options.fx is not None:
+        origin = "intrinsics given"
+    return replace(
+        calibration,
+        **{name: given.get(name, getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")},
+        size=(width, height),
+        origin=origin,
+        is_rough=calibration.is_rough and options.fx is None,
+    )
 
 
 def _open_synthetic(
-    source: str, options: InputOptions, progress: Callable[[int, int], None] | None
+    source: str, options: InputOptions, progress: Progress | None
 ) -> RecordedSequence:
     """Render a synthetic sequence, or take it from the cache, and open it."""
     import data_synth  # only here: real footage needs no scene generator

@@ -1,25 +1,35 @@
-"""Sources of raw images: files in a folder, or a video."""
+"""Recordings: raw images, files in a folder or a video, and what lies beside them."""
 
-from dataclasses import dataclass
+import math
+import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from minislam.data.images import read_color
+from minislam.data.calibration import Calibration, read_calibration
+from minislam.data.images import is_image, list_images, read_color
+from minislam.data.metadata import noted_focal_length
 from minislam.errors import InputError
+from minislam.records import Trajectory
 
-# Assumed when neither the file names nor the container state the frame rate.
-ASSUMED_FRAME_RATE = 30.0  # frames per second
+FILES = "files:"  # before the name of a folder
+_IMAGE_FOLDERS = ("images", "rgb")
+_VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+_ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
 
-@dataclass
 class FileImages:
     """Images that are files."""
 
-    paths: list[Path]
+    def __init__(self, paths: list[Path]) -> None:
+        self.paths = paths
+        self.labels = [str(path) for path in paths]  # how to call the images in a message
+        self.names = [path.name for path in paths]
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -27,14 +37,6 @@ class FileImages:
     def read(self, index: int) -> np.ndarray:
         """Return a raw image (H, W, 3) uint8 RGB."""
         return read_color(self.paths[index])
-
-    def label(self, index: int) -> str:
-        """Return the path of an image."""
-        return str(self.paths[index])
-
-    def name(self, index: int) -> str:
-        """Return the name of the file."""
-        return self.paths[index].name
 
 
 class VideoImages:
@@ -61,6 +63,8 @@ class VideoImages:
                 self._calls.append(self._grabbed)
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
+        self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
+        self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]
         self._rewind()
 
     def __len__(self) -> int:
@@ -79,14 +83,6 @@ class VideoImages:
         _, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
-    def label(self, index: int) -> str:
-        """Return how to call this frame in a message."""
-        return f"frame {index} of {self.path}"
-
-    def name(self, index: int) -> str:
-        """Return the name of the video with the number of the frame."""
-        return f"{self.path.stem}_{index:06d}"
-
     def lost(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing: gaps of a constant rate, or calls that failed."""
         gaps = np.diff(self.timestamps) * self.frame_rate  # frames
@@ -103,6 +99,144 @@ class VideoImages:
 
 
 ImageSource = FileImages | VideoImages
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Raw images with timestamps, and whatever else lies beside them.
+
+    The lists of paths are empty, or have one entry per image: None where there is no such file.
+    """
+
+    name: str  # short, usable as a folder name
+    kind: str  # what it is, for the description
+    images: ImageSource
+    timestamps: np.ndarray  # (N,) float64 second, strictly increasing
+    calibration: Calibration | None = None  # None: unknown
+    noted_focal_length: tuple[float, str] | None = None  # over the image diagonal, and its origin
+    trajectory: Trajectory | None = None  # ground truth
+    depth_paths: list[Path | None] = field(default_factory=list)
+    mask_paths: list[Path | None] = field(default_factory=list)  # True on dynamic objects
+    static_paths: list[Path | None] = field(default_factory=list)  # without dynamic objects
+    novel_views: list[tuple[np.ndarray, Path]] = field(default_factory=list)  # (T_world_camera, .)
+    lost: list[tuple[float, str]] = field(default_factory=list)  # timestamp [s], reason
+    notes: list[str] = field(default_factory=list)  # more for the description
+    warnings: list[str] = field(default_factory=list)
+
+    def has_truth(self) -> bool:
+        """Tell whether there is anything to compare with; sensor depth alone is an input."""
+        views = [*self.mask_paths, *self.static_paths, *self.novel_views]
+        return self.trajectory is not None or any(view is not None for view in views)
+
+
+def read_image_folder(folder: Path) -> Recording:
+    """Read a folder of images, in natural order; they may lie in `images/` or `rgb/`."""
+    candidates = [folder] + [folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()]
+    paths = next((found for found in map(list_images, candidates) if found), [])
+    if not paths:
+        raise InputError(f"expected PNG or JPEG images in {folder}, found none; {_hint(folder)}")
+    stamps, source = stamps_of_names(paths)
+    return Recording(
+        name=folder_name(folder),
+        kind="image folder",
+        images=FileImages(paths),
+        timestamps=stamps,
+        calibration=calibration_beside(folder),
+        noted_focal_length=noted_focal_length(paths[0]),
+        notes=[source],
+    )
+
+
+def read_video(path: Path, limit: int | None) -> Recording:
+    """Read a video file; frames after the first `limit` are left alone."""
+    if is_image(path):
+        raise InputError(
+            f"expected a video or a folder, found the single image {path}; give the folder it is in"
+        )
+    images = VideoImages(path, limit)
+    if len(images) == 0:
+        raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")
+    warnings = []
+    rate, stamps, lost = images.frame_rate, images.timestamps, images.lost()
+    if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
+        if not (math.isfinite(rate) and rate > 0):
+            rate = _ASSUMED_FRAME_RATE
+        stamps, lost = np.arange(len(images)) / rate, lost[:0]
+        warnings.append(f"{path.name} has no timestamps: {rate:g} frames per second assumed")
+    if len(images) < images.promised and len(images) != limit:
+        warnings.append(
+            f"{path.name} promises {images.promised} frames, but only {len(images)} can be decoded"
+        )
+    return Recording(
+        name=folder_name(path.with_suffix("")),
+        kind="video",
+        images=images,
+        timestamps=stamps,
+        lost=[(stamp, f"{path.name} is damaged there") for stamp in lost.tolist()],
+        calibration=calibration_beside(path.parent, path.stem + ".calibration.txt"),
+        noted_focal_length=noted_focal_length(path),
+        notes=[f"{rate:g} frames per second"],
+        warnings=warnings,
+    )
+
+
+def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
+    """Return the timestamps (N,) of images, and a note that says where they come from.
+
+    Names that are all numbers are the timestamps; otherwise the images are counted.
+    """
+    if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
+        note = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
+        return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, note
+    stamps = np.array([float(path.stem) for path in paths])
+    if len(same := np.flatnonzero(~(np.diff(stamps) > 0))):
+        first, second = paths[same[0]], paths[same[0] + 1]
+        raise InputError(
+            f"expected file names that are increasing timestamps, found {first.name} and "
+            f"{second.name} in {first.parent}; remove or rename one of them"
+        )
+    return stamps, "timestamps from the file names"
+
+
+def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibration | None:
+    """Return the calibration that lies beside the images, if there is one."""
+    return read_calibration(folder / name) if (folder / name).is_file() else None
+
+
+def folder_name(path: Path) -> str:
+    """Return a name of a source that can be used for an output folder."""
+    return re.sub(r"[^\w.-]+", "_", path.resolve().name).strip("._") or "sequence"
+
+
+def _hint(folder: Path) -> str:
+    """Say what the user may have meant: often the video or data set lies one level deeper."""
+    entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    if videos := [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]:
+        return f"give the video itself, {videos[0]}"
+    if folders := [path for path in entries if path.is_dir()]:
+        return f"perhaps you mean {folders[0]}"
+    return "give a folder that holds images, a video file, or synth:NAME"
+
+
+def mask_files(images: ImageSource, masks: str, chosen: range) -> list[Path | None]:
+    """Return the mask of each image in files:FOLDER: of the image's name, or of its number."""
+    folder = Path(masks.removeprefix(FILES)).expanduser()
+    if not masks.startswith(FILES) or not folder.is_dir():
+        raise InputError(
+            f"expected --masks {FILES}FOLDER with a folder that exists, found {masks}; check it"
+        )
+    files = {path.stem: path for path in list_images(folder)}
+    numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
+    found = [numbered.get(index) for index in range(len(images))]
+    if isinstance(images, FileImages) and any(path.stem in files for path in images.paths):
+        found = [files.get(path.stem) for path in images.paths]
+    if missing := [images.labels[index] for index in chosen if found[index] is None]:
+        raise InputError(
+            f"expected a mask of every frame in {folder}, found none for {len(missing)} of "
+            f"{len(chosen)}, such as {missing[0]}; name them like the images or by number from 0, "
+            "and make a black one where nothing moves"
+        )
+    return found
 
 
 def _open_capture(path: Path) -> cv2.VideoCapture:

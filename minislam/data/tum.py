@@ -1,4 +1,4 @@
-"""TUM RGB-D folders, and the ground truth that synthetic sequences add to them."""
+"""TUM RGB-D folders, their known cameras, and the truth that synthetic sequences add to them."""
 
 import os
 import re
@@ -6,18 +6,45 @@ from pathlib import Path
 
 import numpy as np
 
+from minislam.data import sources
 from minislam.data.calibration import Calibration
 from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
-from minislam.data.folder import calibration_beside, folder_name, stamps_of_names
 from minislam.data.images import list_images, read_color
-from minislam.data.known_cameras import bonn_camera_trajectory, is_bonn, known_camera
-from minislam.data.recording import Recording
-from minislam.data.sources import FileImages
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
+from minislam.geometry import BrownDistortion
+from minislam.records import Trajectory
 
 _TRUTH_NAMES = ("groundtruth.txt", "pose.txt")  # TUM and Bonn; Wild-SLAM
 _DEPTH_MAX_DIFFERENCE = 0.02  # second between a colour and its depth image, as TUM's associate.py
+
+_TUM_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)[_ -]?([123])(?!\d)", re.IGNORECASE)
+_BONN_NAME = re.compile(r"(?<![a-z])rgbd_bonn(?![a-z])", re.IGNORECASE)
+
+# Intrinsics of images of 640x480 px, given by the makers of the TUM RGB-D benchmark (Sturm et al.,
+# IROS 2012) and of the Bonn RGB-D Dynamic Dataset (Palazzolo et al., IROS 2019).
+_INTRINSICS = {
+    "TUM fr1": (517.3, 516.5, 318.6, 255.3),
+    "TUM fr2": (520.9, 521.0, 325.1, 249.7),
+    "TUM fr3": (535.4, 539.2, 320.1, 247.6),
+    "Bonn": (542.822841, 542.576870, 315.593520, 237.756098),
+}
+_DISTORTIONS = {
+    "TUM fr1": BrownDistortion(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "TUM fr2": BrownDistortion(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "TUM fr3": BrownDistortion(),
+    "Bonn": BrownDistortion(0.039903, -0.099343, -0.000730, -0.000144),
+}
+
+# Bonn's ground truth is the pose of a plate of markers in the axes of ROS. The makers give the
+# camera in the frame of the plate; its block is a rotation only up to a few per cent.
+_BONN_T_marker_camera = np.array([
+    [ 1.0157,  0.1828, -0.2389,  0.0113],
+    [ 0.0009, -0.8431, -0.6413, -0.0098],
+    [-0.3009,  0.6147, -0.8085,  0.0111],
+    [ 0.0,     0.0,     0.0,     1.0   ],
+])  # fmt: skip
+_BONN_T_ros = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def is_tum_folder(folder: Path) -> bool:
@@ -28,26 +55,27 @@ def is_tum_folder(folder: Path) -> bool:
     return bool(images) and all(re.fullmatch(r"\d+\.\d+", path.stem) for path in images)
 
 
-def read_tum_folder(folder: Path) -> Recording:
+def read_tum_folder(folder: Path) -> sources.Recording:
     """Read a TUM RGB-D folder; everything but the colour images is optional."""
     stamps, paths = _images(folder, "rgb")
     if len(paths) == 0:
         raise InputError(f"expected images in {folder}/rgb.txt, found none; check the list")
     depth_stamps, depths = _images(folder, "depth")
     truth_path = next((folder / name for name in _TRUTH_NAMES if (folder / name).is_file()), None)
-    trajectory = read_trajectory(truth_path) if truth_path else None
-    if trajectory is not None and is_bonn(folder.resolve().name):
-        trajectory = bonn_camera_trajectory(trajectory)
+    trajectory = None
     notes = [f"{len(depths)} depth"] if depths else []
-    if trajectory is not None:
+    if truth_path is not None:
+        trajectory = read_trajectory(truth_path)
+        if _BONN_NAME.search(folder.resolve().name):
+            trajectory = bonn_camera_trajectory(trajectory)
         seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
         notes.append(f"ground truth {seconds:.3g} s")
-    return Recording(
-        name=folder_name(folder),
+    return sources.Recording(
+        name=sources.folder_name(folder),
         kind="TUM RGB-D folder",
-        images=FileImages(paths),
+        images=sources.FileImages(paths),
         timestamps=stamps,
-        calibration=calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
+        calibration=sources.calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
         trajectory=trajectory,
         depth_paths=_nearest(stamps, depth_stamps, depths),
         mask_paths=_beside(folder / "masks", paths),
@@ -57,15 +85,15 @@ def read_tum_folder(folder: Path) -> Recording:
     )
 
 
-def parse_image_list(text: str, name: str) -> tuple[np.ndarray, list[str]]:
-    """Parse lines of `timestamp filename`; `name` goes into the errors.
-
-    Returns the timestamps (N,) in seconds and the N file names.
-    """
+def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
+    """Return timestamps and paths of the images in `kind`.txt, or else in the folder `kind`."""
+    list_path = folder / f"{kind}.txt"
+    if not list_path.is_file():
+        paths = list_images(folder / kind) if (folder / kind).is_dir() else []
+        return (sources.stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
     stamps: list[float] = []
-    names: list[str] = []
-    for number, row in data_rows(text):
-        where = f"line {number} of {name}"
+    paths = []
+    for where, row in data_rows(read_text(list_path), str(list_path)):
         fields = row.split(maxsplit=1)
         if len(fields) != 2:
             raise InputError(
@@ -78,25 +106,14 @@ def parse_image_list(text: str, name: str) -> tuple[np.ndarray, list[str]]:
                 f"{where}; sort the list and remove double entries"
             )
         stamps.append(stamp)
-        names.append(fields[1])
-    return np.array(stamps), names
-
-
-def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
-    """Return timestamps and paths of the images in `kind`.txt, or else in the folder `kind`."""
-    list_path = folder / f"{kind}.txt"
-    if not list_path.is_file():
-        paths = list_images(folder / kind) if (folder / kind).is_dir() else []
-        return (stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
-    stamps, names = parse_image_list(read_text(list_path), str(list_path))
-    paths = [folder / name for name in names]
+        paths.append(folder / fields[1])
     missing = next((path for path in paths if not os.path.isfile(path)), None)
     if missing is not None:
         raise InputError(
             f"expected all images of {list_path}, but {missing} does not exist; complete the "
             "folder or remove the line"
         )
-    return stamps, paths
+    return np.array(stamps), paths
 
 
 def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
@@ -115,13 +132,31 @@ def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
     return found if found is not None and found.fits(width, height) else None
 
 
+def known_camera(text: str) -> Calibration | None:
+    """Return the intrinsics of the camera that a text names: freiburg1, fr3, rgbd_bonn."""
+    tum = _TUM_NAME.search(text)
+    name = f"TUM fr{tum[1]}" if tum else "Bonn"
+    if not tum and not _BONN_NAME.search(text):
+        return None
+    size, origin = (640, 480), f"{name} intrinsics"
+    return Calibration(*_INTRINSICS[name], size, _DISTORTIONS[name], origin)
+
+
+def bonn_camera_trajectory(markers: Trajectory) -> Trajectory:
+    """Return the camera's poses from the published poses of Bonn's marker plate."""
+    poses = _BONN_T_ros @ markers.T_world_camera @ _BONN_T_ros @ _BONN_T_marker_camera
+    # The nearest rotation to each block: what follows relies on poses being rigid.
+    u, _, v_transposed = np.linalg.svd(poses[:, :3, :3])
+    poses[:, :3, :3] = u @ v_transposed
+    return Trajectory(markers.timestamps, poses)
+
+
 def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[Path | None]:
     """Return for each timestamp the path whose own timestamp is nearest, None if none is near."""
     if len(others) == 0:
         return [None] * len(stamps)
-    after = np.searchsorted(others, stamps).clip(1, max(len(others) - 1, 1))
-    before = after - 1
-    after = after.clip(max=len(others) - 1)
+    after = np.searchsorted(others, stamps).clip(max=len(others) - 1)
+    before = (after - 1).clip(0)
     nearest = np.where(stamps - others[before] <= others[after] - stamps, before, after)
     near = np.abs(others[nearest] - stamps) <= _DEPTH_MAX_DIFFERENCE
     return [paths[index] if ok else None for index, ok in zip(nearest, near, strict=True)]

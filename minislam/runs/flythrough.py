@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minislam.data.animation import write_animation
+from minislam.data.images import write_animation
 from minislam.data.run_folder import CLIP
 from minislam.errors import InputError
 from minislam.geometry import Camera

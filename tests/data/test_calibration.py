@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 
 from minislam.data.calibration import (
-    parse_calibration,
+    Calibration,
     read_calibration,
     rough_calibration,
 )
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
+
+
+def read(text: str, folder: Path) -> Calibration:
+    (folder / "kinect.txt").write_text(text)
+    return read_calibration(folder / "kinect.txt")
+
 
 # Known answers
 
@@ -20,14 +26,14 @@ def test_four_six_and_eleven_numbers(tmp_path: Path):
     path = tmp_path / "calibration.txt"
     path.write_bytes(b"\xef\xbb\xbf# fx fy cx cy\r\n500 501 320 240\r\n")
     assert read_calibration(path).camera_for(640, 480) == Camera(500, 501, 320, 240, 640, 480)
-    six = parse_calibration("500, 501, 320, 240, 640, 480", "six")
+    six = read("500, 501, 320, 240, 640, 480", tmp_path)
     assert six.size == (640, 480)
-    eleven = parse_calibration("500 501 320 240 640 480 0.1 0.2 0.3 0.4 0.5", "eleven")
+    eleven = read("500 501 320 240 640 480 0.1 0.2 0.3 0.4 0.5", tmp_path)
     assert eleven.distortion == BrownDistortion(0.1, 0.2, 0.3, 0.4, 0.5)
 
 
-def test_a_calibration_is_carried_to_images_resized_by_half():
-    calibration = parse_calibration("500 500 319.5 239.5 640 480", "c")
+def test_a_calibration_is_carried_to_images_resized_by_half(tmp_path: Path):
+    calibration = read("500 500 319.5 239.5 640 480", tmp_path)
     assert calibration.camera_for(320, 240) == Camera(250, 250, 159.5, 119.5, 320, 240)
 
 
@@ -39,10 +45,10 @@ def test_the_guess_is_a_field_of_view_of_about_sixty_degrees():
         assert (camera.cx, camera.cy) == ((width - 1) / 2, (height - 1) / 2)
 
 
-def test_a_noted_focal_length_comes_before_the_guess():
+def test_a_noted_focal_length_comes_before_the_guess(tmp_path: Path):
     noted = rough_calibration(400, 300, (0.6, "EXIF of a photo"))
     assert (noted.fx, noted.fy, noted.origin) == (300, 300, "EXIF of a photo")
-    assert noted.is_rough and not parse_calibration("500 500 320 240", "c").is_rough
+    assert noted.is_rough and not read("500 500 320 240", tmp_path).is_rough
 
 
 # Errors
@@ -64,17 +70,17 @@ def test_a_noted_focal_length_comes_before_the_guess():
         ("500 500 320 240 0 480", "whole"),
     ],
 )
-def test_wrong_calibrations_name_the_file(text: str, message: str):
+def test_wrong_calibrations_name_the_file(text: str, message: str, tmp_path: Path):
     with pytest.raises(InputError, match=message) as caught:
-        parse_calibration(text, "kinect.txt").camera_for(640, 480)
+        read(text, tmp_path).camera_for(640, 480)
     assert "kinect.txt" in str(caught.value)
 
 
-def test_a_centre_outside_the_image_is_refused():
-    with pytest.raises(InputError, match=r"cal.*principal point inside"):
-        parse_calibration("500 500 700 240", "cal").camera_for(640, 480)
+def test_a_centre_outside_the_image_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match=r"kinect.*principal point inside"):
+        read("500 500 700 240", tmp_path).camera_for(640, 480)
 
 
-def test_images_of_another_shape_are_refused():
+def test_images_of_another_shape_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match="do not match"):
-        parse_calibration("500 500 320 240 640 480", "cal").camera_for(1280, 720)
+        read("500 500 320 240 640 480", tmp_path).camera_for(1280, 720)

@@ -11,19 +11,19 @@ import pytest
 import torch
 
 from minislam.config import SlamConfig, as_json, from_json
-from minislam.data.calibration import parse_calibration
+from minislam.data.calibration import read_calibration
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.files import read_json
 from minislam.data.images import encode_jpeg, encode_png, read_color
-from minislam.data.ply import GaussianArrays, decode_ply, encode_ply
+from minislam.data.ply import GaussianArrays, encode_ply, read_ply
 from minislam.data.sources import VideoImages
-from minislam.data.trajectory import parse_trajectory
-from minislam.data.tum import parse_image_list
+from minislam.data.trajectory import read_trajectory
+from minislam.data.tum import read_tum_folder
 from minislam.errors import InputError
 from minislam.priors.files import read_array
-from tests.recordings import picture, video
+from tests.recordings import picture, save, video
 
-MUTATIONS = 2000
+MUTATIONS = 500
 OF_FILES = 250  # mutations of what is read from the disk
 _TEXT_PIECES = [
     "nan", "inf", "-", "1e400", "#", "\n", " ", "\t", ",", "\0", "0", "-1", "\ufeff", "é", "1_0",
@@ -51,19 +51,21 @@ def mutated_bytes(content: bytes, source: random.Random) -> bytes:
     return bytes(changed)
 
 
-def check_list(text: str) -> None:
-    stamps, names = parse_image_list(text, "x")
-    assert np.isfinite(stamps).all() and (np.diff(stamps) > 0).all() and len(stamps) == len(names)
+def check_list(path: Path) -> None:
+    recording = read_tum_folder(path.parent)
+    stamps = recording.timestamps
+    assert np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()
+    assert len(stamps) == len(recording.images)
 
 
-def check_trajectory(text: str) -> None:
-    trajectory = parse_trajectory(text, "x")
+def check_trajectory(path: Path) -> None:
+    trajectory = read_trajectory(path)
     assert np.isfinite(trajectory.T_world_camera).all()
     assert (np.diff(trajectory.timestamps) > 0).all()
 
 
-def check_calibration(text: str) -> None:
-    camera = parse_calibration(text, "x").camera_for(64, 48)
+def check_calibration(path: Path) -> None:
+    camera = read_calibration(path).camera_for(64, 48)
     values = [camera.fx, camera.fy, camera.cx, camera.cy]
     assert np.isfinite(values).all() and camera.fx > 0
 
@@ -77,25 +79,31 @@ CALIBRATION = "# fx fy cx cy\n50.5 50.5 31.5 23.5 64 48 0.1 -0.2 0.001 0.002 0.0
     "check, valid",
     [(check_list, LIST), (check_trajectory, TRAJECTORY), (check_calibration, CALIBRATION)],
 )
-def test_mutated_text_files(check: Callable[[str], None], valid: str):
+def test_mutated_text_files(check: Callable[[Path], None], valid: str, tmp_path: Path):
     source, refused = random.Random(0), 0
-    check(valid)
+    path = tmp_path / "rgb.txt"
+    for stamp in ("1.5", "2.25", "3.0"):
+        save(tmp_path / f"rgb/{stamp}.png", picture(0, 8, 8))
+    path.write_text(valid, encoding="utf-8")
+    check(path)
     for _ in range(MUTATIONS):
+        path.write_text(mutated_text(valid, source), encoding="utf-8")
         try:
-            check(mutated_text(valid, source))
+            check(path)
         except InputError:
             refused += 1
     assert 0 < refused < MUTATIONS
 
 
-def test_mutated_maps():
+def test_mutated_maps(tmp_path: Path):
     values = np.random.default_rng(0).normal(size=(4, 14)).astype(np.float32)
     arrays = GaussianArrays(values[:, :3], values[:, 3:6], values[:, 6:10], values[:, 10],
                             values[:, 11:])  # fmt: skip
     valid, source, refused = encode_ply(arrays), random.Random(0), 0
     for _ in range(MUTATIONS):
+        (tmp_path / "map.ply").write_bytes(mutated_bytes(valid, source))
         try:
-            read = decode_ply(mutated_bytes(valid, source), "x")
+            read = read_ply(tmp_path / "map.ply")
         except InputError:
             refused += 1
             continue

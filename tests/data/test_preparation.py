@@ -91,7 +91,7 @@ def test_no_black_border_remains_after_undistortion():
     prepare = ImagePreparation(FR1, FR1_DISTORTION, None, 320 * 240)
     assert prepare.color(white).min() == 1.0
     assert prepare.nearest(np.ones((480, 640), np.float32)).min() == 1.0
-    window = seen_window(*FR1_DISTORTION.undistortion_maps(FR1), (640, 480))
+    window = seen_window(*FR1_DISTORTION.undistortion_maps(FR1))
     assert window[2] * window[3] > 0.85 * 640 * 480
 
 
@@ -106,4 +106,4 @@ def test_tiny_images_are_refused():
 def test_a_distortion_that_leaves_nothing_is_refused():
     maps = np.full((48, 64), -1, np.float32), np.full((48, 64), -1, np.float32)
     with pytest.raises(InputError, match="order k1 k2 p1 p2 k3"):
-        seen_window(*maps, (64, 48))
+        seen_window(*maps)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from minislam.data import InputOptions, RecordedSequence, sources
-from minislam.data.folder import read_video
-from minislam.data.sources import VideoImages
+from minislam.data.sources import VideoImages, read_video
 from minislam.errors import InputError
 from tests.recordings import picture, save, video
 

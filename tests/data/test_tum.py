@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minislam.data.tum import is_tum_folder, parse_image_list, read_tum_folder
+from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from tests.recordings import picture, save, tum_folder
 
@@ -76,16 +76,17 @@ def test_names_with_spaces_percent_and_unicode(tmp_path: Path):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("1.0\n", "timestamp filename.*line 1 of rgb.txt"),
+        ("1.0\n", "timestamp filename.*line 1 of .*rgb.txt"),
         ("one a.png\n", "finite numbers in line 1"),
         ("nan a.png\n", "finite numbers in line 1"),
-        ("1 a.png\n\n1 b.png\n", "increase.*line 3 of rgb.txt"),
+        ("1 a.png\n\n1 b.png\n", "increase.*line 3 of .*rgb.txt"),
         ("2 a.png\n1 b.png\n", "increase.*line 2"),
     ],
 )
-def test_wrong_lists_name_the_line(text: str, message: str):
+def test_wrong_lists_name_the_line(text: str, message: str, tmp_path: Path):
+    (tmp_path / "rgb.txt").write_text(text)
     with pytest.raises(InputError, match=message):
-        parse_image_list(text, "rgb.txt")
+        read_tum_folder(tmp_path)
 
 
 def test_a_missing_image_is_named(tmp_path: Path):

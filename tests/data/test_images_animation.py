@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from minislam.data.animation import write_animation
+from minislam.data.images import write_animation
 from minislam.errors import InputError
 
 REDS = np.linspace(0.1, 0.9, 8)

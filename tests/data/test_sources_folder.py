@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minislam.data.folder import folder_name, read_image_folder
+from minislam.data.sources import folder_name, read_image_folder
 from minislam.errors import InputError
 from tests.recordings import picture, save
 

@@ -4,7 +4,7 @@ import tempfile
 
 import numpy as np
 
-from minislam.data.kept_images import KeptImages
+from minislam.data.preparation import KeptImages
 
 
 def image(number: int) -> np.ndarray:

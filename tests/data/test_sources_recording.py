@@ -7,7 +7,6 @@ import pytest
 
 from minislam.data import InputOptions, RecordedSequence, open_sequence
 from minislam.data.images import encode_png
-from minislam.data.recording import path_of
 from minislam.data.tum import read_tum_folder
 from minislam.errors import InputError
 from tests.recordings import picture, tum_folder, video
@@ -42,12 +41,6 @@ def test_depth_alone_is_an_input_and_no_truth(tmp_path: Path):
     recording = read_tum_folder(folder)
     assert recording.depth_paths and not recording.has_truth()
     assert open_sequence(str(folder)).ground_truth is None
-
-
-def test_an_image_without_a_file_has_none():
-    assert path_of([], 3) is None
-    assert path_of([None, Path("1.png")], 0) is None
-    assert path_of([None, Path("1.png")], 1) == Path("1.png")
 
 
 # Masks from files

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from minislam.data.known_cameras import bonn_camera_trajectory, known_camera
-from minislam.data.tum import read_tum_folder
+from minislam.data.tum import bonn_camera_trajectory, known_camera, read_tum_folder
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
 from tests.recordings import tum_folder
