@@ -120,34 +120,26 @@ class Lpips:
 
 def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:
     """Return the layout of a trunk that is complete, by the shapes of its convolutions."""
-    first = trunk["features.0.weight"] if "features.0.weight" in trunk else None
-    for layout in (_ALEXNET, _VGG16):
-        if first is None or first.shape[-1] != layout.first_kernel:
-            continue
-        for name, shape in _expected_channels(layout).items():
-            found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
-            if found != shape:
-                raise InputError(
-                    f"expected {name} of {layout.name} to have {shape} channels, found "
-                    f"{found}; give torchvision's file of this network, whole"
-                )
-        return layout
-    raise InputError(
-        "expected the convolutions of AlexNet or VGG-16 for LPIPS, found another network; give "
-        "alexnet-owt-*.pth or vgg16-*.pth of torchvision"
-    )
-
-
-def _expected_channels(layout: _Trunk) -> dict[str, tuple[int, ...]]:
-    """Return the channels (out, in) of every weight and (out,) of every bias of a trunk."""
-    expected: dict[str, tuple[int, ...]] = {}
+    kernel = trunk["features.0.weight"].shape[-1] if "features.0.weight" in trunk else 0
+    layout = {known.first_kernel: known for known in (_ALEXNET, _VGG16)}.get(kernel)
+    if layout is None:
+        raise InputError(
+            "expected the convolutions of AlexNet or VGG-16 for LPIPS, found another network; give "
+            "alexnet-owt-*.pth or vgg16-*.pth of torchvision"
+        )
     before = 3
     for channels, convs in zip(layout.channels, layout.convs, strict=True):
         for number in convs:
-            expected[f"features.{number}.weight"] = (channels, before)
-            expected[f"features.{number}.bias"] = (channels,)
+            for part, shape in (("weight", (channels, before)), ("bias", (channels,))):
+                name = f"features.{number}.{part}"
+                found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
+                if found != shape:
+                    raise InputError(
+                        f"expected {name} of {layout.name} to have {shape} channels, found "
+                        f"{found}; give torchvision's file of this network, whole"
+                    )
             before = channels
-    return expected
+    return layout
 
 
 def recognise_heads(heads: Mapping[str, Tensor]) -> str:
