@@ -30,9 +30,8 @@ def frame_rate(run: Run) -> float:
 
 
 def fly_along(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
-    """Yield the static map from the pose of each frame."""
-    for pose in run.poses.values():
-        yield run.render(pose, camera)
+    """Return the static map from the pose of each frame."""
+    return (run.render(pose, camera) for pose in run.poses.values())
 
 
 def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
@@ -73,7 +72,9 @@ def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarra
 def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:
     """Return the images of a short clip beside the input, and how many per second."""
     every = -(-len(run.poses) // CLIP_IMAGES)
-    return side_by_side(run, shrunk(run.camera, CLIP_WIDTH), every), frame_rate(run) / every
+    scale = min(1.0, CLIP_WIDTH / run.camera.width)
+    camera = run.camera.resized(round(scale * run.camera.width), round(scale * run.camera.height))
+    return side_by_side(run, camera, every), frame_rate(run) / every
 
 
 def write_clip(folder: str) -> bool:
@@ -83,12 +84,6 @@ def write_clip(folder: str) -> bool:
     except InputError:
         return False
     return True
-
-
-def shrunk(camera: Camera, width: int) -> Camera:
-    """Return the camera for images of at most this width [px]."""
-    scale = min(1.0, width / camera.width)
-    return camera.resized(round(scale * camera.width), round(scale * camera.height))
 
 
 def _labelled(row: np.ndarray, width: int) -> np.ndarray:

@@ -28,8 +28,7 @@ class Checkpoints:
         self._folder = folder
         self._fraction = config.checkpoint_fraction
         self._origin = _origin(sequence, config, choice)
-        self._start = time.perf_counter()
-        self._last = self._start  # time of the last checkpoint
+        self._start = self._last = time.perf_counter()  # of the run and of the last checkpoint
         self._cost = 0.0  # of the last checkpoint [s]
 
     @property
