@@ -58,14 +58,12 @@ class Lpips:
         trunk: Mapping[str, Tensor],  # torchvision's names: features.0.weight, ...
         heads: Mapping[str, Tensor],  # the authors' names: lin0.model.1.weight, ...
     ) -> None:
-        self._layout = recognise_trunk(trunk)
-        found = recognise_heads(heads)
-        if found != self._layout.name:
+        self._layout, self.name = recognise_trunk(trunk), recognise_heads(heads)
+        if self.name != self._layout.name:
             raise InputError(
-                f"expected LPIPS heads for {self._layout.name}, found heads for {found}; give "
+                f"expected LPIPS heads for {self._layout.name}, found heads for {self.name}; give "
                 "alex.pth with AlexNet and vgg.pth with VGG-16"
             )
-        self.name = found
         self._trunk, self._heads = trunk, heads
 
     def __call__(
@@ -75,13 +73,13 @@ class Lpips:
     ) -> float:
         """Return the distance of two images, 0 for equal ones."""
         both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
-        shapes = [tuple(x.shape) for x in both]
-        if shapes[0] != shapes[1] or len(shapes[0]) != 3 or shapes[0][2] != 3:
+        shape, other = (tuple(x.shape) for x in both)
+        if shape != other or len(shape) != 3 or shape[2] != 3:
             raise InputError(
-                f"expected two RGB images of one size, found {shapes[0]} and {shapes[1]}; render "
-                "at the size of the reference"
+                f"expected two RGB images of one size, found {shape} and {other}; render at the "
+                "size of the reference"
             )
-        self.require_size(shapes[0][1], shapes[0][0])
+        self.require_size(shape[1], shape[0])
         total = 0.0
         with torch.no_grad():
             for level, (a, b) in enumerate(zip(*map(self._features, both), strict=True)):

@@ -220,16 +220,14 @@ def _focal_length_warnings(slam: Slam) -> Iterator[str]:
     is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.adjustments.failed
     if fit is None or not fit.is_doubtful or is_broken:
         return
-    better = f"fits {fit.factor:.2f} times the present focal length better, with {fit.saved:.0%}"
+    found = (
+        f"the flow fits {fit.factor:.2f} times the present focal length better, with "
+        f"{fit.saved:.0%} less cost"
+    )
+    zoomed = "the lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
     if fit.half:
-        yield (
-            f"from frame {fit.half[0]} to {fit.half[1]} the flow {better} less cost: if the lens "
-            "zoomed while it filmed, no focal length is right, and the trajectory is bent; run "
-            "each part for itself"
-        )
+        first, last = fit.half
+        yield f"from frame {first} to {last} {found}: if {zoomed}; run each part for itself"
     else:
-        yield (
-            f"the flow {better} less cost: check the calibration, or give {fit.factor:.2f} times "
-            "the present --fx and --fy. If the lens zoomed while it filmed, no focal length is "
-            "right, and the trajectory is bent"
-        )
+        advice = f"check the calibration, or give {fit.factor:.2f} times the present --fx and --fy"
+        yield f"{found}: {advice}. If {zoomed}"

@@ -53,10 +53,7 @@ def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
 
 
 def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarray]:  # (H, 3 W, 3)
-    """Yield input, beta and static map of every n-th frame that has a pose; all betas in one scale.
-
-    Only as much of the source is read as is shown.
-    """
+    """Yield input, beta (in one scale) and static map of every n-th frame that has a pose."""
     shown = list(run.poses)[::every]
     sampled = shown[:: max(1, len(shown) // _SHOWN_BETAS)]
     limits = beta_limits(np.stack([run.beta(index) for index in sampled]))
@@ -65,8 +62,7 @@ def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarra
         image = run.sequence.frame(index).image.numpy()
         beta = beta_to_rgb(run.beta(index), limits)
         panels = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (image, beta)]
-        row = np.concatenate([*panels, run.render(run.poses[index], camera)], 1)
-        yield _labelled(row, camera.width)
+        yield _labelled([*panels, run.render(run.poses[index], camera)])
 
 
 def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:
@@ -86,11 +82,10 @@ def write_clip(folder: str) -> bool:
     return True
 
 
-def _labelled(row: np.ndarray, width: int) -> np.ndarray:
-    row = np.round(255 * row).astype(np.uint8)  # the type that OpenCV writes text on
+def _labelled(panels: list[np.ndarray]) -> np.ndarray:
+    row = np.round(255 * np.concatenate(panels, 1)).astype(np.uint8)  # OpenCV writes on bytes
     for number, label in enumerate(LABELS):
-        place = number * width + 6, 16
+        text = label, (number * panels[0].shape[1] + 6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45
         for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            font = cv2.FONT_HERSHEY_SIMPLEX
-            cv2.putText(row, label, place, font, 0.45, color, thickness, cv2.LINE_AA)
+            cv2.putText(row, *text, color, thickness, cv2.LINE_AA)
     return row / 255
