@@ -1,7 +1,6 @@
 """Images of a finished run in motion: along its trajectory, in a circle, or beside the input."""
 
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -25,8 +24,8 @@ _SHOWN_BETAS = 8  # frames from whose beta one range of colours is chosen
 
 def frame_rate(run: Run) -> float:
     """Return how many frames per second the run's source has, between 5 and 30."""
-    steps = [b.timestamp - a.timestamp for a, b in pairwise(run.frames)]
-    return float(np.clip(1 / np.median(steps), *_RATES)) if steps else _RATES[0]
+    steps = np.diff([frame.timestamp for frame in run.frames])
+    return float(np.clip(1 / np.median(steps), *_RATES)) if len(steps) else _RATES[0]
 
 
 def fly_along(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
