@@ -86,36 +86,31 @@ class Workers:
         It must be a function of a module of this package, with annotated arguments and result:
         tensors, arrays, plain values, and dataclasses, lists or dictionaries of them.
         """
-        *kinds, kind = _kinds(function)
-        # Tensors are contiguous, as a helper gets them: the layout can change the last bits.
-        tidy = [[_tidy(k, a) for k, a in zip(kinds, call, strict=True)] for call in calls]
-        results: list[Any] = [None] * len(calls)
+        arguments = [_contiguous(to_tree(list(call))) for call in calls]
+        answers: list[Tree] = [None] * len(calls)
         left = deque(range(len(calls)))
 
-        def compute(helper: _Helper | None = None) -> None:
+        def compute(answer: Callable[..., Tree]) -> None:
             while left:
                 try:
                     number = left.popleft()
                 except IndexError:  # another thread was faster
                     return
-                if helper is None:
-                    results[number] = _tidy(kind, function(*tidy[number]))
-                    continue
                 try:
-                    results[number] = _of_tree(kind, helper.answer(function, tidy[number]))
-                except (EOFError, OSError, ValueError):
+                    answers[number] = answer(function, arguments[number])
+                except _HelperLost:
                     left.append(number)  # for this process, where an error of the function is seen
                     return
 
         helpers = self._helpers[: max(0, len(calls) - 1)]
-        threads = [Thread(target=compute, args=(helper,), daemon=True) for helper in helpers]
+        threads = [Thread(target=compute, args=(h.answer,), daemon=True) for h in helpers]
         for thread in threads:
             thread.start()
         try:
-            compute()
+            compute(_answer)
             for thread in threads:
                 thread.join()
-            compute()
+            compute(_answer)
         except BaseException:
             self.close()  # else a late answer would be taken for that of the next call
             raise
@@ -123,29 +118,32 @@ class Workers:
         if len(alive) < len(self._helpers):
             self._warn(f"a worker process has ended; the run goes on with {len(alive) + 1}")
         self._helpers = alive
-        return results
+        return [_result(function, answer) for answer in answers]
 
     def start(self, function: Callable[..., Any], *call: Any) -> Callable[[], Any]:
         """Begin function(*call) in a helper, as for `map`; return what waits for the result.
 
         Without a helper, or if that ends or fails, it is computed here when it is asked for.
         """
-        *kinds, kind = _kinds(function)
-        tidy = [_tidy(k, a) for k, a in zip(kinds, call, strict=True)]
-        results: list[Any] = []
+        arguments = _contiguous(to_tree(list(call)))
+        answers: list[Tree] = []
 
         def ask() -> None:
             for helper in self._helpers[-1:]:
-                with suppress(EOFError, OSError, ValueError):
-                    results.append(_of_tree(kind, helper.answer(function, tidy)))
+                with suppress(_HelperLost):
+                    answers.append(helper.answer(function, arguments))
 
         def result() -> Any:
             thread.join()
-            return results[0] if results else function(*tidy)
+            return _result(function, answers[0] if answers else _answer(function, arguments))
 
         thread = Thread(target=ask, daemon=True)
         thread.start()
         return result
+
+
+class _HelperLost(Exception):
+    """A helper has ended before it answered."""
 
 
 class _Helper:
@@ -160,15 +158,15 @@ class _Helper:
         self.runs = True
         self._lock = Lock()  # while it computes a call
 
-    def answer(self, function: Callable[..., Any], arguments: list[Any]) -> Tree:
-        """Return function(*arguments) as a tree."""
+    def answer(self, function: Callable[..., Any], arguments: Tree) -> Tree:
+        """Return what `_answer` returns, or raise _HelperLost."""
         try:
             with self._lock:
                 _send(self._process.stdin, [function.__module__, function.__name__, arguments])
                 return _receive(self._process.stdout)
-        except (EOFError, OSError, ValueError):
+        except (EOFError, OSError, ValueError) as error:
             self.end()
-            raise
+            raise _HelperLost from error
 
     def end(self) -> None:
         self.runs = False
@@ -190,12 +188,20 @@ def serve() -> None:
     try:
         while True:
             module, name, arguments = _receive(sys.stdin.buffer)
-            function = getattr(importlib.import_module(module), name)
-            *kinds, _ = _kinds(function)
-            values = [_of_tree(k, a) for k, a in zip(kinds, arguments, strict=True)]
-            _send(answers, function(*values))
+            _send(answers, _answer(getattr(importlib.import_module(module), name), arguments))
     except Exception:  # the parent has ended, or computes the call itself and sees the error
         return
+
+
+def _answer(function: Callable[..., Any], arguments: Tree) -> Tree:
+    """Return function(*arguments), both as trees: here as in a helper."""
+    *kinds, _ = _kinds(function)
+    values = [from_tree(k, a, _no_frame) for k, a in zip(kinds, arguments, strict=True)]
+    return _contiguous(to_tree(function(*values)))
+
+
+def _result(function: Callable[..., Any], answer: Tree) -> Any:
+    return from_tree(_kinds(function)[-1], answer, _no_frame)
 
 
 @cache
@@ -204,38 +210,30 @@ def _kinds(function: Callable[..., Any]) -> list[Any]:
     return list(get_type_hints(function).values())
 
 
-def _tidy(kind: Any, value: Any) -> Any:
-    """Return a value as it would be after a way through a pipe."""
-    return _of_tree(kind, _each_tensor(to_tree(value), lambda t: t.detach().contiguous()))
+def _no_frame(index: int) -> Frame:
+    raise TypeError(f"expected a call without frames, found frame {index}; give its image")
 
 
-def _of_tree(kind: Any, tree: Tree) -> Any:
-    def no_frame(index: int) -> Frame:
-        raise TypeError(f"expected a call without frames, found frame {index}; give its image")
-
-    return from_tree(kind, tree, no_frame)
-
-
-def _each_tensor(tree: Tree, change: Callable[[Tensor], Any]) -> Tree:
-    """Return a tree whose tensors are changed, arrays as well."""
-    if isinstance(tree, np.ndarray):
-        return change(torch.from_numpy(tree))
-    if isinstance(tree, Tensor):
-        return change(tree)
+def _contiguous(tree: Tree) -> Tree:
+    """Return a tree with tensors as a pipe carries them: the layout can change the last bits."""
     if isinstance(tree, dict):
-        return {key: _each_tensor(item, change) for key, item in tree.items()}
-    return [_each_tensor(item, change) for item in tree] if isinstance(tree, list) else tree
+        return {key: _contiguous(item) for key, item in tree.items()}
+    if isinstance(tree, list):
+        return [_contiguous(item) for item in tree]
+    if isinstance(tree, np.ndarray):
+        return torch.from_numpy(tree).contiguous()
+    return tree.detach().contiguous() if isinstance(tree, Tensor) else tree
 
 
-def _send(stream: Any, value: Any) -> None:
+def _send(stream: Any, tree: Tree) -> None:
     """Write the length of a JSON text, the text, and the bytes of the tensors it names."""
     tensors: list[Tensor] = []
 
-    def named(tensor: Tensor) -> Tree:
-        tensors.append(tensor.detach().contiguous())
+    def named(tensor: Tensor) -> Tree:  # called in the order of the text
+        tensors.append(tensor)
         return {_TENSOR: [str(tensor.dtype).removeprefix("torch."), list(tensor.shape)]}
 
-    text = json.dumps(_each_tensor(to_tree(value), named)).encode()
+    text = json.dumps(tree, default=named).encode()
     stream.write(struct.pack("<Q", len(text)) + text)
     for tensor in tensors:
         stream.write(tensor.numpy().data)

@@ -58,14 +58,12 @@ class Lpips:
         trunk: Mapping[str, Tensor],  # torchvision's names: features.0.weight, ...
         heads: Mapping[str, Tensor],  # the authors' names: lin0.model.1.weight, ...
     ) -> None:
-        self._layout = recognise_trunk(trunk)
-        found = recognise_heads(heads)
-        if found != self._layout.name:
+        self._layout, self.name = recognise_trunk(trunk), recognise_heads(heads)
+        if self.name != self._layout.name:
             raise InputError(
-                f"expected LPIPS heads for {self._layout.name}, found heads for {found}; give "
+                f"expected LPIPS heads for {self._layout.name}, found heads for {self.name}; give "
                 "alex.pth with AlexNet and vgg.pth with VGG-16"
             )
-        self.name = found
         self._trunk, self._heads = trunk, heads
 
     def __call__(
@@ -75,13 +73,13 @@ class Lpips:
     ) -> float:
         """Return the distance of two images, 0 for equal ones."""
         both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
-        shapes = [tuple(x.shape) for x in both]
-        if shapes[0] != shapes[1] or len(shapes[0]) != 3 or shapes[0][2] != 3:
+        shape, other = (tuple(x.shape) for x in both)
+        if shape != other or len(shape) != 3 or shape[2] != 3:
             raise InputError(
-                f"expected two RGB images of one size, found {shapes[0]} and {shapes[1]}; render "
-                "at the size of the reference"
+                f"expected two RGB images of one size, found {shape} and {other}; render at the "
+                "size of the reference"
             )
-        self.require_size(shapes[0][1], shapes[0][0])
+        self.require_size(shape[1], shape[0])
         total = 0.0
         with torch.no_grad():
             for level, (a, b) in enumerate(zip(*map(self._features, both), strict=True)):
@@ -120,34 +118,26 @@ class Lpips:
 
 def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:
     """Return the layout of a trunk that is complete, by the shapes of its convolutions."""
-    first = trunk["features.0.weight"] if "features.0.weight" in trunk else None
-    for layout in (_ALEXNET, _VGG16):
-        if first is None or first.shape[-1] != layout.first_kernel:
-            continue
-        for name, shape in _expected_channels(layout).items():
-            found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
-            if found != shape:
-                raise InputError(
-                    f"expected {name} of {layout.name} to have {shape} channels, found "
-                    f"{found}; give torchvision's file of this network, whole"
-                )
-        return layout
-    raise InputError(
-        "expected the convolutions of AlexNet or VGG-16 for LPIPS, found another network; give "
-        "alexnet-owt-*.pth or vgg16-*.pth of torchvision"
-    )
-
-
-def _expected_channels(layout: _Trunk) -> dict[str, tuple[int, ...]]:
-    """Return the channels (out, in) of every weight and (out,) of every bias of a trunk."""
-    expected: dict[str, tuple[int, ...]] = {}
+    kernel = trunk["features.0.weight"].shape[-1] if "features.0.weight" in trunk else 0
+    layout = {known.first_kernel: known for known in (_ALEXNET, _VGG16)}.get(kernel)
+    if layout is None:
+        raise InputError(
+            "expected the convolutions of AlexNet or VGG-16 for LPIPS, found another network; give "
+            "alexnet-owt-*.pth or vgg16-*.pth of torchvision"
+        )
     before = 3
     for channels, convs in zip(layout.channels, layout.convs, strict=True):
         for number in convs:
-            expected[f"features.{number}.weight"] = (channels, before)
-            expected[f"features.{number}.bias"] = (channels,)
+            for part, shape in (("weight", (channels, before)), ("bias", (channels,))):
+                name = f"features.{number}.{part}"
+                found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
+                if found != shape:
+                    raise InputError(
+                        f"expected {name} of {layout.name} to have {shape} channels, found "
+                        f"{found}; give torchvision's file of this network, whole"
+                    )
             before = channels
-    return expected
+    return layout
 
 
 def recognise_heads(heads: Mapping[str, Tensor]) -> str:

@@ -10,8 +10,7 @@ from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 
-# Two poses whose timestamps differ by more do not belong together (evo's default).
-DEFAULT_MAX_DIFFERENCE = 0.01  # second
+DEFAULT_MAX_DIFFERENCE = 0.01  # second between two poses that belong together (evo's default)
 
 
 class Alignment(Enum):
@@ -95,19 +94,18 @@ def paired(
     estimate: Trajectory, truth: Trajectory, max_difference: float, offset: float = 0.0
 ) -> tuple[Trajectory, Trajectory]:
     """Return the poses of both trajectories that belong together, in order of time."""
-    of_estimate, of_truth = associate(
-        estimate.timestamps + offset, truth.timestamps, max_difference
-    )
-    if len(of_estimate) == 0:
+    pairs = associate(estimate.timestamps + offset, truth.timestamps, max_difference)
+    if len(pairs[0]) == 0:
         raise InputError(
             f"expected timestamps of estimate and truth within {max_difference:g} s of each "
             f"other, found none (estimate {_span(estimate)}, truth {_span(truth)}); check that "
             "the files belong together, or use --t_offset and --t_max_diff"
         )
-    return (
-        Trajectory(estimate.timestamps[of_estimate], estimate.T_world_camera[of_estimate]),
-        Trajectory(truth.timestamps[of_truth], truth.T_world_camera[of_truth]),
+    estimate, truth = (
+        Trajectory(whole.timestamps[kept], whole.T_world_camera[kept])
+        for whole, kept in zip((estimate, truth), pairs, strict=True)
     )
+    return estimate, truth
 
 
 def associate(
@@ -122,8 +120,6 @@ def associate(
     if len(first) > len(second):
         of_second, of_first = associate(second, first, max_difference)
         return of_first, of_second
-    if len(first) == 0:
-        return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
     after = np.searchsorted(second, first).clip(max=len(second) - 1)
     before = (after - 1).clip(min=0)
     earlier_is_nearer = np.abs(second[before] - first) <= np.abs(second[after] - first)
@@ -136,8 +132,7 @@ def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     """Return the similarity that maps the paired estimate to the truth."""
     if alignment is Alignment.NONE:
         return Similarity(1.0, np.eye(3), np.zeros(3))
-    with_scale = alignment is not Alignment.SE3
-    fitted = umeyama(centres(estimate), centres(truth), with_scale)
+    fitted = umeyama(centres(estimate), centres(truth), alignment is not Alignment.SE3)
     if alignment is Alignment.SCALE:
         return Similarity(fitted.scale, np.eye(3), np.zeros(3))
     return fitted
@@ -152,7 +147,7 @@ def truth_to_estimate(
     error is least there. The error of the trajectory enters every measure taken at these views.
     """
     estimate, truth = paired(estimate, truth, max_difference)
-    return fit_alignment(truth, estimate, Alignment.SIM3)
+    return umeyama(centres(truth), centres(estimate))
 
 
 def oriented_truth_to_estimate(

@@ -1,4 +1,6 @@
-"""Warnings at the time something goes wrong; the summary at the end has the final verdict."""
+"""What is said the moment something goes wrong; the summary at the end has the final verdict."""
+
+import os
 
 from minislam.slam import Slam
 from minislam.state.steps import Observer
@@ -31,3 +33,24 @@ class Alarms:
                     f"{newest.explained:.0%} of the optical flow; the trajectory may break here"
                 )
             self._judged = newest.frame_index
+
+
+def check_finite(slam: Slam) -> None:
+    """Raise FloatingPointError at the first NaN or infinity, under MINISLAM_DEBUG=1 only."""
+    if not os.environ.get("MINISLAM_DEBUG"):
+        return
+    keyframes = slam.tracker.keyframes
+    parts = {
+        "poses": [keyframes.T_camera_world],
+        "disparities": [keyframes.disparities],
+        "static weights from beta": [keyframes.static_weights],
+        "the map": slam.mapper.gaussians.parameters.values(),
+    }
+    for name, tensors in parts.items():
+        for tensor in tensors:
+            wrong = int((~tensor.isfinite()).sum())
+            if wrong:
+                raise FloatingPointError(
+                    f"expected finite numbers in {name}, found {wrong} of {tensor.numel()} that "
+                    "are not"
+                )

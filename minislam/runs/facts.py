@@ -35,7 +35,8 @@ def run_facts(
     slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int | None
 ) -> dict[str, Any]:
     """Return the content of run.json: the command, how long the run took, and how it ended."""
-    adjustments = slam.tracker.graph.adjustments
+    adjustments, fit = slam.tracker.graph.adjustments, slam.focal_length
+    stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
     return {
         "version": minislam.__version__,
         "command": sys.argv,
@@ -61,20 +62,14 @@ def run_facts(
         "unit": unit_of(slam),
         "camera": asdict(slam.tracker.grid.camera),
         "focal_length": {"used": focal_length_note(slam)}
-        | (asdict(slam.focal_length) if slam.focal_length else {})
-        | ({"is_doubtful": slam.focal_length.is_doubtful} if slam.focal_length else {}),
+        | (asdict(fit) | {"is_doubtful": fit.is_doubtful} if fit else {}),
         "readout_seconds": list(slam.tracker.graph.shutter.readout),
-        "frame_seconds": _frame_seconds(slam),
+        # Numbered images are a second apart.
+        "frame_seconds": float(np.median(np.diff(stamps))) if len(stamps) > 1 else None,
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
         "segments": slam.tracker.watch.segments,
         "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],
     }
-
-
-def _frame_seconds(slam: Slam) -> float | None:
-    """Return the median time between two frames; numbered images are a second apart."""
-    stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
-    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else None
 
 
 def unit_of(slam: Slam) -> str:
@@ -84,12 +79,13 @@ def unit_of(slam: Slam) -> str:
 
 def focal_length_note(slam: Slam) -> str:
     """Return which focal length was used, and where it comes from."""
-    camera, start = slam.tracker.grid.camera, slam.sequence.camera
-    how = "as given"
-    if slam.tracker.graph.seeks_focal:
-        how = f"estimated from the motion, from {start.fx:.1f} px on"
-        if not slam.tracker.graph.focal_is_free:
-            how = "kept as noted or guessed, because the motion does not tell it"
+    camera, graph = slam.tracker.grid.camera, slam.tracker.graph
+    if not graph.seeks_focal:
+        how = "as given"
+    elif graph.focal_is_free:
+        how = f"estimated from the motion, from {slam.sequence.camera.fx:.1f} px on"
+    else:
+        how = "kept as noted or guessed, because the motion does not tell it"
     return f"{camera.fx:.1f} px for {camera.width}x{camera.height} images, {how}"
 
 
@@ -107,14 +103,16 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
             pictures = keyframe.exposed(rendering.color), keyframe.image, static
             likeness.append(psnr(*(picture.cpu() for picture in pictures)))
     truth, paths = slam.sequence.ground_truth, (slam.trajectory(), slam.keyframe_trajectory())
-    metrics: dict[str, Any] = measure_run(truth, *paths, views, slam.render, lpips)
-    metrics |= _segment_errors(slam)
-    metrics["focal_length_px"] = slam.tracker.grid.camera.fx
-    metrics["seconds_total"] = seconds
-    metrics["frames_per_second"] = len(slam.tracker.tracked) / seconds
-    metrics["peak_memory_mb"] = peak_memory_mb()
-    metrics["psnr_static_db"] = float(np.mean(likeness)) if likeness else None
-    return metrics | _ties(slam)
+    return {
+        **measure_run(truth, *paths, views, slam.render, lpips),
+        **_segment_errors(slam),
+        "focal_length_px": slam.tracker.grid.camera.fx,
+        "seconds_total": seconds,
+        "frames_per_second": len(slam.tracker.tracked) / seconds,
+        "peak_memory_mb": peak_memory_mb(),
+        "psnr_static_db": float(np.mean(likeness)) if likeness else None,
+        **_ties(slam),
+    }
 
 
 def _ties(slam: Slam) -> dict[str, float | None]:
@@ -135,13 +133,13 @@ def _ties(slam: Slam) -> dict[str, float | None]:
 
 def _segment_errors(slam: Slam) -> dict[str, float | None]:
     """Return the ATE of each piece of a broken trajectory, aligned by itself [cm]."""
-    truth, segments = slam.sequence.ground_truth, slam.tracker.watch.segments
-    if truth is None or truth.trajectory is None or not slam.tracker.watch.is_broken:
+    truth, watch = slam.sequence.ground_truth, slam.tracker.watch
+    if truth is None or truth.trajectory is None or not watch.is_broken:
         return {}
     trajectory, errors = slam.trajectory(), {}
+    times = trajectory.timestamps
     stamp = {tracked.frame_index: tracked.timestamp for tracked in slam.tracker.tracked}
-    for first, last in segments:
-        times = trajectory.timestamps
+    for first, last in watch.segments:
         inside = (times >= stamp[first]) & (times <= stamp[last])
         piece = Trajectory(times[inside], trajectory.T_world_camera[inside])
         errors[f"ate_{first}_to_{last}_cm"] = ate_cm(piece, truth.trajectory)
@@ -222,16 +220,14 @@ def _focal_length_warnings(slam: Slam) -> Iterator[str]:
     is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.adjustments.failed
     if fit is None or not fit.is_doubtful or is_broken:
         return
-    better = f"fits {fit.factor:.2f} times the present focal length better, with {fit.saved:.0%}"
+    found = (
+        f"the flow fits {fit.factor:.2f} times the present focal length better, with "
+        f"{fit.saved:.0%} less cost"
+    )
+    zoomed = "the lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
     if fit.half:
-        yield (
-            f"from frame {fit.half[0]} to {fit.half[1]} the flow {better} less cost: if the lens "
-            "zoomed while it filmed, no focal length is right, and the trajectory is bent; run "
-            "each part for itself"
-        )
+        first, last = fit.half
+        yield f"from frame {first} to {last} {found}: if {zoomed}; run each part for itself"
     else:
-        yield (
-            f"the flow {better} less cost: check the calibration, or give {fit.factor:.2f} times "
-            "the present --fx and --fy. If the lens zoomed while it filmed, no focal length is "
-            "right, and the trajectory is bent"
-        )
+        advice = f"check the calibration, or give {fit.factor:.2f} times the present --fx and --fy"
+        yield f"{found}: {advice}. If {zoomed}"

@@ -1,7 +1,6 @@
 """Images of a finished run in motion: along its trajectory, in a circle, or beside the input."""
 
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -25,14 +24,13 @@ _SHOWN_BETAS = 8  # frames from whose beta one range of colours is chosen
 
 def frame_rate(run: Run) -> float:
     """Return how many frames per second the run's source has, between 5 and 30."""
-    steps = [b.timestamp - a.timestamp for a, b in pairwise(run.frames)]
-    return float(np.clip(1 / np.median(steps), *_RATES)) if steps else _RATES[0]
+    steps = np.diff([frame.timestamp for frame in run.frames])
+    return float(np.clip(1 / np.median(steps), *_RATES)) if len(steps) else _RATES[0]
 
 
 def fly_along(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
-    """Yield the static map from the pose of each frame."""
-    for pose in run.poses.values():
-        yield run.render(pose, camera)
+    """Return the static map from the pose of each frame."""
+    return (run.render(pose, camera) for pose in run.poses.values())
 
 
 def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
@@ -54,10 +52,7 @@ def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
 
 
 def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarray]:  # (H, 3 W, 3)
-    """Yield input, beta and static map of every n-th frame that has a pose; all betas in one scale.
-
-    Only as much of the source is read as is shown.
-    """
+    """Yield input, beta (in one scale) and static map of every n-th frame that has a pose."""
     shown = list(run.poses)[::every]
     sampled = shown[:: max(1, len(shown) // _SHOWN_BETAS)]
     limits = beta_limits(np.stack([run.beta(index) for index in sampled]))
@@ -66,14 +61,15 @@ def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarra
         image = run.sequence.frame(index).image.numpy()
         beta = beta_to_rgb(run.beta(index), limits)
         panels = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (image, beta)]
-        row = np.concatenate([*panels, run.render(run.poses[index], camera)], 1)
-        yield _labelled(row, camera.width)
+        yield _labelled([*panels, run.render(run.poses[index], camera)])
 
 
 def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:
     """Return the images of a short clip beside the input, and how many per second."""
     every = -(-len(run.poses) // CLIP_IMAGES)
-    return side_by_side(run, shrunk(run.camera, CLIP_WIDTH), every), frame_rate(run) / every
+    scale = min(1.0, CLIP_WIDTH / run.camera.width)
+    camera = run.camera.resized(round(scale * run.camera.width), round(scale * run.camera.height))
+    return side_by_side(run, camera, every), frame_rate(run) / every
 
 
 def write_clip(folder: str) -> bool:
@@ -85,17 +81,10 @@ def write_clip(folder: str) -> bool:
     return True
 
 
-def shrunk(camera: Camera, width: int) -> Camera:
-    """Return the camera for images of at most this width [px]."""
-    scale = min(1.0, width / camera.width)
-    return camera.resized(round(scale * camera.width), round(scale * camera.height))
-
-
-def _labelled(row: np.ndarray, width: int) -> np.ndarray:
-    row = np.round(255 * row).astype(np.uint8)  # the type that OpenCV writes text on
+def _labelled(panels: list[np.ndarray]) -> np.ndarray:
+    row = np.round(255 * np.concatenate(panels, 1)).astype(np.uint8)  # OpenCV writes on bytes
     for number, label in enumerate(LABELS):
-        place = number * width + 6, 16
+        text = label, (number * panels[0].shape[1] + 6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45
         for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            font = cv2.FONT_HERSHEY_SIMPLEX
-            cv2.putText(row, label, place, font, 0.45, color, thickness, cv2.LINE_AA)
+            cv2.putText(row, *text, color, thickness, cv2.LINE_AA)
     return row / 255

@@ -47,13 +47,11 @@ def scene_of(slam: Slam) -> dict[str, Any]:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
     exposures = {index: e.tolist() for index, e in slam.mapper.exposures.items()}
-    frames = [
-        SourceFrame(
-            index, frame.timestamp, sequence.source_name(index), index in keyframes,
-            exposures.get(index),
-        )
-        for index, frame in enumerate(slam.tracker.tracked)
-    ]  # fmt: skip
+    frames = []
+    for index, tracked in enumerate(slam.tracker.tracked):
+        origin = tracked.timestamp, sequence.source_name(index)
+        frame = SourceFrame(index, *origin, index in keyframes, exposures.get(index))
+        frames.append(asdict(frame))
     return {
         "sequence": {"name": sequence.name, "description": sequence.description},
         "camera": asdict(slam.tracker.grid.camera),
@@ -61,7 +59,7 @@ def scene_of(slam: Slam) -> dict[str, Any]:
         "background": slam.mapper.background.tolist(),
         "least_weight": slam.mapper.least_weight,
         "preparation": sequence.preparation,
-        "frames": [asdict(frame) for frame in frames],
+        "frames": frames,
     }
 
 
@@ -143,16 +141,14 @@ class Run:
             return beta_of_mask(torch.from_numpy(mask)).numpy()
         if frame_index not in self._betas:  # a network may take seconds for the features
             with torch.no_grad():
-                features = self._features(sequence.frame(frame_index))
-                self._betas[frame_index] = self._mlp(features)
+                self._betas[frame_index] = self._mlp(self._features(sequence.frame(frame_index)))
         return resample(self._betas[frame_index], height, width).numpy()
 
     def displacement(self, frame_index: int) -> np.ndarray | None:  # (H, W, 2) px
         """Return how far a rolling shutter shows each pixel from its place; None: not at all."""
         across, down = self.folder.read_run().get("readout_seconds", (0.0, 0.0))
-        if across == down == 0:
-            return None
-        return self._motion.displacement(frame_index, (across, down))
+        is_global = across == down == 0
+        return None if is_global else self._motion.displacement(frame_index, (across, down))
 
     def plot(self, frame_index: int | None = None) -> Figure:
         """Return one picture of the run: a frame (by default the middle keyframe) and the path."""

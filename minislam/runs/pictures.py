@@ -4,7 +4,6 @@ import shlex
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +60,10 @@ class Preview:
     def write(self, slam: Slam, facts: dict[str, Any]) -> None:
         """Write the report of what is known so far, if it can be written: no run ends of it."""
         with suppress(Exception):
-            newest = len(slam.mapper.keyframes) - 1
-            keyframe = slam.mapper.keyframes[newest]
-            rendering = slam.mapper.render(keyframe.T_camera_world)
-            color = keyframe.exposed(rendering.color).cpu().numpy()
-            strip = [keyframe.image.cpu().numpy(), viz.beta_to_rgb(slam.beta_image(newest)), color]
+            shown = _pictures(slam, len(slam.mapper.keyframes) - 1)
+            strip = [shown["input"], viz.beta_to_rgb(shown["beta"]), shown["render"]]
             jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
-            page = replace(_known(self._folder, slam, {}, facts), overview=jpeg)
-            write_text(self._folder.path / REPORT, viz.build_report(page))
+            _write_report(self._folder, slam, {}, facts, overview=jpeg)
 
 
 def write_pictures(
@@ -76,53 +71,59 @@ def write_pictures(
 ) -> None:
     """Write keyframe images, plots, viewer and report."""
     estimate, true_path, unit = slam.trajectory(), None, facts["unit"]
-    plots: dict[str, tuple[str, bytes]] = {}  # caption and PNG, by name
-    plots["health"] = "How much of the flow poses and depths explain, by keyframe", _health(slam)
+    diagnostics, history = slam.tracker.watch.diagnostics, slam.mapper.history
+    health = viz.keyframe_health(
+        [keyframe.frame_index for keyframe in diagnostics],
+        [keyframe.explained for keyframe in diagnostics],
+        MIN_EXPLAINED_LONG,
+        [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
+        [index for index, _, _ in slam.lost_frames()],
+    )
+    plots = [("health", "How much of the flow poses and depths explain, by keyframe", health)]
     truth = slam.sequence.ground_truth
     if metrics["ate_all_cm"] is not None and truth is not None and truth.trajectory is not None:
         error = absolute_trajectory_error(estimate, truth.trajectory, max_difference=MAX_DIFFERENCE)
         estimate, true_path, unit = error.estimate, error.truth, "m"
-        over_time = figure_png(viz.ate_over_time(estimate.timestamps, error.errors, unit))
-        plots["ate_over_time"] = "Error of the camera's position over time", over_time
-    path = figure_png(viz.trajectory_plot(estimate, true_path, unit))
-    plots["trajectory"] = "Path of the camera, from above and from behind", path
-    history = slam.mapper.history
+        over_time = viz.ate_over_time(estimate.timestamps, error.errors, unit)
+        plots += [("ate_over_time", "Error of the camera's position over time", over_time)]
+    path = viz.trajectory_plot(estimate, true_path, unit)
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
-    plots["losses"] = "Losses while the map was optimised", figure_png(viz.loss_curves(curves))
-    plots["gaussians"] = "Size of the map", figure_png(viz.map_growth(history.gaussians))
+    plots += [
+        ("trajectory", "Path of the camera, from above and from behind", path),
+        ("losses", "Losses while the map was optimised", viz.loss_curves(curves)),
+        ("gaussians", "Size of the map", viz.map_growth(history.gaussians)),
+    ]
+    figures = []
+    for name, caption, figure in plots:
+        figures.append((caption, figure_png(figure)))
+        folder.write_plot(name, figures[-1][1])
 
-    of_depth, of_beta = _colour_limits(slam)
-    jpegs = _write_keyframes(folder, slam, of_depth, of_beta)
-    middle = len(slam.mapper.keyframes) // 2
-    keyframe, beta = slam.mapper.keyframes[middle], slam.beta_image(middle)
-    color = keyframe.exposed(slam.mapper.render(keyframe.T_camera_world).color).cpu().numpy()
-    picture = viz.overview(keyframe.image.cpu().numpy(), beta, color, estimate, true_path, unit)
-    folder.write_plot("overview", png := figure_png(picture))
-    for name, (_, plot) in plots.items():
-        folder.write_plot(name, plot)
+    limits = _colour_limits(slam)
+    jpegs = _write_keyframes(folder, slam, *limits)
+    middle = _pictures(slam, len(slam.mapper.keyframes) // 2)
+    parts = middle["input"], middle["beta"], middle["render"]
+    overview = figure_png(viz.overview(*parts, estimate, true_path, unit))
+    folder.write_plot("overview", overview)
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
     write_text(folder.path / VIEWER, viz.build_viewer(f"minislam: {run.name}", *scene))
-    page = replace(
-        _known(folder, slam, metrics, facts),
-        overview=png,
-        keyframes=jpegs,
-        depth_limits=of_depth,
-        beta_limits=of_beta,
-        unit=facts["unit"],
-        figures=list(plots.values()),
-    )
-    write_text(folder.path / REPORT, viz.build_report(page))
+    _write_report(
+        folder, slam, metrics, facts, overview=overview, keyframes=jpegs, depth_limits=limits[0],
+        beta_limits=limits[1], unit=facts["unit"], figures=figures,
+    )  # fmt: skip
 
 
-def _known(
-    folder: RunFolder, slam: Slam, metrics: dict[str, float | None], facts: dict[str, Any]
-) -> viz.Report:
-    """Return a report without pictures."""
+def _write_report(
+    folder: RunFolder,
+    slam: Slam,
+    metrics: dict[str, float | None],
+    facts: dict[str, Any],
+    **pictures: Any,  # of viz.Report
+) -> None:
     program, *arguments = facts["command"]
     by_hand = Path(program).stem in ("minislam", "__main__")  # or else by a program of the user
-    return viz.Report(
+    report = viz.Report(
         title=f"minislam: {slam.sequence.name}",
         folder=shlex.quote(str(folder.path)),
         state=facts["state"],
@@ -134,7 +135,9 @@ def _known(
         ],
         command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
         settings=named_settings(slam.config),
+        **pictures,
     )
+    write_text(folder.path / REPORT, viz.build_report(report))
 
 
 def named_settings(config: SlamConfig) -> str:
@@ -147,31 +150,29 @@ def named_settings(config: SlamConfig) -> str:
     return " with ".join(filter(None, [f"preset {nearest}", ", ".join(others[nearest])]))
 
 
-def _health(slam: Slam) -> bytes:
-    diagnostics = slam.tracker.watch.diagnostics
-    figure = viz.keyframe_health(
-        [keyframe.frame_index for keyframe in diagnostics],
-        [keyframe.explained for keyframe in diagnostics],
-        MIN_EXPLAINED_LONG,
-        [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
-        [index for index, _, _ in slam.lost_frames()],
-    )
-    return figure_png(figure)
-
-
 def _spread(count: int, most: int) -> list[int]:
     """Return at most `most` of `count` positions, the first and the last among them."""
     return sorted(set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()))
 
 
+def _pictures(slam: Slam, index: int) -> dict[str, np.ndarray]:
+    """Return what a keyframe shows, and depth and beta as numbers."""
+    keyframe = slam.mapper.keyframes[index]
+    rendering = slam.mapper.render(keyframe.T_camera_world)
+    return {
+        "input": keyframe.image.cpu().numpy(),
+        "depth": surface_depth(rendering).cpu().numpy(),
+        "beta": slam.beta_image(index),
+        "render": keyframe.exposed(rendering.color).cpu().numpy(),
+    }
+
+
 def _colour_limits(slam: Slam) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the depths and the betas between which all keyframes are coloured."""
-    depths, betas = [], []
-    for index in _spread(len(slam.mapper.keyframes), COLOUR_SAMPLES):
-        rendering = slam.mapper.render(slam.mapper.keyframes[index].T_camera_world)
-        depths.append(surface_depth(rendering).cpu().numpy())
-        betas.append(slam.beta_image(index))
-    return viz.depth_limits(np.array(depths)), viz.beta_limits(np.array(betas))
+    samples = _spread(len(slam.mapper.keyframes), COLOUR_SAMPLES)
+    sampled = [_pictures(slam, index) for index in samples]
+    depths, betas = (np.array([shown[kind] for shown in sampled]) for kind in ("depth", "beta"))
+    return viz.depth_limits(depths), viz.beta_limits(betas)
 
 
 def _write_keyframes(
@@ -184,13 +185,9 @@ def _write_keyframes(
     jpegs: dict[int, list[bytes]] = {}
     shown = set(_spread(len(slam.mapper.keyframes), MAX_SHOWN))
     for index, keyframe in enumerate(slam.mapper.keyframes):
-        rendering = slam.mapper.render(keyframe.T_camera_world)
-        pictures = {
-            "input": keyframe.image.cpu().numpy(),
-            "depth": viz.depth_to_rgb(surface_depth(rendering).cpu().numpy(), of_depth),
-            "beta": viz.beta_to_rgb(slam.beta_image(index), of_beta),
-            "render": keyframe.exposed(rendering.color).cpu().numpy(),
-        }
+        pictures = _pictures(slam, index)
+        pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
+        pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
         for kind, picture in pictures.items():
             folder.write_keyframe_image(keyframe.frame_index, kind, picture)
         if index in shown:

@@ -27,9 +27,19 @@ class Checkpoints:
         self.problem: str | None = None  # why the last checkpoint could not be written
         self._folder = folder
         self._fraction = config.checkpoint_fraction
-        self._origin = _origin(sequence, config, choice)
-        self._start = time.perf_counter()
-        self._last = self._start  # time of the last checkpoint
+        origin = {
+            "version": minislam.__version__,
+            "sequence": {
+                "name": sequence.name,
+                "description": sequence.description,
+                "frames": len(sequence),
+                "camera": asdict(sequence.camera),
+            },
+            "priors": asdict(choice),
+            "settings": as_json(config),
+        }  # must be the same for a run to be resumed, as it is read back from JSON
+        self._origin: dict[str, Any] = json.loads(json.dumps(origin))
+        self._start = self._last = time.perf_counter()  # of the run and of the last checkpoint
         self._cost = 0.0  # of the last checkpoint [s]
 
     @property
@@ -102,19 +112,3 @@ class Checkpoints:
                 f"expected the whole state of a run in the checkpoint of {where}, found {error!r}; "
                 "it is damaged or of another program: start again with --overwrite"
             ) from error
-
-
-def _origin(sequence: Sequence, config: SlamConfig, choice: PriorChoice) -> dict[str, Any]:
-    """Return what must be the same for a run to be resumed, as it is read back from JSON."""
-    origin = {
-        "version": minislam.__version__,
-        "sequence": {
-            "name": sequence.name,
-            "description": sequence.description,
-            "frames": len(sequence),
-            "camera": asdict(sequence.camera),
-        },
-        "priors": asdict(choice),
-        "settings": as_json(config),
-    }
-    return json.loads(json.dumps(origin))

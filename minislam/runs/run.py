@@ -1,10 +1,13 @@
 """One run from a name to a folder: read the sequence, do SLAM, measure it, write everything."""
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,7 +22,7 @@ from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
 from minislam.records import Sequence
-from minislam.runs.alarms import Alarms
+from minislam.runs.alarms import Alarms, check_finite
 from minislam.runs.facts import measure, run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
@@ -27,7 +30,6 @@ from minislam.runs.pictures import Preview, write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.runs.summary import Line, summarise
 from minislam.slam import Priors, Slam
-from minislam.state.finite import check_finite
 from minislam.state.steps import Observer, SilentObserver
 from minislam.workers import Workers, idle_cores
 
@@ -83,54 +85,43 @@ def run_in_folder(
     for index in range(len(sequence)):
         sequence.given_mask(index)
     priors = choose_priors(choice, sequence, config)
-    threads = torch.get_num_threads()
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
-    warn = (observer or SilentObserver()).warn
-    with names.locked(output), Workers(count, config.threads, warn) as helpers:
+    threads, observer = torch.get_num_threads(), observer or SilentObserver()
+    with names.locked(output), Workers(count, config.threads, observer.warn) as helpers:
         folder = (
             RunFolder(output) if resume else RunFolder.create(output, overwrite, sequence.files)
         )
         try:
-            return run_sequence(
-                sequence, config, choice, priors, folder, observer, lpips, resume, helpers
-            )
+            torch.set_num_threads(config.threads)
+            checkpoints = Checkpoints(folder, sequence, config, choice)
+            alarms, preview = Alarms(observer), Preview(folder, observer)
+
+            def between_steps(force: bool) -> None:
+                alarms.check(slam)
+                check_finite(slam)
+                checkpoints.save(slam, force)
+
+            slam = Slam(sequence, config, priors, preview, between_steps, choice.device, helpers)
+            facts_of = partial(run_facts, slam, choice, checkpoints)
+            preview.watch(slam, partial(facts_of, "running", None))
+            if resume:
+                checkpoints.restore(slam)
+            settings = {**sequence.opened_as, "priors": asdict(choice), **as_json(config)}
+            write_json(folder.path / names.CONFIG, settings)
+            write_json(folder.path / names.RUN, facts_of("running", None))
+            return _run(slam, folder, facts_of, preview, lpips)
         finally:
             torch.set_num_threads(threads)
 
 
-def run_sequence(
-    sequence: Sequence,
-    config: SlamConfig,
-    choice: PriorChoice,
-    priors: Priors,  # made by choose_priors from this choice
+def _run(
+    slam: Slam,
     folder: RunFolder,
-    observer: Observer | None = None,
-    lpips: Lpips | None = None,
-    resume: bool = False,
-    workers: Workers | None = None,
+    facts_of: Callable[[str, int | None], dict[str, Any]],  # run.json by state and exit code
+    preview: Preview,
+    lpips: Lpips | None,
 ) -> RunOutcome:
-    """Run SLAM, or with `resume` the rest of it, and write the folder, however the run ends."""
-    torch.set_num_threads(config.threads)
-    checkpoints = Checkpoints(folder, sequence, config, choice)
-    observer = observer or SilentObserver()
-    alarms, preview = Alarms(observer), Preview(folder, observer)
-
-    def between_steps(force: bool) -> None:
-        alarms.check(slam)
-        keyframes, gaussians = slam.tracker.keyframes, slam.mapper.gaussians
-        check_finite("poses", keyframes.T_camera_world)
-        check_finite("disparities", keyframes.disparities)
-        check_finite("static weights from beta", keyframes.static_weights)
-        check_finite("the map", *gaussians.parameters.values())
-        checkpoints.save(slam, force)
-
-    slam = Slam(sequence, config, priors, preview, between_steps, choice.device, workers)
-    preview.watch(slam, lambda: run_facts(slam, choice, checkpoints, "running", None))
-    if resume:
-        checkpoints.restore(slam)
-    settings = {**sequence.opened_as, "priors": asdict(choice), **as_json(config)}
-    write_json(folder.path / names.CONFIG, settings)
-    write_json(folder.path / names.RUN, run_facts(slam, choice, checkpoints, "running", None))
+    """Run SLAM, or the rest of it, and write the folder, however the run ends."""
     interrupted = False
     try:
         try:
@@ -140,7 +131,7 @@ def run_sequence(
                 raise
             interrupted = True
         state, exit_code = _ending(slam, interrupted)
-        facts = run_facts(slam, choice, checkpoints, state, exit_code)
+        facts = facts_of(state, exit_code)
         _write_estimates(folder, slam)
         clip_is_written = slam.workers.start(write_clip, str(folder.path))
         metrics = measure(slam, facts["seconds"]["total"], lpips)
@@ -153,7 +144,7 @@ def run_sequence(
         if isinstance(error, KeyboardInterrupt):
             state, exit_code = "interrupted", INTERRUPTED_EXIT
         with suppress(Exception):  # a full disk: the first error is the one to hear of
-            facts = run_facts(slam, choice, checkpoints, state, exit_code)
+            facts = facts_of(state, exit_code)
             write_json(folder.path / names.RUN, facts)
             _write_trajectories(folder, slam)
             preview.write(slam, facts)
