@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.mutants import MUTANTS
+
 ROOT = Path(__file__).parent.parent
 TESTS = sorted((ROOT / "tests").glob("*/**/test_*.py"))
 MODULES = sorted(p for p in (ROOT / "minislam").glob("*/**/*.py") if p.stem != "__init__")
@@ -49,3 +51,10 @@ def test_every_module_has_a_test_file(module: Path):
     folder = ROOT / "tests" / Path(place(module)).parent
     owners = [modules_of(test)[:1] for test in folder.glob(f"test_{module.stem}*.py")]
     assert [module.stem] in owners, f"expected tests/{place(module)} as test_{module.stem}.py"
+
+
+def test_every_mutant_changes_a_line_that_is_there():
+    for (name, tests), changes in MUTANTS.items():
+        text = (ROOT / "minislam" / name).read_text(encoding="utf-8")
+        assert [old for old, _ in changes if old not in text] == [], name
+        assert all((ROOT / "tests" / test).exists() for test in tests.split()), tests
