@@ -44,6 +44,7 @@ HORIZON = 3  # BA windows of keyframes among which a new one looks for such link
 GLOBAL_EDGES = 6  # further links per keyframe in a global BA
 GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
 ROBUST_NARROWING = 0.5  # between keyframes, because the structure is known by then [-]
+LEAST_WEIGHT = 0.01  # mean weight of cells, below which little is known of a pose between them [-]
 ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [-]
 
 
@@ -140,7 +141,11 @@ class KeyframeGraph(Stateful):
         around: list[int],  # keyframes that may show the same
         start: Tensor,  # (4, 4)
     ) -> tuple[Tensor, float]:
-        """Return T_camera_world (4, 4) of an image, in turns with its flow, and the mean weight."""
+        """Return T_camera_world (4, 4) of an image, in turns with its flow, and its support.
+
+        That is the weight of the flow over that of the keyframes' cells: where a dynamic object
+        fills the view, the few other cells are enough.
+        """
         keyframes, grid, newest, count = self.keyframes, self.grid, len(self.keyframes), len(around)
         known, weights = keyframes.T_camera_world[around], keyframes.cell_weights[around]
         robust = self.robust and self.robust.widened(ROBUST_NARROWING)
@@ -166,7 +171,8 @@ class KeyframeGraph(Stateful):
         self.flow.remove_frame(newest)
         self.count_adjustment(report)
         _, final_weights = residuals(problem, state)
-        return state.T_camera_world[-1], float(final_weights.mean())
+        support = final_weights.mean() / weights.mean().clamp_min(LEAST_WEIGHT)
+        return state.T_camera_world[-1], float(support)
 
     def warp_disparities(self, keyframe: int, T_camera_world: Tensor) -> Tensor:  # (N,)
         """Warp the disparities of a keyframe to another camera pose (4, 4)."""

@@ -18,9 +18,16 @@ KEYFRAMES = [0, 3, 5, 8]
 LOST = 6
 
 
-def posed(progress=None, flow: TrueFlow | None = None, frame=wall_frame) -> dict[int, Tensor]:
-    """Return the poses of twelve frames, four of which are keyframes and one of which is lost."""
+def posed(
+    progress=None, flow: TrueFlow | None = None, frame=wall_frame, covered: int | None = None
+) -> dict[int, Tensor]:
+    """Return the poses of twelve frames, four of which are keyframes and one of which is lost.
+
+    Of the keyframe `covered` beta trusts a twentieth of the cells only.
+    """
     graph = true_graph(KEYFRAMES, flow=flow)
+    if covered is not None:
+        graph.keyframes.static_weights[covered, torch.arange(len(GRID.rays)) % 20 > 0] = 0.001
     tracked = [
         TrackedFrame(
             number, 0.1 * number, TrackingStatus.LOST if number == LOST else TrackingStatus.OK, 1.0
@@ -53,6 +60,12 @@ def test_every_frame_that_was_not_lost_has_its_true_pose():
     for number, pose in poses.items():
         error = se3_log(pose @ se3_inverse(truth[number])).norm()
         assert error < 1e-4, (number, float(error))
+
+
+def test_a_view_that_a_dynamic_object_fills_is_not_lost():
+    poses, truth = posed(covered=3), true_poses()
+    assert set(poses) == {number for number in range(FRAMES) if number != LOST}
+    assert se3_log(poses[10] @ se3_inverse(truth[10])).norm() < 1e-3  # from keyframe 3 alone
 
 
 def test_it_is_the_flow_that_says_so():

@@ -30,7 +30,7 @@ class PoseFit:
     """A pose and how much of the flow fits it."""
 
     T_camera_world: Tensor  # (4, 4)
-    support: float  # in [0, 1], mean robust weight of all cells
+    support: float  # in [0, 1], robust weight of the flow over the weight of the cells
 
 
 def retry_doubtful(
