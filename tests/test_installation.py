@@ -71,6 +71,7 @@ def test_the_source_archive_has_every_file_of_the_repository():
     assert missing == [".gitattributes", ".gitignore"]
 
 
+@pytest.mark.slow
 def test_it_works_without_the_modules_that_windows_lacks():
     command = [sys.executable, "-c", WITHOUT_POSIX]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -33,6 +33,7 @@ def is_running(pid: int) -> bool:
 # Known answers
 
 
+@pytest.mark.slow
 def test_calls_are_shared_and_answered_in_their_order(two):
     pids = two.map(process_of, [(0.3,)] * 2)
     assert os.getpid() in pids and len(set(pids)) == 2
@@ -40,6 +41,7 @@ def test_calls_are_shared_and_answered_in_their_order(two):
     assert two.map(prints, []) == []
 
 
+@pytest.mark.slow
 def test_a_call_runs_beside_others_and_is_computed_here_if_it_must(two):
     begun = time.perf_counter()
     result = two.start(process_of, 0.3)
@@ -68,6 +70,7 @@ def test_tensors_and_records_come_through_unchanged(two):
             assert back.second.dtype == pair.first.dtype and back.sizes == pair.sizes[::-1]
 
 
+@pytest.mark.slow
 def test_the_map_has_the_same_bytes_with_one_and_two_workers_and_with_one_killed(two):
     def optimised(workers, kills=None):
         mapper = make_mapper(replace(CONFIG, init_iterations=7))
@@ -95,6 +98,7 @@ def test_the_map_has_the_same_bytes_with_one_and_two_workers_and_with_one_killed
 # Degenerate input
 
 
+@pytest.mark.slow
 def test_a_helper_that_dies_at_a_call_is_replaced_by_this_process():
     warnings = []
     with Workers(3, warn=warnings.append) as workers:
@@ -104,6 +108,7 @@ def test_a_helper_that_dies_at_a_call_is_replaced_by_this_process():
         assert len(warnings) == 1
 
 
+@pytest.mark.slow
 def test_helpers_end_with_the_block_and_with_a_killed_parent():
     with Workers(2) as workers:
         (pid,) = {*workers.map(process_of, [(0.3,)] * 2)} - {os.getpid()}

@@ -97,8 +97,6 @@ class Mapper(JointOptimisation):
 
         Half way, what is now known to move is excluded. A resumed run goes on after what is done.
         """
-        if done == 0:
-            self._replace_dynamic_gaussians()
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
         how = cameras, None, progress, self.config.refine_rate_end

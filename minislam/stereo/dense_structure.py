@@ -154,6 +154,7 @@ class SweepPlanner:
         self.camera = _small(camera, width)
         self._read = read
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
+        self._centres = {k: np.linalg.inv(pose)[:3, 3] for k, pose in self._poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
 
     def plan(
@@ -186,8 +187,7 @@ class SweepPlanner:
 
     def _distance(self, first: int, second: int) -> float:
         """Return the distance between two cameras."""
-        centres = [np.linalg.inv(self._poses[k])[:3, 3] for k in (first, second)]
-        return float(np.linalg.norm(centres[0] - centres[1]))
+        return float(np.linalg.norm(self._centres[first] - self._centres[second]))
 
 
 def full_size(depth: ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from minislam.geometry import Camera
+from minislam.geometry.distortion import camera_matrix
 
 TOLERANCE = 0.05  # relative error of the inverse depth that still agrees [-]
 WELL_MATCHED = 0.5  # a view with a larger matching cost cannot refute [-]
@@ -109,19 +110,25 @@ def vote(camera: Camera, view: SweptView, other: SweptView) -> tuple[np.ndarray,
     Both are (h, w) bool; a point outside the other image is neither agreed with nor refuted.
     """
     height, width = view.cost.shape
-    column, row = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
+    K = camera_matrix(camera)
     motion = other.T_camera_world @ np.linalg.inv(view.T_camera_world)
-    # Points times their inverse depth: a point at infinity stays finite.
-    points = rays @ motion[:3, :2].T + motion[:3, 2] + view.inverse_depth[..., None] * motion[:3, 3]
-    z = np.maximum(points[..., 2], 1e-6)
-    u = camera.fx * points[..., 0] / z + camera.cx
-    v = camera.fy * points[..., 1] / z + camera.cy
-    inside = (points[..., 2] > 1e-3) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    u, v = np.where(inside, u, 0).round().astype(int), np.where(inside, v, 0).round().astype(int)
+    # Each pixel lies on a plane of its own: H(q) p = K R K^-1 p + q K t, as in a sweep.
+    at_infinity = (K @ motion[:3, :3] @ np.linalg.inv(K)).astype(np.float32)
+    parallax = (K @ motion[:3, 3]).astype(np.float32)
+    column, row = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    x, y, z = (
+        (H[0] * column + (H[1] * row + H[2])) + view.inverse_depth * t
+        for H, t in zip(at_infinity, parallax, strict=True)
+    )
+    in_front = z > 1e-3
+    z = np.where(in_front, z, 1)
+    u, v = x / z, y / z
+    inside = in_front & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    place = np.rint(np.where(inside, v, 0)) * width + np.rint(np.where(inside, u, 0))
+    place = place.astype(np.int32)
     expected = view.inverse_depth / z
-    found = other.inverse_depth[v, u]
+    found = other.inverse_depth.take(place)
     tolerance = np.maximum(TOLERANCE * expected, max(view.plane_step, other.plane_step))
     agrees = inside & (np.abs(found - expected) < tolerance)
     behind = found < expected - 2 * tolerance
-    return agrees, inside & behind & (other.cost[v, u] < WELL_MATCHED)
+    return agrees, inside & behind & (other.cost.take(place) < WELL_MATCHED)

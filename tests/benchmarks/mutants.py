@@ -130,7 +130,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("stereo/votes.py", "stereo/test_votes.py"): [
         ("expected - 2 * tolerance", "expected"),
-        ("& (other.cost[v, u] < WELL_MATCHED)", ""),
+        ("& (other.cost.take(place) < WELL_MATCHED)", ""),
     ],
     ("evaluation/images.py", "evaluation/test_images_separability.py"): [
         ("- positives * (positives + 1) / 2", ""),

@@ -65,6 +65,7 @@ def with_change(**change):
     return lambda *arguments: adjusted(*arguments, **change)
 
 
+@pytest.mark.slow
 @pytest.mark.ex05_3
 def test_bundle_adjustment():
     right = {"all at once": adjusted, "Schur complement": with_change(schur=True)}

@@ -49,6 +49,7 @@ def unwritten():
     raise NotImplementedError
 
 
+@pytest.mark.slow
 def test_an_endless_loop_ends():
     def endless():
         while True:

@@ -39,6 +39,7 @@ def kept(
     return chosen
 
 
+@pytest.mark.slow
 @pytest.mark.ex06_3
 def test_keyframes():
     right = {

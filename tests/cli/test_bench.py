@@ -102,6 +102,7 @@ def test_a_failing_sequence_does_not_end_the_bench(made: Bench, capsys):
     assert "| minislam | Monocular | F      | 1.23  | -    |" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_interrupted_bench_keeps_its_tables_and_goes_on(made: Bench):
     for name in ("ball", "slow"):
         made.sequence(name)

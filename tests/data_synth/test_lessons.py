@@ -23,6 +23,7 @@ def test_the_first_camera_is_the_world(views: KnownViews):
     assert 0 < views.masks.mean() < 0.8
 
 
+@pytest.mark.slow
 def test_a_clip_has_the_frames_of_the_generated_sequence():
     clip, sequence = known_clip("table2", [0, 2], (32, 24)), generate("table2", 0, 3, (32, 24))
     assert np.array_equal(clip.rgb, sequence.rgb[::2])

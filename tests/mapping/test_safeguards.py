@@ -94,6 +94,7 @@ def test_before_a_keyframe_was_rendered_four_times_the_usual_cut_stays():
     assert mapper.least_weight == MAPPING_CUT
 
 
+@pytest.mark.slow
 def test_a_refinement_that_is_resumed_half_way_ends_at_the_same_map():
     whole, (resumed,) = moving_square(48)
     resumed.predict_beta = whole.predict_beta

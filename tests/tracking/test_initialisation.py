@@ -85,6 +85,7 @@ def test_hypotheses_without_confident_matches_are_the_wall_alone():
     assert len(first_disparity_hypotheses(GRID, UNKNOWN, 2 * [flat(blind)])) == 1
 
 
+@pytest.mark.slow
 def test_the_best_hypothesis_is_the_one_that_explains_the_matches():
     truth, disparities = sideways(), room_disparities()
     forward, backward = seen_matches(truth, disparities), room_disparities(5)
@@ -115,6 +116,7 @@ def test_the_best_hypothesis_is_the_one_that_explains_the_matches():
     assert torch.equal(shared.T_camera_world, best.T_camera_world)
 
 
+@pytest.mark.slow
 def test_a_wrong_prior_starts_the_search_and_does_not_bend_its_result():
     graph = true_graph(list(range(4)))
     keyframes, truth = graph.keyframes, true_poses()[:4]

@@ -92,6 +92,7 @@ def test_the_jacobian_is_that_of_autograd():
     torch.testing.assert_close(J, expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [None, RobustKernel(1.5)])
 def test_normal_equations_are_those_of_all_unknowns_at_once(robust: RobustKernel | None):
     known = known_problem(3)

@@ -59,6 +59,7 @@ def test_the_true_focal_length_is_found(factor: float):
     assert fit.is_doubtful == (factor != 1)
 
 
+@pytest.mark.slow
 def test_two_processes_find_the_same():
     known = known_problem()
     problem = seen_through(noisy(known, NOISE), 1.1)

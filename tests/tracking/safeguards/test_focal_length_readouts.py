@@ -7,6 +7,8 @@ import pytest
 from minislam.evaluation import absolute_trajectory_error
 from tests.benchmarks.bench_phone import NONE, filmed, follow, truth
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_phone_is_followed_as_if_it_had_a_global_shutter():
     # Upright, so columns are read. Measured: 19.4 ms, 0.36 cm; with the readouts held 3.7 cm.

@@ -133,6 +133,7 @@ def test_the_columns_are_those_of_finite_differences():
     assert with_readout(at, None, READOUT) is at
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [None, RobustKernel(1.5)])
 def test_normal_equations_are_those_of_all_unknowns_at_once(robust: RobustKernel | None):
     known = known_problem(3)
