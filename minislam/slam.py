@@ -137,11 +137,12 @@ class Slam(Stateful):
 
     def _map_new_keyframes(self) -> None:
         """Add new keyframes to the map. Without a depth prior it is built at the end alone."""
-        new_keyframes = self._keyframes(first=len(self.mapper.keyframes))
-        if not (new_keyframes and self.tracker.keyframes.has_prior):
+        mapped, store = len(self.mapper.keyframes), self.tracker.keyframes
+        if not store.has_prior or mapped == len(store):
             return
+        new_keyframes = self._keyframes(first=mapped)
         with self.steps.timed("mapping"):
-            if self.mapper.keyframes:
+            if mapped:
                 self._move_map()
                 for keyframe in new_keyframes:
                     self.mapper.integrate(keyframe)
