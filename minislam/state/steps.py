@@ -72,12 +72,13 @@ class Steps(Stateful):
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the time spent inside to a stage."""
+        """Add the time spent inside to a stage, then go on with the stage around it, if any."""
+        around = self._stage
         self._lap(stage)
         try:
             yield
         finally:
-            self._lap(None)
+            self._lap(around)
 
     def _save_and_stop_if_asked(self, force: bool = False) -> None:
         should_stop = self._observer.should_stop()

@@ -56,3 +56,13 @@ def test_seconds_and_finished_steps_are_the_state():
     other = Steps(Watcher(), lambda force: None)
     other.restore_state(steps.saved_state(), lambda index: None)
     assert other.done("walking") == 2 and other.seconds == steps.seconds
+
+
+def test_a_stage_goes_on_when_one_inside_it_ends(monkeypatch: pytest.MonkeyPatch):
+    # Inside "final adjustment" the last keyframe is mapped; what came after it was not counted.
+    moments = iter(range(10))
+    monkeypatch.setattr("minislam.state.steps.time.perf_counter", lambda: float(next(moments)))
+    steps = Steps(Watcher(), lambda force: None)
+    with steps.timed("outer"), steps.timed("inner"):
+        pass
+    assert steps.seconds == {"outer": 2.0, "inner": 1.0}
