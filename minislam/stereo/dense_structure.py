@@ -58,7 +58,8 @@ def with_swept_depth(
             enough = int(both.sum()) > LEAST_COMMON
             guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
             guessed = _view(small, keyframe, guess, confirmation)
-            agreeing, refuting = count_votes(small, guessed, judges(views, index))
+            others = [views[k] for k in judges(len(views)) if k != index]
+            agreeing, refuting = count_votes(small, guessed, others)
             moves = torch.from_numpy(refuting > MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
             depth = torch.where((depth > 0) | moves, depth, guess)
@@ -108,8 +109,9 @@ def dense_depths(
     for at, view in enumerate(swept):
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
         depths.append(confirm(planner.camera, view, others))
-    depths = keep_what_stays(planner.camera, swept, depths)
-    return [full_size(depths[frames.index(keyframe)], camera) for keyframe in keyframes]
+    wanted = [frames.index(keyframe) for keyframe in keyframes]
+    kept = keep_what_stays(planner.camera, swept, depths, wanted)
+    return [full_size(depth, camera) for depth in kept]
 
 
 def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:

@@ -57,22 +57,18 @@ def keep_what_stays(
     camera: Camera,
     views: list[SweptView],  # in the order of time
     depths: list[ConfirmedDepth],  # of the views
-) -> list[ConfirmedDepth]:
+    wanted: list[int],  # positions of views
+) -> list[ConfirmedDepth]:  # of the wanted views
     """Drop, by confirmed depths alone, what views of other times look through.
 
     Around a dropped pixel the confirmation fades too.
     """
-    known_only = [
-        replace(
-            view,
-            inverse_depth=np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
-            cost=1 - depth.confirmation,
-        )
-        for view, depth in zip(views, depths, strict=True)
-    ]
+    known_only = {k: _known_only(views[k], depths[k]) for k in judges(len(views))}
     kept = []
-    for index, (view, depth) in enumerate(zip(known_only, depths, strict=True)):
-        agreeing, refuting = count_votes(camera, view, judges(known_only, index))
+    for index in wanted:
+        view, depth = views[index], depths[index]
+        others = [known_only[k] for k in judges(len(views)) if k != index]
+        agreeing, refuting = count_votes(camera, _known_only(view, depth), others)
         left = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
         known = (depth.inverse_depth > 0) & ~left
         known &= _window_share(known) >= MIN_SUPPORT
@@ -81,10 +77,15 @@ def keep_what_stays(
     return kept
 
 
-def judges(views: list[SweptView], index: int) -> list[SweptView]:
-    """Return the views, of all times, that judge the view at an index."""
-    chosen = np.linspace(0, len(views) - 1, JUDGES).round().astype(int)
-    return [views[k] for k in np.unique(chosen[chosen != index])]
+def _known_only(view: SweptView, depth: ConfirmedDepth) -> SweptView:
+    """Return a view that votes with its confirmed depths alone."""
+    known = np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan)
+    return replace(view, inverse_depth=known, cost=1 - depth.confirmation)
+
+
+def judges(count: int) -> list[int]:
+    """Return which of so many views, of all times, judge the others."""
+    return sorted({*np.linspace(0, count - 1, JUDGES).round().astype(int).tolist()})
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32

@@ -119,7 +119,7 @@ def of_time(time: int, stands: bool) -> tuple[SweptView, ConfirmedDepth]:
 
 def kept(stands: list[bool]) -> list[ConfirmedDepth]:
     views, depths = zip(*(of_time(*at) for at in enumerate(stands)), strict=True)
-    return keep_what_stays(CAMERA, list(views), list(depths))
+    return keep_what_stays(CAMERA, list(views), list(depths), list(range(len(views))))
 
 
 def test_a_box_that_leaves_is_dropped_though_the_views_before_confirm_it():
@@ -150,11 +150,11 @@ def test_depths_that_nothing_confirms_do_not_judge():
         depth if k < 3 else ConfirmedDepth(depth.inverse_depth, 0 * depth.confirmation)
         for k, depth in enumerate(depths)
     ]
-    first = keep_what_stays(CAMERA, list(views), doubtful)[0]
+    (first,) = keep_what_stays(CAMERA, list(views), doubtful, [0])
     assert (first.inverse_depth[10:20, 10:20] == np.float32(0.8)).all()
 
 
 def test_views_that_know_nothing_are_kept_as_they_are():
     empty = ConfirmedDepth(np.zeros_like(view().cost), np.zeros_like(view().cost))
-    for depth in keep_what_stays(CAMERA, others(), [empty] * 4):
+    for depth in keep_what_stays(CAMERA, others(), [empty] * 4, [0, 3]):
         assert depth.inverse_depth.max() == 0 and depth.confirmation.max() == 0
