@@ -24,7 +24,6 @@ from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
 Edge = tuple[int, int]  # keyframe index of source and target
 
 THREADS = 2  # that compute flows side by side, without effect on the result
-JUDGED = 8  # one cell in so many tells whether the start of an edge has moved
 PAIRS_AT_ONCE = 16  # of keyframes: a dense flow has 600 kB at 320x240, and there may be thousands
 
 
@@ -34,7 +33,7 @@ class MeasuredEdge:
 
     source: int  # keyframe index
     target: int  # keyframe index
-    start: np.ndarray  # (2, n) px, of one cell in `JUDGED`
+    start: np.ndarray  # (2, N) px
     targets: np.ndarray  # (h, w, 2) px
     confidence: np.ndarray  # (h, w) in [0, 1)
 
@@ -100,8 +99,7 @@ class ClassicalFlow(Stateful):
     def _has_moved(self, edge: Edge, start: np.ndarray) -> bool:
         if edge not in self._measured:
             return True
-        moved = start[:, ::JUDGED] - self._measured[edge].start
-        distance = np.median(np.linalg.norm(moved, axis=0))
+        distance = np.median(np.linalg.norm(start - self._measured[edge].start, axis=0))
         return bool(distance >= self.config.start_tolerance)
 
     def _measure(self, starts: dict[Edge, np.ndarray]) -> None:
@@ -127,7 +125,7 @@ class ClassicalFlow(Stateful):
         texture = self._textures[edge[0]]
         on_grid = measure_on_grid(source, target, forward, backward, texture, self.stride)
         # A copy: a view would keep the starts of all edges of this call.
-        return MeasuredEdge(*edge, start[:, ::JUDGED].copy(), *on_grid)
+        return MeasuredEdge(*edge, start.copy(), *on_grid)
 
     def _edge_flow(self, edge: Edge, start: np.ndarray) -> np.ndarray:
         source, target = (self._images[end] for end in edge)
