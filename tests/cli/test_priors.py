@@ -91,9 +91,8 @@ def test_the_papers_front_end_runs_from_its_checkpoint_files(
         tensor.shape[-1] == 384
         for tensor in torch.load(folder.path / "uncertainty_mlp.pt", weights_only=True).values()
     )
-    assert (
-        len(read_ply(folder.path / "map.ply").means) > 50
-    )  # 93 measured: random weights see little alike
+    # Measured: 93. Depth and features of random weights agree on little.
+    assert len(read_ply(folder.path / "map.ply").means) > 50
 
 
 def test_the_paper_preset_runs_on_its_networks(files: Path, tmp_path: Path):
@@ -105,9 +104,7 @@ def test_the_paper_preset_runs_on_its_networks(files: Path, tmp_path: Path):
     folder = RunFolder(out)
     assert folder.read_run()["frames"] == 5
     assert np.isfinite(folder.read_trajectory().T_world_camera).all()
-    assert (
-        len(read_ply(folder.path / "map.ply").means) > 50
-    )  # 93 measured: random weights see little alike
+    assert len(read_ply(folder.path / "map.ply").means) > 100
 
 
 def test_priors_written_to_files_give_the_same_run(files: Path, tmp_path: Path, capsys):
