@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from minislam.geometry import Camera
-from minislam.geometry.distortion import camera_matrix
+from minislam.stereo.sweep import plane_homographies
 
 TOLERANCE = 0.05  # relative error of the inverse depth that still agrees [-]
 WELL_MATCHED = 0.5  # a view with a larger matching cost cannot refute [-]
@@ -67,7 +67,7 @@ def keep_what_stays(
     kept = []
     for index in wanted:
         view, depth = views[index], depths[index]
-        others = [known_only[k] for k in judges(len(views)) if k != index]
+        others = [judge for k, judge in known_only.items() if k != index]
         agreeing, refuting = count_votes(camera, _known_only(view, depth), others)
         left = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
         known = (depth.inverse_depth > 0) & ~left
@@ -85,7 +85,8 @@ def _known_only(view: SweptView, depth: ConfirmedDepth) -> SweptView:
 
 def judges(count: int) -> list[int]:
     """Return which of so many views, of all times, judge the others."""
-    return sorted({*np.linspace(0, count - 1, JUDGES).round().astype(int).tolist()})
+    chosen: list[int] = np.unique(np.linspace(0, count - 1, JUDGES).round().astype(int)).tolist()
+    return chosen
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
@@ -111,11 +112,11 @@ def vote(camera: Camera, view: SweptView, other: SweptView) -> tuple[np.ndarray,
     Both are (h, w) bool; a point outside the other image is neither agreed with nor refuted.
     """
     height, width = view.cost.shape
-    K = camera_matrix(camera)
     motion = other.T_camera_world @ np.linalg.inv(view.T_camera_world)
-    # Each pixel lies on a plane of its own: H(q) p = K R K^-1 p + q K t, as in a sweep.
-    at_infinity = (K @ motion[:3, :3] @ np.linalg.inv(K)).astype(np.float32)
-    parallax = (K @ motion[:3, 3]).astype(np.float32)
+    # Each pixel p lies on a plane of its own, and H(q) p = H(0) p + q K t is linear in q.
+    at_infinity, at_one = plane_homographies(camera, motion, np.array([0.0, 1.0]))
+    parallax = (at_one - at_infinity)[:, 2].astype(np.float32)
+    at_infinity = at_infinity.astype(np.float32)
     column, row = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
     x, y, z = (
         (H[0] * column + (H[1] * row + H[2])) + view.inverse_depth * t
@@ -125,8 +126,8 @@ def vote(camera: Camera, view: SweptView, other: SweptView) -> tuple[np.ndarray,
     z = np.where(in_front, z, 1)
     u, v = x / z, y / z
     inside = in_front & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    place = np.rint(np.where(inside, v, 0)) * width + np.rint(np.where(inside, u, 0))
-    place = place.astype(np.int32)
+    row, column = np.rint(np.where(inside, v, 0)), np.rint(np.where(inside, u, 0))
+    place = (row * width + column).astype(np.int32)
     expected = view.inverse_depth / z
     found = other.inverse_depth.take(place)
     tolerance = np.maximum(TOLERANCE * expected, max(view.plane_step, other.plane_step))
