@@ -90,8 +90,7 @@ class TrackingStatus(Enum):
 
     INITIALISING = "initialising"  # followed, but there is no map yet
     OK = "ok"
-    RECENTLY_LOST = "recently lost"  # the view is expected back where it was lost
-    LOST = "lost"  # the view may come back anywhere
+    LOST = "lost"  # without a pose
 
     @property
     def is_followed(self) -> bool:

@@ -38,8 +38,8 @@ minislam run --resume -o FOLDER
 
 exit codes: 0 finished, 1 known error in one sentence, 2 wrong usage, 3 finished but not to be
   trusted as a whole: frames were lost, the trajectory is broken (motion and depth contradict the
-  images; run.json lists the breaks and the segments between them) or most bundle adjustments
-  failed, 130 interrupted with everything so far written
+  images; run.json lists the breaks and the segments between them), the map has large holes or
+  most bundle adjustments failed, 130 interrupted with everything so far written
 
 settings: every constant is an option, like --tracking.window 8; minislam settings lists them.
   Ablations of the paper:

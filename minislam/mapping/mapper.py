@@ -22,6 +22,7 @@ from minislam.records import Keyframe, Progress
 
 RECHECKED = 10  # keyframes beside the window whose Gaussians are looked at with every new one
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
+OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 
 class Mapper(JointOptimisation):
@@ -106,6 +107,7 @@ class Mapper(JointOptimisation):
             if half >= LEAST_VIEWS * len(self.keyframes):
                 self._exclude_upper_mode()
         self._optimise(*how, range(max(done, half), iterations))
+        self.shown = [self._shown_fraction(keyframe) for keyframe in self.keyframes]
 
     def refine_poses(
         self,
@@ -136,6 +138,12 @@ class Mapper(JointOptimisation):
         new = gaussians_of_keyframe(keyframe, *scene, insertion, self._generator)
         self._optimizer.append(new)
         self._reset_gradients()
+
+    def _shown_fraction(self, keyframe: MappedKeyframe) -> float:
+        """Return the fraction of a keyframe's static pixels where the map is opaque [-]."""
+        static = self.static_weight(self.beta_of(keyframe), self.camera) > 0
+        shown = self.render(keyframe.T_camera_world).opacity[static] > OPAQUE
+        return float(shown.float().mean()) if len(shown) else 1.0
 
     def _remove_dynamic_gaussians(self, positions: Iterable[int]) -> None:
         """Remove Gaussians that keyframes inserted on an object before the MLP knew it moves."""

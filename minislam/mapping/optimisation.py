@@ -37,6 +37,7 @@ class JointOptimisation(Stateful):
     least_weight: float = MAPPING_CUT  # a pixel with less is excluded
     background: Tensor  # RGB of what no keyframe sees
     history: MappingHistory
+    shown: list[float]  # by keyframe, fraction of the static pixels that the refined map shows [-]
     _trainer: UncertaintyTrainer
     _generator: torch.Generator
     _optimizer: MapOptimizer
@@ -61,7 +62,7 @@ class JointOptimisation(Stateful):
         self.seed = seed
         self.cell = config.insertion.cell
         self.keyframes = []
-        self.window = []
+        self.window, self.shown = [], []
         self.background = torch.zeros(3, device=device)
         self.history = MappingHistory()
         self._workers = workers or Workers()

@@ -23,7 +23,7 @@ from minislam.priors.choice import PriorChoice, choose_depth, choose_features, c
 from minislam.priors.names import FILES
 from minislam.records import Sequence
 from minislam.runs.alarms import Alarms, check_finite
-from minislam.runs.facts import measure, run_facts
+from minislam.runs.facts import has_large_holes, measure, run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
 from minislam.runs.pictures import Preview, write_pictures
@@ -163,6 +163,8 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
         return "finished, most bundle adjustments failed", LOST_EXIT
     if slam.tracker.watch.is_broken:
         return "finished, broken", LOST_EXIT
+    if has_large_holes(slam):
+        return "finished, map with large holes", LOST_EXIT
     if slam.lost_frames() or slam.sequence.lost:
         return "finished, partly lost", LOST_EXIT
     return "finished", 0

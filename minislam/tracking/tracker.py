@@ -64,7 +64,6 @@ class Tracker(Stateful):
     _settling: Settling
     mode: Mode = Mode.WAITING
     last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
-    _lost_in_a_row: int = 0  # frames
     _last_global: int = 0  # keyframes at the last online global BA
 
     def __init__(
@@ -160,7 +159,6 @@ class Tracker(Stateful):
         return chain, judged_by_pose(self.graph, matches) if self.graph.is_learned else matches
 
     def _log_followed(self, frame: Frame, ratio: float) -> None:
-        self._lost_in_a_row = 0
         if self.initialised:
             self.mode = Mode.TRACKING
         status = TrackingStatus.OK if self.initialised else TrackingStatus.INITIALISING
@@ -211,16 +209,14 @@ class Tracker(Stateful):
 
     def _handle_loss(self, frame: Frame, ratio: float) -> None:
         """Look for the camera among all keyframes; keep the chain, should the old view return."""
-        self._lost_in_a_row += 1
         if self.initialised:
             self.mode = Mode.LOST
             features = self._features(frame)
             place = self._relocaliser.find(frame.image, features)
             if place is not None and self._resume(frame, place, features):
                 return
-        recently = self._lost_in_a_row <= self.config.recently_lost_frames
-        status = TrackingStatus.RECENTLY_LOST if recently else TrackingStatus.LOST
-        self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
+        lost = frame.frame_index, frame.timestamp, TrackingStatus.LOST, ratio
+        self.tracked.append(TrackedFrame(*lost))
 
     def _resume(self, frame: Frame, place: Place, features: Tensor) -> bool:
         """Make a relocalised frame a keyframe, or return False if its flow does not match."""

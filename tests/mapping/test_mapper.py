@@ -43,6 +43,20 @@ def test_a_wall_that_was_exposed_darker_has_its_colour_in_the_map():
     assert errors[0] < 0.2 * errors[1]  # measured: .11
 
 
+def test_the_fraction_that_is_shown_counts_holes_but_not_where_something_moves():
+    shown = []
+    on_the_right = torch.arange(32).expand(24, 32) >= 16
+    nowhere = torch.zeros_like(on_the_right)
+    for holes, mask in ((nowhere, None), (on_the_right, None), (on_the_right, on_the_right)):
+        mapper, keyframe = make_mapper(), replace(wall_keyframe(0), moving_mask=mask)
+        keyframe.depth[holes] = 0
+        mapper.initialise([keyframe])
+        mapper.refine(0)
+        shown += mapper.shown
+    assert shown[0] == 1 and shown[2] == 1
+    assert shown[1] == pytest.approx(0.5, abs=0.1)  # a Gaussian reaches over the border
+
+
 def test_exposures_are_those_of_the_views():
     mapper = make_mapper()
     told = torch.tensor([[1.0, 1.0, 1.0], [0.5, 0.6, 0.7]])

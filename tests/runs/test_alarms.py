@@ -44,7 +44,7 @@ def said(statuses: list[TrackingStatus], explained: dict[int, float | None]) -> 
     return observer.texts
 
 
-OK, LOST, RECENTLY = TrackingStatus.OK, TrackingStatus.LOST, TrackingStatus.RECENTLY_LOST
+OK, LOST = TrackingStatus.OK, TrackingStatus.LOST
 
 
 def test_a_good_run_is_quiet():
@@ -52,12 +52,12 @@ def test_a_good_run_is_quiet():
 
 
 def test_a_loss_is_said_once_each_time():
-    texts = said([OK, RECENTLY, LOST, OK, RECENTLY], {})
+    texts = said([OK, LOST, LOST, OK, LOST], {})
     assert [text.split(":")[0] for text in texts] == ["frame 1", "frame 4"]
 
 
 def test_nothing_is_looked_for_before_there_is_a_map():
-    assert said([TrackingStatus.INITIALISING, RECENTLY, LOST, OK], {}) == []
+    assert said([TrackingStatus.INITIALISING, LOST, LOST, OK], {}) == []
 
 
 def test_a_keyframe_that_contradicts_its_flow_is_said_once():

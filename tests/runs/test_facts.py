@@ -39,8 +39,10 @@ def slam(**parts: object) -> SimpleNamespace:
             has_prior=parts.pop("has_prior", True), overlay=parts.pop("overlay", None)
         ),
     )
-    lost = parts.pop("lost", 0)
+    lost, shown = parts.pop("lost", 0), parts.pop("shown", [1.0])
+    keyframes = [SimpleNamespace(frame_index=8 * k) for k in range(len(shown))]
     return SimpleNamespace(
+        mapper=SimpleNamespace(shown=shown, keyframes=keyframes),
         sequence=SimpleNamespace(warnings=[], camera=CAMERA),
         lost_frames=lambda: [None] * lost,
         tracker=tracker,
@@ -56,6 +58,7 @@ WARNINGS = [
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
     ({"breaks": [Break(2, 2)]}, "each piece (frames 0 to 1, 3 to 3) stands for itself"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
+    ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
     ({"seeks_focal": True}, "the motion does not tell it"),

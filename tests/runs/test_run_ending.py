@@ -8,11 +8,18 @@ from minislam.records import AdjustmentCount
 from minislam.runs.run import _ending
 
 
-def ended(lost: int = 0, undecoded: int = 0, failed: int = 0, broken: bool = False) -> object:
+def ended(
+    lost: int = 0,
+    undecoded: int = 0,
+    failed: int = 0,
+    broken: bool = False,
+    shown: tuple[float, ...] = (1.0, 0.9),
+) -> object:
     graph = SimpleNamespace(adjustments=AdjustmentCount(5, failed, ""))
     tracker = SimpleNamespace(graph=graph, watch=SimpleNamespace(is_broken=broken))
     sequence = SimpleNamespace(lost=[(0.1, "damaged")] * undecoded)
-    return SimpleNamespace(tracker=tracker, sequence=sequence, lost_frames=lambda: [None] * lost)
+    parts = {"tracker": tracker, "sequence": sequence, "mapper": SimpleNamespace(shown=shown)}
+    return SimpleNamespace(**parts, lost_frames=lambda: [None] * lost)
 
 
 @pytest.mark.parametrize(
@@ -22,6 +29,10 @@ def ended(lost: int = 0, undecoded: int = 0, failed: int = 0, broken: bool = Fal
         ({"failed": 2}, ("finished", 0)),
         ({"failed": 3}, ("finished, most bundle adjustments failed", 3)),
         ({"broken": True, "lost": 1}, ("finished, broken", 3)),
+        ({"shown": (1.0, 0.4), "lost": 1}, ("finished, map with large holes", 3)),
+        ({"shown": (1.0, 0.6)}, ("finished", 0)),
+        ({"shown": (0.0, 0.0)}, ("finished, map with large holes", 3)),
+        ({"shown": ()}, ("finished", 0)),
         ({"lost": 1}, ("finished, partly lost", 3)),
         ({"undecoded": 1}, ("finished, partly lost", 3)),
     ],

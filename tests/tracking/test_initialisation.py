@@ -1,5 +1,6 @@
 """The first geometry, on matches of a known scene: exact at first, then spoilt."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,14 +8,17 @@ import torch
 
 from minislam.geometry import se3_exp, se3_inverse
 from minislam.priors.flow import ClassicalFlow
+from minislam.tracking import initialisation
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
 from minislam.tracking.config import TrackingConfig
+from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.initialisation import (
     best_hypothesis,
     chain_state,
     first_disparity_hypotheses,
     first_geometry,
 )
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 from tests.tracking import oracle
@@ -129,6 +133,38 @@ def test_a_wrong_prior_starts_the_search_and_does_not_bend_its_result():
     assert float((found[0] - found[1]).abs().max()) < 1e-4  # with it: 6e-4
     rotations = [poses[:, :3, :3] for poses in (keyframes.T_camera_world, truth)]
     assert float((rotations[0] - rotations[1]).abs().max()) < 1e-4
+
+
+def graph_with_focal(factor: float) -> KeyframeGraph:
+    """Return the links of a walk along a wall under a focal length that is this much too long."""
+    graph = true_graph([0, 2, 4, 6, 8, 10])
+    graph.match(neighbourhood_edges(0, 6, 5))
+    graph.grid.zoom(math.log(factor))
+    graph.seeks_focal = True
+    return graph
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.4, 2.5])
+def test_an_unknown_focal_length_is_found_from_a_guess_that_is_far_off(
+    factor: float, monkeypatch: pytest.MonkeyPatch
+):
+    graph = graph_with_focal(factor)
+    first_geometry(graph)
+    assert graph.focal_is_free
+    assert graph.grid.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+    alone = graph_with_focal(factor)
+    monkeypatch.setattr(initialisation, "OTHER_FOCALS", (0.0,))
+    first_geometry(alone)
+    assert alone.grid.camera.fx != pytest.approx(CAMERA.fx, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_good_guess_of_the_focal_length_is_the_start(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(initialisation, "seek_focal_length", lambda graph: None)
+    graph = graph_with_focal(1.1)
+    first_geometry(graph)
+    assert not graph.focal_is_free and graph.grid.camera.fx == pytest.approx(1.1 * CAMERA.fx)
 
 
 @pytest.mark.slow

@@ -152,7 +152,7 @@ def test_a_start_that_was_given_up_is_repeated_if_none_was_better():
     followed, tracker = followed_in(images)
     assert followed == list(range(9))
     statuses = {frame.status for frame in tracker.tracked[9:]}
-    assert statuses == {TrackingStatus.RECENTLY_LOST, TrackingStatus.LOST}
+    assert statuses == {TrackingStatus.LOST}
 
 
 def test_without_a_depth_prior_a_title_that_stands_is_worth_less_than_a_scene_that_moves():
