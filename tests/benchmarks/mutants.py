@@ -75,6 +75,19 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("in_front & (opacity", "(opacity"),
         ("(scales - scales.mean(-1, keepdim=True))", "scales"),
     ],
+    ("mapping/mapper.py", "mapping/test_mapper.py"): [
+        ("self.camera) > 0\n        shown", "self.camera) > -1\n        shown"),
+        ("opacity[static] > OPAQUE", "opacity[static] < OPAQUE"),
+    ],
+    ("runs/facts.py", "runs/test_facts.py runs/test_run_ending.py"): [
+        ("shown is not None and shown < LEAST_SHOWN", "bool(shown) and shown < LEAST_SHOWN"),
+        ("np.argmin(slam.mapper.shown)", "np.argmax(slam.mapper.shown)"),
+    ],
+    ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
+        ("report.cost_after\n        state", "2 * report.cost_after\n        state"),
+        ("replace(chain, log_focal=log_focal)", "chain"),
+        ("key=lambda found: found[1]", "key=lambda found: -found[1]"),
+    ],
     ("tracking/bundle_adjustment.py", "tracking/test_bundle_adjustment_steps.py"): [
         ("trial <= cost", "trial <= 1.001 * cost"),
     ],

@@ -160,8 +160,12 @@ def test_an_unknown_focal_length_is_found_from_a_guess_that_is_far_off(
 
 
 @pytest.mark.slow
-def test_a_good_guess_of_the_focal_length_is_the_start(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("others", [initialisation.OTHER_FOCALS, (-0.001,)])
+def test_another_focal_length_that_saves_little_is_no_start(
+    others: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(initialisation, "seek_focal_length", lambda graph: None)
+    monkeypatch.setattr(initialisation, "OTHER_FOCALS", others)
     graph = graph_with_focal(1.1)
     first_geometry(graph)
     assert not graph.focal_is_free and graph.grid.camera.fx == pytest.approx(1.1 * CAMERA.fx)
