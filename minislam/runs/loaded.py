@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.config import SlamConfig, from_json
+from minislam.config import SlamConfig, settings_in, settings_of, with_settings
 from minislam.data import InputOptions, RecordedSequence, RunFolder, open_sequence
 from minislam.data.files import read_bytes, read_json, read_text
 from minislam.data.ply import GaussianArrays, read_ply
@@ -98,8 +98,10 @@ class Run:
 
     @cached_property
     def config(self) -> SlamConfig:
-        """Return the settings of the run."""
-        return from_json(self.folder.read_config())
+        """Return the settings of the run, without those that an older version had."""
+        given, known = settings_in(self.folder.read_config()), settings_of(SlamConfig())
+        kept = {name: value for name, value in given.items() if name in known}
+        return with_settings(SlamConfig(), kept)
 
     @cached_property
     def poses(self) -> dict[int, np.ndarray]:

@@ -1,6 +1,7 @@
 """A finished run from its folder alone: the same renderings, poses, beta and frames."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -105,6 +106,14 @@ def test_a_damaged_or_missing_camera_is_said(run: minislam.Run, tmp_path: Path):
     write_json(tmp_path / "camera.json", {"camera": 3})
     with pytest.raises(InputError, match=r"expected camera\.json of a run"):
         minislam.load(tmp_path)
+
+
+def test_a_run_of_a_version_with_other_settings_is_read(run: minislam.Run, tmp_path: Path):
+    folder = Path(shutil.copytree(run.folder.path, tmp_path / "old"))
+    tree = run.folder.read_config()
+    tree["tracking"]["of_an_older_version"] = 15
+    write_json(folder / "config.json", tree)
+    assert minislam.load(folder).config == run.config
 
 
 def test_a_source_with_fewer_frames_is_said(run: minislam.Run, root: Path, tmp_path: Path):
