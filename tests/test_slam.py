@@ -36,7 +36,7 @@ METRICS = [
     "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
     "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
-    "psnr_static_db", "path_length", "reprojection_px", "parallax_px",
+    "psnr_static_db", "shown_static", "path_length", "reprojection_px", "parallax_px",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0
