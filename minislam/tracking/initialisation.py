@@ -111,7 +111,8 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
     problem = bundle_problem(graph, range(len(graph.links)), first_free=0, lambda_prior=0.0)
 
     def start(log_focal: float) -> tuple[BundleState, BundleReport]:
-        (grid := replace(graph.grid)).zoom(log_focal)
+        grid = replace(graph.grid)
+        grid.zoom(log_focal)
         known, weights = keyframes.prior_disparities, keyframes.cell_weights[0]
         guesses = first_disparity_hypotheses(grid, known, graph.links.flow_from(0))
         chains = [chain_state(grid, flow_to_next, *g, graph.robust, weights) for g in guesses]

@@ -215,8 +215,8 @@ class Tracker(Stateful):
             place = self._relocaliser.find(frame.image, features)
             if place is not None and self._resume(frame, place, features):
                 return
-        lost = frame.frame_index, frame.timestamp, TrackingStatus.LOST, ratio
-        self.tracked.append(TrackedFrame(*lost))
+        status = TrackingStatus.LOST
+        self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
 
     def _resume(self, frame: Frame, place: Place, features: Tensor) -> bool:
         """Make a relocalised frame a keyframe, or return False if its flow does not match."""
