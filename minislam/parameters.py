@@ -1,9 +1,18 @@
-"""The form of a setting: a dataclass field with a default, a meaning and bounds."""
+"""The form of a setting: a dataclass field with a default, a meaning and bounds.
 
-from dataclasses import field
-from typing import Any
+Settings stand in trees of dataclasses; names with dots reach every part of one: `tracking.window`.
+"""
+
+import difflib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import Field, field, fields, is_dataclass, replace
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin
 
 from minislam.errors import InputError
+
+Tree = TypeVar("Tree")  # a dataclass whose fields are values or again dataclasses
 
 MOST = 1e9  # no setting of the package is larger, where it does not say so
 
@@ -21,3 +30,87 @@ def require_bounds(name: str, value: Any, least: float, most: float) -> None:
                 f"expected {name} of at least {least:g} and at most {most:g}, found {value}; "
                 "choose a value between"
             )
+
+
+def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any, Field[Any]]]:
+    """Yield the name with dots, the value and the field of every value in a tree."""
+    for entry in fields(tree):
+        value = getattr(tree, entry.name)
+        if is_dataclass(value):
+            yield from leaves(value, f"{prefix}{entry.name}.")
+        else:
+            yield prefix + entry.name, value, entry
+
+
+def kind_of(entry: Field[Any]) -> Any:
+    """Return the type of a field's values that are not None, like int or tuple[int, int]."""
+    return get_args(entry.type)[0] if isinstance(entry.type, UnionType) else entry.type
+
+
+def with_values(tree: Tree, values: Mapping[str, Any]) -> Tree:
+    """Return a tree with values replaced; they are given by name, as in JSON or as text."""
+    known = {name: (value, entry) for name, value, entry in leaves(tree)}
+    converted = {}
+    for name, value in values.items():
+        if value == {} and any(other.startswith(f"{name}.") for other in known):
+            continue  # a part of which nothing is given
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+            raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
+        present, entry = known[name]
+        converted[name] = _converted(name, value, present, entry)
+        bounds = entry.metadata.get("least", 0), entry.metadata.get("most", MOST)
+        require_bounds(name, converted[name], *bounds)
+    return _replaced(tree, converted)
+
+
+def _replaced(tree: Any, values: Mapping[str, Any], prefix: str = "") -> Any:
+    changed = {}
+    for entry in fields(tree):
+        name, value = prefix + entry.name, getattr(tree, entry.name)
+        if is_dataclass(value):
+            changed[entry.name] = _replaced(value, values, f"{name}.")
+        elif name in values:
+            changed[entry.name] = values[name]
+    return replace(tree, **changed)
+
+
+def _converted(name: str, value: Any, present: Any, entry: Field[Any]) -> Any:
+    """Convert a value from JSON or from the command line to the type of its field."""
+    kind = kind_of(entry)
+    if value is None and kind is not entry.type:
+        return None
+    try:
+        if kind is bool:
+            words = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
+            return value if isinstance(value, bool) else words[str(value).lower()]
+        if get_origin(kind) is tuple:
+            parts = value.split(",") if isinstance(value, str) else value
+            return tuple(of(part) for of, part in zip(get_args(kind), parts, strict=True))
+        converted = kind(value)
+        # int(2.5) and float("nan") succeed, but are always mistakes.
+        is_wrong = isinstance(value, bool) or (kind is not str and not math.isfinite(converted))
+        if is_wrong or (not isinstance(value, str) and converted != value):
+            raise ValueError
+        return converted
+    except (KeyError, OverflowError, TypeError, ValueError):
+        like = "" if present is None else f" like {present!r}"
+        raise InputError(
+            f"expected {name} to be of type {kind.__name__}{like}, found {value!r}"
+        ) from None
+
+
+def flattened(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Return nested dictionaries as a single one, with names that contain dots."""
+    if not isinstance(tree, dict):
+        raise InputError(
+            f"expected settings as a JSON object, found {type(tree).__name__}; write "
+            '{"tracking": {"window": 8}} or {"tracking.window": 8}'
+        )
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict) and value:
+            flat |= flattened(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat

@@ -1,22 +1,20 @@
 """The one tree of settings: presets, names with dots, JSON, and what a wrong value is told."""
 
 import json
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 
 import pytest
 
 from minislam.config import (
     PRESETS,
     SlamConfig,
-    as_json,
-    flattened,
-    from_json,
-    metadata_of,
     preset,
+    settings_in,
     settings_of,
     with_settings,
 )
 from minislam.errors import InputError
+from minislam.parameters import flattened, leaves
 
 CHANGED = {
     "seed": 7,
@@ -27,6 +25,11 @@ CHANGED = {
     "uncertainty.enabled": False,
     "networks.metric3d.size": (28, 84),
 }
+
+
+def from_json(tree: dict) -> SlamConfig:
+    """Return the settings of a config.json."""
+    return with_settings(SlamConfig(), settings_in(tree))
 
 
 # Known answers
@@ -61,7 +64,7 @@ def test_settings_of_deeper_parts_are_named_with_more_dots():
 
 
 def test_every_setting_says_what_it_means():
-    meanings = {name: data["meaning"] for name, data in metadata_of(SlamConfig()).items()}
+    meanings = {name: entry.metadata["meaning"] for name, _, entry in leaves(SlamConfig())}
     assert set(meanings) == set(settings_of(SlamConfig()))
     assert [name for name, meaning in meanings.items() if len(meaning) < 8] == []
 
@@ -90,7 +93,7 @@ def test_text_and_json_values_take_the_type_of_the_setting(name: str, text: obje
 
 def test_the_json_form_comes_back_the_same():
     config = with_settings(SlamConfig(), CHANGED)
-    text = json.dumps(as_json(config))
+    text = json.dumps(asdict(config))
     assert from_json(json.loads(text)) == config
 
 

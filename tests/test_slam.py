@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from minislam.cli.main import main
-from minislam.config import from_json, preset, with_settings
+from minislam.config import SlamConfig, preset, settings_in, with_settings
 from minislam.data import InputOptions, RunFolder, open_sequence, read_ply, read_trajectory
 from minislam.evaluation import absolute_trajectory_error
 from minislam.priors.features import ClassicalFeatures
@@ -127,7 +127,7 @@ def test_the_metrics_are_those_we_promise(finished: RunFolder):
     metrics = finished.read_metrics()
     assert list(metrics) == METRICS
     unknown = [name for name, value in metrics.items() if value is None]
-    config = from_json(finished.read_config())
+    config = with_settings(SlamConfig(), settings_in(finished.read_config()))
     assert unknown == ([] if config.uncertainty.enabled else ["beta_auroc"])
 
 
@@ -172,7 +172,7 @@ def test_the_map_holds_logits_and_logarithms(with_depth: RunFolder):
 
 
 def test_the_configuration_can_be_used_again(without_uncertainty: RunFolder):
-    config = from_json(without_uncertainty.read_config())
+    config = with_settings(SlamConfig(), settings_in(without_uncertainty.read_config()))
     assert config == with_settings(preset("test"), {"uncertainty.enabled": False})
 
 
@@ -208,7 +208,7 @@ def test_pictures_and_report_are_there(finished: RunFolder):
 
 def test_the_weights_of_the_mlp_can_be_used_again(with_depth: RunFolder):
     state = torch.load(with_depth.path / "uncertainty_mlp.pt", weights_only=True)
-    config = from_json(with_depth.read_config()).uncertainty
+    config = with_settings(SlamConfig(), settings_in(with_depth.read_config())).uncertainty
     dimension = ClassicalFeatures().dimension
     mlp = UncertaintyTrainer(dimension, config, seed=3).mlp
     mlp.load_state_dict(state)

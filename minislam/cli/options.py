@@ -8,11 +8,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from minislam.cli.help import unknown_option
 from minislam.data.files import read_json
 from minislam.errors import InputError
+from minislam.parameters import flattened, kind_of, with_values
 
 if TYPE_CHECKING:
     from minislam.config import SlamConfig
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from minislam.evaluation.lpips import Lpips
     from minislam.priors.names import PriorChoice
 
+Options = TypeVar("Options")  # InputOptions or PriorChoice
 PRESETS = ("laptop", "paper", "paper-fast", "test")  # of minislam.config, which needs torch
 
 
@@ -33,13 +35,13 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         help="video file, image folder, TUM folder or synth:NAME[:SEED]; default: that of --config",
     )
     group = parser.add_argument_group("input")
-    types = _field_types(InputOptions)
     for option in fields(InputOptions):
         shown = "" if option.default is None else f"; {option.default}"
+        is_size = option.name == "size"
         group.add_argument(
             f"--{option.name.replace('_', '-')}",
-            type=size_of if types[option.name] is tuple else types[option.name],
-            metavar="WIDTHxHEIGHT" if option.name == "size" else "VALUE",
+            type=size_of if is_size else kind_of(option),
+            metavar="WIDTHxHEIGHT" if is_size else "VALUE",
             help=option.metadata["meaning"] + shown,
         )
 
@@ -125,19 +127,14 @@ def size_of(text: str) -> tuple[int, int]:
 
 def config_file(args: argparse.Namespace) -> dict[str, Any]:
     """Return the file given with --config, or config.json of the run that --resume goes on with."""
+    tree: Any = {}
     if args.config:
         tree = read_json(args.config)
     elif getattr(args, "resume", False):
         from minislam.data import RunFolder
 
         tree = RunFolder(args.output).read_config()
-    else:
-        return {}
-    if not isinstance(tree, dict):
-        raise InputError(
-            f"expected settings as a JSON object in {args.config}, found {type(tree).__name__}; "
-            "write it like config.json of a run"
-        )
+    flattened(tree)  # refuses what is no JSON object
     return tree
 
 
@@ -153,48 +150,21 @@ def input_options(args: argparse.Namespace) -> InputOptions:
     """Return the input options: those of the file of --config, replaced by what is given."""
     from minislam.data import InputOptions
 
-    return InputOptions(**_section(args, "input", InputOptions))
+    return _with_given(InputOptions(), args, "input")
 
 
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
     """Return the priors: those of the file of --config, replaced by what is given."""
     from minislam.priors.names import PriorChoice
 
-    return PriorChoice(**{"depth": default_depth, **_section(args, "priors", PriorChoice)})
+    return _with_given(PriorChoice(depth=default_depth), args, "priors")
 
 
-def _section(args: argparse.Namespace, name: str, kind: type) -> dict[str, Any]:
-    """Return the fields of a dataclass that the file of --config or a flag gives."""
-    types = _field_types(kind)
-    values = config_file(args).get(name, {})
-    try:
-        given = {
-            key: _converted(value, types[key]) for key, value in values.items() if value is not None
-        }
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise InputError(
-            f"expected {name} in {args.config} to hold some of {', '.join(types)}, found {values}"
-        ) from None
-    flags = {key: getattr(args, key, None) for key in types}
-    return given | {key: value for key, value in flags.items() if value is not None}
-
-
-def _field_types(kind: type) -> dict[str, type]:
-    """Return the plain type of each field of a dataclass: int, float, str or tuple."""
-    types = {}
-    for name, hint in get_type_hints(kind).items():
-        first = (get_args(hint) or (hint,))[0]  # int of `int | None`
-        types[name] = get_origin(first) or first
-    return types
-
-
-def _converted(value: Any, kind: type) -> Any:
-    if kind is tuple:
-        width, height = value
-        return int(width), int(height)
-    if kind(value) != value:
-        raise ValueError
-    return kind(value)
+def _with_given(options: Options, args: argparse.Namespace, part: str) -> Options:
+    """Return options replaced by those of a part of the file of --config, and by the flags."""
+    flags = {name: getattr(args, name, None) for name in vars(options)}
+    given = {name: value for name, value in flags.items() if value is not None}
+    return with_values(options, flattened(config_file(args).get(part, {})) | given)
 
 
 def lpips_of(args: argparse.Namespace) -> Lpips | None:
@@ -220,23 +190,21 @@ def settings(args: argparse.Namespace) -> SlamConfig:
     With --resume, those of the interrupted run stand for the preset if none is given; a run that
     its checkpoint does not belong to is refused by `Checkpoints.restore`.
     """
-    from minislam.config import from_json, preset, settings_in, settings_of, with_settings
+    from minislam.config import preset, settings_in, settings_of, with_settings
 
+    base = preset("laptop" if args.preset is None else args.preset)
     if getattr(args, "resume", False) and args.preset is None:
         from minislam.data import RunFolder
 
-        base = from_json(RunFolder(args.output).read_config())
-    else:
-        base = preset("laptop" if args.preset is None else args.preset)
+        base = with_settings(base, settings_in(RunFolder(args.output).read_config()))
     if args.config:
         base = with_settings(base, settings_in(read_json(args.config)))
     known, given = settings_of(base), dict(args.settings)
     unknown = [name for name in given if name not in known]
     if unknown:
         raise unknown_option(f"--{unknown[0]}", args.parser)
-    for name in ("seed", "threads", "checkpoint_fraction"):
-        if getattr(args, name) is not None:
-            given[name] = getattr(args, name)
+    flags = {name: getattr(args, name) for name in known if "." not in name}
+    given |= {name: value for name, value in flags.items() if value is not None}
     if args.no_uncertainty:
         given["uncertainty.enabled"] = False
     if getattr(args, "masks", None):

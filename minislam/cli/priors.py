@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import io
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,13 +77,12 @@ def _kinds(
     choice: PriorChoice, with_features: bool, sequence: RecordedSequence, config: SlamConfig
 ) -> dict[str, tuple[str, Callable[[Frame], Tensor | None]]]:
     """Return for each folder to write: a line that identifies its content, and a function."""
-    from minislam.config import as_json
     from minislam.priors.choice import choose_depth, choose_features
     from minislam.priors.features import with_finer_grid
     from minislam.priors.files import DEPTH, FEATURES
 
     # Everything the result depends on, so that files of another command are not taken for these.
-    tree = as_json(config)
+    tree = asdict(config)
     constants = {name: tree[name] for name in ("seed", "simulated_depth", "networks")}
     conditions = f"{sequence.description}; {sequence.camera}; {constants}"
     kinds: dict[str, tuple[str, Callable[[Frame], Tensor | None]]] = {}

@@ -27,23 +27,25 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run_settings(args: argparse.Namespace) -> int:
     """Print the settings whose names fit the pattern; return the exit code."""
-    from minislam.config import PRESETS, SlamConfig, metadata_of, settings_of
-    from minislam.parameters import MOST
+    from minislam.config import PRESETS, SlamConfig
+    from minislam.parameters import MOST, leaves
 
-    values, metadata = settings_of(SlamConfig()), metadata_of(SlamConfig())
-    pattern: str = args.pattern
-    found = fnmatch.filter(values, f"*{pattern}*")
+    settings = {name: (value, entry.metadata) for name, value, entry in leaves(SlamConfig())}
+    found = fnmatch.filter(settings, f"*{args.pattern}*")
     if not found:
-        hint = nearest(pattern, values, "minislam settings lists all of them")
-        raise InputError(f"expected part of a setting's name, found {pattern!r} in none; {hint}")
+        hint = nearest(args.pattern, settings, "minislam settings lists all of them")
+        raise InputError(
+            f"expected part of a setting's name, found {args.pattern!r} in none; {hint}"
+        )
     width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
     for name in found:
-        least, most = metadata[name]["least"], metadata[name]["most"]
+        value, about = settings[name]
+        least, most = about["least"], about["most"]
         bounds = f"at least {least:g}" if most == MOST else f"{least:g} to {most:g}"
-        notes = ["on or off" if isinstance(values[name], bool) else bounds]
+        notes = ["on or off" if isinstance(value, bool) else bounds]
         notes += [f"{key} {_shown(PRESETS[key][name])}" for key in PRESETS if name in PRESETS[key]]
-        print(f"--{name} {_shown(values[name])}  ({'; '.join(notes)})")
-        print(textwrap.indent(textwrap.fill(metadata[name]["meaning"], width - 4), "    "))
+        print(f"--{name} {_shown(value)}  ({'; '.join(notes)})")
+        print(textwrap.indent(textwrap.fill(about["meaning"], width - 4), "    "))
     return 0
 
 

@@ -17,6 +17,7 @@ from minislam.data.run_folder import CAMERA, MAP, PLOTS, VIEWER
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_inverse
 from minislam.images import resample
+from minislam.parameters import with_values
 from minislam.priors.choice import PriorChoice, choose_features
 from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import FeatureExtractor
@@ -186,8 +187,7 @@ class Run:
     def sequence(self) -> RecordedSequence:
         """Return the source of the run, opened again."""
         source, options = (self.folder.read_config()[part] for part in ("sequence", "input"))
-        options["size"] = options["size"] and tuple(options["size"])
-        sequence = open_sequence(source, InputOptions(**options))
+        sequence = open_sequence(source, with_values(InputOptions(), options))
         if len(sequence) < len(self.frames):
             raise InputError(
                 f"expected the {len(self.frames)} frames of the run in {source}, found "

@@ -7,9 +7,10 @@ from dataclasses import asdict
 from typing import Any
 
 import minislam
-from minislam.config import SlamConfig, as_json, flattened
+from minislam.config import SlamConfig
 from minislam.data import RunFolder
 from minislam.errors import InputError, MinislamError
+from minislam.parameters import flattened
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
 from minislam.slam import Slam
@@ -36,7 +37,7 @@ class Checkpoints:
                 "camera": asdict(sequence.camera),
             },
             "priors": asdict(choice),
-            "settings": as_json(config),
+            "settings": asdict(config),
         }  # must be the same for a run to be resumed, as it is read back from JSON
         self._origin: dict[str, Any] = json.loads(json.dumps(origin))
         self._start = self._last = time.perf_counter()  # of the run and of the last checkpoint

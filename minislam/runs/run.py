@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from minislam.config import SlamConfig, as_json
+from minislam.config import SlamConfig
 from minislam.data import GaussianArrays, RunFolder
 from minislam.data import run_folder as names
 from minislam.data.files import write_json
@@ -106,7 +106,7 @@ def run_in_folder(
             preview.watch(slam, partial(facts_of, "running", None))
             if resume:
                 checkpoints.restore(slam)
-            settings = {**sequence.opened_as, "priors": asdict(choice), **as_json(config)}
+            settings = {**sequence.opened_as, "priors": asdict(choice), **asdict(config)}
             write_json(folder.path / names.CONFIG, settings)
             write_json(folder.path / names.RUN, facts_of("running", None))
             return _run(slam, folder, facts_of, preview, lpips)

@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from minislam.config import SlamConfig, metadata_of, settings_of
+from minislam.config import SlamConfig
+from minislam.parameters import leaves
 from tests.benchmarks.bad_files import CODE, FOREIGN, NOISE, picture
 from tests.benchmarks.bad_input_case import EITHER, REFUSED, RUN, Case, Spoil, content, replaced
 
@@ -34,9 +35,8 @@ def options() -> Iterator[Case]:
     for text in " | ".join(texts.splitlines()).split("|"):
         # A later option replaces the earlier one of RUN.
         yield Case("options", text.strip(), f"{RUN.format('good')} {text.strip()}")
-    metadata = metadata_of(SlamConfig())
-    for number, (name, value) in enumerate(settings_of(SlamConfig()).items()):
-        least, most = metadata[name]["least"], metadata[name]["most"]
+    for number, (name, value, entry) in enumerate(leaves(SlamConfig())):
+        least, most = entry.metadata["least"], entry.metadata["most"]
         bad = (f"{least - 1:g}", f"{10 * abs(most) + 1:g}", "nan", "x", "")[number % 5]
         if isinstance(value, bool):
             bad = "maybe"

@@ -4,13 +4,14 @@ import io
 import json
 import random
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from minislam.config import SlamConfig, as_json, from_json
+from minislam.config import SlamConfig, settings_in, with_settings
 from minislam.data.calibration import read_calibration
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.files import read_json
@@ -116,7 +117,8 @@ def test_mutated_maps(tmp_path: Path):
 
 
 def check_settings(path: Path) -> None:
-    assert isinstance(from_json(read_json(path)), SlamConfig)
+    config = with_settings(SlamConfig(), settings_in(read_json(path)))
+    assert isinstance(config, SlamConfig)
 
 
 def check_array(path: Path) -> None:
@@ -133,7 +135,7 @@ def check_picture(path: Path) -> None:
 
 
 def settings_file() -> bytes:
-    return json.dumps(as_json(SlamConfig())).encode()
+    return json.dumps(asdict(SlamConfig())).encode()
 
 
 def array_file() -> bytes:
