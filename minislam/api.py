@@ -21,6 +21,7 @@ from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run
 from minislam.runs.run import default_output, run_in_folder
+from minislam.state.steps import SilentObserver
 
 _INPUTS = {field.name for field in fields(InputOptions)}
 _PRIORS = {field.name for field in fields(PriorChoice)}
@@ -57,7 +58,7 @@ def run(
     progress.plan = plan_of(config, choice, sequence)
     is_main = threading.current_thread() is threading.main_thread()
     with ending_signals(progress.interrupt) if is_main else nullcontext():
-        observer = None if quiet else progress
+        observer = SilentObserver() if quiet else progress
         run_in_folder(
             sequence, config, choice, Path(output), observer, overwrite=overwrite, workers=workers
         )

@@ -64,7 +64,7 @@ def _run_recorded(args: argparse.Namespace, log: Log) -> int:
     require_priors(choice)
     from minislam.data import open_sequence
     from minislam.runs.run import default_output, run_in_folder
-    from minislam.runs.summary import as_text
+    from minislam.runs.summary import as_text, summarise
 
     config, lpips = options.settings(args), options.lpips_of(args)
     progress = ProgressLine(args.quiet, args.verbose)
@@ -78,17 +78,17 @@ def _run_recorded(args: argparse.Namespace, log: Log) -> int:
     progress.plan = plan_of(config, choice, sequence)
     log.folder = Path(output)
     with ending_signals(progress.interrupt):
-        outcome = run_in_folder(
+        metrics, facts = run_in_folder(
             sequence, config, choice, output, progress, lpips, args.overwrite, args.resume,
             args.workers,
         )  # fmt: skip
-    say("\n".join([f"{outcome.state}:", *as_text(outcome.summary)]))
-    for warning in outcome.warnings:
+    say("\n".join([f"{facts['state']}:", *as_text(summarise(metrics, facts))]))
+    for warning in facts["warnings"]:
         if warning not in sequence.warnings:
             say(f"WARNING: {warning}", "stderr")
     say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
-    if outcome.state == "interrupted":
+    if facts["state"] == "interrupted":
         say(f"to go on: minislam run --resume -o {shlex.quote(output)}")
     else:
         say(f"next: minislam render {shlex.quote(output)} -o fly.webm, or minislam export -h")
-    return outcome.exit_code
+    return facts["exit_code"]

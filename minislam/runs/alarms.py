@@ -1,38 +1,26 @@
 """What is said the moment something goes wrong; the summary at the end has the final verdict."""
 
 import os
+from collections.abc import Iterator
 
 from minislam.slam import Slam
-from minislam.state.steps import Observer
 from minislam.tracking.safeguards.diagnostics import is_unexplained
 
 
-class Alarms:
-    """Says once when the camera is lost and when a keyframe contradicts its flow."""
-
-    def __init__(self, observer: Observer) -> None:
-        self._observer = observer
-        self._lost = False
-        self._judged = -1  # frame of the keyframe that was looked at last
-
-    def check(self, slam: Slam) -> None:
-        """Look at the newest frame and at the newest keyframe."""
-        tracked, diagnostics = slam.tracker.tracked, slam.tracker.watch.diagnostics
-        lost = slam.tracker.initialised and not tracked[-1].status.is_followed
-        if lost and not self._lost:
-            self._observer.warn(
-                f"frame {tracked[-1].frame_index}: the camera is lost; it is looked for among the "
-                "keyframes"
-            )
-        self._lost = lost
-        if diagnostics and diagnostics[-1].frame_index > self._judged:
-            newest = diagnostics[-1]
-            if is_unexplained(newest):
-                self._observer.warn(
-                    f"frame {newest.frame_index}: the estimated motion explains only "
-                    f"{newest.explained:.0%} of the optical flow; the trajectory may break here"
-                )
-            self._judged = newest.frame_index
+def alarms(slam: Slam) -> Iterator[str]:
+    """Yield that the camera is lost since the newest frame, and what contradicts a keyframe."""
+    tracked, diagnostics = slam.tracker.tracked, slam.tracker.watch.diagnostics
+    followed = [frame.status.is_followed for frame in tracked[-2:]]
+    if slam.tracker.initialised and followed == [True, False]:
+        yield (
+            f"frame {tracked[-1].frame_index}: the camera is lost; it is looked for among the "
+            "keyframes"
+        )
+    if diagnostics and is_unexplained(diagnostics[-1]):
+        yield (
+            f"frame {diagnostics[-1].frame_index}: the estimated motion explains only "
+            f"{diagnostics[-1].explained:.0%} of the optical flow; the trajectory may break here"
+        )
 
 
 def check_finite(slam: Slam) -> None:

@@ -21,7 +21,6 @@ from minislam.runs.facts import surface_depth
 from minislam.runs.loaded import Run
 from minislam.runs.summary import summarise
 from minislam.slam import Slam
-from minislam.state.steps import Observer
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
 from minislam.viz import figure_png
 
@@ -32,38 +31,29 @@ PREVIEW_FRACTION = 0.01  # of a run's time that writing reports before its end m
 
 
 class Preview:
-    """Keeps a report in the folder while the run goes on, from the first iteration of the map on.
+    """Keeps a report in the folder while the run goes on, from its first map on."""
 
-    It stands between the run and its observer, because it is told of progress as often as that.
-    """
-
-    def __init__(self, folder: RunFolder, observer: Observer) -> None:
-        self._folder, self._observer = folder, observer
-        self._slam: Slam | None = None
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
         self._last, self._cost = 0.0, 0.0  # second: when the last one was written, how long it took
-        self.warn, self.should_stop = observer.warn, observer.should_stop
 
-    def watch(self, slam: Slam, facts: Callable[[], dict[str, Any]]) -> None:
-        """Take up a run; `facts` returns the present content of run.json."""
-        self._slam, self._facts = slam, facts
-
-    def show(self, stage: str, done: int, total: int) -> None:
-        """Pass progress on. If there is a map and a new report is due, write it."""
-        self._observer.show(stage, done, total)
+    def update(self, slam: Slam, facts_of: Callable[[str, None], dict[str, Any]]) -> None:
+        """Write the report if there is a map and a new one is due; `facts_of` is run.json."""
         begun = time.perf_counter()
         is_due = begun - self._last >= self._cost / PREVIEW_FRACTION
-        if is_due and self._slam is not None and self._slam.mapper.keyframes:
-            self.write(self._slam, self._facts())
+        if is_due and slam.mapper.keyframes:
+            write_preview(self._folder, slam, facts_of("running", None))
             self._last = time.perf_counter()
             self._cost = self._last - begun
 
-    def write(self, slam: Slam, facts: dict[str, Any]) -> None:
-        """Write the report of what is known so far, if it can be written: no run ends of it."""
-        with suppress(Exception):
-            shown = _pictures(slam, len(slam.mapper.keyframes) - 1)
-            strip = [shown["input"], viz.beta_to_rgb(shown["beta"]), shown["render"]]
-            jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
-            _write_report(self._folder, slam, {}, facts, overview=jpeg)
+
+def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:
+    """Write the report of what is known so far, if it can be written: no run ends of it."""
+    with suppress(Exception):
+        shown = _pictures(slam, len(slam.mapper.keyframes) - 1)
+        strip = [shown["input"], viz.beta_to_rgb(shown["beta"]), shown["render"]]
+        jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
+        _write_report(folder, slam, {}, facts, overview=jpeg)
 
 
 def write_pictures(

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -22,28 +22,17 @@ from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
 from minislam.records import Sequence
-from minislam.runs.alarms import Alarms, check_finite
+from minislam.runs.alarms import alarms, check_finite
 from minislam.runs.facts import has_large_holes, measure, run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
-from minislam.runs.pictures import Preview, write_pictures
+from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints
-from minislam.runs.summary import Line, summarise
 from minislam.slam import Priors, Slam
-from minislam.state.steps import Observer, SilentObserver
+from minislam.state.steps import Observer
 from minislam.workers import Workers, idle_cores
 
 FAILED_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 3, 130  # exit codes of a run that is not complete
-
-
-@dataclass(frozen=True)
-class RunOutcome:
-    """The result of a finished or interrupted run, for the command line to print."""
-
-    summary: list[Line]  # what is known, in words
-    warnings: list[str]
-    exit_code: int
-    state: str  # "finished", "interrupted", ... as in run.json
 
 
 def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -> Priors:
@@ -71,13 +60,13 @@ def run_in_folder(
     config: SlamConfig,
     choice: PriorChoice,
     output: Path | str,
-    observer: Observer | None = None,
+    observer: Observer,
     lpips: Lpips | None = None,
     overwrite: bool = False,  # replace an earlier run
     resume: bool = False,  # go on with an interrupted one
     workers: int | None = None,  # processes; as many as there are idle cores, at most 4
-) -> RunOutcome:
-    """Check everything that may be wrong, then run SLAM into a folder of its own.
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Check everything that may be wrong, then run SLAM into a folder; return metrics and run.json.
 
     Nothing of an earlier run is removed before the checks. The threads of torch are afterwards as
     they were.
@@ -86,7 +75,7 @@ def run_in_folder(
         sequence.given_mask(index)
     priors = choose_priors(choice, sequence, config)
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
-    threads, observer = torch.get_num_threads(), observer or SilentObserver()
+    threads = torch.get_num_threads()
     with names.locked(output), Workers(count, config.threads, observer.warn) as helpers:
         folder = (
             RunFolder(output) if resume else RunFolder.create(output, overwrite, sequence.files)
@@ -94,22 +83,25 @@ def run_in_folder(
         try:
             torch.set_num_threads(config.threads)
             checkpoints = Checkpoints(folder, sequence, config, choice)
-            alarms, preview = Alarms(observer), Preview(folder, observer)
+            preview, said = Preview(folder), set[str]()
 
             def between_steps(force: bool) -> None:
-                alarms.check(slam)
+                for text in alarms(slam):
+                    if text not in said:
+                        observer.warn(text)
+                        said.add(text)
                 check_finite(slam)
+                preview.update(slam, facts_of)
                 checkpoints.save(slam, force)
 
-            slam = Slam(sequence, config, priors, preview, between_steps, choice.device, helpers)
+            slam = Slam(sequence, config, priors, observer, between_steps, choice.device, helpers)
             facts_of = partial(run_facts, slam, choice, checkpoints)
-            preview.watch(slam, partial(facts_of, "running", None))
             if resume:
                 checkpoints.restore(slam)
             settings = {**sequence.opened_as, "priors": asdict(choice), **asdict(config)}
             write_json(folder.path / names.CONFIG, settings)
             write_json(folder.path / names.RUN, facts_of("running", None))
-            return _run(slam, folder, facts_of, preview, lpips)
+            return _run(slam, folder, facts_of, lpips)
         finally:
             torch.set_num_threads(threads)
 
@@ -118,9 +110,8 @@ def _run(
     slam: Slam,
     folder: RunFolder,
     facts_of: Callable[[str, int | None], dict[str, Any]],  # run.json by state and exit code
-    preview: Preview,
     lpips: Lpips | None,
-) -> RunOutcome:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run SLAM, or the rest of it, and write the folder, however the run ends."""
     interrupted = False
     try:
@@ -130,8 +121,7 @@ def _run(
             if not slam.mapper.keyframes:  # there is no map to write yet
                 raise
             interrupted = True
-        state, exit_code = _ending(slam, interrupted)
-        facts = facts_of(state, exit_code)
+        facts = facts_of(*_ending(slam, interrupted))
         _write_estimates(folder, slam)
         clip_is_written = slam.workers.start(write_clip, str(folder.path))
         metrics = measure(slam, facts["seconds"]["total"], lpips)
@@ -140,18 +130,18 @@ def _run(
         clip_is_written()
         write_json(folder.path / names.RUN, facts)
     except (Exception, KeyboardInterrupt) as error:
-        state, exit_code = f"failed: {str(error) or repr(error)}", FAILED_EXIT
+        ending = f"failed: {str(error) or repr(error)}", FAILED_EXIT
         if isinstance(error, KeyboardInterrupt):
-            state, exit_code = "interrupted", INTERRUPTED_EXIT
+            ending = "interrupted", INTERRUPTED_EXIT
         with suppress(Exception):  # a full disk: the first error is the one to hear of
-            facts = facts_of(state, exit_code)
+            facts = facts_of(*ending)
             write_json(folder.path / names.RUN, facts)
             _write_trajectories(folder, slam)
-            preview.write(slam, facts)
+            write_preview(folder, slam, facts)
         raise
     if not interrupted:
         folder.remove_checkpoint()
-    return RunOutcome(summarise(metrics, facts), facts["warnings"], exit_code, state)
+    return metrics, facts
 
 
 def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:

@@ -6,24 +6,8 @@ import pytest
 import torch
 
 from minislam.records import TrackedFrame, TrackingStatus
-from minislam.runs.alarms import Alarms, check_finite
+from minislam.runs.alarms import alarms, check_finite
 from minislam.tracking.safeguards.diagnostics import KeyframeDiagnostics
-
-
-class Said:
-    """An observer that remembers its warnings."""
-
-    def __init__(self) -> None:
-        self.texts: list[str] = []
-
-    def show(self, stage: str, done: int, total: int) -> None:
-        pass
-
-    def should_stop(self) -> bool:
-        return False
-
-    def warn(self, text: str) -> None:
-        self.texts.append(text)
 
 
 def said(statuses: list[TrackingStatus], explained: dict[int, float | None]) -> list[str]:
@@ -31,17 +15,14 @@ def said(statuses: list[TrackingStatus], explained: dict[int, float | None]) -> 
     tracked, diagnostics = [], []
     watch = SimpleNamespace(diagnostics=diagnostics)
     slam = SimpleNamespace(tracker=SimpleNamespace(tracked=tracked, watch=watch, initialised=False))
-    observer = Said()
-    alarms = Alarms(observer)
-    alarms.check(slam)
+    texts: dict[str, None] = {}
     for index, status in enumerate(statuses):
         tracked.append(TrackedFrame(index, index / 30, status, 0.5))
         slam.tracker.initialised |= status is TrackingStatus.OK
         if index in explained:
             diagnostics.append(KeyframeDiagnostics(index, 0.5, 9.0, explained[index], 0.01))
-        alarms.check(slam)
-        alarms.check(slam)  # between steps may come more often than frames
-    return observer.texts
+        texts |= dict.fromkeys(alarms(slam))  # a text that was said is not said again
+    return list(texts)
 
 
 OK, LOST = TrackingStatus.OK, TrackingStatus.LOST

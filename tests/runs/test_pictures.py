@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from minislam.config import preset
 from minislam.runs import pictures
 from minislam.runs.pictures import MAX_SHOWN, Preview, named_settings
-from minislam.state.steps import SilentObserver
 
 
 def test_settings_are_named_by_the_nearest_preset():
@@ -25,33 +24,28 @@ def test_of_many_keyframes_some_are_shown_the_first_and_the_last_among_them():
 def test_a_preview_waits_for_a_map_and_then_keeps_its_share_of_the_time(monkeypatch):
     now, written = [100.0], []
     monkeypatch.setattr(pictures.time, "perf_counter", lambda: now[0])
-    preview = Preview(None, SilentObserver())
+    preview = Preview(None)
 
-    def write(slam: object, facts: dict) -> None:
+    def write(folder: object, slam: object, facts: dict) -> None:
+        assert facts == {"state": "running"}
         written.append(now[0])
         now[0] += 0.5  # second that it takes
 
-    monkeypatch.setattr(preview, "write", write)
-    preview.show("tracking", 1, 2)  # it knows of no run yet
+    def facts_of(state: str, exit_code: None) -> dict:
+        return {"state": state}
+
+    monkeypatch.setattr(pictures, "write_preview", write)
     slam = SimpleNamespace(mapper=SimpleNamespace(keyframes=[]))
-    preview.watch(slam, dict)
-    preview.show("tracking", 2, 2)
+    preview.update(slam, facts_of)
     assert written == []  # no map yet
     slam.mapper.keyframes.append(object())
-    for step in range(200):
-        preview.show("mapping", step, 200)
+    for _ in range(200):
+        preview.update(slam, facts_of)
         now[0] += 1.0
     assert written[0] == 100.0 and len(written) == 4
     assert 0.5 / (written[1] - written[0]) <= pictures.PREVIEW_FRACTION
 
 
-def test_a_preview_passes_on_what_the_run_says_and_never_ends_it():
-    said = []
-    observer = SimpleNamespace(
-        show=lambda *step: said.append(step), warn=said.append, should_stop=lambda: True
-    )
-    preview = Preview(None, observer)
-    preview.watch(SimpleNamespace(mapper=SimpleNamespace(keyframes=[None])), dict)
-    preview.show("mapping", 1, 2)  # the run has no picture to show, and the folder is none
-    preview.warn("lost")
-    assert said == [("mapping", 1, 2), "lost"] and preview.should_stop()
+def test_a_preview_never_ends_a_run():
+    slam = SimpleNamespace(mapper=SimpleNamespace(keyframes=[None]))
+    pictures.write_preview(None, slam, {})  # the run has no picture to show, and the folder is none

@@ -32,7 +32,7 @@ def test_config_json_alone_gives_the_same_bytes_again(root: Path, monkeypatch):
         first, again = (root / run / name for run in ("first", "again"))
         assert first.read_bytes() == again.read_bytes(), name
     running = [html for html in reports if '<main class="running">' in html]
-    assert len(running) > 5 and len(reports) == len(running) + 2  # at the end: viewer and report
+    assert len(running) >= 3 and len(reports) == len(running) + 2  # at the end: viewer and report
     assert "data:image/jpeg" in running[0] and "location.reload" in running[0]
     facts = RunFolder(root / "again").read_run()
     assert facts["failed_adjustments"] == 0 < facts["adjustments"]
