@@ -60,13 +60,13 @@ def run_export(args: argparse.Namespace) -> int:
     from minislam.data.ply import encode_ply
     from minislam.runs import export
 
-    run, show = minislam.load(args.folder), ProgressLine().show
+    run, progress = minislam.load(args.folder), ProgressLine()
     wanted = run.keyframes if args.keyframes else run.poses
     frames = [frame for frame in sorted(run.poses) if frame in wanted]
     writers = [export.export_colmap, export.export_nerfstudio, export.export_depth]
     for folder, write in zip(folders, [*writers, export.export_masks], strict=True):
         if folder:
-            write(run, Path(folder), frames, show)
+            write(run, Path(folder), progress.over(f"writing {folder}", frames, len(frames)))
             say(f"{folder}: {len(frames)} frames, lengths in {run.unit}")
     if args.points:
         export.export_points(run, Path(args.points))

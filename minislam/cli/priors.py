@@ -7,7 +7,6 @@ Heavy networks then run once, on a machine with a GPU, and `minislam run --featu
 from __future__ import annotations
 
 import argparse
-import io
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING
 from minislam.cli import options
 from minislam.cli.help import add_command
 from minislam.cli.progress import ProgressLine
-from minislam.data.files import atomic_write, read_text, write_text
+from minislam.data.files import atomic_file, read_text, write_text
 from minislam.data.options import require_source
 from minislam.errors import InputError
 from minislam.priors.names import require_priors
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from minislam.data import RecordedSequence
     from minislam.priors.choice import PriorChoice
     from minislam.records import Frame
-
-FRAME_DIGITS = 5  # of the file names, as WildGS-SLAM names its own
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -68,7 +65,7 @@ def run_priors(args: argparse.Namespace) -> int:
     out = Path(args.out).expanduser()
     kinds = _kinds(choice, args.features is not None, sequence, config)
     for kind, (origin, compute) in kinds.items():
-        _write_kind(out / kind, origin, sequence, compute, progress.show)
+        _write_kind(out / kind, origin, sequence, compute, progress)
     print(f"use them with {' '.join(f'--{kind} files:{out}' for kind in kinds)}")
     return 0
 
@@ -103,7 +100,7 @@ def _write_kind(
     origin: str,  # one line
     sequence: RecordedSequence,
     compute: Callable[[Frame], Tensor | None],
-    show: Callable[[str, int, int], None],  # stage, done, total
+    progress: ProgressLine,
 ) -> None:
     """Write one .npy file per frame. Files of an interrupted call are kept and not made again."""
     import numpy as np
@@ -119,11 +116,9 @@ def _write_kind(
             "files; choose another --out"
         )
     write_text(path, index)
-    for frame in sequence:
-        path = folder / f"{frame.frame_index:0{FRAME_DIGITS}d}.npy"
+    for frame in progress.over(f"writing {folder.name}", sequence, len(sequence)):
+        path = folder / f"{frame.frame_index:05d}.npy"  # as WildGS-SLAM names its own
         values = None if path.exists() else compute(frame)
         if values is not None:
-            buffer = io.BytesIO()
-            np.save(buffer, values.float().cpu().numpy())
-            atomic_write(path, buffer.getvalue())
-        show(f"writing {folder.name}", frame.frame_index + 1, len(sequence))
+            with atomic_file(path) as file:
+                np.save(file, values.float().cpu().numpy())

@@ -7,15 +7,17 @@ import signal
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from minislam.config import SlamConfig
     from minislam.priors.names import PriorChoice
     from minislam.records import Sequence
+
+Item = TypeVar("Item")
 
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
 REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
@@ -141,6 +143,12 @@ class ProgressLine:
         in_all = taken + (sum(planned) - done) * slowness
         number = f"stage {self._stage + 1} of {len(self.plan)}, "
         return number, f", about {_duration(in_all)} in all"
+
+    def over(self, stage: str, items: Iterable[Item], total: int) -> Iterator[Item]:
+        """Yield the items of a stage, and report each that is done."""
+        for done, item in enumerate(items, start=1):
+            yield item
+            self.show(stage, done, total)
 
     def warn(self, text: str) -> None:
         """Print a warning on a line of its own."""

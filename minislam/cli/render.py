@@ -1,16 +1,9 @@
 """`minislam render RUN`: the static map of a finished run as a video or an animated picture."""
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
 from minislam.cli.options import size_of
 from minislam.cli.progress import ProgressLine, say
-
-if TYPE_CHECKING:
-    import numpy as np
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -46,20 +39,13 @@ def _render(args: argparse.Namespace) -> int:
     require_bounds("--size", args.size, MINIMUM_SIDE, 16384)
     camera = run.camera.resized(*args.size) if args.size else run.camera
     rate, count = flythrough.frame_rate(run), len(run.poses)
-    if args.path == "orbit":
+    if args.path == "trajectory":
+        images = flythrough.fly_along(run, camera)
+    elif args.path == "side-by-side":
+        images = flythrough.side_by_side(run, camera)
+    else:
+        images = flythrough.fly_around(run, camera)
         rate, count = flythrough.ORBIT_RATE, flythrough.ORBIT_IMAGES
-    film = {
-        "trajectory": flythrough.fly_along,
-        "orbit": flythrough.fly_around,
-        "side-by-side": flythrough.side_by_side,
-    }[args.path]
-    write_animation(args.output, _shown(film(run, camera), count), rate)
+    write_animation(args.output, ProgressLine().over("rendering", images, count), rate)
     say(f"{count} images at {rate:.0f} per second in {args.output}")
     return 0
-
-
-def _shown(images: Iterable[np.ndarray], count: int) -> Iterator[np.ndarray]:
-    progress = ProgressLine()
-    for done, image in enumerate(images, start=1):
-        progress.show("rendering", done, count)
-        yield image

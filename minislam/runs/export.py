@@ -6,8 +6,7 @@ as trainers of radiance fields read them, and cut where the map's own training c
 The centre of our first pixel is (0, 0), theirs is (0.5, 0.5).
 """
 
-import io
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from minislam.data.files import atomic_write, write_json, write_text
+from minislam.data.files import atomic_file, atomic_write, write_json, write_text
 from minislam.data.images import encode_png
 from minislam.data.ply import encode_points
 from minislam.errors import InputError
@@ -29,17 +28,15 @@ HALF_PIXEL = 0.5  # px, from our pixel coordinates to those of COLMAP and nerfst
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # of camera axes: y up, z backward
 IMAGES, MASKS, POINTS = "images", "masks", "points.ply"
 
-Show = Callable[[str, int, int], None]  # stage, done, total
 
-
-def export_colmap(run: Run, folder: Path, frames: Sequence[int], show: Show) -> None:
+def export_colmap(run: Run, folder: Path, frames: Iterable[int]) -> None:
     """Write images/, masks/ and sparse/0/ with COLMAP's text files, and the map as points."""
-    camera = _write_images(run, folder, frames, show)
+    camera, written = _write_images(run, folder, frames)
     fx, fy, cx, cy, *size = vars(camera).values()
     lens = (fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL)
     write_text(folder / "sparse/0/cameras.txt", _row([1, "PINHOLE", *size, *lens]))
     rows = ""
-    for number, frame in enumerate(frames, start=1):
+    for number, frame in enumerate(written, start=1):
         T_camera_world = np.linalg.inv(run.poses[frame])
         x, y, z, w = Rotation.from_matrix(T_camera_world[:3, :3]).as_quat()
         rows += _row([number, w, x, y, z, *T_camera_world[:3, 3], 1, _name(frame)])
@@ -50,9 +47,9 @@ def export_colmap(run: Run, folder: Path, frames: Sequence[int], show: Show) -> 
     write_text(folder / "sparse/0/points3D.txt", rows)
 
 
-def export_nerfstudio(run: Run, folder: Path, frames: Sequence[int], show: Show) -> None:
+def export_nerfstudio(run: Run, folder: Path, frames: Iterable[int]) -> None:
     """Write images/, masks/, the map as points.ply, and transforms.json for nerfstudio."""
-    camera = _write_images(run, folder, frames, show)
+    camera, written = _write_images(run, folder, frames)
     export_points(run, folder / POINTS)
     views = [
         {
@@ -60,7 +57,7 @@ def export_nerfstudio(run: Run, folder: Path, frames: Sequence[int], show: Show)
             "mask_path": f"{MASKS}/{_name(frame)}",
             "transform_matrix": (run.poses[frame] @ OPENCV_TO_OPENGL).tolist(),
         }
-        for frame in frames
+        for frame in written
     ]
     lens = {"fl_x": camera.fx, "fl_y": camera.fy, "w": camera.width, "h": camera.height}
     lens |= {"cx": camera.cx + HALF_PIXEL, "cy": camera.cy + HALF_PIXEL}
@@ -73,27 +70,24 @@ def export_points(run: Run, file: Path) -> None:
     atomic_write(file, encode_points(*points_of(run)))
 
 
-def export_depth(run: Run, folder: Path, frames: Sequence[int], show: Show) -> None:
+def export_depth(run: Run, folder: Path, frames: Iterable[int]) -> None:
     """Write the z-depth of the map in every frame as .npy, float32 of the working size.
 
     camera.json holds the intrinsics, for pixel centres at integers, and the unit of length.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for done, frame in enumerate(frames, start=1):
-        buffer = io.BytesIO()
-        np.save(buffer, np.asarray(run.render_depth(run.poses[frame]), np.float32))
-        atomic_write(folder / _name(frame, ".npy"), buffer.getvalue())
-        show("rendering depth", done, len(frames))
+    for frame in frames:
+        with atomic_file(folder / _name(frame, ".npy")) as file:
+            np.save(file, np.asarray(run.render_depth(run.poses[frame]), np.float32))
     write_json(folder / "camera.json", {**asdict(run.camera), "unit": run.unit})
 
 
-def export_masks(run: Run, folder: Path, frames: Sequence[int], show: Show) -> None:
+def export_masks(run: Run, folder: Path, frames: Iterable[int]) -> None:
     """Write a mask of every frame at the size of the source: 255 where static, 0 where it moves."""
     camera = run.sequence.full_camera(run.camera)
     folder.mkdir(parents=True, exist_ok=True)
-    for done, frame in enumerate(frames, start=1):
+    for frame in frames:
         atomic_write(folder / _name(frame), encode_png(static_mask(run, frame, camera)))
-        show("writing masks", done, len(frames))
 
 
 def points_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -111,8 +105,8 @@ def static_mask(run: Run, frame: int, camera: Camera) -> np.ndarray:  # (H, W) u
     return np.where(weight > 0, 255, 0).astype(np.uint8)
 
 
-def _write_images(run: Run, folder: Path, frames: Sequence[int], show: Show) -> Camera:
-    """Write images/ and masks/; return the camera of both."""
+def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera, list[int]]:
+    """Write images/ and masks/; return the camera of both, and the frames."""
     sequence = run.sequence
     inside = [path for path in sequence.files if path.resolve().is_relative_to(folder.resolve())]
     if inside:
@@ -122,8 +116,8 @@ def _write_images(run: Run, folder: Path, frames: Sequence[int], show: Show) -> 
         )
     for part in (IMAGES, MASKS, "sparse/0"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    camera = sequence.full_camera(run.camera)
-    for done, frame in enumerate(frames, start=1):
+    camera, written = sequence.full_camera(run.camera), list[int]()
+    for frame in frames:
         image, mask = sequence.full_image(frame), static_mask(run, frame, camera)
         moved = run.displacement(frame)
         if moved is not None:
@@ -132,8 +126,8 @@ def _write_images(run: Run, folder: Path, frames: Sequence[int], show: Show) -> 
             mask = warp(mask, enlarged, cv2.INTER_NEAREST)
         atomic_write(folder / IMAGES / _name(frame), encode_png(image))
         atomic_write(folder / MASKS / _name(frame), encode_png(mask))
-        show(f"writing {folder}", done, len(frames))
-    return camera
+        written.append(frame)
+    return camera, written
 
 
 def _working_pixels(run: Run, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

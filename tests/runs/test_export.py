@@ -28,10 +28,6 @@ FRAMES = (2, 5)  # frames with a pose, of six
 STEPS = {2: [0.1, -0.2, 0.3], 5: [0.3, 0.0, 0.0]}
 
 
-def quiet(stage: str, done: int, total: int) -> None:
-    """Show nothing."""
-
-
 def pose(frame: int) -> np.ndarray:
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.from_rotvec([0.1, 0.05 * frame, -0.2]).as_matrix()
@@ -102,7 +98,7 @@ def exported(folder: Path, frame: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_colmap_projects_a_point_where_the_exported_image_shows_it(run, tmp_path: Path):
     folder = tmp_path / "out"
-    export.export_colmap(run, folder, FRAMES, quiet)
+    export.export_colmap(run, folder, FRAMES)
     camera = (folder / "sparse/0/cameras.txt").read_text().split()
     assert camera[:2] == ["1", "PINHOLE"]
     width, height, fx, fy, cx, cy = map(float, camera[2:])
@@ -123,7 +119,7 @@ def test_colmap_projects_a_point_where_the_exported_image_shows_it(run, tmp_path
 
 def test_nerfstudio_projects_a_point_where_the_exported_image_shows_it(run, tmp_path: Path):
     folder = tmp_path / "out"
-    export.export_nerfstudio(run, folder, FRAMES, quiet)
+    export.export_nerfstudio(run, folder, FRAMES)
     model = json.loads((folder / "transforms.json").read_text())
     for view, frame in zip(model["frames"], FRAMES, strict=True):
         # Axes of OpenGL: x right, y up, and the camera looks along -z.
@@ -139,10 +135,10 @@ def test_nerfstudio_projects_a_point_where_the_exported_image_shows_it(run, tmp_
 
 
 def test_images_and_masks_beside_poses_are_those_of_a_global_shutter(run, tmp_path: Path):
-    export.export_nerfstudio(run, tmp_path / "as filmed", FRAMES, quiet)
+    export.export_nerfstudio(run, tmp_path / "as filmed", FRAMES)
     shift = np.float32([3.0, -2.0])  # px of the run's images, by which the spot is shown too far
     run.displacement = lambda frame: np.broadcast_to(shift, (64, 96, 2)) if frame == 5 else None
-    export.export_nerfstudio(run, tmp_path / "undone", FRAMES, quiet)
+    export.export_nerfstudio(run, tmp_path / "undone", FRAMES)
     scale = run.sequence.full_camera(run.camera).fx / run.camera.fx
     assert scale > 1.5
     for frame, moved in ((2, 0 * shift), (5, shift)):
@@ -151,7 +147,7 @@ def test_images_and_masks_beside_poses_are_those_of_a_global_shutter(run, tmp_pa
         np.testing.assert_allclose(centroid(after[0]), expected, atol=0.1)
         expected = centroid(255 - before[1]) - scale * moved
         np.testing.assert_allclose(centroid(255 - after[1]), expected, atol=0.6)
-    export.export_masks(run, tmp_path / "masks", [5], quiet)  # these belong to the source's images
+    export.export_masks(run, tmp_path / "masks", [5])  # these belong to the source's images
     assert (tmp_path / "masks/000005.png").read_bytes() == (
         tmp_path / "as filmed/masks/000005.png"
     ).read_bytes()
@@ -159,7 +155,7 @@ def test_images_and_masks_beside_poses_are_those_of_a_global_shutter(run, tmp_pa
 
 def test_pycolmap_reads_what_we_write(run, tmp_path: Path):
     pycolmap = pytest.importorskip("pycolmap")
-    export.export_colmap(run, tmp_path / "out", FRAMES, quiet)
+    export.export_colmap(run, tmp_path / "out", FRAMES)
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert (model.num_images(), model.num_points3D()) == (2, 4)
     for image in model.images.values():
@@ -192,14 +188,14 @@ def test_points_are_the_opaque_gaussians_with_their_colours(run, tmp_path: Path)
     table = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     np.testing.assert_allclose(table["xyz"], run.gaussians.means[5:], rtol=1e-6)
     np.testing.assert_array_equal(table["rgb"], np.round(255 * run.gaussians.colors[5:]))
-    export.export_colmap(run, tmp_path / "out", FRAMES, quiet)
+    export.export_colmap(run, tmp_path / "out", FRAMES)
     first = (tmp_path / "out/sparse/0/points3D.txt").read_text().splitlines()[0].split()
     assert first[0] == "1" and first[4:] == [*map(str, table["rgb"][0]), "0"]
     assert [float(x) for x in first[1:4]] == pytest.approx(run.gaussians.means[5])
 
 
 def test_depth_is_written_in_numbers_with_camera_and_unit(run, tmp_path: Path):
-    export.export_depth(run, tmp_path / "depth", FRAMES, quiet)
+    export.export_depth(run, tmp_path / "depth", FRAMES)
     depth = np.load(tmp_path / "depth/000002.npy")
     assert depth.dtype == np.float32 and depth.shape == (64, 96)
     assert depth[0, 0] == pytest.approx(2.3)
@@ -209,7 +205,7 @@ def test_depth_is_written_in_numbers_with_camera_and_unit(run, tmp_path: Path):
 
 def test_masks_of_a_static_scene_are_white(run, tmp_path: Path):
     run.beta = lambda frame: np.zeros((64, 96), np.float32)
-    export.export_masks(run, tmp_path / "masks", [5], quiet)
+    export.export_masks(run, tmp_path / "masks", [5])
     mask = cv2.imread(str(tmp_path / "masks/000005.png"), cv2.IMREAD_GRAYSCALE)
     full = run.sequence.full_camera(run.camera)
     assert (mask == 255).all() and mask.shape == (full.height, full.width)
@@ -219,7 +215,7 @@ def test_masks_follow_the_cut_of_the_run(run, tmp_path: Path):
     run.beta = lambda frame: np.full((64, 96), 1.2, np.float32)
     for name, least, expected in (("usual", MAPPING_CUT, 255), ("of this clip", 0.17, 0)):
         run.least_weight = least
-        export.export_masks(run, tmp_path / name, [5], quiet)
+        export.export_masks(run, tmp_path / name, [5])
         mask = cv2.imread(str(tmp_path / name / "000005.png"), cv2.IMREAD_GRAYSCALE)
         assert (mask == expected).all()
 
@@ -241,5 +237,5 @@ def test_images_of_the_sequence_are_never_written_over(run, tmp_path: Path):
     (tmp_path / "in").rename(tmp_path / "images")
     run.sequence = open_sequence(str(tmp_path / "images"))
     with pytest.raises(InputError, match="expected a folder without images of the sequence"):
-        export.export_colmap(run, tmp_path, FRAMES, quiet)
+        export.export_colmap(run, tmp_path, FRAMES)
     assert not (tmp_path / "masks").exists()
