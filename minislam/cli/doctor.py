@@ -20,7 +20,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run_doctor)
 
 
-def run_doctor(args: argparse.Namespace) -> int:
+def run_doctor(args: argparse.Namespace) -> None:
     """Print versions and threads, and compare an estimated flow with the known one."""
     import platform
 
@@ -46,7 +46,6 @@ def run_doctor(args: argparse.Namespace) -> int:
             f"expected the self-test to be exact to {MAX_SELF_TEST_ERROR} px, found "
             f"{error:.3f} px; reinstall opencv-python-headless"
         )
-    return 0
 
 
 def installation_warnings(torch_sees_a_gpu: bool) -> Iterator[str]:

@@ -42,8 +42,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run_eval)
 
 
-def run_eval(args: argparse.Namespace) -> int:
-    """Compare two trajectory files; return the exit code."""
+def run_eval(args: argparse.Namespace) -> None:
+    """Compare two trajectory files."""
     from minislam.data.run_folder import TRAJECTORY
     from minislam.data.trajectory import read_trajectory
     from minislam.evaluation.trajectory import absolute_trajectory_error
@@ -64,7 +64,9 @@ def run_eval(args: argparse.Namespace) -> int:
         fitted = f"(with {alignment.value}{reason})"
         if args.verbose:
             print(_fit(result, len(estimate), len(truth)))
-        print("\n\n".join(_table(title, fitted, tables[title]) for title in tables))
+        for number, (title, table) in enumerate(tables.items()):
+            rows = [f"{name:>10}\t{table[name]:.6f}" for name in sorted(table)]  # as evo prints it
+            print(*[""] * number, title, fitted, "", *rows, sep="\n")
     if args.save_results:
         numbers = {
             "reference": args.reference,
@@ -82,7 +84,6 @@ def run_eval(args: argparse.Namespace) -> int:
         write_json(args.save_results, numbers)
     if args.plot or args.save_plot:
         _plot(args, result)
-    return 0
 
 
 def _alignment(args: argparse.Namespace) -> Alignment:
@@ -91,10 +92,8 @@ def _alignment(args: argparse.Namespace) -> Alignment:
 
     if args.no_align and (args.align or args.correct_scale):
         raise InputError("expected either --no_align or -a / -s, found both; leave one out")
-    if args.no_align:
-        return Alignment.NONE
     if args.align == args.correct_scale:
-        return Alignment.SIM3
+        return Alignment.NONE if args.no_align else Alignment.SIM3
     return Alignment.SE3 if args.align else Alignment.SCALE
 
 
@@ -133,12 +132,6 @@ def _fit(result: TrajectoryError, estimate_poses: int, truth_poses: int) -> str:
         f"{len(result.errors)} pairs ({estimate_poses} estimated, {truth_poses} true poses)\n"
         f"scale {similarity.scale:.6f}, translation {shift}, rotation\n{rows}\n"
     )
-
-
-def _table(title: str, fitted: str, statistics: dict[str, float]) -> str:
-    """Return one table as evo prints it, with the alignment named above it."""
-    rows = [f"{name:>10}\t{statistics[name]:.6f}" for name in sorted(statistics)]
-    return "\n".join([title, fitted, "", *rows])
 
 
 def _plot(args: argparse.Namespace, result: TrajectoryError) -> None:

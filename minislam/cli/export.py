@@ -40,8 +40,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run_export)
 
 
-def run_export(args: argparse.Namespace) -> int:
-    """Write what is asked for; return the exit code."""
+def run_export(args: argparse.Namespace) -> None:
+    """Write what is asked for."""
     folders = [args.colmap, args.nerfstudio, args.depth, args.masks]
     if not any([*folders, args.points, args.sh_degree]):
         raise InputError(
@@ -76,4 +76,3 @@ def run_export(args: argparse.Namespace) -> int:
         say(f"{padded}: the map with zeros up to degree {args.sh_degree}")
     if args.nerfstudio:
         say(f"to go on: ns-train splatfacto --data {args.nerfstudio}")
-    return 0

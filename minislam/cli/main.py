@@ -82,7 +82,7 @@ def _command(arguments: list[str]) -> int:
     if unknown:
         raise unknown_option(unknown[0], args.parser)
     args.settings = given
-    return args.run(args)
+    return args.run(args) or 0  # a command without an exit code of its own has succeeded
 
 
 def _parser() -> argparse.ArgumentParser:

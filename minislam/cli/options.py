@@ -154,10 +154,12 @@ def input_options(args: argparse.Namespace) -> InputOptions:
 
 
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
-    """Return the priors: those of the file of --config, replaced by what is given."""
-    from minislam.priors.names import PriorChoice
+    """Return the priors, which exist: those of the file of --config, replaced by what is given."""
+    from minislam.priors.names import PriorChoice, require_priors
 
-    return _with_given(PriorChoice(depth=default_depth), args, "priors")
+    choice = _with_given(PriorChoice(depth=default_depth), args, "priors")
+    require_priors(choice)
+    return choice
 
 
 def _with_given(options: Options, args: argparse.Namespace, part: str) -> Options:

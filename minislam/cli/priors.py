@@ -19,7 +19,6 @@ from minislam.cli.progress import ProgressLine
 from minislam.data.files import atomic_file, read_text, write_text
 from minislam.data.options import require_source
 from minislam.errors import InputError
-from minislam.priors.names import require_priors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -44,12 +43,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run_priors)
 
 
-def run_priors(args: argparse.Namespace) -> int:
-    """Write the priors that are asked for; return the exit code."""
+def run_priors(args: argparse.Namespace) -> None:
+    """Write the priors that are asked for."""
     source, inputs = options.source_of(args), options.input_options(args)
     choice = options.prior_choice(args, "none")
     require_source(source)
-    require_priors(choice)
     if args.features is None and choice.depth == "none":
         raise InputError(
             "expected --features or --depth, found neither; name at least one to write"
@@ -67,7 +65,6 @@ def run_priors(args: argparse.Namespace) -> int:
     for kind, (origin, compute) in kinds.items():
         _write_kind(out / kind, origin, sequence, compute, progress)
     print(f"use them with {' '.join(f'--{kind} files:{out}' for kind in kinds)}")
-    return 0
 
 
 def _kinds(

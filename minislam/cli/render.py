@@ -28,7 +28,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=_render)
 
 
-def _render(args: argparse.Namespace) -> int:
+def _render(args: argparse.Namespace) -> None:
     from minislam.data.images import write_animation
     from minislam.data.options import MINIMUM_SIDE
     from minislam.parameters import require_bounds
@@ -48,4 +48,3 @@ def _render(args: argparse.Namespace) -> int:
         rate, count = flythrough.ORBIT_RATE, flythrough.ORBIT_IMAGES
     write_animation(args.output, ProgressLine().over("rendering", images, count), rate)
     say(f"{count} images at {rate:.0f} per second in {args.output}")
-    return 0

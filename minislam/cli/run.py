@@ -12,7 +12,6 @@ from minislam.cli.progress import ProgressLine, ending_signals, plan_of, say
 from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
 from minislam.errors import InputError
-from minislam.priors.names import require_priors
 
 DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
 
@@ -61,7 +60,6 @@ def _run_recorded(args: argparse.Namespace, log: Log) -> int:
         also = " (or --resume, to go on with an interrupted run)"
         require_free(args.output, args.overwrite, also)
     choice = options.prior_choice(args, default_depth(source))
-    require_priors(choice)
     from minislam.data import open_sequence
     from minislam.runs.run import default_output, run_in_folder
     from minislam.runs.summary import as_text, summarise

@@ -25,8 +25,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run_settings)
 
 
-def run_settings(args: argparse.Namespace) -> int:
-    """Print the settings whose names fit the pattern; return the exit code."""
+def run_settings(args: argparse.Namespace) -> None:
+    """Print the settings whose names fit the pattern."""
     from minislam.config import PRESETS, SlamConfig
     from minislam.parameters import MOST, leaves
 
@@ -46,7 +46,6 @@ def run_settings(args: argparse.Namespace) -> int:
         notes += [f"{key} {_shown(PRESETS[key][name])}" for key in PRESETS if name in PRESETS[key]]
         print(f"--{name} {_shown(value)}  ({'; '.join(notes)})")
         print(textwrap.indent(textwrap.fill(about["meaning"], width - 4), "    "))
-    return 0
 
 
 def _shown(value: object) -> str:

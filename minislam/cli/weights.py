@@ -26,18 +26,17 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     check.set_defaults(run=run_check)
 
 
-def run_list(args: argparse.Namespace) -> int:
-    """Print one line per published file; return the exit code."""
+def run_list(args: argparse.Namespace) -> None:
+    """Print one line per published file."""
     rows = list(published_files().values())
     for row in rows:
         here = "fetched" if row.path.exists() else ""
         print(f"{row.name:28s} {row.megabytes:>7s} MB  {row.use:22s} {row.licence:32s} {here}")
     print(f"minislam weights fetch NAME... puts them in {rows[0].path.parent}")
-    return 0
 
 
-def run_fetch(args: argparse.Namespace) -> int:
-    """Fetch files by their names; return the exit code."""
+def run_fetch(args: argparse.Namespace) -> None:
+    """Fetch files by their names."""
     from minislam.data.download import download
 
     known = published_files()
@@ -57,10 +56,9 @@ def run_fetch(args: argparse.Namespace) -> int:
             show = partial(progress.show, f"fetching {row.file} [kB]")
             download(row.url, row.path, partial(require_published, row), show)
         print(f"{row.path}: complete, use it with {row.use}")
-    return 0
 
 
-def run_check(args: argparse.Namespace) -> int:
+def run_check(args: argparse.Namespace) -> None:
     """Print one line per checkpoint file: which network, how large, complete or not, its flag."""
     rows = {row.file: row for row in published_files().values()}
     folder = Path(args.folder or rows["droid.pth"].path.parent).expanduser()
@@ -78,7 +76,6 @@ def run_check(args: argparse.Namespace) -> int:
         size = file.stat().st_size / 1e6  # MB
         width = max(len(file.name) for file in files)
         print(f"{file.name:{width}s}  {size:7.1f} MB  {verdict}", flush=True)
-    return 0
 
 
 def require_published(row: PublishedFile, path: Path) -> None:

@@ -27,18 +27,10 @@ def check_finite(slam: Slam) -> None:
     """Raise FloatingPointError at the first NaN or infinity, under MINISLAM_DEBUG=1 only."""
     if not os.environ.get("MINISLAM_DEBUG"):
         return
-    keyframes = slam.tracker.keyframes
-    parts = {
-        "poses": [keyframes.T_camera_world],
-        "disparities": [keyframes.disparities],
-        "static weights from beta": [keyframes.static_weights],
-        "the map": slam.mapper.gaussians.parameters.values(),
-    }
-    for name, tensors in parts.items():
-        for tensor in tensors:
-            wrong = int((~tensor.isfinite()).sum())
-            if wrong:
-                raise FloatingPointError(
-                    f"expected finite numbers in {name}, found {wrong} of {tensor.numel()} that "
-                    "are not"
-                )
+    names = ("T_camera_world", "disparities", "static_weights")  # of the keyframes
+    parts = {name: getattr(slam.tracker.keyframes, name) for name in names}
+    for name, tensor in (parts | slam.mapper.gaussians.parameters).items():
+        if wrong := int((~tensor.isfinite()).sum()):
+            raise FloatingPointError(
+                f"expected finite numbers in {name}, found {wrong} of {tensor.numel()} that are not"
+            )

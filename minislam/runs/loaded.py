@@ -48,11 +48,11 @@ def scene_of(slam: Slam) -> dict[str, Any]:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
     exposures = {index: e.tolist() for index, e in slam.mapper.exposures.items()}
-    frames = []
-    for index, tracked in enumerate(slam.tracker.tracked):
-        origin = tracked.timestamp, sequence.source_name(index)
-        frame = SourceFrame(index, *origin, index in keyframes, exposures.get(index))
-        frames.append(asdict(frame))
+    origins = [(t.timestamp, sequence.source_name(i)) for i, t in enumerate(slam.tracker.tracked)]
+    frames = [
+        asdict(SourceFrame(index, *origin, index in keyframes, exposures.get(index)))
+        for index, origin in enumerate(origins)
+    ]
     return {
         "sequence": {"name": sequence.name, "description": sequence.description},
         "camera": asdict(slam.tracker.grid.camera),
@@ -217,14 +217,11 @@ class Run:
         mlp.load_state_dict(self.folder.read_mlp())
         return mlp
 
-    @cached_property
-    def _map(self) -> GaussianMap:
-        rows = {name: torch.from_numpy(values) for name, values in vars(self.gaussians).items()}
-        anchors = torch.zeros(len(self.gaussians), dtype=torch.int64)
-        return GaussianMap(**rows, anchor_keyframe=anchors)
-
     def _rendering(self, T_world_camera: np.ndarray, camera: Camera | None) -> Rendering:
         T_camera_world = se3_inverse(torch.from_numpy(np.asarray(T_world_camera, np.float64)))
         background = torch.from_numpy(self.background)
+        rows = {name: torch.from_numpy(values) for name, values in vars(self.gaussians).items()}
+        anchors = torch.zeros(len(self.gaussians), dtype=torch.int64)
+        gaussians = GaussianMap(**rows, anchor_keyframe=anchors)
         with torch.no_grad():
-            return render(self._map, camera or self.camera, T_camera_world.float(), background)
+            return render(gaussians, camera or self.camera, T_camera_world.float(), background)

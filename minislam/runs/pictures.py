@@ -88,8 +88,7 @@ def write_pictures(
         figures.append((caption, figure_png(figure)))
         folder.write_plot(name, figures[-1][1])
 
-    limits = _colour_limits(slam)
-    jpegs = _write_keyframes(folder, slam, *limits)
+    jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
     middle = _pictures(slam, len(slam.mapper.keyframes) // 2)
     parts = middle["input"], middle["beta"], middle["render"]
     overview = figure_png(viz.overview(*parts, estimate, true_path, unit))
@@ -99,8 +98,8 @@ def write_pictures(
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
     write_text(folder.path / VIEWER, viz.build_viewer(f"minislam: {run.name}", *scene))
     _write_report(
-        folder, slam, metrics, facts, overview=overview, keyframes=jpegs, depth_limits=limits[0],
-        beta_limits=limits[1], unit=facts["unit"], figures=figures,
+        folder, slam, metrics, facts, overview=overview, keyframes=jpegs, depth_limits=of_depth,
+        beta_limits=of_beta, unit=facts["unit"], figures=figures,
     )  # fmt: skip
 
 
@@ -157,24 +156,20 @@ def _pictures(slam: Slam, index: int) -> dict[str, np.ndarray]:
     }
 
 
-def _colour_limits(slam: Slam) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the depths and the betas between which all keyframes are coloured."""
-    samples = _spread(len(slam.mapper.keyframes), COLOUR_SAMPLES)
-    sampled = [_pictures(slam, index) for index in samples]
-    depths, betas = (np.array([shown[kind] for shown in sampled]) for kind in ("depth", "beta"))
-    return viz.depth_limits(depths), viz.beta_limits(betas)
-
-
 def _write_keyframes(
-    folder: RunFolder,
-    slam: Slam,
-    of_depth: tuple[float, float],  # world units, limits of the colours
-    of_beta: tuple[float, float],
-) -> dict[int, list[bytes]]:  # frame_index: JPEG of input, depth, beta, render
-    """Write the pictures of all keyframes; return small ones for report and viewer."""
-    jpegs: dict[int, list[bytes]] = {}
-    shown = set(_spread(len(slam.mapper.keyframes), MAX_SHOWN))
-    for index, keyframe in enumerate(slam.mapper.keyframes):
+    folder: RunFolder, slam: Slam
+) -> tuple[dict[int, list[bytes]], tuple[float, float], tuple[float, float]]:
+    """Write the pictures of all keyframes.
+
+    Return small ones for report and viewer, frame_index: JPEG of input, depth, beta, render; and
+    between which depths [world units] and betas all are coloured.
+    """
+    keyframes, jpegs = slam.mapper.keyframes, dict[int, list[bytes]]()
+    sampled = [_pictures(slam, index) for index in _spread(len(keyframes), COLOUR_SAMPLES)]
+    of_depth = viz.depth_limits(np.array([pictures["depth"] for pictures in sampled]))
+    of_beta = viz.beta_limits(np.array([pictures["beta"] for pictures in sampled]))
+    shown = set(_spread(len(keyframes), MAX_SHOWN))
+    for index, keyframe in enumerate(keyframes):
         pictures = _pictures(slam, index)
         pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
         pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
@@ -183,4 +178,4 @@ def _write_keyframes(
         if index in shown:
             small = [encode_jpeg(picture, LONGEST_SIDE) for picture in pictures.values()]
             jpegs[keyframe.frame_index] = small
-    return jpegs
+    return jpegs, of_depth, of_beta

@@ -53,11 +53,9 @@ class Checkpoints:
 
         With a checkpoint_fraction of 0 none is saved, forced or not.
         """
-        if self._fraction <= 0:
-            return
         begun = time.perf_counter()
-        is_due = begun - self._last >= self._cost / self._fraction
-        if not (is_due or force):
+        is_due = force or (begun - self._last) * self._fraction >= self._cost
+        if self._fraction <= 0 or not is_due:
             return
         tree = self._origin | {
             "run_seconds": self.run_seconds,

@@ -57,7 +57,7 @@ def test_nan_is_looked_for_only_under_debug_and_said_with_its_place(monkeypatch)
     monkeypatch.setenv("MINISLAM_DEBUG", "1")
     check_finite(slam)
     gaussians.parameters["colors"] = bad
-    with pytest.raises(FloatingPointError, match="in the map, found 2 of 4 that are not"):
+    with pytest.raises(FloatingPointError, match="in colors, found 2 of 4 that are not"):
         check_finite(slam)
     monkeypatch.delenv("MINISLAM_DEBUG")
     check_finite(slam)
