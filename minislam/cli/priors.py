@@ -7,7 +7,7 @@ Heavy networks then run once, on a machine with a GPU, and `minislam run --featu
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -61,16 +61,16 @@ def run_priors(args: argparse.Namespace) -> None:
     sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
     print(sequence.description)
     out = Path(args.out).expanduser()
-    kinds = _kinds(choice, args.features is not None, sequence, config)
-    for kind, (origin, compute) in kinds.items():
+    kinds = list(_kinds(choice, args.features is not None, sequence, config))
+    for kind, origin, compute in kinds:
         _write_kind(out / kind, origin, sequence, compute, progress)
-    print(f"use them with {' '.join(f'--{kind} files:{out}' for kind in kinds)}")
+    print(f"use them with {' '.join(f'--{kind} files:{out}' for kind, *_ in kinds)}")
 
 
 def _kinds(
     choice: PriorChoice, with_features: bool, sequence: RecordedSequence, config: SlamConfig
-) -> dict[str, tuple[str, Callable[[Frame], Tensor | None]]]:
-    """Return for each folder to write: a line that identifies its content, and a function."""
+) -> Iterator[tuple[str, str, Callable[[Frame], Tensor | None]]]:
+    """Yield the folders to write: name, a line that identifies the content, function of a frame."""
     from minislam.priors.choice import choose_depth, choose_features
     from minislam.priors.features import with_finer_grid
     from minislam.priors.files import DEPTH, FEATURES
@@ -79,17 +79,15 @@ def _kinds(
     tree = asdict(config)
     constants = {name: tree[name] for name in ("seed", "simulated_depth", "networks")}
     conditions = f"{sequence.description}; {sequence.camera}; {constants}"
-    kinds: dict[str, tuple[str, Callable[[Frame], Tensor | None]]] = {}
     if with_features:
         features = choose_features(choice, sequence.camera, config.networks)
         factor = config.uncertainty.grid_factor
         origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
-        kinds[FEATURES] = (origin, with_finer_grid(features, factor))
+        yield FEATURES, origin, with_finer_grid(features, factor)
     if choice.depth != "none":
         depth = choose_depth(choice, sequence, config.seed, config.simulated_depth, config.networks)
         origin = f"{choice.depth} {choice.depth_weights}; {conditions}"
-        kinds[DEPTH] = (origin, lambda frame: depth(frame, sequence.camera))
-    return kinds
+        yield DEPTH, origin, lambda frame: depth(frame, sequence.camera)
 
 
 def _write_kind(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from minislam.cli import options
 from minislam.cli.help import RUN_EPILOG, SHORT_EPILOG, add_command
-from minislam.cli.log import Log, recorded
+from minislam.cli.log import recorded
 from minislam.cli.progress import ProgressLine, ending_signals, plan_of, say
 from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
@@ -44,49 +44,45 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    with recorded(args.quiet) as log:
-        return _run_recorded(args, log)
-
-
-def _run_recorded(args: argparse.Namespace, log: Log) -> int:
     if args.resume and args.output is None:
         raise InputError(
             "expected --output FOLDER with --resume, found none; give that of the interrupted run"
         )
-    # What may be wrong is looked for in the order of the time that it takes.
-    source, inputs = options.source_of(args), options.input_options(args)
-    require_source(source)
-    if args.output and not args.resume:
-        also = " (or --resume, to go on with an interrupted run)"
-        require_free(args.output, args.overwrite, also)
-    choice = options.prior_choice(args, default_depth(source))
-    from minislam.data import open_sequence
-    from minislam.runs.run import default_output, run_in_folder
-    from minislam.runs.summary import as_text, summarise
+    with recorded(args.quiet) as log:
+        # What may be wrong is looked for in the order of the time that it takes.
+        source, inputs = options.source_of(args), options.input_options(args)
+        require_source(source)
+        if args.output and not args.resume:
+            also = " (or --resume, to go on with an interrupted run)"
+            require_free(args.output, args.overwrite, also)
+        choice = options.prior_choice(args, default_depth(source))
+        from minislam.data import open_sequence
+        from minislam.runs.run import default_output, run_in_folder
+        from minislam.runs.summary import as_text, summarise
 
-    config, lpips = options.settings(args), options.lpips_of(args)
-    progress = ProgressLine(args.quiet, args.verbose)
-    sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
-    if lpips is not None:
-        lpips.require_size(sequence.camera.width, sequence.camera.height)
-    output = args.output or default_output(sequence)
-    say(sequence.description)
-    for warning in sequence.warnings:
-        say(f"WARNING: {warning}", "stderr")
-    progress.plan = plan_of(config, choice, sequence)
-    log.folder = Path(output)
-    with ending_signals(progress.interrupt):
-        metrics, facts = run_in_folder(
-            sequence, config, choice, output, progress, lpips, args.overwrite, args.resume,
-            args.workers,
-        )  # fmt: skip
-    say("\n".join([f"{facts['state']}:", *as_text(summarise(metrics, facts))]))
-    for warning in facts["warnings"]:
-        if warning not in sequence.warnings:
+        config, lpips = options.settings(args), options.lpips_of(args)
+        progress = ProgressLine(args.quiet, args.verbose)
+        sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
+        if lpips is not None:
+            lpips.require_size(sequence.camera.width, sequence.camera.height)
+        output = args.output or default_output(sequence)
+        say(sequence.description)
+        for warning in sequence.warnings:
             say(f"WARNING: {warning}", "stderr")
-    say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
-    if facts["state"] == "interrupted":
-        say(f"to go on: minislam run --resume -o {shlex.quote(output)}")
-    else:
-        say(f"next: minislam render {shlex.quote(output)} -o fly.webm, or minislam export -h")
-    return facts["exit_code"]
+        progress.plan = plan_of(config, choice, sequence)
+        log.folder = Path(output)
+        with ending_signals(progress.interrupt):
+            metrics, facts = run_in_folder(
+                sequence, config, choice, output, progress, lpips, args.overwrite, args.resume,
+                args.workers,
+            )  # fmt: skip
+        say("\n".join([f"{facts['state']}:", *as_text(summarise(metrics, facts))]))
+        for warning in facts["warnings"]:
+            if warning not in sequence.warnings:
+                say(f"WARNING: {warning}", "stderr")
+        say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
+        if facts["state"] == "interrupted":
+            say(f"to go on: minislam run --resume -o {shlex.quote(output)}")
+        else:
+            say(f"next: minislam render {shlex.quote(output)} -o fly.webm, or minislam export -h")
+        return facts["exit_code"]

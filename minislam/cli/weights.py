@@ -1,11 +1,11 @@
 """The sub-command `minislam weights`: list, fetch and check official checkpoint files."""
 
 import argparse
-import difflib
 import hashlib
 from functools import partial
 from pathlib import Path
 
+from minislam.cli.help import nearest
 from minislam.cli.progress import ProgressLine
 from minislam.errors import InputError, MinislamError
 from minislam.priors.names import PublishedFile, published_files
@@ -42,10 +42,8 @@ def run_fetch(args: argparse.Namespace) -> None:
     known = published_files()
     unknown = [name for name in args.names if name not in known]
     if unknown:
-        near = difflib.get_close_matches(unknown[0], known, n=1, cutoff=0)[0]
-        raise InputError(
-            f"expected names of minislam weights list, found {unknown[0]!r}; the nearest is {near}"
-        )
+        hint = nearest(unknown[0], known, "see which there are")
+        raise InputError(f"expected names of minislam weights list, found {unknown[0]!r}; {hint}")
     rows, progress = [known[name] for name in args.names], ProgressLine()
     for row in rows:
         print(f"{row.name}: {row.megabytes} MB, licence {row.licence}, from {row.url}", flush=True)

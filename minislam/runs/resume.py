@@ -15,8 +15,6 @@ from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
 from minislam.slam import Slam
 
-_OF_THE_GPU = ("device", "precision")  # of the choice of priors; may change where there is none
-
 
 class Checkpoints:
     """Saves the state of a run in its folder; saving takes a small fraction of the time."""
@@ -82,7 +80,8 @@ class Checkpoints:
         try:
             then = flattened({name: found.get(name) for name in self._origin})
             if device == "cpu" and then.get("priors.device") != "cpu":
-                then |= {f"priors.{name}": self._origin["priors"][name] for name in _OF_THE_GPU}
+                for name in ("device", "precision"):
+                    then[f"priors.{name}"] = self._origin["priors"][name]
             for name, now in flattened(self._origin).items():
                 if then.get(name) != now:
                     raise InputError(
