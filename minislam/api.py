@@ -4,9 +4,7 @@ Stable from version to version: the names in `minislam.__all__`, the public attr
 and the files of a run folder. Everything else may move.
 """
 
-import threading
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
@@ -56,8 +54,7 @@ def run(
     output = output or default_output(sequence)
     progress = ProgressLine()
     progress.plan = plan_of(config, choice, sequence)
-    is_main = threading.current_thread() is threading.main_thread()
-    with ending_signals(progress.interrupt) if is_main else nullcontext():
+    with ending_signals(progress.interrupt):
         observer = SilentObserver() if quiet else progress
         run_in_folder(
             sequence, config, choice, Path(output), observer, overwrite=overwrite, workers=workers

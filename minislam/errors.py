@@ -1,5 +1,8 @@
 """The errors a user can meet. Everything else is a bug of ours and may show a traceback."""
 
+# Exit codes: a known error, wrong usage, a run not to be trusted as a whole, an interruption.
+FAILED_EXIT, USAGE_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 2, 3, 130
+
 
 class MinislamError(Exception):
     """Base of all known errors: the command line prints its one sentence and exits with code 1."""

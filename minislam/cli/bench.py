@@ -14,10 +14,9 @@ from pathlib import Path
 
 from minislam.cli.progress import ending_signals, say
 from minislam.data.files import read_json, write_json, write_text
-from minislam.errors import InputError
+from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, USAGE_EXIT, InputError
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
-LOST_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 3, 2, 130
 LEGEND = """\
 RMSE of the ATE over all frames, for minislam after a Sim(3) alignment. F: failed. -: no number.
 *: frames were lost or the geometry broke (minislam), run by the authors of the paper (others)."""

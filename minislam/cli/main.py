@@ -14,11 +14,10 @@ import minislam
 from minislam.cli.help import UsageError, nearest, unknown_option
 from minislam.cli.options import take_settings
 from minislam.cli.progress import ending_signals, say
-from minislam.errors import MinislamError
+from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, USAGE_EXIT, MinislamError
 
 # The modules of minislam.cli that add the commands, in the order of the help.
 COMMANDS = "run render export evaluate settings weights priors bench notebooks grade doctor".split()
-FAILED_EXIT, USAGE_EXIT, INTERRUPTED_EXIT = 1, 2, 130
 # Settings of glibc's malloc and their values: one arena for all threads, and blocks of 4 MB and
 # more mapped one by one. Otherwise freed images leave holes that later ones do not fit.
 MALLOC = {-8: 1, -3: 4 << 20}  # M_ARENA_MAX, M_MMAP_THRESHOLD

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -36,8 +37,12 @@ def say(text: str, stream: str = "stdout", end: str = "\n") -> None:
 
 @contextmanager
 def ending_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Handle what asks a program to end; what is ignored already (`nohup`) stays so."""
-    numbers = [getattr(signal, name) for name in ENDING if hasattr(signal, name)]
+    """Handle what asks a program to end; what is ignored already (`nohup`) stays so.
+
+    Python lets only the main thread do so; in another one nothing is handled.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = [getattr(signal, name) for name in ENDING if is_main and hasattr(signal, name)]
     before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
     for number in before:
         signal.signal(number, handler)

@@ -17,7 +17,7 @@ from minislam.data import run_folder as names
 from minislam.data.files import write_json
 from minislam.data.ply import write_ply
 from minislam.data.trajectory import write_trajectory
-from minislam.errors import InputError
+from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
@@ -31,8 +31,6 @@ from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer
 from minislam.workers import Workers, idle_cores
-
-FAILED_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 3, 130  # exit codes of a run that is not complete
 
 
 def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -> Priors:

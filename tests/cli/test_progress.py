@@ -4,6 +4,7 @@ import io
 import re
 import signal
 import sys
+import threading
 from itertools import pairwise
 from unittest.mock import MagicMock
 
@@ -58,6 +59,19 @@ def test_what_is_ignored_stays_ignored():
             signal.raise_signal(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_in_another_thread_nothing_is_handled_and_nothing_fails():
+    before, seen = signal.getsignal(signal.SIGINT), []
+
+    def work() -> None:
+        with ending_signals(lambda *_: None):
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [before]
 
 
 def test_nobody_who_listens_ends_no_run(monkeypatch):
