@@ -83,7 +83,14 @@ def run_eval(args: argparse.Namespace) -> None:
         }
         write_json(args.save_results, numbers)
     if args.plot or args.save_plot:
-        _plot(args, result)
+        from minislam.viz import figure_png, show_figure, trajectory_plot
+
+        figure = trajectory_plot(result.estimate, result.truth, unit="m")
+        if args.save_plot:
+            path = Path(args.save_plot)
+            atomic_write(path if path.suffix else path.with_suffix(".png"), figure_png(figure))
+        if args.plot:
+            show_figure(figure)
 
 
 def _alignment(args: argparse.Namespace) -> Alignment:
@@ -132,14 +139,3 @@ def _fit(result: TrajectoryError, estimate_poses: int, truth_poses: int) -> str:
         f"{len(result.errors)} pairs ({estimate_poses} estimated, {truth_poses} true poses)\n"
         f"scale {similarity.scale:.6f}, translation {shift}, rotation\n{rows}\n"
     )
-
-
-def _plot(args: argparse.Namespace, result: TrajectoryError) -> None:
-    from minislam.viz import figure_png, show_figure, trajectory_plot
-
-    figure = trajectory_plot(result.estimate, result.truth, unit="m")
-    if args.save_plot:
-        path = Path(args.save_plot)
-        atomic_write(path if path.suffix else path.with_suffix(".png"), figure_png(figure))
-    if args.plot:
-        show_figure(figure)
