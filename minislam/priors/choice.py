@@ -88,11 +88,12 @@ def _choose(
 
 def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any:
     """Return the prior that --KIND NAME names in a module or an installed package, checked."""
-    entry = plugins(kind).get(name)
     if name.startswith(PYTHON):
         if "" not in sys.path:
             sys.path.append("")  # the current folder, which `minislam` alone does not look into
         entry = EntryPoint(name, name.removeprefix(PYTHON), f"minislam.{kind}")
+    else:
+        entry = plugins(kind)[name]
     try:
         make = entry.load()
         prior = make(device) if weights is None else make(device, weights)

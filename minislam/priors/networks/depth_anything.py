@@ -99,10 +99,10 @@ def _limit_of_name(name: str) -> float:
 
     The file itself states neither this depth nor whether its output is metric.
     """
-    for part, limit in _LIMIT_OF_NAME.items():
-        if part in name:
-            return limit
-    raise InputError(
-        f"expected {' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint, found "
-        f"{name}, whose output may be no metric depth; keep the official name of the file"
-    )
+    limits = [limit for part, limit in _LIMIT_OF_NAME.items() if part in name]
+    if not limits:
+        raise InputError(
+            f"expected {' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint, "
+            f"found {name}, whose output may be no metric depth; keep the official name"
+        )
+    return limits[0]

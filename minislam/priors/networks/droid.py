@@ -5,7 +5,7 @@ the hidden state of its recurrent unit from call to call: a later answer refines
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -50,14 +50,12 @@ class EncodedFrame:
     def __init__(self, weights: Weights, image: Tensor) -> None:
         self.image = image  # (H, W, 3)
         self._weights, self._normalised = weights, normalise(image, weights.device)
-        with weights.autocast():
-            self.features = net.encode_features(weights, self._normalised)  # (1, 128, h, w)
+        self.features = net.encode_features(weights, self._normalised)  # (1, 128, h, w)
 
     @cached_property
     def context(self) -> tuple[Tensor, Tensor]:  # (1, 128, h, w) twice
         """Return the first hidden state and the context of all updates."""
-        with self._weights.autocast():
-            return net.encode_context(self._weights, self._normalised)
+        return net.encode_context(self._weights, self._normalised)
 
 
 class DroidFlow(Stateful):
@@ -68,6 +66,7 @@ class DroidFlow(Stateful):
 
     def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
         self.weights = weights
+        self.update, self.damping = partial(net.update, weights), partial(net.damping, weights)
         self.config = config or DroidFlowConfig()
         self._frames: dict[int, EncodedFrame] = {}
         self._edges: dict[tuple[int, int], _EdgeState] = {}  # the last ones were used last
@@ -118,13 +117,13 @@ class DroidFlow(Stateful):
         states: dict[tuple[int, int], _EdgeState] = {}
         confidences = []
         for start in range(0, len(edges), self.config.edges_per_batch):
-            batch = edges[start : start + self.config.edges_per_batch]
-            answer = self._update_edges(batch, expected[start : start + len(batch)])
-            states |= dict(zip(batch, map(_EdgeState, *answer[:2]), strict=True))
-            confidences.append(answer[2])
-        others = [(edge, state) for edge, state in self._edges.items() if edge not in states]
-        free = max(0, self.config.kept_edges - len(states))
-        self._edges = dict(others[max(0, len(others) - free) :]) | states
+            batch = slice(start, start + self.config.edges_per_batch)
+            hidden, target, confidence = self._update_edges(edges[batch], expected[batch])
+            states |= zip(edges[batch], map(_EdgeState, hidden, target), strict=True)
+            confidences.append(confidence)
+        used_last = {e: state for e, state in self._edges.items() if e not in states} | states
+        kept = max(self.config.kept_edges, len(states))
+        self._edges = dict(list(used_last.items())[-kept:])
         for source in dict.fromkeys(edges_source):
             hidden = torch.stack([states[edge].hidden for edge in edges if edge[0] == source])
             eta = self.damping(hidden).flatten().to(predicted_targets)
@@ -140,7 +139,7 @@ class DroidFlow(Stateful):
     def _update_edges(
         self, edges: list[tuple[int, int]], expected: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Update a batch of edges once, each from its last state; see update."""
+        """Update a batch of edges once, each from its last state."""
         sources = [self._frames[source] for source, _ in edges]
         known = [
             self._edges.get(edge) or _EdgeState(source.context[0][0], where)
@@ -163,26 +162,6 @@ class DroidFlow(Stateful):
         """Return the chain whose saved state this is."""
         reference, newest = (self.encode(image) for image in state["_images"])
         return DroidChain(self, reference, newest, state["_target"])
-
-    def update(
-        self,
-        source: Tensor,  # (E, 128, h, w) features
-        target: Tensor,  # (E, 128, h, w) features
-        hidden: Tensor,  # (E, 128, h, w)
-        context: Tensor,  # (E, 128, h, w)
-        expected: Tensor,  # (E, h, w, 2) cells
-        last_target: Tensor,  # (E, h, w, 2) cells
-    ) -> tuple[Tensor, Tensor, Tensor]:  # (E, 128, h, w), (E, h, w, 2) cells, (E, h, w, 2)
-        """Update edges once; return hidden states, targets and confidences."""
-        with self.weights.autocast():
-            correlation = net.look_up(net.correlation_pyramid(source, target), expected)
-            answer = net.update(self.weights, hidden, context, correlation, expected, last_target)
-        return answer.hidden.float(), expected + answer.revision, answer.confidence.float()
-
-    def damping(self, hidden: Tensor) -> Tensor:  # (E, 128, h, w) of one source -> (h, w)
-        """Return how much the network would damp the disparities of a source."""
-        with self.weights.autocast():
-            return net.damping(self.weights, hidden).float()
 
 
 class DroidChain(Stateful):

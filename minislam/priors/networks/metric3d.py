@@ -30,7 +30,7 @@ CANONICAL_FOCAL = 1000.0  # px, of the camera that all training images were turn
 FARTHEST = 300.0  # world units (metre); the official cut of the scaled depth
 NETWORK_SIZE = (616, 1064)  # px (height, width), as in the training
 _SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling of the coarsest map needs an even grid
-_ROUNDS = {384: 4, 1024: 8}  # of refinement, by the width of the ViT (S, L)
+_ROUNDS = {12: 4, 24: 8}  # of refinement, by the number of blocks of the ViT (S, L)
 _NEAREST, _FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
 _BINS = 256  # of depth, between the two on a logarithmic scale
 _STATE_UNIT = 100.0  # metre per unit of the state's depth channel
@@ -67,13 +67,7 @@ class Metric3DDepth:
         # It has registers, yet resizes its positions like the networks without.
         self._transformer = VisionTransformer(weights.below("depth_model.encoder."))
         self._decoder = weights.below("depth_model.decoder.")
-        width = self._transformer.width
-        if width not in _ROUNDS:
-            raise InputError(
-                f"expected Metric3D v2 with a ViT of width {' or '.join(map(str, _ROUNDS))}, found "
-                f"{width} in {weights.file}; give the small or the large one"
-            )
-        self._rounds = _ROUNDS[width]
+        self._rounds = _ROUNDS[self._transformer.depth]
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor:
         """Return the depth (H, W) in metres of an image taken by a camera."""
@@ -153,7 +147,7 @@ def _refine(
     rounds: int,
 ) -> Tensor:  # (B, H, W) metre
     """Return the refined and upsampled depth for the canonical camera."""
-    state = _first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
+    state = _first_estimate(weights, features)
     hidden, gates = [], []  # of the units; what the context adds to their three gates
     for level, (name, seen) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
         encoder = weights.below(f"context_feature_encoder.{name}.")
@@ -172,10 +166,9 @@ def _refine(
     return (_STATE_UNIT * fine + _FARTHEST).clamp(_NEAREST, _FARTHEST)
 
 
-def _first_estimate(
-    weights: Weights, features: Tensor, depth_confidence: Tensor, normal_confidence: Tensor
-) -> Tensor:  # (B, 6, h, w)
+def _first_estimate(weights: Weights, features: Tensor) -> Tensor:  # (B, 6, h, w)
     """Return the state before refinement: depth is an expectation over logarithmic bins."""
+    features, depth_confidence, normal_confidence = features.tensor_split([-2, -1], 1)
     logits = weights.below("depth_regressor.").convs(features, channels=(_BINS,))
     bins = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _BINS, device=features.device)
     depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
@@ -205,16 +198,13 @@ def _recurrent_round(
     """Update the coarsest unit three times, the middle one twice, the finest once."""
     fine, middle, coarse = hidden
     size = middle.shape[-2:]
-
-    def gru(level: int, h: Tensor, *inputs: Tensor) -> Tensor:
-        unit = weights.below(f"{_GRU_NAMES[level]}.")
-        return unit.gru(h, torch.cat(inputs, 1), gates[level])
-
-    coarse = gru(2, coarse, _halved(middle))
+    of_fine, of_middle, of_coarse = (weights.below(f"{name}.") for name in _GRU_NAMES)
+    coarse = of_coarse.gru(coarse, _halved(middle), gates[2])
     for _ in range(2):
-        coarse = gru(2, coarse, _halved(middle))
-        middle = gru(1, middle, resize(_halved(fine), size), resize(coarse, size))
-    fine = gru(0, fine, state, resize(middle, fine.shape[-2:]))
+        coarse = of_coarse.gru(coarse, _halved(middle), gates[2])
+        seen = torch.cat([resize(_halved(fine), size), resize(coarse, size)], 1)
+        middle = of_middle.gru(middle, seen, gates[1])
+    fine = of_fine.gru(fine, torch.cat([state, resize(middle, fine.shape[-2:])], 1), gates[0])
     return [fine, middle, coarse]
 
 
