@@ -104,17 +104,18 @@ def _verdict(file: Path) -> str:
     title = "unreadable"
     try:
         weights = load_checkpoint(file)
-        title = table.describe(weights)
-        network = table.recognise(weights)
+        title, network = table.describe(weights), table.recognise(weights)
         if network is not None:
             table.build_checked(network, weights)
-            return f"{title}, complete: --{network.kind} {network.name}"
-        if title == table.LPIPS_HEADS:
+            flag = f"--{network.kind} {network.name}"
+        elif title == table.LPIPS_HEADS:
             recognise_heads(weights.as_dict())
-            return f"{title}, complete: --lpips-heads"
-        if title == table.CLASSIFIER:
+            flag = "--lpips-heads"
+        elif title == table.CLASSIFIER:
             recognise_trunk(weights.as_dict())
-            return f"{title}, complete: --lpips-trunk"
-        return f"{title}, of no use here"
+            flag = "--lpips-trunk"
+        else:
+            return f"{title}, of no use here"
+        return f"{title}, complete: {flag}"
     except MinislamError as error:
         return f"{title}, NOT usable: {error}"

@@ -96,10 +96,8 @@ class Metric3DDepth:
         level = weights.below("upconv_3.")
         fused = level.conv("out_conv", level.below("way_trunk.").residual_unit(coarsest))
         doubled = [2 * side for side in coarse.shape[-2:]]
-        for name, branch, size in (
-            ("upconv_2.", coarse, doubled),
-            ("upconv_1.", middle, fine.shape[-2:]),
-        ):
+        branches = {"upconv_2.": (coarse, doubled), "upconv_1.": (middle, fine.shape[-2:])}
+        for name, (branch, size) in branches.items():
             level = weights.below(name)
             fused = (fused + level.below("way_branch.").residual_unit(branch)).relu()
             fused = resize(level.below("way_trunk.").residual_unit(fused), size)
