@@ -104,18 +104,17 @@ def _verdict(file: Path) -> str:
     title = "unreadable"
     try:
         weights = load_checkpoint(file)
-        title, network = table.describe(weights), table.recognise(weights)
+        title = table.describe(weights)
+        network = table.recognise(weights)
         if network is not None:
             table.build_checked(network, weights)
-            flag = f"--{network.kind} {network.name}"
-        elif title == table.LPIPS_HEADS:
+            return f"{title}, complete: --{network.kind} {network.name}"
+        if title == table.LPIPS_HEADS:
             recognise_heads(weights.as_dict())
-            flag = "--lpips-heads"
-        elif title == table.CLASSIFIER:
+            return f"{title}, complete: --lpips-heads"
+        if title == table.CLASSIFIER:
             recognise_trunk(weights.as_dict())
-            flag = "--lpips-trunk"
-        else:
-            return f"{title}, of no use here"
-        return f"{title}, complete: {flag}"
+            return f"{title}, complete: --lpips-trunk"
+        return f"{title}, of no use here"
     except MinislamError as error:
         return f"{title}, NOT usable: {error}"

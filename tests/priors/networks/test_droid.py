@@ -85,7 +85,7 @@ def test_a_source_is_damped_by_all_its_edges_and_in_square_pixels():
     flow = flow_with_frames()
     flow.match([0, 0, 2], [1, 2, 1], still(3))
     found = flow.disparity_damping(4)
-    hidden = torch.stack([flow._edges[edge].hidden for edge in [(0, 1), (0, 2)]])
+    hidden = torch.stack([flow._edges[edge][0] for edge in [(0, 1), (0, 2)]])
     # 0.2 eta on 0.001 of the confidence and squared cells: 0.2 * 1000 * 64 on our scale.
     torch.testing.assert_close(found[0], 12800 * flow.damping(hidden).flatten())
     assert found.shape == (4, 9 * 12) and (found[2] > 0).all()
