@@ -37,9 +37,6 @@ _STATE_UNIT = 100.0  # metre per unit of the state's depth channel
 _EPSILON = 1e-5  # of the layer norms in the convolutional part
 _UPSAMPLING = 4
 _MASK_SCALE = 0.25  # of the upsampling logits, as in RAFT
-# From fine to coarse; the GRUs are called by twice their level's stride.
-_CONTEXT_NAMES = ("outputs04", "outputs08", "outputs16")
-_GRU_NAMES = ("gru08", "gru16", "gru32")
 
 
 @dataclass(frozen=True)
@@ -147,8 +144,8 @@ def _refine(
     """Return the refined and upsampled depth for the canonical camera."""
     state = _first_estimate(weights, features)
     hidden, gates = [], []  # of the units; what the context adds to their three gates
-    for level, (name, seen) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
-        encoder = weights.below(f"context_feature_encoder.{name}.")
+    for level, seen in enumerate(context):
+        encoder = weights.below(f"context_feature_encoder.outputs{4 * 2**level:02d}.")
         hidden.append(_context_head(encoder.below("0."), seen).tanh())
         offsets = _context_head(encoder.below("1."), seen).relu()
         gates.append(weights.conv(f"context_zqr_convs.{level}", offsets).chunk(3, 1))
@@ -196,7 +193,8 @@ def _recurrent_round(
     """Update the coarsest unit three times, the middle one twice, the finest once."""
     fine, middle, coarse = hidden
     size = middle.shape[-2:]
-    of_fine, of_middle, of_coarse = (weights.below(f"{name}.") for name in _GRU_NAMES)
+    # They are called by twice their level's stride.
+    of_fine, of_middle, of_coarse = (weights.below(f"gru{n}.") for n in ("08", "16", "32"))
     coarse = of_coarse.gru(coarse, _halved(middle), gates[2])
     for _ in range(2):
         coarse = of_coarse.gru(coarse, _halved(middle), gates[2])

@@ -1,4 +1,4 @@
-"""The table of pretrained networks, read by `choice.py` and `minislam doctor`.
+"""The table of pretrained networks, read by `choice.py` and `minislam weights`.
 
 To add a network, write a class that is a `FlowEstimator`, a `FeatureExtractor`, or a `DepthPrior`
 with a method `network` behind its resizing. Then add its row to NETWORKS below and to weights.csv,
