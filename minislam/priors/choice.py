@@ -8,7 +8,7 @@ installed package gives its factory a name of its own by an entry point in the g
 
 import sys
 from collections.abc import Callable
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,14 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.priors import conformance
+from minislam.priors import conformance, names
 from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.files import DEPTH, FEATURES, FileDepth, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.priors.names import FILES, FOLDER, PRECISIONS, PYTHON, PriorChoice, require_prior
+from minislam.priors.names import FILES, FOLDER, PYTHON, PriorChoice, plugins, require_prior
 from minislam.priors.networks.table import NetworksConfig, find_network, load_network
 from minislam.records import Sequence
 
@@ -80,26 +80,22 @@ def _choose(
     weights = require_prior(kind, name, getattr(choice, f"{kind}_weights"))
     network = find_network(kind, name)
     if network is not None:
-        path, precision = Path(str(weights)).expanduser(), PRECISIONS[choice.precision]
+        path, precision = Path(str(weights)).expanduser(), names.PRECISIONS[choice.precision]
         return load_network(network, path, choice.device, networks, getattr(torch, precision))
     maker = makers.get(FOLDER if name.startswith(FILES) else name)
-    if maker is not None and weights is None:
-        return maker()
-    return load_plugin(kind, name, choice.device, weights)
+    return maker() if maker else load_plugin(kind, name, choice.device, weights)
 
 
-def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any | None:
-    """Return the prior of a flag --KIND NAME, checked; None if no package has this name."""
-    group = f"minislam.{kind}"
-    found = list(entry_points(group=group, name=name))
+def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any:
+    """Return the prior that --KIND NAME names in a module or an installed package, checked."""
     if name.startswith(PYTHON):
         if "" not in sys.path:
             sys.path.append("")  # the current folder, which `minislam` alone does not look into
-        found = [EntryPoint(name, name.removeprefix(PYTHON), group)]
-    if not found:
-        return None
+        entry = EntryPoint(name, name.removeprefix(PYTHON), f"minislam.{kind}")
+    else:
+        entry = plugins(kind)[name]
     try:
-        make = found[0].load()
+        make = entry.load()
         prior = make(device) if weights is None else make(device, weights)
     except (Exception, SystemExit) as error:
         raise InputError(

@@ -16,29 +16,31 @@ def grayscale(image: Tensor) -> np.ndarray:
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
 
 
-def pixel_maps(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the column and row of every pixel, each (H, W) float32."""
-    return np.meshgrid(np.arange(shape[1], dtype=np.float32), np.arange(shape[0], dtype=np.float32))
+def pixel_positions(shape: tuple[int, int]) -> np.ndarray:  # (H, W, 2) float32
+    """Return the column and row of every pixel of an image."""
+    sides = (np.arange(side, dtype=np.float32) for side in (shape[1], shape[0]))
+    return np.stack(np.meshgrid(*sides), -1)
 
 
 def sample(
-    image: np.ndarray, column: np.ndarray, row: np.ndarray, method: int = cv2.INTER_LINEAR
+    image: np.ndarray,
+    positions: np.ndarray,  # (h, w, 2) px
+    method: int = cv2.INTER_LINEAR,
 ) -> np.ndarray:
     """Return the image at these positions; those outside take the nearest border pixel."""
+    column, row = cv2.split(positions)
     return cv2.remap(image, column, row, method, borderMode=cv2.BORDER_REPLICATE)
 
 
 def warp(image: np.ndarray, flow: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:
     """Return image(p + flow(p))."""
-    column, row = pixel_maps(flow.shape[:2])
-    return sample(image, column + flow[..., 0], row + flow[..., 1], method)
+    return sample(image, pixel_positions(flow.shape[:2]) + flow, method)
 
 
 def dense_from_grid(grid_targets: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
     """Return the dense flow (H, W, 2) that interpolates grid target positions (h, w, 2) [px]."""
-    grid_flow = grid_targets - stride * np.stack(pixel_maps(grid_targets.shape[:2]), -1)
-    column, row = pixel_maps(shape)
-    return sample(grid_flow, column / stride, row / stride)
+    grid_flow = grid_targets - stride * pixel_positions(grid_targets.shape[:2])
+    return sample(grid_flow, pixel_positions(shape) / stride)
 
 
 def residual_flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:

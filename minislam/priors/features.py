@@ -50,11 +50,11 @@ class ClassicalFeatures:
         image = frame.image
         height, width = grid_size(image, STRIDE)
         lab = cv2.cvtColor(image.detach().cpu().float().numpy(), cv2.COLOR_RGB2LAB)
-        mean = _cell_mean(lab, width, height)
-        mean_square = _cell_mean(lab * lab, width, height)
-        edges = _cell_mean(oriented_edges(lab[..., 0], ORIENTATION_BINS), width, height)
-        groups = [_describe(mean, mean_square, edges, side) for side in WINDOWS]
-        features = torch.from_numpy(np.concatenate(groups, -1).reshape(height, width, -1))
+        channels = [*np.moveaxis(lab, -1, 0), *np.moveaxis(lab * lab, -1, 0)]
+        channels += oriented_edges(lab[..., 0], ORIENTATION_BINS)
+        cells = [cv2.resize(c, (width, height), interpolation=cv2.INTER_AREA) for c in channels]
+        groups = [_describe(np.stack(cells, -1), side) for side in WINDOWS]
+        features = torch.from_numpy(np.concatenate(groups, -1))
         # Unit length on average per channel: what an MLP with standard initialisation expects.
         length = features.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # never 0/0
         return (features / length * self.dimension**0.5).to(image.device)
@@ -72,13 +72,12 @@ def grid_size(image: Tensor, stride: int) -> tuple[int, int]:
 
 
 def _describe(
-    mean: np.ndarray,  # (h, w, 3) Lab
-    mean_square: np.ndarray,  # (h, w, 3) Lab^2
-    edges: np.ndarray,  # (h, w, bins) Lab L per px
+    grid: np.ndarray,  # (h, w, 3 + 3 + bins): Lab, its squares, and edges in Lab L per px
     side: int,  # cells
 ) -> np.ndarray:  # (h, w, 3 + 3 + bins + 1)
     """Return the centred and scaled statistics of the window of `side` cells."""
-    mean, mean_square, edges = (_box(grid, side) for grid in (mean, mean_square, edges))
+    window = cv2.blur(grid, (side, side), borderType=cv2.BORDER_REPLICATE)
+    mean, mean_square, edges = np.split(window, (3, 6), -1)
     contrast = np.sqrt(np.maximum(mean_square - mean * mean, 0.0))  # round-off may be < 0
     strength = edges.sum(-1, keepdims=True)
     bins = edges.shape[-1]
@@ -97,35 +96,15 @@ def _describe(
 def oriented_edges(
     brightness: np.ndarray,  # (H, W) float32
     bins: int,
-) -> np.ndarray:  # (H, W, bins) float32, sums over bins to the gradient magnitude per px
+) -> list[np.ndarray]:  # per bin (H, W) float32, with the gradient magnitude per px as their sum
     """Split the gradient magnitude among orientation bins over 180 degrees, linearly."""
     # The 3x3 Sobel kernel sums to 8 per unit slope.
     du = cv2.Sobel(brightness, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     dv = cv2.Sobel(brightness, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
     magnitude, angle = cv2.cartToPolar(du, dv)
     position = (angle * np.float32(bins / np.pi)) % bins  # in bins; opposite directions are one
-    edges = np.empty((*brightness.shape, bins), np.float32)
-    for k in range(bins):
-        distance = np.abs(position - k)
-        distance = np.minimum(distance, bins - distance)
-        edges[..., k] = magnitude * np.maximum(1 - distance, 0)
-    return edges
-
-
-def _cell_mean(channels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return the mean (height, width, C) over cells spread evenly over an image (H, W, C)."""
-    means = [
-        cv2.resize(channels[..., c], (width, height), interpolation=cv2.INTER_AREA)
-        for c in range(channels.shape[-1])
-    ]
-    return np.stack(means, -1).reshape(height, width, -1)
-
-
-def _box(grid: np.ndarray, side: int) -> np.ndarray:
-    """Return the mean over side x side cells, kept 3D for a single channel too."""
-    if side == 1:
-        return grid
-    return cv2.blur(grid, (side, side), borderType=cv2.BORDER_REPLICATE).reshape(grid.shape)
+    distances = (np.abs(position - k) for k in range(bins))
+    return [magnitude * np.maximum(1 - np.minimum(d, bins - d), 0) for d in distances]
 
 
 def with_finer_grid(extractor: FeatureExtractor, factor: int) -> FeatureExtractor:
@@ -149,19 +128,19 @@ class HighResolutionFeatures:
 
     def __call__(self, frame: Frame) -> Tensor:  # (factor * h', factor * w', C)
         """Return the features of a frame on the finer grid."""
+        height, width = frame.image.shape[:2]
+        patch_width = width / (width // self.extractor.stride)
+        patch_height = height / (height // self.extractor.stride)
         # A patch is cut into factor x factor parts; the shifts [patches] lead to their centres.
         shifts = [(part + 0.5) / self.factor - 0.5 for part in range(self.factor)]
-        rows = [torch.stack([self._shifted(frame, x, y) for x in shifts], 2) for y in shifts]
-        fine = torch.stack(rows, 1)  # (h', factor, w', factor, C)
-        height, _, width, _, channels = fine.shape
-        return fine.reshape(height * self.factor, width * self.factor, channels)
 
-    def _shifted(self, frame: Frame, x: float, y: float) -> Tensor:  # (h', w', C)
-        """Return the features of the patches that lie x patches further right, y further down."""
-        height, width = frame.image.shape[:2]
-        rows, columns = height // self.extractor.stride, width // self.extractor.stride
-        image = shift_image(frame.image, x * width / columns, y * height / rows)
-        return self.extractor(replace(frame, pixels=image))
+        def features_at(x: float, y: float) -> Tensor:  # (h', w', C) of patches further right, down
+            image = shift_image(frame.image, x * patch_width, y * patch_height)
+            return self.extractor(replace(frame, pixels=image))
+
+        rows = [torch.stack([features_at(x, y) for x in shifts], 2) for y in shifts]
+        fine = torch.stack(rows, 1)  # (h', factor, w', factor, C)
+        return fine.flatten(0, 1).flatten(1, 2)
 
 
 def shift_image(

@@ -19,7 +19,8 @@ from minislam.records import Frame
 
 INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
 FEATURES, DEPTH = "features", "depth"  # folders of one sequence's priors
-_ALSO_DEPTH = "depths"  # the folder's name where WildGS-SLAM writes its own
+_FOLDERS = {FEATURES: ("features",), DEPTH: ("depth", "depths")}  # the last: of WildGS-SLAM
+_AXES = {FEATURES: ("rows", "columns", "channels"), DEPTH: ("rows", "columns")}
 
 
 class FrameFiles:
@@ -32,12 +33,8 @@ class FrameFiles:
     def __init__(self, folder: Path | str, what: str, endings: tuple[str, ...]) -> None:
         self.folder = Path(folder)
         self.what = what  # "depth" or "features", for messages
-        if not self.folder.is_dir():
-            raise InputError(
-                f"expected a folder of {what} files, found nothing at {self.folder}; check the path"
-            )
         # Sorted, so that of 17.npy and 17.png the same one wins on every machine.
-        files = sorted(p for p in self.folder.iterdir() if p.suffix.lower() in endings)
+        files = sorted(p for p in self.folder.glob("*") if p.suffix.lower() in endings)
         self._files = {int(path.stem): path for path in files if path.stem.isdecimal()}
         if not self._files:
             raise InputError(
@@ -52,13 +49,13 @@ class FrameFiles:
         """Return the file of a frame, or None if the folder has none for it."""
         if self._number_of is None:
             return self._files.get(frame.frame_index)
-        moment = stamp(frame.timestamp)
-        if moment not in self._number_of:
+        number = self._number_of.get(round(frame.timestamp, 6))
+        if number is None:
             raise InputError(
-                f"expected {self.what} of the frame at {moment} s, found no such frame in "
-                f"{self.folder / INDEX}; make them from this sequence with minislam priors"
+                f"expected {self.what} of the frame at {frame.timestamp:.6f} s, found no such "
+                f"frame in {self.folder / INDEX}; make them from this sequence with minislam priors"
             )
-        return self._files.get(self._number_of[moment])
+        return self._files.get(number)
 
 
 class FileFeatures:
@@ -66,7 +63,7 @@ class FileFeatures:
 
     def __init__(self, folder: Path | str, camera: Camera) -> None:
         self._files = FrameFiles(folder, "features", (".npy",))
-        rows, _, self.dimension = _read_features(self._files.first).shape
+        rows, _, self.dimension = read_array(self._files.first, FEATURES).shape
         self.stride = max(1, round(camera.height / rows))
 
     def __call__(self, frame: Frame) -> Tensor:  # (h', w', C) float32
@@ -77,12 +74,13 @@ class FileFeatures:
                 f"expected features of every keyframe in {self._files.folder}, found none for "
                 f"frame {frame.frame_index}; make them from this sequence with minislam priors"
             )
-        features = _read_features(path)
+        features = read_array(path, FEATURES).astype(np.float32)
         rows, cols, channels = features.shape
-        if channels != self.dimension:
+        is_finite = np.isfinite(features).all()
+        if channels != self.dimension or not is_finite:
             raise InputError(
-                f"expected {self.dimension} channels in {path} as in the other files, found "
-                f"{channels}; write all of them with one network"
+                f"expected finite features of {self.dimension} channels in {path}, found "
+                f"{channels if is_finite else 'NaN or infinity'}; write all with one network"
             )
         height, width = frame.image.shape[:2]
         # Whole patches are counted, so each side of the grid may lack up to one of them.
@@ -111,7 +109,7 @@ class FileDepth:
         if path is None:
             return None
         if path.suffix.lower() == ".npy":
-            return as_depth(_read_depth(path), frame, str(path))
+            return as_depth(read_array(path, DEPTH), frame, str(path))
         counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
             raise InputError(
@@ -124,62 +122,39 @@ class FileDepth:
 def folder_of(name: str, kind: str) -> Path:
     """Return where the files of a kind are: in the subfolder of that name, or in the folder."""
     folder = Path(name.removeprefix(FILES)).expanduser()
-    parts = [kind, _ALSO_DEPTH] if kind == DEPTH else [kind]
-    return next((folder / part for part in parts if (folder / part).is_dir()), folder)
+    return next((folder / sub for sub in _FOLDERS[kind] if (folder / sub).is_dir()), folder)
 
 
 def index_text(origin: str, frames: list[tuple[int, float]]) -> str:
     """Return the content of an index: frame index and timestamp [s] of every frame."""
-    rows = "".join(f"{number} {stamp(timestamp)}\n" for number, timestamp in frames)
+    rows = "".join(f"{number} {timestamp:.6f}\n" for number, timestamp in frames)
     return f"# {origin}\n# frame_index timestamp\n{rows}"
 
 
-def stamp(timestamp: float) -> str:
-    """Return a timestamp [s] as text, to the microsecond, so that equal ones are found."""
-    return f"{timestamp:.6f}"
-
-
-def read_array(path: Path, what: str) -> np.ndarray:
-    """Return the array of an .npy file of floating-point numbers."""
+def read_array(path: Path, kind: str) -> np.ndarray:
+    """Return the array of an .npy file of features (rows, columns, channels) or depth."""
     try:
-        array = np.load(path, allow_pickle=False)
+        with open(path, "rb") as file:
+            array = np.lib.format.read_array(file)
     except Exception as error:  # damaged bytes fail inside numpy in many ways
         raise InputError(
-            f"expected a numpy array of {what}, found an unreadable file {path}; write it again"
+            f"expected a numpy array of {kind}, found an unreadable file {path}; write it again"
         ) from error
-    if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, np.floating):
+    array = np.squeeze(array) if kind == DEPTH else array
+    axes, is_float = _AXES[kind], np.issubdtype(array.dtype, np.floating)
+    if array.ndim != len(axes) or array.size == 0 or not is_float:
         raise InputError(
-            f"expected floating-point {what} in {path}, found {getattr(array, 'dtype', 'several')}"
-            "; store one array of float32 per file"
+            f"expected floating-point {kind} of shape ({', '.join(axes)}) in {path}, found "
+            f"{array.dtype} of shape {array.shape}; store one such array per file"
         )
     return array
 
 
-def _read_features(path: Path) -> np.ndarray:
-    features = read_array(path, "features")
-    if features.ndim != 3 or features.size == 0 or not np.isfinite(features).all():
-        raise InputError(
-            f"expected finite features of shape (rows, columns, channels) in {path}, found shape "
-            f"{features.shape}; write it again"
-        )
-    return features.astype(np.float32)
-
-
-def _read_depth(path: Path) -> np.ndarray:
-    depth = np.squeeze(read_array(path, "depth"))
-    if depth.ndim != 2 or depth.size == 0:
-        raise InputError(
-            f"expected depth of shape (H, W) in {path}, found {depth.dtype} of shape "
-            f"{depth.shape}; store one depth map in world units per file"
-        )
-    return depth
-
-
-def _read_index(path: Path) -> dict[str, int]:
+def _read_index(path: Path) -> dict[float, int]:
     try:
         rows = path.read_text(encoding="utf-8").splitlines()
         pairs = [row.split() for row in rows if row and not row.startswith("#")]
-        return {stamp(float(timestamp)): int(number) for number, timestamp in pairs}
+        return {round(float(timestamp), 6): int(number) for number, timestamp in pairs}
     except (OSError, ValueError) as error:
         raise InputError(
             f"expected rows of frame index and timestamp in {path}, found something else "

@@ -24,7 +24,6 @@ from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
 Edge = tuple[int, int]  # keyframe index of source and target
 
 THREADS = 2  # that compute flows side by side, without effect on the result
-PAIRS_AT_ONCE = 16  # of keyframes: a dense flow has 600 kB at 320x240, and there may be thousands
 
 
 @dataclass(frozen=True)
@@ -82,13 +81,16 @@ class ClassicalFlow(Stateful):
         """Match every grid cell of each source in its target; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
         starts = dict(zip(edges, predicted_targets.cpu().numpy().astype(np.float32), strict=True))
-        moved = {edge for edge, start in starts.items() if self._has_moved(edge, start)}
+        moved = [edge for edge, start in starts.items() if self._has_moved(edge, start)]
         # Each direction checks the other, so both are measured anew, or none.
-        self._measure({(i, j): starts[i, j] for i, j in edges if {(i, j), (j, i)} & moved})
-        measured = [self._measured[edge] for edge in edges]
+        pairs = dict.fromkeys((min(edge), max(edge)) for edge in moved)
+        both = ({e: starts[e] for e in ((i, j), (j, i)) if e in starts} for i, j in pairs)
+        for measured in _threads().map(self._measure, both):
+            self._measured |= measured
+        found = [self._measured[edge] for edge in edges]
         return as_matches(
-            [edge.targets for edge in measured],
-            [edge.confidence for edge in measured],
+            [edge.targets for edge in found],
+            [edge.confidence for edge in found],
             [self._textures[source] for source in edges_source],
             predicted_targets,
         )
@@ -102,35 +104,22 @@ class ClassicalFlow(Stateful):
         distance = np.median(np.linalg.norm(start - self._measured[edge].start, axis=0))
         return bool(distance >= self.config.start_tolerance)
 
-    def _measure(self, starts: dict[Edge, np.ndarray]) -> None:
-        pool = _threads()
-        pairs = list(dict.fromkeys((min(edge), max(edge)) for edge in starts))
-        for first in range(0, len(pairs), PAIRS_AT_ONCE):
-            both = [e for i, j in pairs[first : first + PAIRS_AT_ONCE] for e in ((i, j), (j, i))]
-            edges = [edge for edge in dict.fromkeys(both) if edge in starts]
-            flows = pool.map(self._edge_flow, edges, [starts[edge] for edge in edges])
-            flow_of = dict(zip(edges, flows, strict=True))
-            measured = [
-                pool.submit(self._measured_edge, edge, starts[edge], flow, flow_of.get(edge[::-1]))
-                for edge, flow in flow_of.items()
-            ]
-            self._measured.update(zip(edges, (m.result() for m in measured), strict=True))
-
-    def _measured_edge(
-        self, edge: Edge, start: np.ndarray, forward: np.ndarray, backward: np.ndarray | None
-    ) -> MeasuredEdge:
-        source, target = (self._images[end] for end in edge)
-        if backward is None:
-            backward = reverse_flow(source, target, forward)
-        texture = self._textures[edge[0]]
-        on_grid = measure_on_grid(source, target, forward, backward, texture, self.stride)
-        # A copy: a view would keep the starts of all edges of this call.
-        return MeasuredEdge(*edge, start.copy(), *on_grid)
-
-    def _edge_flow(self, edge: Edge, start: np.ndarray) -> np.ndarray:
-        source, target = (self._images[end] for end in edge)
-        on_grid = np.ascontiguousarray(start.T).reshape(*self._textures[edge[0]].shape, 2)
-        return composed_flow(source, target, dense_from_grid(on_grid, source.shape, self.stride))
+    def _measure(self, starts: dict[Edge, np.ndarray]) -> dict[Edge, MeasuredEdge]:
+        """Measure the one direction of a pair of keyframes, or both: each checks the other."""
+        flows: dict[Edge, np.ndarray] = {}
+        for (i, j), start in starts.items():
+            on_grid = np.ascontiguousarray(start.T).reshape(*self._textures[i].shape, 2)
+            dense = dense_from_grid(on_grid, self._images[i].shape, self.stride)
+            flows[i, j] = composed_flow(self._images[i], self._images[j], dense)
+        measured = {}
+        for (i, j), flow in flows.items():
+            images, backward = (self._images[i], self._images[j]), flows.get((j, i))
+            if backward is None:
+                backward = reverse_flow(*images, flow)
+            matches = measure_on_grid(*images, flow, backward, self._textures[i], self.stride)
+            # A copy: a view would keep the starts of all edges of this call.
+            measured[i, j] = MeasuredEdge(i, j, starts[i, j].copy(), *matches)
+        return measured
 
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
@@ -140,10 +129,10 @@ class ClassicalFlow(Stateful):
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "FlowChain":
         """Return the chain whose saved state this is."""
-        images, flow = (state["_reference"], state["_newest"]), state["_flow"]
-        return FlowChain(*images, flow, state["_increment"], self.config)
+        return from_tree(FlowChain, state, frame_of)
 
 
+@dataclass
 class FlowChain(Stateful):
     """The flow from one reference frame to the newest frame, updated frame by frame.
 
@@ -152,44 +141,34 @@ class FlowChain(Stateful):
     changed: the next frame gives a new one, so a bad frame can be skipped.
     """
 
-    _reference: np.ndarray  # (H, W) uint8
-    _newest: np.ndarray  # (H, W) uint8
-    _flow: np.ndarray  # (H, W, 2) px, reference to newest
-    _increment: np.ndarray  # (H, W, 2) px, how much of it the last frame added
-
-    def __init__(
-        self,
-        reference: np.ndarray,
-        newest: np.ndarray,
-        flow: np.ndarray,
-        increment: np.ndarray,
-        config: ClassicalFlowConfig,
-    ) -> None:
-        self._reference, self._newest = reference, newest
-        self._flow, self._increment, self._config = flow, increment, config
+    reference: np.ndarray  # (H, W) uint8
+    newest: np.ndarray  # (H, W) uint8
+    flow: np.ndarray  # (H, W, 2) px, reference to newest
+    increment: np.ndarray  # (H, W, 2) px, how much of it the last frame added
+    config: ClassicalFlowConfig
 
     def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
-        gray, stride = grayscale(image), self._config.stride
-        texture = texture_confidence(self._reference, stride)
+        gray, stride = grayscale(image), self.config.stride
+        texture = texture_confidence(self.reference, stride)
 
         def follow(start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            images = self._reference, gray
+            images = self.reference, gray
             flow = composed_flow(*images, start)
             backward = reverse_flow(*images, flow)
             return flow, *measure_on_grid(*images, flow, backward, texture, stride)
 
         # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
         # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
-        measured = _threads().map(follow, (self._flow, self._flow + self._increment))
+        measured = _threads().map(follow, (self.flow, self.flow + self.increment))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
-        chain = FlowChain(self._reference, gray, flow, flow - self._flow, self._config)
+        chain = FlowChain(self.reference, gray, flow, flow - self.flow, self.config)
         return chain, as_matches([targets], [confidence], [texture], image)
 
     def restart(self) -> "FlowChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
-        standing = np.zeros_like(self._flow)
-        return FlowChain(self._newest, self._newest, standing, self._increment, self._config)
+        standing = np.zeros_like(self.flow)
+        return FlowChain(self.newest, self.newest, standing, self.increment, self.config)
 
 
 @cache

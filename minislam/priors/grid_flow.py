@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from minislam.parameters import parameter
-from minislam.priors.dense_flow import pixel_maps, sample, warp
+from minislam.priors.dense_flow import pixel_positions, sample, warp
 from minislam.priors.interfaces import FlowMatches
 
 SIMILARITY_WINDOW = (9, 9)  # px
@@ -94,7 +94,7 @@ def lucas_kanade(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndar
     over large parts of an image and so rotate the estimated camera. A least-squares match of one
     window per cell has independent errors, which average out.
     """
-    cells = np.stack(pixel_maps(source.shape), -1)[::stride, ::stride]
+    cells = pixel_positions(source.shape)[::stride, ::stride]
     points = cells.reshape(-1, 1, 2)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         source, warped, points, points.copy(), winSize=LK_WINDOW, maxLevel=0, criteria=LK_STOP,
@@ -117,15 +117,14 @@ def grid_matches(
     Matches outside of the target have confidence 0.
     """
     height, width = forward.shape[:2]
-    column, row = (m[::stride, ::stride] for m in pixel_maps((height, width)))
-    moved_u, moved_v = column + remainder[..., 0], row + remainder[..., 1]
-    flow = sample(forward, moved_u, moved_v)
-    target_u, target_v = moved_u + flow[..., 0], moved_v + flow[..., 1]
-    returned = sample(backward, target_u, target_v)
+    moved = pixel_positions((height, width))[::stride, ::stride] + remainder
+    flow = sample(forward, moved)
+    targets = moved + flow
+    returned = sample(backward, targets)
     squared_error = ((remainder + flow + returned) ** 2).sum(-1)
     agreement = np.exp(-0.5 * squared_error / CONSISTENCY_SCALE**2)
-    inside = (target_u >= 0) & (target_u <= width - 1) & (target_v >= 0) & (target_v <= height - 1)
-    return np.stack([target_u, target_v], -1), agreement * texture * inside
+    inside = ((targets >= 0) & (targets <= (width - 1, height - 1))).all(-1)
+    return targets, agreement * texture * inside
 
 
 def texture_confidence(gray: np.ndarray, stride: int) -> np.ndarray:

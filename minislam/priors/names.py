@@ -7,6 +7,7 @@ import csv
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from minislam.errors import InputError
 
@@ -90,11 +91,11 @@ def find_weights(use: str, given: str | None) -> str | None:
     return str(row.path)
 
 
-def plugin_names(kind: str) -> list[str]:
-    """Return the names that installed packages give to priors of a kind."""
+def plugins(kind: str) -> dict[str, Any]:
+    """Return the entry points by which installed packages name priors of a kind."""
     from importlib.metadata import entry_points
 
-    return sorted({entry.name for entry in entry_points(group=f"minislam.{kind}")})
+    return {entry.name: entry for entry in entry_points(group=f"minislam.{kind}")}
 
 
 def require_prior(kind: str, name: str, weights: str | None) -> str | None:
@@ -106,33 +107,30 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
     learned = list(dict.fromkeys(use.split()[-1] for use in uses))
     if name in learned:
         file = find_weights(f"--{kind} {name}", weights)
-        if file is None:
+        if file is None or not Path(file).expanduser().is_file():
             raise InputError(
-                f"expected --{kind}-weights FILE with --{kind} {name}, found none; fetch it with "
-                f"minislam weights fetch {name}, or give an official checkpoint"
-            )
-        if not Path(file).expanduser().is_file():
-            raise InputError(
-                f"expected an official checkpoint of {name}, found nothing at {file}; check the "
-                "path, or name one of minislam weights list"
+                f"expected --{kind}-weights FILE with --{kind} {name}, found "
+                f"{'none' if file is None else f'nothing at {file}'}; fetch it with minislam "
+                f"weights fetch {name}, or give the path of an official checkpoint"
             )
         return file
-    if name.startswith(PYTHON) or name in plugin_names(kind):
+    if name.startswith(PYTHON) or name in plugins(kind):
         return weights
     if weights is not None:
         raise InputError(
             f"expected --{kind} {' or '.join(learned)} with --{kind}-weights, found --{kind} "
             f"{name}; name the network of {weights}"
         )
-    if (FOLDER if name.startswith(FILES) else name) not in BUILT_IN[kind]:
-        known = ", ".join([*BUILT_IN[kind], *learned, *plugin_names(kind)])
+    if name.startswith(FILES) and FOLDER in BUILT_IN[kind]:
+        folder = Path(name.removeprefix(FILES)).expanduser()
+        if not folder.is_dir():
+            raise InputError(
+                f"expected a folder of {kind} files, found nothing at {folder}; check the path"
+            )
+    elif name not in BUILT_IN[kind]:
+        known = ", ".join([*BUILT_IN[kind], *learned, *plugins(kind)])
         raise InputError(
             f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
-        )
-    folder = Path(name.removeprefix(FILES)).expanduser()
-    if name.startswith(FILES) and not folder.is_dir():
-        raise InputError(
-            f"expected a folder of {kind} files, found nothing at {folder}; check the path"
         )
     return None
 

@@ -99,7 +99,7 @@ def points_of(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 def static_mask(run: Run, frame: int, camera: Camera) -> np.ndarray:  # (H, W) uint8, 255 or 0
     """Return where a frame is static, for another image size of the same view."""
-    beta = sample(run.beta(frame), *_working_pixels(run, camera))
+    beta = sample(run.beta(frame), _working_pixels(run, camera))
     raw = torch.from_numpy(np.asarray(beta, np.float32))
     weight = mapping_weight(raw, camera, run.least_weight)
     return np.where(weight > 0, 255, 0).astype(np.uint8)
@@ -121,7 +121,7 @@ def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera
         image, mask = sequence.full_image(frame), static_mask(run, frame, camera)
         moved = run.displacement(frame)
         if moved is not None:
-            enlarged = sample(moved, *_working_pixels(run, camera)) * (camera.fx / run.camera.fx)
+            enlarged = sample(moved, _working_pixels(run, camera)) * (camera.fx / run.camera.fx)
             image = warp(image, enlarged, cv2.INTER_CUBIC)
             mask = warp(mask, enlarged, cv2.INTER_NEAREST)
         atomic_write(folder / IMAGES / _name(frame), encode_png(image))
@@ -130,11 +130,11 @@ def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera
     return camera, written
 
 
-def _working_pixels(run: Run, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the column and row in the run's images of every pixel of another size, (H, W) each."""
+def _working_pixels(run: Run, camera: Camera) -> np.ndarray:  # (H, W, 2)
+    """Return the column and row in the run's images of every pixel of another size."""
     columns = (np.arange(camera.width) - camera.cx) / camera.fx * run.camera.fx + run.camera.cx
     rows = (np.arange(camera.height) - camera.cy) / camera.fy * run.camera.fy + run.camera.cy
-    return np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    return np.stack(np.meshgrid(columns, rows), -1).astype(np.float32)
 
 
 def _name(frame: int, ending: str = ".png") -> str:

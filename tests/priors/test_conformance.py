@@ -177,7 +177,7 @@ def test_a_flow_that_drifts_and_a_chain_that_changes_are_refused():
 
     class Changing(FlowChain):
         def restart(self):
-            self._reference = self._newest
+            self.reference = self.newest
             return self
 
     def start(image):

@@ -8,7 +8,7 @@ from minislam.priors.dense_flow import (
     composed_flow,
     dense_from_grid,
     grayscale,
-    pixel_maps,
+    pixel_positions,
     residual_flow,
     reverse_flow,
     warp,
@@ -18,7 +18,7 @@ from tests.priors.patterns import CONFIG, HEIGHT, INNER, SIZE, WIDTH, constant, 
 
 def affine(matrix: list[list[float]], offset: list[float]) -> np.ndarray:
     """Return the flow field matrix p + offset (H, W, 2)."""
-    pixels = np.stack(pixel_maps(SIZE), -1)
+    pixels = pixel_positions(SIZE)
     return (pixels @ np.float32(matrix).T + np.float32(offset)).astype(np.float32)
 
 
@@ -30,7 +30,7 @@ def test_a_prediction_is_composed_with_what_is_left(monkeypatch: pytest.MonkeyPa
     blank = np.zeros(SIZE, np.uint8)
     actual = composed_flow(blank, blank, start)
     A, a = np.array([[0.02, -0.05], [0.04, 0.03]]), np.array([7.0, -3.0])
-    moved = np.stack(pixel_maps(SIZE), -1) + remainder
+    moved = pixel_positions(SIZE) + remainder
     expected = remainder + moved @ A.T + a
     # cv2.remap interpolates at steps of 1/32 px.
     np.testing.assert_allclose(actual[INNER], expected[INNER], atol=5e-3)
@@ -78,7 +78,7 @@ def test_warping_brings_the_target_back():
 def test_grid_targets_become_a_dense_flow():
     flow = affine([[0.02, -0.05], [0.04, 0.03]], [7.0, -3.0])
     stride = CONFIG.stride
-    targets = (np.stack(pixel_maps(SIZE), -1) + flow)[::stride, ::stride]
+    targets = (pixel_positions(SIZE) + flow)[::stride, ::stride]
     dense = dense_from_grid(targets, SIZE, stride)
     assert dense.shape == flow.shape
     inside = (slice(0, HEIGHT - stride), slice(0, WIDTH - stride))  # beyond the last cell: held
@@ -95,7 +95,7 @@ def test_the_reverse_flow_is_the_inverse(monkeypatch: pytest.MonkeyPatch):
     blank = np.zeros(SIZE, np.uint8)
     backward = reverse_flow(blank, blank, affine(M.tolist(), m.tolist()))
     # q = (I + M) p + m, so p - q = (I + M)^-1 (q - m) - q.
-    pixels = np.stack(pixel_maps(SIZE), -1)
+    pixels = pixel_positions(SIZE)
     expected = (pixels - m) @ np.linalg.inv(np.eye(2) + M).T - pixels
     np.testing.assert_allclose(backward[INNER], expected[INNER], atol=2e-2)
 

@@ -100,14 +100,14 @@ def test_the_number_of_threads_changes_nothing(other: int, monkeypatch: pytest.M
     assert torch.equal(one.matched_ratios, many.matched_ratios)
 
 
-def test_edges_in_parts_are_measured_as_all_at_once(monkeypatch: pytest.MonkeyPatch):
+def test_edges_are_measured_alike_one_by_one_and_all_at_once():
     images = [shifted(3 * d, -d, SIZE) for d in range(4)]
-    sources, targets = [0, 1, 1, 2, 3, 0], [1, 2, 0, 3, 2, 3]
-    whole = flow_of(images).match(sources, targets, still(6))
-    monkeypatch.setattr(flow_module, "PAIRS_AT_ONCE", 1)
-    split = flow_of(images).match(sources, targets, still(6))
-    assert torch.equal(split.targets, whole.targets)
-    assert torch.equal(split.confidences, whole.confidences)
+    sources, targets = [0, 1, 2, 0], [1, 2, 3, 3]
+    whole = flow_of(images).match(sources, targets, still(4))
+    for edge, (source, target) in enumerate(zip(sources, targets, strict=True)):
+        alone = flow_of(images).match([source], [target], still())
+        assert torch.equal(alone.targets[0], whole.targets[edge])
+        assert torch.equal(alone.confidences[0], whole.confidences[edge])
     # One confidence counts for u and v, and is stored once.
     assert whole.confidences.untyped_storage().nbytes() == 4 * whole.confidences[:, 0].numel()
 

@@ -100,6 +100,7 @@ class OracleFlow(DroidFlow):
 
     def __init__(self, clip: Clip, skill: Skill, config: DroidFlowConfig) -> None:
         super().__init__(_NoWeights(), config)
+        self.update, self.damping = self.answers, lambda hidden: torch.full(hidden.shape[2:], 0.007)
         self.clip, self.skill = clip, skill
         self._index = {_key(torch.from_numpy(rgb)): k for k, rgb in enumerate(clip.rgb)}
         self._truth: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
@@ -108,7 +109,7 @@ class OracleFlow(DroidFlow):
         """Return the number of a frame in the place of its features; -1 for an unknown image."""
         return _Numbered(image, self._index.get(_key(image), -1))
 
-    def update(
+    def answers(
         self,
         source: Tensor,
         target: Tensor,
@@ -117,15 +118,11 @@ class OracleFlow(DroidFlow):
         expected: Tensor,  # (E, h, w, 2) cells
         last_target: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Answer as `DroidFlow.update` does."""
+        """Answer as the network does."""
         numbers = [x[:, 0, 0, 0].int().tolist() for x in (source, target, hidden)]
         answers = [self.answer(*n, e) for *n, e in zip(*numbers, expected, strict=True)]
         targets, confidences = (torch.stack(part) for part in zip(*answers, strict=True))
         return hidden + 1, targets, confidences[..., None].expand(-1, -1, -1, 2)
-
-    def damping(self, hidden: Tensor) -> Tensor:
-        """Return a usual damping."""
-        return torch.full(hidden.shape[2:], 0.007)
 
     def answer(
         self, source: int, target: int, updates: int, expected: Tensor

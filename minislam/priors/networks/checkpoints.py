@@ -142,12 +142,11 @@ def resize(x: Tensor, size: Sequence[int]) -> Tensor:
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Weights:
     """Read a checkpoint file of plain tensors to a device; nothing in it is executed."""
-    path = Path(path)
-    if not path.is_file():
+    if not Path(path).is_file():
         raise InputError(f"expected a checkpoint file, found nothing at {path}; check the path")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-        tensors = _unwrapped(_tensors_in(content))
+        tensors = _tensors_in(content)
     except Exception as error:  # a broken file can break the reader anywhere
         refused = re.search(r"GLOBAL (\S+)", str(error))
         problem = f"which cannot be read as one ({type(error).__name__}); download it again"
@@ -157,8 +156,8 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
                 "with weights_only=True: if you trust its maker, save its tensors alone to a file"
             )
         raise InputError(
-            f"expected a PyTorch checkpoint of plain tensors, found {path} ({path.stat().st_size} "
-            f"bytes), {problem}"
+            f"expected a PyTorch checkpoint of plain tensors, found {path} "
+            f"({Path(path).stat().st_size} bytes), {problem}"
         ) from error
     if not tensors:
         found = f"the entries {list(content)}" if isinstance(content, dict) else type(content)
@@ -170,27 +169,20 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
     return Weights({name: tensor.float() for name, tensor in tensors.items()}, str(path))
 
 
-def _tensors_in(content: Any, prefix: str = "") -> dict[str, Tensor]:
-    """Return the tensors of a file; those of a wrapper in it begin with the wrapper's name."""
-    tensors: dict[str, Tensor] = {}
-    for key, value in content.items() if isinstance(content, dict) else ():
-        if isinstance(value, Tensor):
-            tensors[f"{prefix}{key}"] = value
-        elif key in _WRAPPERS:
-            tensors |= _tensors_in(value, f"{prefix}{key}.")
-    return tensors
-
-
-def _unwrapped(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def _tensors_in(content: Any) -> dict[str, Tensor]:
     """Return the tensors inside all wrappers, whatever their order; what is beside goes."""
+    entries = {str(k): v for k, v in content.items()} if isinstance(content, dict) else {}
     for wrapper in _WRAPPERS:
-        names = [name for name in tensors if name.startswith(f"{wrapper}.")]
-        if names:
-            return _unwrapped({name[len(wrapper) + 1 :]: tensors[name] for name in names})
-    return tensors
+        start = f"{wrapper}."
+        inside = {n[len(start) :]: v for n, v in entries.items() if n.startswith(start)}
+        if isinstance(entries.get(wrapper), dict):
+            inside |= entries[wrapper]
+        if inside:
+            return _tensors_in(inside)
+    return {name: value for name, value in entries.items() if isinstance(value, Tensor)}
 
 
-def _require_numbers(tensors: dict[str, Tensor], path: Path) -> None:
+def _require_numbers(tensors: dict[str, Tensor], path: Path | str) -> None:
     """Refuse tensors that are no trained weights: integers, NaN and infinity, mostly zeros."""
     found = ""
     for name, tensor in tensors.items():

@@ -81,17 +81,13 @@ class DepthAnything:
     def _resized(self, image: Tensor) -> Tensor:
         """Return the image with sides of whole patches, the shorter one of `shorter_side`."""
         scale = max(self.shorter_side / side for side in image.shape[:2])
-        rows, cols = (_whole_patches(side * scale, self.shorter_side) for side in image.shape[:2])
+        patches = [side * scale / PATCH for side in image.shape[:2]]
+        least = self.shorter_side / PATCH
+        rows, cols = (PATCH * (round(n) if round(n) >= least else math.ceil(n)) for n in patches)
         # In float64, as the official code: float32 weights of the cubic differ in the last digits.
         pixels = image.double().cpu().numpy()
-        return torch.from_numpy(
-            cv2.resize(pixels, (cols, rows), interpolation=cv2.INTER_CUBIC)
-        ).float()
-
-
-def _whole_patches(side: float, shortest: int) -> int:
-    rounded = round(side / PATCH) * PATCH
-    return rounded if rounded >= shortest else math.ceil(side / PATCH) * PATCH
+        resized = cv2.resize(pixels, (cols, rows), interpolation=cv2.INTER_CUBIC)
+        return torch.from_numpy(resized).float()
 
 
 def _limit_of_name(name: str) -> float:
@@ -99,10 +95,10 @@ def _limit_of_name(name: str) -> float:
 
     The file itself states neither this depth nor whether its output is metric.
     """
-    for part, limit in _LIMIT_OF_NAME.items():
-        if part in name:
-            return limit
-    raise InputError(
-        f"expected {' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint, found "
-        f"{name}, whose output may be no metric depth; keep the official name of the file"
-    )
+    limits = [limit for part, limit in _LIMIT_OF_NAME.items() if part in name]
+    if not limits:
+        raise InputError(
+            f"expected {' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint, "
+            f"found {name}, whose output may be no metric depth; keep the official name"
+        )
+    return limits[0]

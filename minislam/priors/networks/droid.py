@@ -5,7 +5,7 @@ the hidden state of its recurrent unit from call to call: a later answer refines
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from minislam.priors.interfaces import FlowMatches
 from minislam.priors.networks import droid_network as net
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.vit import normalise
-from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
+from minislam.state.stateful import FrameOf, Stateful, Tree
 
 # Sides must be longer [px]: of 8 cells, the coarsest level of the correlations has one.
 _TOO_SMALL = net.STRIDE * (2 ** (net.LEVELS - 1) - 1)
@@ -38,10 +38,7 @@ class DroidFlowConfig:
     edges_per_batch: int = parameter(8, "edges in one pass, bounds the memory of correlations", 1)
 
 
-@dataclass(frozen=True)
-class _EdgeState:
-    hidden: Tensor  # (128, h, w)
-    target: Tensor  # (h, w, 2) cells
+EdgeState = tuple[Tensor, Tensor]  # of the recurrent unit (128, h, w), last target (h, w, 2) cells
 
 
 class EncodedFrame:
@@ -50,14 +47,12 @@ class EncodedFrame:
     def __init__(self, weights: Weights, image: Tensor) -> None:
         self.image = image  # (H, W, 3)
         self._weights, self._normalised = weights, normalise(image, weights.device)
-        with weights.autocast():
-            self.features = net.encode_features(weights, self._normalised)  # (1, 128, h, w)
+        self.features = net.encode_features(weights, self._normalised)  # (1, 128, h, w)
 
     @cached_property
     def context(self) -> tuple[Tensor, Tensor]:  # (1, 128, h, w) twice
         """Return the first hidden state and the context of all updates."""
-        with self._weights.autocast():
-            return net.encode_context(self._weights, self._normalised)
+        return net.encode_context(self._weights, self._normalised)
 
 
 class DroidFlow(Stateful):
@@ -68,9 +63,10 @@ class DroidFlow(Stateful):
 
     def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
         self.weights = weights
+        self.update, self.damping = partial(net.update, weights), partial(net.damping, weights)
         self.config = config or DroidFlowConfig()
         self._frames: dict[int, EncodedFrame] = {}
-        self._edges: dict[tuple[int, int], _EdgeState] = {}  # the last ones were used last
+        self._edges: dict[tuple[int, int], EdgeState] = {}  # the last ones were used last
         self._dampings: dict[int, Tensor] = {}  # (N,) px^2
         self._newest: EncodedFrame | None = None
 
@@ -98,12 +94,12 @@ class DroidFlow(Stateful):
 
     def saved_state(self) -> Tree:
         """Return the state of the edges; the frames are encoded again."""
-        edges = [[*edge, to_tree(state)] for edge, state in self._edges.items()]
+        edges = [[*edge, *state] for edge, state in self._edges.items()]
         return {"edges": edges, "dampings": [list(item) for item in self._dampings.items()]}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
-        self._edges = {(i, j): _EdgeState(**edge) for i, j, edge in state["edges"]}
+        self._edges = {(i, j): (hidden, where) for i, j, hidden, where in state["edges"]}
         self._dampings = dict(state["dampings"])
 
     @torch.no_grad()
@@ -115,21 +111,21 @@ class DroidFlow(Stateful):
         height, width = self._frames[edges_source[0]].features.shape[2:]
         expected = predicted_targets.to(self.weights.device, torch.float32) / net.STRIDE
         expected = expected.mT.reshape(-1, height, width, 2)
-        states: dict[tuple[int, int], _EdgeState] = {}
+        states: dict[tuple[int, int], EdgeState] = {}
         confidences = []
         for start in range(0, len(edges), self.config.edges_per_batch):
-            batch = edges[start : start + self.config.edges_per_batch]
-            answer = self._update_edges(batch, expected[start : start + len(batch)])
-            states |= dict(zip(batch, map(_EdgeState, *answer[:2]), strict=True))
-            confidences.append(answer[2])
-        others = [(edge, state) for edge, state in self._edges.items() if edge not in states]
-        free = max(0, self.config.kept_edges - len(states))
-        self._edges = dict(others[max(0, len(others) - free) :]) | states
+            batch = slice(start, start + self.config.edges_per_batch)
+            hidden, target, confidence = self._update_edges(edges[batch], expected[batch])
+            states |= zip(edges[batch], zip(hidden, target, strict=True), strict=True)
+            confidences.append(confidence)
+        used_last = {e: state for e, state in self._edges.items() if e not in states} | states
+        kept = max(self.config.kept_edges, len(states))
+        self._edges = dict(list(used_last.items())[-kept:])
         for source in dict.fromkeys(edges_source):
-            hidden = torch.stack([states[edge].hidden for edge in edges if edge[0] == source])
+            hidden = torch.stack([states[edge][0] for edge in edges if edge[0] == source])
             eta = self.damping(hidden).flatten().to(predicted_targets)
             self._dampings[source] = _DAMPING * eta
-        targets = torch.stack([states[edge].target for edge in edges])
+        targets = torch.stack([states[edge][1] for edge in edges])
         return as_matches(targets, torch.cat(confidences), predicted_targets)
 
     def disparity_damping(self, keyframes: int) -> Tensor:  # (K, N) px^2
@@ -140,19 +136,19 @@ class DroidFlow(Stateful):
     def _update_edges(
         self, edges: list[tuple[int, int]], expected: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Update a batch of edges once, each from its last state; see update."""
+        """Update a batch of edges once, each from its last state."""
         sources = [self._frames[source] for source, _ in edges]
         known = [
-            self._edges.get(edge) or _EdgeState(source.context[0][0], where)
+            self._edges.get(edge, (source.context[0][0], where))
             for edge, source, where in zip(edges, sources, expected, strict=True)
         ]
         return self.update(
             torch.cat([source.features for source in sources]),
             torch.cat([self._frames[target].features for _, target in edges]),
-            torch.stack([state.hidden for state in known]),
+            torch.stack([hidden for hidden, _ in known]),
             torch.cat([source.context[1] for source in sources]),
             expected,
-            torch.stack([state.target for state in known]),
+            torch.stack([target for _, target in known]),
         )
 
     def start_chain(self, image: Tensor) -> "DroidChain":
@@ -163,26 +159,6 @@ class DroidFlow(Stateful):
         """Return the chain whose saved state this is."""
         reference, newest = (self.encode(image) for image in state["_images"])
         return DroidChain(self, reference, newest, state["_target"])
-
-    def update(
-        self,
-        source: Tensor,  # (E, 128, h, w) features
-        target: Tensor,  # (E, 128, h, w) features
-        hidden: Tensor,  # (E, 128, h, w)
-        context: Tensor,  # (E, 128, h, w)
-        expected: Tensor,  # (E, h, w, 2) cells
-        last_target: Tensor,  # (E, h, w, 2) cells
-    ) -> tuple[Tensor, Tensor, Tensor]:  # (E, 128, h, w), (E, h, w, 2) cells, (E, h, w, 2)
-        """Update edges once; return hidden states, targets and confidences."""
-        with self.weights.autocast():
-            correlation = net.look_up(net.correlation_pyramid(source, target), expected)
-            answer = net.update(self.weights, hidden, context, correlation, expected, last_target)
-        return answer.hidden.float(), expected + answer.revision, answer.confidence.float()
-
-    def damping(self, hidden: Tensor) -> Tensor:  # (E, 128, h, w) of one source -> (h, w)
-        """Return how much the network would damp the disparities of a source."""
-        with self.weights.autocast():
-            return net.damping(self.weights, hidden).float()
 
 
 class DroidChain(Stateful):

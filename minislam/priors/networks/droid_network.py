@@ -7,8 +7,6 @@
 All positions and lengths in this file are in cells (1 cell = 8 px); droid.py converts them to px.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -22,14 +20,6 @@ _HEAD = (2, 3)  # channels; a third of some checkpoints was of use in the traini
 RADIUS = 3  # cells looked at around the expected position, at every level
 _DAMPING_SCALE = 0.01  # of eta, as in the training
 _MOTION_LIMIT = 64.0  # cells; motions are cut there, as in the training
-
-
-class Update(NamedTuple):
-    """The result of one update."""
-
-    hidden: Tensor  # (E, 128, h, w)
-    revision: Tensor  # (E, h, w, 2) cells, to be added to the expected position
-    confidence: Tensor  # (E, h, w, 2) in (0, 1), for u and v
 
 
 def encode_features(weights: Weights, image: Tensor) -> Tensor:  # (B, 128, h, w)
@@ -49,16 +39,17 @@ def _encode(weights: Weights, x: Tensor, normalised: bool) -> Tensor:
     def norm(y: Tensor) -> Tensor:
         return functional.instance_norm(y) if normalised else y
 
-    x = norm(weights.conv("conv1", x, stride=2)).relu()
-    for stage in (1, 2, 3):
-        for block in (0, 1):
-            part = weights.below(f"layer{stage}.{block}.")
-            stride = 2 if stage > 1 and block == 0 else 1
-            y = norm(part.conv("conv1", x, stride)).relu()
-            y = norm(part.conv("conv2", y)).relu()
-            skip = norm(part.conv("downsample.0", x, stride)) if stride == 2 else x
-            x = (skip + y).relu()
-    return weights.conv("conv2", x, channels=(CHANNELS if normalised else 2 * CHANNELS,))
+    with weights.autocast():
+        x = norm(weights.conv("conv1", x, stride=2)).relu()
+        for stage in (1, 2, 3):
+            for block in (0, 1):
+                part = weights.below(f"layer{stage}.{block}.")
+                stride = 2 if stage > 1 and block == 0 else 1
+                y = norm(part.conv("conv1", x, stride)).relu()
+                y = norm(part.conv("conv2", y)).relu()
+                skip = norm(part.conv("downsample.0", x, stride)) if stride == 2 else x
+                x = (skip + y).relu()
+        return weights.conv("conv2", x, channels=(CHANNELS if normalised else 2 * CHANNELS,))
 
 
 def correlation_pyramid(
@@ -97,29 +88,33 @@ def look_up(
 
 def update(
     weights: Weights,
+    source: Tensor,  # (E, 128, h, w) features
+    target: Tensor,  # (E, 128, h, w) features
     hidden: Tensor,  # (E, 128, h, w)
     context: Tensor,  # (E, 128, h, w) of the source
-    correlation: Tensor,  # (E, 196, h, w) around the expected positions
     expected: Tensor,  # (E, h, w, 2) cells in the target, by the present geometry
     last_target: Tensor,  # (E, h, w, 2) cells, the answer of the last update
-) -> Update:
-    """Return the revision of each expected position, its confidence and the new hidden state."""
-    weights = weights.below("update.")
+) -> tuple[Tensor, Tensor, Tensor]:  # (E, 128, h, w), (E, h, w, 2) cells, (E, h, w, 2) in (0, 1)
+    """Return the new hidden state, the corrected positions, and their confidences for u and v."""
+    parts = weights.below("update.")
     motion = torch.cat([expected - cell_grid(expected), last_target - expected], -1)
     motion = motion.clamp(-_MOTION_LIMIT, _MOTION_LIMIT).permute(0, 3, 1, 2)
-    inputs = [
-        context,
-        weights.below("corr_encoder.").convs(correlation).relu(),
-        weights.below("flow_encoder.").convs(motion).relu(),
-    ]
-    unit = weights.below("gru.")
-    # Every cell also gets a gated mean over the whole image.
-    whole = (unit.conv("w", hidden).sigmoid() * hidden).mean((2, 3), keepdim=True)
-    offsets = [unit.conv(f"conv{gate}_glo", whole) for gate in "zrq"]  # (E, 128, 1, 1) each
-    hidden = unit.gru(hidden, torch.cat(inputs, 1), offsets)
-    revision = weights.below("delta.").convs(hidden, channels=_HEAD)[:, :2]
-    confidence = weights.below("weight.").convs(hidden, channels=_HEAD)[:, :2].sigmoid()
-    return Update(hidden, revision.permute(0, 2, 3, 1), confidence.permute(0, 2, 3, 1))
+    with weights.autocast():
+        correlation = look_up(correlation_pyramid(source, target), expected)
+        inputs = [
+            context,
+            parts.below("corr_encoder.").convs(correlation).relu(),
+            parts.below("flow_encoder.").convs(motion).relu(),
+        ]
+        unit = parts.below("gru.")
+        # Every cell also gets a gated mean over the whole image.
+        whole = (unit.conv("w", hidden).sigmoid() * hidden).mean((2, 3), keepdim=True)
+        offsets = [unit.conv(f"conv{gate}_glo", whole) for gate in "zrq"]  # (E, 128, 1, 1) each
+        hidden = unit.gru(hidden, torch.cat(inputs, 1), offsets)
+        revision = parts.below("delta.").convs(hidden, channels=_HEAD)[:, :2]
+        confidence = parts.below("weight.").convs(hidden, channels=_HEAD)[:, :2].sigmoid()
+    revision, confidence = (x.permute(0, 2, 3, 1) for x in (revision, confidence))
+    return hidden.float(), expected + revision, confidence.float()
 
 
 def damping(
@@ -127,10 +122,12 @@ def damping(
     hidden: Tensor,  # (E, 128, h, w) of the edges of one source
 ) -> Tensor:  # (h, w)
     """Return eta, by which a bundle adjustment should damp the disparities of that source."""
-    weights = weights.below("update.agg.")
-    seen = weights.conv("conv1", hidden).relu().mean(0, keepdim=True)
-    features = weights.conv("conv2", seen).relu()
-    return _DAMPING_SCALE * functional.softplus(weights.conv("eta.0", features))[0, 0]
+    part = weights.below("update.agg.")
+    with weights.autocast():
+        seen = part.conv("conv1", hidden).relu().mean(0, keepdim=True)
+        features = part.conv("conv2", seen).relu()
+        eta = functional.softplus(part.conv("eta.0", features))[0, 0]
+    return (_DAMPING_SCALE * eta).float()
 
 
 def cell_grid(like: Tensor) -> Tensor:  # (h, w, 2) cells

@@ -30,16 +30,13 @@ CANONICAL_FOCAL = 1000.0  # px, of the camera that all training images were turn
 FARTHEST = 300.0  # world units (metre); the official cut of the scaled depth
 NETWORK_SIZE = (616, 1064)  # px (height, width), as in the training
 _SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling of the coarsest map needs an even grid
-_ROUNDS = {384: 4, 1024: 8}  # of refinement, by the width of the ViT (S, L)
+_ROUNDS = {12: 4, 24: 8}  # of refinement, by the number of blocks of the ViT (S, L)
 _NEAREST, _FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
 _BINS = 256  # of depth, between the two on a logarithmic scale
 _STATE_UNIT = 100.0  # metre per unit of the state's depth channel
 _EPSILON = 1e-5  # of the layer norms in the convolutional part
 _UPSAMPLING = 4
 _MASK_SCALE = 0.25  # of the upsampling logits, as in RAFT
-# From fine to coarse; the GRUs are called by twice their level's stride.
-_CONTEXT_NAMES = ("outputs04", "outputs08", "outputs16")
-_GRU_NAMES = ("gru08", "gru16", "gru32")
 
 
 @dataclass(frozen=True)
@@ -67,13 +64,7 @@ class Metric3DDepth:
         # It has registers, yet resizes its positions like the networks without.
         self._transformer = VisionTransformer(weights.below("depth_model.encoder."))
         self._decoder = weights.below("depth_model.decoder.")
-        width = self._transformer.width
-        if width not in _ROUNDS:
-            raise InputError(
-                f"expected Metric3D v2 with a ViT of width {' or '.join(map(str, _ROUNDS))}, found "
-                f"{width} in {weights.file}; give the small or the large one"
-            )
-        self._rounds = _ROUNDS[width]
+        self._rounds = _ROUNDS[self._transformer.depth]
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor:
         """Return the depth (H, W) in metres of an image taken by a camera."""
@@ -102,10 +93,8 @@ class Metric3DDepth:
         level = weights.below("upconv_3.")
         fused = level.conv("out_conv", level.below("way_trunk.").residual_unit(coarsest))
         doubled = [2 * side for side in coarse.shape[-2:]]
-        for name, branch, size in (
-            ("upconv_2.", coarse, doubled),
-            ("upconv_1.", middle, fine.shape[-2:]),
-        ):
+        branches = {"upconv_2.": (coarse, doubled), "upconv_1.": (middle, fine.shape[-2:])}
+        for name, (branch, size) in branches.items():
             level = weights.below(name)
             fused = (fused + level.below("way_branch.").residual_unit(branch)).relu()
             fused = resize(level.below("way_trunk.").residual_unit(fused), size)
@@ -153,10 +142,10 @@ def _refine(
     rounds: int,
 ) -> Tensor:  # (B, H, W) metre
     """Return the refined and upsampled depth for the canonical camera."""
-    state = _first_estimate(weights, features[:, :-2], features[:, -2:-1], features[:, -1:])
+    state = _first_estimate(weights, features)
     hidden, gates = [], []  # of the units; what the context adds to their three gates
-    for level, (name, seen) in enumerate(zip(_CONTEXT_NAMES, context, strict=True)):
-        encoder = weights.below(f"context_feature_encoder.{name}.")
+    for level, seen in enumerate(context):
+        encoder = weights.below(f"context_feature_encoder.outputs{4 * 2**level:02d}.")
         hidden.append(_context_head(encoder.below("0."), seen).tanh())
         offsets = _context_head(encoder.below("1."), seen).relu()
         gates.append(weights.conv(f"context_zqr_convs.{level}", offsets).chunk(3, 1))
@@ -172,10 +161,9 @@ def _refine(
     return (_STATE_UNIT * fine + _FARTHEST).clamp(_NEAREST, _FARTHEST)
 
 
-def _first_estimate(
-    weights: Weights, features: Tensor, depth_confidence: Tensor, normal_confidence: Tensor
-) -> Tensor:  # (B, 6, h, w)
+def _first_estimate(weights: Weights, features: Tensor) -> Tensor:  # (B, 6, h, w)
     """Return the state before refinement: depth is an expectation over logarithmic bins."""
+    features, depth_confidence, normal_confidence = features.tensor_split([-2, -1], 1)
     logits = weights.below("depth_regressor.").convs(features, channels=(_BINS,))
     bins = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _BINS, device=features.device)
     depth = torch.einsum("bkhw,k->bhw", logits.softmax(1), bins.exp())[:, None]
@@ -205,16 +193,14 @@ def _recurrent_round(
     """Update the coarsest unit three times, the middle one twice, the finest once."""
     fine, middle, coarse = hidden
     size = middle.shape[-2:]
-
-    def gru(level: int, h: Tensor, *inputs: Tensor) -> Tensor:
-        unit = weights.below(f"{_GRU_NAMES[level]}.")
-        return unit.gru(h, torch.cat(inputs, 1), gates[level])
-
-    coarse = gru(2, coarse, _halved(middle))
+    # They are called by twice their level's stride.
+    of_fine, of_middle, of_coarse = (weights.below(f"gru{n}.") for n in ("08", "16", "32"))
+    coarse = of_coarse.gru(coarse, _halved(middle), gates[2])
     for _ in range(2):
-        coarse = gru(2, coarse, _halved(middle))
-        middle = gru(1, middle, resize(_halved(fine), size), resize(coarse, size))
-    fine = gru(0, fine, state, resize(middle, fine.shape[-2:]))
+        coarse = of_coarse.gru(coarse, _halved(middle), gates[2])
+        seen = torch.cat([resize(_halved(fine), size), resize(coarse, size)], 1)
+        middle = of_middle.gru(middle, seen, gates[1])
+    fine = of_fine.gru(fine, torch.cat([state, resize(middle, fine.shape[-2:])], 1), gates[0])
     return [fine, middle, coarse]
 
 

@@ -1,4 +1,4 @@
-"""The table of pretrained networks, read by `choice.py` and `minislam doctor`.
+"""The table of pretrained networks, read by `choice.py` and `minislam weights`.
 
 To add a network, write a class that is a `FlowEstimator`, a `FeatureExtractor`, or a `DepthPrior`
 with a method `network` behind its resizing. Then add its row to NETWORKS below and to weights.csv,
@@ -41,7 +41,6 @@ class Network:
     marks: tuple[str, ...]  # tensors by which its checkpoint is recognised
     make: Callable[[Weights, NetworksConfig], Any]
     unneeded: tuple[str, ...] = ()  # parts of names that are stored in its files but not used
-    transformer: str | None = None  # prefix of the names of its vision transformer, if it has one
     is_strict: bool = True  # its official loader refuses further tensors, as we do; else we warn
 
 
@@ -57,19 +56,16 @@ NETWORKS = (
         "features", "dinov2", "DINOv2", ("blocks.0.ls1.gamma", "mask_token"),
         lambda weights, config: DinoFeatures(weights),
         unneeded=("mask_token",),  # used in training only, here and below
-        transformer="",
     ),
     Network(
         "features", "fit3d", "FiT3D", ("blocks.0.ls1.gamma", "patch_embed.proj.weight"),
         lambda weights, config: DinoFeatures(weights),
-        transformer="",
     ),
     Network(
         "depth", "metric3d", "Metric3D v2",
         ("depth_model.decoder.token2feature.read_0.readoper.project_patch.weight",),
         lambda weights, config: Metric3DDepth(weights, config.metric3d.size),
         unneeded=("mask_token", "norm3."),  # norm3 is another norm under a second name
-        transformer="depth_model.encoder.",
         is_strict=False,
     ),
     Network(
@@ -77,7 +73,6 @@ NETWORKS = (
         lambda weights, config: DepthAnything(weights, config.depth_anything),
         # The first unit of the coarsest level has nothing to add, yet it is stored.
         unneeded=("mask_token", "refinenet4.resConfUnit1."),
-        transformer="pretrained.",
     ),
 )  # fmt: skip
 LPIPS_HEADS, CLASSIFIER = "LPIPS linear weights", "an image classifier of torchvision"
@@ -101,13 +96,12 @@ def describe(weights: Weights) -> str:
         names = sorted(weights)
         unknown = f"something unknown ({len(names)} tensors, the first is {names[0]})"
         return next((other for mark, other in _OTHER_MARKS.items() if mark in weights), unknown)
-    if network.transformer is None:
+    patches = next((name for name in weights if name.endswith("patch_embed.proj.weight")), None)
+    if patches is None:
         return network.title
-    transformer = weights.below(network.transformer)
-    width = transformer["patch_embed.proj.weight"].shape[0]
-    has_registers = "register_tokens" in transformer or "reg_token" in transformer
+    has_registers = any(name.endswith(("register_tokens", "reg_token")) for name in weights)
     registers = "with registers" if has_registers else "no registers"
-    return f"{network.title} (ViT of width {width}, {registers})"
+    return f"{network.title} (ViT of width {len(weights[patches])}, {registers})"
 
 
 def load_network(

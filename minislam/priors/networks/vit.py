@@ -59,23 +59,11 @@ class VisionTransformer:
                 f"expected a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in "
                 f"{weights.file}, found one of width {self.width}; give another size of the network"
             )
-        self.depth = 0  # blocks, those that are there in a row
-        while any(name.startswith(self._block.format(self.depth)) for name in weights):
-            self.depth += 1
-        if self.depth != _BLOCKS[self.width]:
-            raise InputError(
-                f"expected {_BLOCKS[self.width]} blocks of a ViT of width {self.width} in "
-                f"{weights.file}, found {self.depth} in a row; the file is not complete"
-            )
+        self.depth = _BLOCKS[self.width]
         class_token, positions = weights["cls_token"], weights["pos_embed"]
         if positions.shape[1] == _TRAINED_GRID**2 + 1:
             # DINOv2 keeps the class token's position in row 0; timm has already added it.
             class_token, positions = class_token + positions[:, :1], positions[:, 1:]
-        if positions.shape[1] != _TRAINED_GRID**2:
-            raise InputError(
-                f"expected {_TRAINED_GRID}x{_TRAINED_GRID} positions in {weights.file}, found "
-                f"{positions.shape[1]}; only networks with patches of {PATCH} px are supported"
-            )
         leading = [class_token]
         leading += [weights[n] for n in ("register_tokens", "reg_token") if n in weights]
         self._leading = torch.cat(leading, 1)
@@ -84,27 +72,24 @@ class VisionTransformer:
     def __call__(
         self,
         image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 14
-        taps: tuple[int, ...] | None = None,  # blocks to read, counted from 0
+        taps: tuple[int, ...] = (),  # blocks to read, counted from 0, in ascending order
     ) -> list[Tokens]:
         """Return the normed tokens after the given blocks, or after the last one."""
+        taps, count = taps or (self.depth - 1,), self._leading.shape[1]
         with self.weights.autocast():
-            return self._tokens(image, (self.depth - 1,) if taps is None else taps)
-
-    def _tokens(self, image: Tensor, taps: tuple[int, ...]) -> list[Tokens]:
-        count = self._leading.shape[1]
-        patches = self.weights.conv("patch_embed.proj", image, stride=PATCH, padding=0)
-        rows, cols = patches.shape[-2:]
-        patches = patches + self._resized_positions(rows, cols)
-        leading = self._leading.expand(len(image), -1, -1)
-        x = torch.cat([leading, patches.flatten(2).mT], 1)
-        readings = {}
-        for index in range(self.depth):
-            x = _transformer_block(self.weights.below(self._block.format(index)), x)
-            if index in taps:
-                normed = self.weights.layer_norm("norm", x, _EPSILON).float()
-                grid = normed[:, count:].mT.unflatten(2, (rows, cols))
-                readings[index] = Tokens(normed[:, :count], grid)
-        return [readings[index] for index in taps]
+            patches = self.weights.conv("patch_embed.proj", image, stride=PATCH, padding=0)
+            rows, cols = patches.shape[-2:]
+            patches = patches + self._resized_positions(rows, cols)
+            leading = self._leading.expand(len(image), -1, -1)
+            x = torch.cat([leading, patches.flatten(2).mT], 1)
+            readings = []
+            for index in range(self.depth):
+                x = _transformer_block(self.weights.below(self._block.format(index)), x)
+                if index in taps:
+                    normed = self.weights.layer_norm("norm", x, _EPSILON).float()
+                    grid = normed[:, count:].mT.unflatten(2, (rows, cols))
+                    readings.append(Tokens(normed[:, :count], grid))
+        return readings
 
     def _resized_positions(self, rows: int, cols: int) -> Tensor:
         """Return the positions (1, C, rows, cols)."""

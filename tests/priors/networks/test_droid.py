@@ -18,12 +18,7 @@ from minislam.priors.features import ClassicalFeatures
 from minislam.priors.networks import droid
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid import DroidFlow, DroidFlowConfig, as_matches
-from minislam.priors.networks.droid_network import (
-    cell_grid,
-    correlation_pyramid,
-    look_up,
-    update,
-)
+from minislam.priors.networks.droid_network import cell_grid, update
 from minislam.records import Frame
 from minislam.tracking.config import LearnedFlowConfig, TrackingConfig
 from minislam.tracking.tracker import Tracker
@@ -66,17 +61,10 @@ def test_matches_are_the_networks_answer_in_pixels():
     matches = flow.match([0], [1], still())
     source, target = flow.encode(image(0)), flow.encode(image(1))
     expected = cell_grid(torch.zeros(1, 9, 12, 2))[None]
-    pyramid = correlation_pyramid(source.features, target.features)
-    answer = update(
-        weights(),
-        *source.context,
-        look_up(pyramid, expected),
-        expected,
-        expected,
-    )
-    targets = 8 * (expected + answer.revision)
-    torch.testing.assert_close(matches.targets, targets.flatten(1, 2).mT)
-    torch.testing.assert_close(matches.confidences, answer.confidence.flatten(1, 2).mT)
+    both = source.features, target.features
+    _, targets, confidences = update(weights(), *both, *source.context, expected, expected)
+    torch.testing.assert_close(matches.targets, 8 * targets.flatten(1, 2).mT)
+    torch.testing.assert_close(matches.confidences, confidences.flatten(1, 2).mT)
 
 
 def test_the_grid_is_that_of_the_camera():
@@ -97,7 +85,7 @@ def test_a_source_is_damped_by_all_its_edges_and_in_square_pixels():
     flow = flow_with_frames()
     flow.match([0, 0, 2], [1, 2, 1], still(3))
     found = flow.disparity_damping(4)
-    hidden = torch.stack([flow._edges[edge].hidden for edge in [(0, 1), (0, 2)]])
+    hidden = torch.stack([flow._edges[edge][0] for edge in [(0, 1), (0, 2)]])
     # 0.2 eta on 0.001 of the confidence and squared cells: 0.2 * 1000 * 64 on our scale.
     torch.testing.assert_close(found[0], 12800 * flow.damping(hidden).flatten())
     assert found.shape == (4, 9 * 12) and (found[2] > 0).all()

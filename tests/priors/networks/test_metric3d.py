@@ -97,18 +97,3 @@ def test_an_image_is_fitted_without_changing_its_aspect(size: tuple[int, int]):
 def test_an_odd_size_is_refused():
     with pytest.raises(InputError, match=r"multiples of 28 px, found \(616, 1066\)"):
         Metric3DDepth(weights(), (616, 1066))
-
-
-def test_a_size_of_the_network_that_does_not_exist_is_refused():
-    encoder = "depth_model.encoder."
-    tensors = {
-        f"{encoder}patch_embed.proj.weight": torch.zeros(768, 3, 14, 14),
-        f"{encoder}cls_token": torch.zeros(1, 1, 768),
-        f"{encoder}pos_embed": torch.zeros(1, 1370, 768),
-    }
-    with pytest.raises(InputError, match=r"12 blocks of a ViT of width 768 in b\.pth, found 0"):
-        Metric3DDepth(Weights(tensors, "b.pth"))
-    for block in range(12):
-        tensors[f"{encoder}blocks.0.{block}.norm1.weight"] = torch.zeros(768)
-    with pytest.raises(InputError, match=r"ViT of width 384 or 1024, found 768 in b\.pth"):
-        Metric3DDepth(Weights(tensors, "b.pth"))
