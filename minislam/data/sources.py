@@ -123,6 +123,16 @@ class Recording:
     notes: list[str] = field(default_factory=list)  # more for the description
     warnings: list[str] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        stamps = np.round(self.timestamps, 6)
+        if len(wrong := np.flatnonzero(np.diff(stamps) <= 0)):
+            index = wrong[0]
+            found = [f"{stamps[k]} s of {self.images.labels[k]}" for k in (index, index + 1)]
+            raise InputError(
+                "expected timestamps that increase by a microsecond at least, found "
+                f"{' before '.join(found)}; sort, remove or rename them"
+            )
+
     def has_truth(self) -> bool:
         """Tell whether there is anything to compare with; sensor depth alone is an input."""
         views = [*self.mask_paths, *self.static_paths, *self.novel_views]
@@ -188,14 +198,7 @@ def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
     if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
         note = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
         return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, note
-    stamps = np.array([float(path.stem) for path in paths])
-    if len(same := np.flatnonzero(~(np.diff(stamps) > 0))):
-        first, second = paths[same[0]], paths[same[0] + 1]
-        raise InputError(
-            f"expected file names that are increasing timestamps, found {first.name} and "
-            f"{second.name} in {first.parent}; remove or rename one of them"
-        )
-    return stamps, "timestamps from the file names"
+    return np.array([float(path.stem) for path in paths]), "timestamps from the file names"
 
 
 def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibration | None:

@@ -18,23 +18,20 @@ from minislam.records import Trajectory
 _TRUTH_NAMES = ("groundtruth.txt", "pose.txt")  # TUM and Bonn; Wild-SLAM
 _DEPTH_MAX_DIFFERENCE = 0.02  # second between a colour and its depth image, as TUM's associate.py
 
-_TUM_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)[_ -]?([123])(?!\d)", re.IGNORECASE)
-_BONN_NAME = re.compile(r"(?<![a-z])rgbd_bonn(?![a-z])", re.IGNORECASE)
-
-# Intrinsics of images of 640x480 px, given by the makers of the TUM RGB-D benchmark (Sturm et al.,
-# IROS 2012) and of the Bonn RGB-D Dynamic Dataset (Palazzolo et al., IROS 2019).
-_INTRINSICS = {
-    "TUM fr1": (517.3, 516.5, 318.6, 255.3),
-    "TUM fr2": (520.9, 521.0, 325.1, 249.7),
-    "TUM fr3": (535.4, 539.2, 320.1, 247.6),
-    "Bonn": (542.822841, 542.576870, 315.593520, 237.756098),
+# Intrinsics and distortion of images of 640x480 px, given by the makers of the TUM RGB-D benchmark
+# (Sturm et al., IROS 2012) and of the Bonn RGB-D Dynamic Dataset (Palazzolo et al., IROS 2019).
+_CAMERAS = {
+    "TUM fr1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "TUM fr2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "TUM fr3": ((535.4, 539.2, 320.1, 247.6), ()),
+    "Bonn": (
+        (542.822841, 542.576870, 315.593520, 237.756098),
+        (0.039903, -0.099343, -0.000730, -0.000144),
+    ),
 }
-_DISTORTIONS = {
-    "TUM fr1": BrownDistortion(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
-    "TUM fr2": BrownDistortion(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    "TUM fr3": BrownDistortion(),
-    "Bonn": BrownDistortion(0.039903, -0.099343, -0.000730, -0.000144),
-}
+_NAMES = re.compile(  # of folders
+    r"(?<![a-z])((?:freiburg|fr)[_ -]?([123])(?!\d)|rgbd_bonn(?![a-z]))", re.IGNORECASE
+)
 
 # Bonn's ground truth is the pose of a plate of markers in the axes of ROS. The makers give the
 # camera in the frame of the plate; its block is a rotation only up to a few per cent.
@@ -66,7 +63,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
     notes = [f"{len(depths)} depth"] if depths else []
     if truth_path is not None:
         trajectory = read_trajectory(truth_path)
-        if _BONN_NAME.search(folder.resolve().name):
+        if "rgbd_bonn" in folder.resolve().name.lower():
             trajectory = bonn_camera_trajectory(trajectory)
         seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
         notes.append(f"ground truth {seconds:.3g} s")
@@ -99,13 +96,7 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
             raise InputError(
                 f"expected 'timestamp filename', found '{row[:80]}' in {where}; correct this line"
             )
-        stamp = finite_numbers(fields[:1], where)[0]
-        if stamps and stamp <= stamps[-1]:
-            raise InputError(
-                f"expected timestamps that increase, found {fields[0]} after {stamps[-1]:.6f} in "
-                f"{where}; sort the list and remove double entries"
-            )
-        stamps.append(stamp)
+        stamps += finite_numbers(fields[:1], where)
         paths.append(folder / fields[1])
     missing = next((path for path in paths if not os.path.isfile(path)), None)
     if missing is not None:
@@ -134,12 +125,12 @@ def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
 
 def known_camera(text: str) -> Calibration | None:
     """Return the intrinsics of the camera that a text names: freiburg1, fr3, rgbd_bonn."""
-    tum = _TUM_NAME.search(text)
-    name = f"TUM fr{tum[1]}" if tum else "Bonn"
-    if not tum and not _BONN_NAME.search(text):
+    found = _NAMES.search(text)
+    if found is None:
         return None
-    size, origin = (640, 480), f"{name} intrinsics"
-    return Calibration(*_INTRINSICS[name], size, _DISTORTIONS[name], origin)
+    name = f"TUM fr{found[2]}" if found[2] else "Bonn"
+    intrinsics, distortion = _CAMERAS[name]
+    return Calibration(*intrinsics, (640, 480), BrownDistortion(*distortion), f"{name} intrinsics")
 
 
 def bonn_camera_trajectory(markers: Trajectory) -> Trajectory:
@@ -153,13 +144,12 @@ def bonn_camera_trajectory(markers: Trajectory) -> Trajectory:
 
 def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[Path | None]:
     """Return for each timestamp the path whose own timestamp is nearest, None if none is near."""
-    if len(others) == 0:
-        return [None] * len(stamps)
-    after = np.searchsorted(others, stamps).clip(max=len(others) - 1)
-    before = (after - 1).clip(0)
-    nearest = np.where(stamps - others[before] <= others[after] - stamps, before, after)
-    near = np.abs(others[nearest] - stamps) <= _DEPTH_MAX_DIFFERENCE
-    return [paths[index] if ok else None for index, ok in zip(nearest, near, strict=True)]
+    found: list[Path | None] = []
+    for stamp in stamps:
+        apart = np.abs(others - stamp)
+        is_near = apart.min(initial=np.inf) <= _DEPTH_MAX_DIFFERENCE
+        found.append(paths[apart.argmin()] if is_near else None)
+    return found
 
 
 def _beside(folder: Path, paths: list[Path]) -> list[Path | None]:

@@ -79,11 +79,13 @@ def test_names_with_spaces_percent_and_unicode(tmp_path: Path):
         ("1.0\n", "timestamp filename.*line 1 of .*rgb.txt"),
         ("one a.png\n", "finite numbers in line 1"),
         ("nan a.png\n", "finite numbers in line 1"),
-        ("1 a.png\n\n1 b.png\n", "increase.*line 3 of .*rgb.txt"),
-        ("2 a.png\n1 b.png\n", "increase.*line 2"),
+        ("1 a.png\n\n1 b.png\n", "increase.*1.0 s of .*a.png before 1.0 s of .*b.png"),
+        ("2 a.png\n1 b.png\n", "increase.*2.0 s of .*a.png before 1.0 s of .*b.png"),
     ],
 )
-def test_wrong_lists_name_the_line(text: str, message: str, tmp_path: Path):
+def test_wrong_lists_name_the_line_or_the_image(text: str, message: str, tmp_path: Path):
+    save(tmp_path / "a.png", picture(1))
+    save(tmp_path / "b.png", picture(2))
     (tmp_path / "rgb.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         read_tum_folder(tmp_path)
