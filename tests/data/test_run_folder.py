@@ -10,7 +10,7 @@ import torch
 
 from minislam.data import read_ply, read_trajectory
 from minislam.data.images import read_color
-from minislam.data.ply import GaussianArrays, write_ply
+from minislam.data.ply import GaussianArrays, encode_ply
 from minislam.data.run_folder import RunFolder, locked
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
@@ -41,7 +41,7 @@ def fill(run: RunFolder) -> None:
     for name in ("trajectory.txt", "keyframe_trajectory.txt"):
         write_trajectory(run.path / name, trajectory)
     gaussians = GaussianArrays(ones, ones, np.ones((2, 4), np.float32), np.zeros(2), ones)
-    write_ply(run.path / "map.ply", gaussians)
+    (run.path / "map.ply").write_bytes(encode_ply(gaussians))
     for name, text in JSON.items():
         (run.path / name).write_text(json.dumps(text))
     (run.path / "report.html").write_text("<html></html>")
