@@ -16,7 +16,6 @@ from minislam.data.preparation import ImagePreparation, KeptImages
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
-from minislam.geometry import Camera
 from minislam.records import Frame, GroundTruth, Progress
 
 _SYNTHETIC_SIZE = (320, 240)  # px
@@ -114,14 +113,10 @@ class RecordedSequence:
         return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
-        """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""
+        """Return one frame undistorted, at the size of the source: `prepare.full_camera`."""
         index = self._chosen[frame_index]
         images = self._recording.images
-        return self.prepare.full_color(images.read(index), images.labels[index])
-
-    def full_camera(self, camera: Camera) -> Camera:
-        """Return the camera of `full_image` from that of the working images."""
-        return self.prepare.full_camera(camera)
+        return self.prepare.undistort(images.read(index), images.labels[index])
 
     def source_name(self, frame_index: int) -> str:
         """Return the name of a frame's image file, or of its video with the number in it."""

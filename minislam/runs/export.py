@@ -89,7 +89,7 @@ def export_depth(run: Run, folder: Path, frames: Sequence[int], show: Show) -> N
 
 def export_masks(run: Run, folder: Path, frames: Sequence[int], show: Show) -> None:
     """Write a mask of every frame at the size of the source: 255 where static, 0 where it moves."""
-    camera = run.sequence.full_camera(run.camera)
+    camera = run.sequence.prepare.full_camera(run.camera)
     folder.mkdir(parents=True, exist_ok=True)
     for done, frame in enumerate(frames, start=1):
         atomic_write(folder / _name(frame), encode_png(static_mask(run, frame, camera)))
@@ -122,7 +122,7 @@ def _write_images(run: Run, folder: Path, frames: Sequence[int], show: Show) -> 
         )
     for part in (IMAGES, MASKS, "sparse/0"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    camera = sequence.full_camera(run.camera)
+    camera = sequence.prepare.full_camera(run.camera)
     for done, frame in enumerate(frames, start=1):
         image, mask = sequence.full_image(frame), static_mask(run, frame, camera)
         moved = run.displacement(frame)
