@@ -132,10 +132,10 @@ class RecordedSequence:
         return self.picture(self._recording.depth_paths, frame_index, read)
 
     def picture(
-        self, paths: list[Path | None], frame_index: int, read: Callable[[Path], np.ndarray]
+        self, paths: dict[int, Path], frame_index: int, read: Callable[[Path], np.ndarray]
     ) -> np.ndarray | None:
         """Return what the file that belongs to a frame shows, None if there is no such file."""
-        path = paths[self._chosen[frame_index]] if paths else None
+        path = paths.get(self._chosen[frame_index])
         if path is None:
             return None
         raw = read(path)

@@ -105,7 +105,7 @@ ImageSource = FileImages | VideoImages
 class Recording:
     """Raw images with timestamps, and whatever else lies beside them.
 
-    The lists of paths are empty, or have one entry per image: None where there is no such file.
+    The files that belong to images are kept by the number of the image, where there is such a file.
     """
 
     name: str  # short, usable as a folder name
@@ -115,9 +115,9 @@ class Recording:
     calibration: Calibration | None = None  # None: unknown
     noted_focal_length: tuple[float, str] | None = None  # over the image diagonal, and its origin
     trajectory: Trajectory | None = None  # ground truth
-    depth_paths: list[Path | None] = field(default_factory=list)
-    mask_paths: list[Path | None] = field(default_factory=list)  # True on dynamic objects
-    static_paths: list[Path | None] = field(default_factory=list)  # without dynamic objects
+    depth_paths: dict[int, Path] = field(default_factory=dict)
+    mask_paths: dict[int, Path] = field(default_factory=dict)  # True on dynamic objects
+    static_paths: dict[int, Path] = field(default_factory=dict)  # without dynamic objects
     novel_views: list[tuple[np.ndarray, Path]] = field(default_factory=list)  # (T_world_camera, .)
     lost: list[tuple[float, str]] = field(default_factory=list)  # timestamp [s], reason
     notes: list[str] = field(default_factory=list)  # more for the description
@@ -135,8 +135,8 @@ class Recording:
 
     def has_truth(self) -> bool:
         """Tell whether there is anything to compare with; sensor depth alone is an input."""
-        views = [*self.mask_paths, *self.static_paths, *self.novel_views]
-        return self.trajectory is not None or any(view is not None for view in views)
+        views = self.mask_paths or self.static_paths or self.novel_views
+        return self.trajectory is not None or bool(views)
 
 
 def read_image_folder(folder: Path) -> Recording:
@@ -221,19 +221,19 @@ def _hint(folder: Path) -> str:
     return "give a folder that holds images, a video file, or synth:NAME"
 
 
-def mask_files(images: ImageSource, masks: str, chosen: range) -> list[Path | None]:
-    """Return the mask of each image in files:FOLDER: of the image's name, or of its number."""
+def mask_files(images: ImageSource, masks: str, chosen: range) -> dict[int, Path]:
+    """Return the mask of each chosen image in files:FOLDER: of its name, or of its number."""
     folder = Path(masks.removeprefix(FILES)).expanduser()
     if not masks.startswith(FILES) or not folder.is_dir():
         raise InputError(
             f"expected --masks {FILES}FOLDER with a folder that exists, found {masks}; check it"
         )
     files = {path.stem: path for path in list_images(folder)}
-    numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
-    found = [numbered.get(index) for index in range(len(images))]
+    found = {int(name): path for name, path in files.items() if name.isdecimal()}
     if isinstance(images, FileImages) and any(path.stem in files for path in images.paths):
-        found = [files.get(path.stem) for path in images.paths]
-    if missing := [images.labels[index] for index in chosen if found[index] is None]:
+        stems = [path.stem for path in images.paths]
+        found = {k: files[stem] for k, stem in enumerate(stems) if stem in files}
+    if missing := [images.labels[index] for index in chosen if index not in found]:
         raise InputError(
             f"expected a mask of every frame in {folder}, found none for {len(missing)} of "
             f"{len(chosen)}, such as {missing[0]}; name them like the images or by number from 0, "

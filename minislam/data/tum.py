@@ -142,20 +142,20 @@ def bonn_camera_trajectory(markers: Trajectory) -> Trajectory:
     return Trajectory(markers.timestamps, poses)
 
 
-def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[Path | None]:
-    """Return for each timestamp the path whose own timestamp is nearest, None if none is near."""
-    found: list[Path | None] = []
-    for stamp in stamps:
+def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> dict[int, Path]:
+    """Return for each timestamp, by its number, the path of the nearest other if it is near."""
+    found = {}
+    for index, stamp in enumerate(stamps):
         apart = np.abs(others - stamp)
-        is_near = apart.min(initial=np.inf) <= _DEPTH_MAX_DIFFERENCE
-        found.append(paths[apart.argmin()] if is_near else None)
+        if apart.min(initial=np.inf) <= _DEPTH_MAX_DIFFERENCE:
+            found[index] = paths[apart.argmin()]
     return found
 
 
-def _beside(folder: Path, paths: list[Path]) -> list[Path | None]:
-    """Return the PNG of the same stem in another folder for each path, None where missing."""
-    candidates = [folder / (path.stem + ".png") for path in paths]
-    return [path if path.is_file() else None for path in candidates]
+def _beside(folder: Path, paths: list[Path]) -> dict[int, Path]:
+    """Return the PNG of the same stem in another folder for each path, where there is one."""
+    candidates = enumerate(folder / f"{path.stem}.png" for path in paths)
+    return {index: path for index, path in candidates if path.is_file()}
 
 
 def _novel_views(folder: Path) -> list[tuple[np.ndarray, Path]]:

@@ -16,8 +16,9 @@ def test_everything_in_the_folder_is_found(tmp_path: Path):
     recording = read_tum_folder(tum_folder(tmp_path / "my run"))
     assert recording.name == "my_run"
     np.testing.assert_allclose(recording.timestamps, 100 + np.arange(6) / 10)
-    assert [path.stem for path in recording.depth_paths] == [f"100.{n}00000" for n in range(6)]
-    assert all(recording.mask_paths) and all(recording.static_paths)
+    stems = [recording.depth_paths[index].stem for index in range(6)]
+    assert stems == [f"100.{n}00000" for n in range(6)]
+    assert len(recording.mask_paths) == len(recording.static_paths) == 6
     assert len(recording.trajectory) == 6 and len(recording.novel_views) == 2
     assert recording.calibration.fx == 40
 
@@ -39,7 +40,7 @@ def test_depth_is_associated_by_nearest_stamp(tmp_path: Path):
     near, far = "depth/100.000000.png", "depth/100.300000.png"
     (tmp_path / "depth.txt").write_text(f"100.015 {near}\n100.33 {far}\n")
     paths = read_tum_folder(tmp_path).depth_paths
-    assert paths == [tmp_path / near, None, None, None, None, None]
+    assert paths == {0: tmp_path / near}
 
 
 @pytest.mark.parametrize("where", ["README.md", "rgb.txt", "folder"])
