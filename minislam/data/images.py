@@ -35,8 +35,9 @@ def natural_key(name: str) -> list[tuple[int, int | str]]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the pictures of a folder in natural order, whatever order the system lists them."""
-    images = [path for path in folder.iterdir() if is_image(path) and path.is_file()]
+    """Return the pictures of a folder in natural order; none of a folder that is not there."""
+    entries = folder.iterdir() if folder.is_dir() else ()
+    images = [path for path in entries if is_image(path) and path.is_file()]
     return sorted(images, key=lambda path: (natural_key(path.name), path.name))
 
 

@@ -49,8 +49,7 @@ class VideoImages:
 
     def __init__(self, path: Path, limit: int | None = None) -> None:
         self.path, self.paths = path, [path]  # the files that hold the images
-        self._capture = _open_capture(path)
-        self._grabbed = 0  # calls of grab() since the start
+        self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
         self.promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less if unknown
@@ -93,9 +92,14 @@ class VideoImages:
         return np.concatenate([[], *(np.linspace(a, b, n + 2)[1:-1] for a, b, n in rows)])
 
     def _rewind(self) -> None:
-        self._capture.release()
-        self._capture = _open_capture(self.path)
-        self._grabbed = 0
+        # FFmpeg, because other back ends may take the name for a camera or a pattern.
+        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        self._grabbed = 0  # calls of grab() since the start
+        if not self._capture.isOpened():
+            raise InputError(
+                f"expected a video, but {self.path} ({self.path.stat().st_size} bytes) cannot be "
+                "opened as one; convert it to MP4 (H.264) or give a folder of images"
+            )
 
 
 ImageSource = FileImages | VideoImages
@@ -141,8 +145,8 @@ class Recording:
 
 def read_image_folder(folder: Path) -> Recording:
     """Read a folder of images, in natural order; they may lie in `images/` or `rgb/`."""
-    candidates = [folder] + [folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()]
-    paths = next((found for found in map(list_images, candidates) if found), [])
+    candidates = [folder, *(folder / name for name in _IMAGE_FOLDERS)]
+    paths = next(filter(None, map(list_images, candidates)), [])
     if not paths:
         raise InputError(f"expected PNG or JPEG images in {folder}, found none; {_hint(folder)}")
     stamps, source = stamps_of_names(paths)
@@ -240,14 +244,3 @@ def mask_files(images: ImageSource, masks: str, chosen: range) -> dict[int, Path
             "and make a black one where nothing moves"
         )
     return found
-
-
-def _open_capture(path: Path) -> cv2.VideoCapture:
-    """Open a video with FFmpeg; other back ends may take the name for a camera or a pattern."""
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    if not capture.isOpened():
-        raise InputError(
-            f"expected a video, but {path} ({path.stat().st_size} bytes) cannot be opened as one; "
-            "convert it to MP4 (H.264) or give a folder of images"
-        )
-    return capture

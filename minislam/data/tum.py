@@ -48,7 +48,7 @@ def is_tum_folder(folder: Path) -> bool:
     """Tell by the content: a list rgb.txt, or rgb/ with file names that are times in seconds."""
     if (folder / "rgb.txt").is_file():
         return True
-    images = list_images(folder / "rgb") if (folder / "rgb").is_dir() else []
+    images = list_images(folder / "rgb")
     return bool(images) and all(re.fullmatch(r"\d+\.\d+", path.stem) for path in images)
 
 
@@ -86,8 +86,8 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
     """Return timestamps and paths of the images in `kind`.txt, or else in the folder `kind`."""
     list_path = folder / f"{kind}.txt"
     if not list_path.is_file():
-        paths = list_images(folder / kind) if (folder / kind).is_dir() else []
-        return (sources.stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
+        paths = list_images(folder / kind)
+        return sources.stamps_of_names(paths)[0], paths
     stamps: list[float] = []
     paths = []
     for where, row in data_rows(read_text(list_path), str(list_path)):
