@@ -23,20 +23,16 @@ def read_trajectory(path: Path | str) -> Trajectory:
     """
     rows: list[list[float]] = []
     for where, row in data_rows(read_text(path), str(path)):
-        fields = row.split()
-        if len(fields) != 8:
+        numbers = finite_numbers(row.split(), where)
+        error = abs(math.hypot(*numbers[4:]) - 1)
+        if len(numbers) != 8 or error > _QUATERNION_NORM_TOLERANCE:
             raise InputError(
-                f"expected 8 columns, {_COLUMNS}, found {len(fields)} in {where}; correct this line"
-            )
-        numbers = finite_numbers(fields, where)
-        if not abs(math.hypot(*numbers[4:]) - 1) <= _QUATERNION_NORM_TOLERANCE:
-            raise InputError(
-                f"expected a unit quaternion qx qy qz qw, found {' '.join(fields[4:])} in {where}; "
-                "check the order of the columns"
+                f"expected 8 columns, {_COLUMNS}, the last four a unit quaternion, found "
+                f"{len(numbers)}, '{row[:200]}', in {where}; check their number and order"
             )
         if rows and numbers[0] < rows[-1][0]:
             raise InputError(
-                f"expected timestamps that increase, found {fields[0]} after {rows[-1][0]} in "
+                f"expected timestamps that increase, found {numbers[0]} after {rows[-1][0]} in "
                 f"{where}; sort the file"
             )
         if not rows or numbers[0] > rows[-1][0]:

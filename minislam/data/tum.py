@@ -63,7 +63,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
     notes = [f"{len(depths)} depth"] if depths else []
     if truth_path is not None:
         trajectory = read_trajectory(truth_path)
-        if "rgbd_bonn" in folder.resolve().name.lower():
+        if (camera := known_camera(folder.resolve().name)) and camera.origin.startswith("Bonn"):
             trajectory = bonn_camera_trajectory(trajectory)
         seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
         notes.append(f"ground truth {seconds:.3g} s")
@@ -91,19 +91,14 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
     stamps: list[float] = []
     paths = []
     for where, row in data_rows(read_text(list_path), str(list_path)):
-        fields = row.split(maxsplit=1)
-        if len(fields) != 2:
+        stamp, *name = row.split(maxsplit=1)
+        stamps += finite_numbers([stamp], where)
+        paths.append(folder.joinpath(*name))
+        if not os.path.isfile(paths[-1]):
             raise InputError(
-                f"expected 'timestamp filename', found '{row[:80]}' in {where}; correct this line"
+                f"expected 'timestamp filename' of an image in {where}, but {paths[-1]} does not "
+                "exist or is none; complete the folder or remove the line"
             )
-        stamps += finite_numbers(fields[:1], where)
-        paths.append(folder / fields[1])
-    missing = next((path for path in paths if not os.path.isfile(path)), None)
-    if missing is not None:
-        raise InputError(
-            f"expected all images of {list_path}, but {missing} does not exist; complete the "
-            "folder or remove the line"
-        )
     return np.array(stamps), paths
 
 

@@ -77,7 +77,7 @@ def test_names_with_spaces_percent_and_unicode(tmp_path: Path):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("1.0\n", "timestamp filename.*line 1 of .*rgb.txt"),
+        ("1.0\n", "timestamp filename.*line 1 of .*rgb.txt, but .* is none"),
         ("one a.png\n", "finite numbers in line 1"),
         ("nan a.png\n", "finite numbers in line 1"),
         ("1 a.png\n\n1 b.png\n", "increase.*1.0 s of .*a.png before 1.0 s of .*b.png"),
