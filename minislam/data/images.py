@@ -106,14 +106,12 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
 
 
 def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    writer = None
+    writer, code = cv2.VideoWriter(), cv2.VideoWriter.fourcc(*"VP80")
     for frame in frames:
-        if writer is None:
-            code = cv2.VideoWriter.fourcc(*"VP80")
-            writer = cv2.VideoWriter(str(file), code, rate, (frame.shape[1], frame.shape[0]))
+        if not writer.isOpened():
+            writer.open(str(file), code, rate, (frame.shape[1], frame.shape[0]))
         writer.write(frame)
-    if writer is not None:
-        writer.release()
+    writer.release()
 
 
 def _write_webp(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:
