@@ -127,11 +127,12 @@ def _keyframe_errors(
             yield "lpips_input", lpips(rendered, static)
         if moving is not None and moving.sum() >= MIN_MASK:
             yield "psnr_masked_db", psnr(rendered, static, moving)
+    if scale is None or view.depth is None:
+        return
     depth = truth.depth(view.frame_index)
-    if scale is not None and view.depth is not None and depth is not None:
-        error = depth_l1(view.depth, depth, scale, moving)
-        if error is not None:
-            yield "depth_l1_cm", CENTIMETRES * error
+    error = None if depth is None else depth_l1(view.depth, depth, scale, moving)
+    if error is not None:
+        yield "depth_l1_cm", CENTIMETRES * error
 
 
 def _beta_auroc(truth: GroundTruth, views: list[MappedView]) -> float | None:
