@@ -47,14 +47,14 @@ def run_eval(args: argparse.Namespace) -> None:
     from minislam.data.run_folder import TRAJECTORY
     from minislam.data.trajectory import read_trajectory
     from minislam.evaluation.trajectory import absolute_trajectory_error
+    from minislam.records import Trajectory
 
     if Path(args.estimate).is_dir():
         args.estimate = str(Path(args.estimate) / TRAJECTORY)
     estimate, truth = read_trajectory(args.estimate), read_trajectory(args.reference)
+    shifted = Trajectory(estimate.timestamps + args.t_offset, estimate.T_world_camera)
     alignment = _alignment(args)
-    result = absolute_trajectory_error(
-        estimate, truth, alignment, args.t_max_diff, offset=args.t_offset
-    )
+    result = absolute_trajectory_error(shifted, truth, alignment, args.t_max_diff)
     tables = {"APE w.r.t. translation part (m)": result.statistics}
     if args.rpe:
         tables = _relative_errors(args, result)
@@ -120,9 +120,7 @@ def _relative_errors(
             f"expected a --delta of seconds or of whole frames, found {args.delta:g} "
             f"{args.delta_unit}; give a positive one"
         )
-    shifts, angles = relative_pose_error(
-        result.estimate, result.truth, int(step), args.t_max_diff, args.t_offset
-    )
+    shifts, angles = relative_pose_error(result.estimate, result.truth, int(step))
     over = f"over {args.delta:g} {args.delta_unit} ({int(step)} poses)"
     return {
         f"RPE w.r.t. translation part (m) {over}": statistics(shifts),

@@ -65,9 +65,15 @@ def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
                 return arrays[value[_ARRAY]]
             if _TENSOR not in value:
                 return value
-            name, *layout = value[_TENSOR]
+            name, shape, strides, written_on = value[_TENSOR]
             if name not in tensors:
-                tensors[name] = _strided(arrays[name], gpu, *layout)
+                stored = torch.from_numpy(arrays[name])
+                # Strides fix the order of summation and thereby the last bits of sums.
+                there = "cpu" if written_on == "cpu" else gpu
+                tensor = torch.empty_strided(
+                    stored.shape, strides, dtype=stored.dtype, device=there
+                )
+                tensors[name] = tensor.copy_(stored).expand(shape)
             return tensors[name]
 
         return json.loads(arrays.pop(_TREE).tobytes(), object_hook=whole)
@@ -76,13 +82,3 @@ def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
             f"expected a checkpoint in {path}, but the file cannot be read; it is damaged or from "
             "another program: start again with --overwrite"
         ) from error
-
-
-def _strided(
-    array: np.ndarray, gpu: str, shape: list[int], strides: list[int], written_on: str
-) -> Tensor:
-    """Restore the strides: they fix the order of summation and thereby the last bits of sums."""
-    stored = torch.from_numpy(array)
-    device = "cpu" if written_on == "cpu" else gpu
-    tensor = torch.empty_strided(stored.shape, strides, dtype=stored.dtype, device=device)
-    return tensor.copy_(stored).expand(shape)

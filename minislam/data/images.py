@@ -35,8 +35,9 @@ def natural_key(name: str) -> list[tuple[int, int | str]]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the pictures of a folder in natural order, whatever order the system lists them."""
-    images = [path for path in folder.iterdir() if is_image(path) and path.is_file()]
+    """Return the pictures of a folder in natural order; none of a folder that is not there."""
+    entries = folder.iterdir() if folder.is_dir() else ()
+    images = [path for path in entries if is_image(path) and path.is_file()]
     return sorted(images, key=lambda path: (natural_key(path.name), path.name))
 
 
@@ -105,14 +106,12 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
 
 
 def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    writer = None
+    writer, code = cv2.VideoWriter(), cv2.VideoWriter.fourcc(*"VP80")
     for frame in frames:
-        if writer is None:
-            code = cv2.VideoWriter.fourcc(*"VP80")
-            writer = cv2.VideoWriter(str(file), code, rate, (frame.shape[1], frame.shape[0]))
+        if not writer.isOpened():
+            writer.open(str(file), code, rate, (frame.shape[1], frame.shape[0]))
         writer.write(frame)
-    if writer is not None:
-        writer.release()
+    writer.release()
 
 
 def _write_webp(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:

@@ -8,6 +8,7 @@ whole millimetres, and stabilisation crops the image, so that all this is a firs
 import math
 import struct
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -31,8 +32,9 @@ def noted_focal_length(path: Path) -> tuple[float, str] | None:
     try:
         with path.open("rb") as file:
             start = file.read(_HEADER)
+            file.seek(0)
             is_photo = start.startswith(b"\xff\xd8")
-            found = _of_exif(_exif_segment(start)) if is_photo else _of_video(_movie_box(file))
+            found = _of_exif(_exif_segment(start)) if is_photo else _of_video(file)
     except (OSError, struct.error, LookupError, ValueError, ArithmeticError):
         return None  # Damaged notes are no reason to refuse whole images.
     if found is None or not POSSIBLE[0] < found < POSSIBLE[1]:
@@ -72,47 +74,41 @@ def _of_exif(tiff: bytes) -> float | None:
     return found[_FOCAL_LENGTH] * per_millimetre / math.hypot(found[_WIDTH], found[_HEIGHT])
 
 
-def _movie_box(file: BinaryIO) -> bytes:
-    """Return the content of the box `moov` of a video; the images beside it are skipped."""
+def _boxes(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+    """Yield kind and length of the boxes in a video; the file stands at the content of each."""
     at = 0
-    while True:
-        file.seek(at)
-        header = file.read(16)
+    while len(header := file.read(16)) >= 8:
         size, kind = struct.unpack_from(">I4s", header)
         start = 16 if size == 1 else 8
         size = struct.unpack_from(">Q", header, 8)[0] if size == 1 else size
-        if kind == b"moov":
-            file.seek(at + start)
-            return file.read(min(size - start, _LARGEST_INDEX))
         if size < start:
-            raise ValueError("no moov")
-        at += size
-
-
-def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield kind and content of the boxes in a box."""
-    at = 0
-    while at + 8 <= len(data):
-        size, kind = struct.unpack_from(">I4s", data, at)
-        if size < 8:
             return
-        yield kind, data[at + 8 : at + size]
+        file.seek(at + start)
+        yield kind, size - start
         at += size
+        file.seek(at)
 
 
-def _of_video(box: bytes) -> float | None:
+def _inside(box: bytes) -> list[tuple[bytes, bytes]]:
+    """Return kind and content of the boxes in a box."""
+    file = BytesIO(box)
+    return [(kind, file.read(length)) for kind, length in _boxes(file)]
+
+
+def _of_video(file: BinaryIO) -> float | None:
     """Return the focal length over the image diagonal that a box, or one inside it, notes."""
-    for kind, content in _boxes(box):
+    for kind, length in _boxes(file):
         found = None
-        if kind in (b"trak", b"udta"):
-            found = _of_video(content)
+        if kind in (b"moov", b"trak", b"udta"):
+            found = _of_video(BytesIO(file.read(min(length, _LARGEST_INDEX))))
         elif kind == b"meta":
             # ISO files have four bytes of version in front of the boxes, QuickTime has none.
-            inner = dict(_boxes(content if content[4:8] == b"hdlr" else content[4:]))
-            names = [name for _, name in _boxes(inner.get(b"keys", b"")[8:])]
+            content = file.read(min(length, _LARGEST_INDEX))
+            inner = dict(_inside(content if content[4:8] == b"hdlr" else content[4:]))
+            names = [name for _, name in _inside(inner.get(b"keys", b"")[8:])]
             if VIDEO_KEY in names:
                 place = struct.pack(">I", names.index(VIDEO_KEY) + 1)  # values go by position
-                ((_, value),) = _boxes(dict(_boxes(inner[b"ilst"]))[place])
+                ((_, value),) = _inside(dict(_inside(inner[b"ilst"]))[place])
                 number = _VIDEO_NUMBERS[struct.unpack_from(">I", value)[0]]
                 found = struct.unpack_from(number, value, 8)[0] / FILM_DIAGONAL
         if found:

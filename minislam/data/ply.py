@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minislam.data.files import atomic_write, read_bytes
+from minislam.data.files import read_bytes
 from minislam.errors import InputError
 
 _SH_C0 = 0.28209479177387814  # Y_00 = 1 / (2 sqrt(pi)): colour = 0.5 + Y_00 * f_dc
@@ -38,11 +38,6 @@ class GaussianArrays:
 
     def __len__(self) -> int:
         return len(self.means)
-
-
-def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
-    """Write a Gaussian map."""
-    atomic_write(path, encode_ply(gaussians))
 
 
 def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:

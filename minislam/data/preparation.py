@@ -70,24 +70,20 @@ class ImagePreparation:
 
     def pixels(self, raw: np.ndarray, label: str) -> np.ndarray:  # (H', W', 3) uint8
         """Prepare a colour image (H, W, 3) uint8; an error calls it by its label."""
-        image = self._undistorted(raw, label, cv2.INTER_LINEAR)
+        image = self.undistort(raw, label)
         if (image.shape[1], image.shape[0]) != self._resized:
             image = cv2.resize(image, self._resized, interpolation=cv2.INTER_AREA)
         return np.ascontiguousarray(self._cropped(image))
 
-    def full_color(self, raw: np.ndarray, label: str) -> np.ndarray:  # (H, W, 3) uint8
-        """Undistort a colour image and cut unseen borders, at the size of the source."""
-        return np.ascontiguousarray(self._undistorted(raw, label, cv2.INTER_LINEAR))
-
     def full_camera(self, camera: Camera) -> Camera:
-        """Return the camera of such an image from that of the working image: the steps back."""
+        """Return the camera of an undistorted image from that of the working image."""
         left, top = self._crop
         return camera.cropped(-left, -top, *self._resized).resized(*self._window[2:])
 
     def nearest(self, raw: np.ndarray, label: str = "an image") -> np.ndarray:  # (H', W')
         """Prepare a depth image or a mask (H, W): every value is one of the raw values."""
         as_numbers = raw.astype(np.uint8) if raw.dtype == bool else raw
-        image = self._undistorted(as_numbers, label, cv2.INTER_NEAREST)
+        image = self.undistort(as_numbers, label, cv2.INTER_NEAREST)
         # cv2's nearest neighbour is off by up to half a pixel; these are the true centres.
         columns, rows = (
             ((np.arange(new) + 0.5) * old / new).astype(int)
@@ -95,7 +91,10 @@ class ImagePreparation:
         )
         return np.ascontiguousarray(self._cropped(image[rows][:, columns])).astype(raw.dtype)
 
-    def _undistorted(self, raw: np.ndarray, label: str, interpolation: int) -> np.ndarray:
+    def undistort(
+        self, raw: np.ndarray, label: str, interpolation: int = cv2.INTER_LINEAR
+    ) -> np.ndarray:  # (H, W, ...)
+        """Undistort an image and cut unseen borders, at the size of the source."""
         width, height = self._raw_size
         if raw.shape[:2] != (height, width):
             raise InputError(

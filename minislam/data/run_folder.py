@@ -8,13 +8,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.files import atomic_write, read_bytes, read_json, require_free, write_text
-from minislam.data.images import encode_png
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
@@ -23,17 +21,17 @@ CONFIG, RUN, METRICS, CAMERA = "config.json", "run.json", "metrics.json", "camer
 TRAJECTORY, KEYFRAME_TRAJECTORY = "trajectory.txt", "keyframe_trajectory.txt"
 LOST_FRAMES, MAP, MLP, REPORT = "lost_frames.txt", "map.ply", "uncertainty_mlp.pt", "report.html"
 CHECKPOINT, VIEWER, CLIP, LOG = "checkpoint.npz", "viewer.html", "clip.webp", "log.txt"
-KEYFRAME_KINDS = ("input", "render", "depth", "beta")
+_KEYFRAME_KINDS = ("input", "render", "depth", "beta")
 
 _FILES = (
     CONFIG, RUN, METRICS, CAMERA, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MLP, REPORT,
     CHECKPOINT, VIEWER, CLIP, LOG, "map_sh.ply",
 )  # fmt: skip
 KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
-PLOT_NAMES = ("ate_over_time", "trajectory", "losses", "gaussians", "health", "overview")
+_PLOT_NAMES = ("ate_over_time", "trajectory", "losses", "gaussians", "health", "overview")
 _OURS = re.compile(  # every path that a run writes, inside its folder, also half-written
-    rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_({'|'.join(KEYFRAME_KINDS)})\.png|"
-    rf"{PLOTS}/({'|'.join(PLOT_NAMES)})\.png)(\.[0-9a-f]{{8}}\.tmp)?"
+    rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_({'|'.join(_KEYFRAME_KINDS)})\.png|"
+    rf"{PLOTS}/({'|'.join(_PLOT_NAMES)})\.png)(\.[0-9a-f]{{8}}\.tmp)?"
 )
 _CONFIG_PARTS = {"sequence", "input", "priors", "tracking", "mapping"}  # of every config.json
 
@@ -104,16 +102,10 @@ class RunFolder:
         torch.save({name: values.cpu() for name, values in state.items()}, buffer)
         atomic_write(self.path / MLP, buffer.getvalue())
 
-    def write_keyframe_image(self, frame_index: int, kind: str, image: np.ndarray) -> None:
-        """Write one picture of a keyframe: (H, W, 3) RGB in [0, 1]; kind is input, render ..."""
-        assert kind in KEYFRAME_KINDS, kind
-        name = f"{frame_index:06d}_{kind}.png"
-        atomic_write(self.path / KEYFRAMES / name, encode_png(np.asarray(image)))
-
-    def write_plot(self, name: str, png: bytes) -> None:
-        """Write the PNG bytes of a figure to plots/NAME.png."""
-        assert name in PLOT_NAMES, name
-        atomic_write(self.path / PLOTS / f"{name}.png", png)
+    def write_picture(self, name: str, png: bytes) -> None:
+        """Write a plot, plots/NAME.png, or what a keyframe shows, keyframes/000123_KIND.png."""
+        assert _OURS.fullmatch(name), name
+        atomic_write(self.path / name, png)
 
     def write_checkpoint(self, tree: dict[str, Any]) -> None:
         """Write the state from which an interrupted run can continue."""

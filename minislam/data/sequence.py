@@ -16,7 +16,6 @@ from minislam.data.preparation import ImagePreparation, KeptImages
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
-from minislam.geometry import Camera
 from minislam.records import Frame, GroundTruth, Progress
 
 _SYNTHETIC_SIZE = (320, 240)  # px
@@ -61,11 +60,6 @@ class RecordedSequence:
                 f"{len(recording.images)}; choose a smaller start"
             )
         stamps = recording.timestamps[self._chosen.start : self._chosen.stop : self._chosen.step]
-        if np.any(np.diff(np.round(stamps, 6)) <= 0):
-            raise InputError(
-                f"expected timestamps at least a microsecond apart, found closer ones in "
-                f"{recording.name}; name the images by seconds, or by numbers from 0"
-            )
         self.lost = [row for row in recording.lost if stamps[0] < row[0] < stamps[-1]]
         self.checksums: dict[int, int] = {}
         self._kept = KeptImages()
@@ -108,7 +102,7 @@ class RecordedSequence:
 
     def frame(self, frame_index: int) -> Frame:
         """Return one frame; timestamps are those of the source, whatever the stride."""
-        index = self.source_index(frame_index)
+        index = self._chosen[frame_index]
 
         def prepare() -> np.ndarray:
             raw = self._recording.images.read(index)
@@ -119,24 +113,14 @@ class RecordedSequence:
         return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
-        """Return one frame undistorted, at the size of the source; `full_camera` belongs to it."""
-        index = self.source_index(frame_index)
+        """Return one frame undistorted, at the size of the source: `prepare.full_camera`."""
+        index = self._chosen[frame_index]
         images = self._recording.images
-        return self.prepare.full_color(images.read(index), images.labels[index])
-
-    def full_camera(self, camera: Camera) -> Camera:
-        """Return the camera of `full_image` from that of the working images."""
-        return self.prepare.full_camera(camera)
-
-    def source_index(self, frame_index: int) -> int:
-        """Return the position of a frame in the source, before start and stride."""
-        if not 0 <= frame_index < len(self):
-            raise IndexError(f"frame {frame_index} of a sequence of {len(self)}")
-        return self._chosen[frame_index]
+        return self.prepare.undistort(images.read(index), images.labels[index])
 
     def source_name(self, frame_index: int) -> str:
         """Return the name of a frame's image file, or of its video with the number in it."""
-        return self._recording.images.names[self.source_index(frame_index)]
+        return self._recording.images.names[self._chosen[frame_index]]
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
@@ -148,11 +132,10 @@ class RecordedSequence:
         return self.picture(self._recording.depth_paths, frame_index, read)
 
     def picture(
-        self, paths: list[Path | None], frame_index: int, read: Callable[[Path], np.ndarray]
+        self, paths: dict[int, Path], frame_index: int, read: Callable[[Path], np.ndarray]
     ) -> np.ndarray | None:
         """Return what the file that belongs to a frame shows, None if there is no such file."""
-        index = self.source_index(frame_index)
-        path = paths[index] if paths else None
+        path = paths.get(self._chosen[frame_index])
         if path is None:
             return None
         raw = read(path)

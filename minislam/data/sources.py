@@ -49,8 +49,7 @@ class VideoImages:
 
     def __init__(self, path: Path, limit: int | None = None) -> None:
         self.path, self.paths = path, [path]  # the files that hold the images
-        self._capture = _open_capture(path)
-        self._grabbed = 0  # calls of grab() since the start
+        self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
         self.promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less if unknown
@@ -93,9 +92,14 @@ class VideoImages:
         return np.concatenate([[], *(np.linspace(a, b, n + 2)[1:-1] for a, b, n in rows)])
 
     def _rewind(self) -> None:
-        self._capture.release()
-        self._capture = _open_capture(self.path)
-        self._grabbed = 0
+        # FFmpeg, because other back ends may take the name for a camera or a pattern.
+        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        self._grabbed = 0  # calls of grab() since the start
+        if not self._capture.isOpened():
+            raise InputError(
+                f"expected a video, but {self.path} ({self.path.stat().st_size} bytes) cannot be "
+                "opened as one; convert it to MP4 (H.264) or give a folder of images"
+            )
 
 
 ImageSource = FileImages | VideoImages
@@ -105,7 +109,7 @@ ImageSource = FileImages | VideoImages
 class Recording:
     """Raw images with timestamps, and whatever else lies beside them.
 
-    The lists of paths are empty, or have one entry per image: None where there is no such file.
+    The files that belong to images are kept by the number of the image, where there is such a file.
     """
 
     name: str  # short, usable as a folder name
@@ -115,24 +119,34 @@ class Recording:
     calibration: Calibration | None = None  # None: unknown
     noted_focal_length: tuple[float, str] | None = None  # over the image diagonal, and its origin
     trajectory: Trajectory | None = None  # ground truth
-    depth_paths: list[Path | None] = field(default_factory=list)
-    mask_paths: list[Path | None] = field(default_factory=list)  # True on dynamic objects
-    static_paths: list[Path | None] = field(default_factory=list)  # without dynamic objects
+    depth_paths: dict[int, Path] = field(default_factory=dict)
+    mask_paths: dict[int, Path] = field(default_factory=dict)  # True on dynamic objects
+    static_paths: dict[int, Path] = field(default_factory=dict)  # without dynamic objects
     novel_views: list[tuple[np.ndarray, Path]] = field(default_factory=list)  # (T_world_camera, .)
     lost: list[tuple[float, str]] = field(default_factory=list)  # timestamp [s], reason
     notes: list[str] = field(default_factory=list)  # more for the description
     warnings: list[str] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        stamps = np.round(self.timestamps, 6)
+        if len(wrong := np.flatnonzero(np.diff(stamps) <= 0)):
+            index = wrong[0]
+            found = [f"{stamps[k]} s of {self.images.labels[k]}" for k in (index, index + 1)]
+            raise InputError(
+                "expected timestamps that increase by a microsecond at least, found "
+                f"{' before '.join(found)}; sort, remove or rename them"
+            )
+
     def has_truth(self) -> bool:
         """Tell whether there is anything to compare with; sensor depth alone is an input."""
-        views = [*self.mask_paths, *self.static_paths, *self.novel_views]
-        return self.trajectory is not None or any(view is not None for view in views)
+        views = self.mask_paths or self.static_paths or self.novel_views
+        return self.trajectory is not None or bool(views)
 
 
 def read_image_folder(folder: Path) -> Recording:
     """Read a folder of images, in natural order; they may lie in `images/` or `rgb/`."""
-    candidates = [folder] + [folder / name for name in _IMAGE_FOLDERS if (folder / name).is_dir()]
-    paths = next((found for found in map(list_images, candidates) if found), [])
+    candidates = [folder, *(folder / name for name in _IMAGE_FOLDERS)]
+    paths = next(filter(None, map(list_images, candidates)), [])
     if not paths:
         raise InputError(f"expected PNG or JPEG images in {folder}, found none; {_hint(folder)}")
     stamps, source = stamps_of_names(paths)
@@ -188,14 +202,7 @@ def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
     if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
         note = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
         return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, note
-    stamps = np.array([float(path.stem) for path in paths])
-    if len(same := np.flatnonzero(~(np.diff(stamps) > 0))):
-        first, second = paths[same[0]], paths[same[0] + 1]
-        raise InputError(
-            f"expected file names that are increasing timestamps, found {first.name} and "
-            f"{second.name} in {first.parent}; remove or rename one of them"
-        )
-    return stamps, "timestamps from the file names"
+    return np.array([float(path.stem) for path in paths]), "timestamps from the file names"
 
 
 def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibration | None:
@@ -218,33 +225,22 @@ def _hint(folder: Path) -> str:
     return "give a folder that holds images, a video file, or synth:NAME"
 
 
-def mask_files(images: ImageSource, masks: str, chosen: range) -> list[Path | None]:
-    """Return the mask of each image in files:FOLDER: of the image's name, or of its number."""
+def mask_files(images: ImageSource, masks: str, chosen: range) -> dict[int, Path]:
+    """Return the mask of each chosen image in files:FOLDER: of its name, or of its number."""
     folder = Path(masks.removeprefix(FILES)).expanduser()
     if not masks.startswith(FILES) or not folder.is_dir():
         raise InputError(
             f"expected --masks {FILES}FOLDER with a folder that exists, found {masks}; check it"
         )
     files = {path.stem: path for path in list_images(folder)}
-    numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
-    found = [numbered.get(index) for index in range(len(images))]
+    found = {int(name): path for name, path in files.items() if name.isdecimal()}
     if isinstance(images, FileImages) and any(path.stem in files for path in images.paths):
-        found = [files.get(path.stem) for path in images.paths]
-    if missing := [images.labels[index] for index in chosen if found[index] is None]:
+        stems = [path.stem for path in images.paths]
+        found = {k: files[stem] for k, stem in enumerate(stems) if stem in files}
+    if missing := [images.labels[index] for index in chosen if index not in found]:
         raise InputError(
             f"expected a mask of every frame in {folder}, found none for {len(missing)} of "
             f"{len(chosen)}, such as {missing[0]}; name them like the images or by number from 0, "
             "and make a black one where nothing moves"
         )
     return found
-
-
-def _open_capture(path: Path) -> cv2.VideoCapture:
-    """Open a video with FFmpeg; other back ends may take the name for a camera or a pattern."""
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    if not capture.isOpened():
-        raise InputError(
-            f"expected a video, but {path} ({path.stat().st_size} bytes) cannot be opened as one; "
-            "convert it to MP4 (H.264) or give a folder of images"
-        )
-    return capture

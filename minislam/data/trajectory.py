@@ -23,20 +23,16 @@ def read_trajectory(path: Path | str) -> Trajectory:
     """
     rows: list[list[float]] = []
     for where, row in data_rows(read_text(path), str(path)):
-        fields = row.split()
-        if len(fields) != 8:
+        numbers = finite_numbers(row.split(), where)
+        error = abs(math.hypot(*numbers[4:]) - 1)
+        if len(numbers) != 8 or error > _QUATERNION_NORM_TOLERANCE:
             raise InputError(
-                f"expected 8 columns, {_COLUMNS}, found {len(fields)} in {where}; correct this line"
-            )
-        numbers = finite_numbers(fields, where)
-        if not abs(math.hypot(*numbers[4:]) - 1) <= _QUATERNION_NORM_TOLERANCE:
-            raise InputError(
-                f"expected a unit quaternion qx qy qz qw, found {' '.join(fields[4:])} in {where}; "
-                "check the order of the columns"
+                f"expected 8 columns, {_COLUMNS}, the last four a unit quaternion, found "
+                f"{len(numbers)}, '{row[:200]}', in {where}; check their number and order"
             )
         if rows and numbers[0] < rows[-1][0]:
             raise InputError(
-                f"expected timestamps that increase, found {fields[0]} after {rows[-1][0]} in "
+                f"expected timestamps that increase, found {numbers[0]} after {rows[-1][0]} in "
                 f"{where}; sort the file"
             )
         if not rows or numbers[0] > rows[-1][0]:
@@ -56,15 +52,12 @@ def write_trajectory(path: Path | str, trajectory: Trajectory) -> None:
     An empty trajectory gives a file with the header only.
     """
     poses = np.asarray(trajectory.T_world_camera, dtype=np.float64).reshape(-1, 4, 4)
-    stamps = [f"{stamp:.6f}" for stamp in trajectory.timestamps]
-    if not (np.isfinite(poses).all() and np.isfinite(trajectory.timestamps).all()):
+    stamps = np.round(trajectory.timestamps, 6)
+    is_finite = np.isfinite(poses).all() and np.isfinite(stamps).all()
+    if not is_finite or np.any(np.diff(stamps) <= 0):
         raise InputError(
-            "expected a finite trajectory, found NaN or infinity; leave out lost poses"
-        )
-    if np.any(np.diff(np.array(stamps, dtype=np.float64)) <= 0):
-        raise InputError(
-            "expected timestamps that increase by at least a microsecond, found equal or falling "
-            "ones; pass the timestamps of the source"
+            "expected finite poses, and timestamps that increase by at least a microsecond, found "
+            "others; leave out lost poses, and pass the timestamps of the source"
         )
     quats_xyzw = np.zeros((0, 4))
     if len(poses):
@@ -72,5 +65,5 @@ def write_trajectory(path: Path | str, trajectory: Trajectory) -> None:
     # Adding zero turns -0.0 into 0.0.
     values = np.concatenate([poses[:, :3, 3], quats_xyzw], axis=1) + 0.0
     rows = (" ".join(f"{value:.9g}" for value in row) for row in values)
-    lines = [f"{stamp} {row}\n" for stamp, row in zip(stamps, rows, strict=True)]
+    lines = [f"{stamp:.6f} {row}\n" for stamp, row in zip(stamps, rows, strict=True)]
     write_text(path, "".join([f"# {_COLUMNS}\n# second, world units, camera to world\n", *lines]))

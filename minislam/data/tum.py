@@ -18,23 +18,20 @@ from minislam.records import Trajectory
 _TRUTH_NAMES = ("groundtruth.txt", "pose.txt")  # TUM and Bonn; Wild-SLAM
 _DEPTH_MAX_DIFFERENCE = 0.02  # second between a colour and its depth image, as TUM's associate.py
 
-_TUM_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)[_ -]?([123])(?!\d)", re.IGNORECASE)
-_BONN_NAME = re.compile(r"(?<![a-z])rgbd_bonn(?![a-z])", re.IGNORECASE)
-
-# Intrinsics of images of 640x480 px, given by the makers of the TUM RGB-D benchmark (Sturm et al.,
-# IROS 2012) and of the Bonn RGB-D Dynamic Dataset (Palazzolo et al., IROS 2019).
-_INTRINSICS = {
-    "TUM fr1": (517.3, 516.5, 318.6, 255.3),
-    "TUM fr2": (520.9, 521.0, 325.1, 249.7),
-    "TUM fr3": (535.4, 539.2, 320.1, 247.6),
-    "Bonn": (542.822841, 542.576870, 315.593520, 237.756098),
+# Intrinsics and distortion of images of 640x480 px, given by the makers of the TUM RGB-D benchmark
+# (Sturm et al., IROS 2012) and of the Bonn RGB-D Dynamic Dataset (Palazzolo et al., IROS 2019).
+_CAMERAS = {
+    "TUM fr1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "TUM fr2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "TUM fr3": ((535.4, 539.2, 320.1, 247.6), ()),
+    "Bonn": (
+        (542.822841, 542.576870, 315.593520, 237.756098),
+        (0.039903, -0.099343, -0.000730, -0.000144),
+    ),
 }
-_DISTORTIONS = {
-    "TUM fr1": BrownDistortion(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
-    "TUM fr2": BrownDistortion(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    "TUM fr3": BrownDistortion(),
-    "Bonn": BrownDistortion(0.039903, -0.099343, -0.000730, -0.000144),
-}
+_NAMES = re.compile(  # of folders
+    r"(?<![a-z])((?:freiburg|fr)[_ -]?([123])(?!\d)|rgbd_bonn(?![a-z]))", re.IGNORECASE
+)
 
 # Bonn's ground truth is the pose of a plate of markers in the axes of ROS. The makers give the
 # camera in the frame of the plate; its block is a rotation only up to a few per cent.
@@ -51,7 +48,7 @@ def is_tum_folder(folder: Path) -> bool:
     """Tell by the content: a list rgb.txt, or rgb/ with file names that are times in seconds."""
     if (folder / "rgb.txt").is_file():
         return True
-    images = list_images(folder / "rgb") if (folder / "rgb").is_dir() else []
+    images = list_images(folder / "rgb")
     return bool(images) and all(re.fullmatch(r"\d+\.\d+", path.stem) for path in images)
 
 
@@ -66,7 +63,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
     notes = [f"{len(depths)} depth"] if depths else []
     if truth_path is not None:
         trajectory = read_trajectory(truth_path)
-        if _BONN_NAME.search(folder.resolve().name):
+        if (camera := known_camera(folder.resolve().name)) and camera.origin.startswith("Bonn"):
             trajectory = bonn_camera_trajectory(trajectory)
         seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
         notes.append(f"ground truth {seconds:.3g} s")
@@ -89,30 +86,19 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
     """Return timestamps and paths of the images in `kind`.txt, or else in the folder `kind`."""
     list_path = folder / f"{kind}.txt"
     if not list_path.is_file():
-        paths = list_images(folder / kind) if (folder / kind).is_dir() else []
-        return (sources.stamps_of_names(paths)[0], paths) if paths else (np.zeros(0), [])
+        paths = list_images(folder / kind)
+        return sources.stamps_of_names(paths)[0], paths
     stamps: list[float] = []
     paths = []
     for where, row in data_rows(read_text(list_path), str(list_path)):
-        fields = row.split(maxsplit=1)
-        if len(fields) != 2:
+        stamp, *name = row.split(maxsplit=1)
+        stamps += finite_numbers([stamp], where)
+        paths.append(folder.joinpath(*name))
+        if not os.path.isfile(paths[-1]):
             raise InputError(
-                f"expected 'timestamp filename', found '{row[:80]}' in {where}; correct this line"
+                f"expected 'timestamp filename' of an image in {where}, but {paths[-1]} does not "
+                "exist or is none; complete the folder or remove the line"
             )
-        stamp = finite_numbers(fields[:1], where)[0]
-        if stamps and stamp <= stamps[-1]:
-            raise InputError(
-                f"expected timestamps that increase, found {fields[0]} after {stamps[-1]:.6f} in "
-                f"{where}; sort the list and remove double entries"
-            )
-        stamps.append(stamp)
-        paths.append(folder / fields[1])
-    missing = next((path for path in paths if not os.path.isfile(path)), None)
-    if missing is not None:
-        raise InputError(
-            f"expected all images of {list_path}, but {missing} does not exist; complete the "
-            "folder or remove the line"
-        )
     return np.array(stamps), paths
 
 
@@ -134,12 +120,12 @@ def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
 
 def known_camera(text: str) -> Calibration | None:
     """Return the intrinsics of the camera that a text names: freiburg1, fr3, rgbd_bonn."""
-    tum = _TUM_NAME.search(text)
-    name = f"TUM fr{tum[1]}" if tum else "Bonn"
-    if not tum and not _BONN_NAME.search(text):
+    found = _NAMES.search(text)
+    if found is None:
         return None
-    size, origin = (640, 480), f"{name} intrinsics"
-    return Calibration(*_INTRINSICS[name], size, _DISTORTIONS[name], origin)
+    name = f"TUM fr{found[2]}" if found[2] else "Bonn"
+    intrinsics, distortion = _CAMERAS[name]
+    return Calibration(*intrinsics, (640, 480), BrownDistortion(*distortion), f"{name} intrinsics")
 
 
 def bonn_camera_trajectory(markers: Trajectory) -> Trajectory:
@@ -151,21 +137,20 @@ def bonn_camera_trajectory(markers: Trajectory) -> Trajectory:
     return Trajectory(markers.timestamps, poses)
 
 
-def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> list[Path | None]:
-    """Return for each timestamp the path whose own timestamp is nearest, None if none is near."""
-    if len(others) == 0:
-        return [None] * len(stamps)
-    after = np.searchsorted(others, stamps).clip(max=len(others) - 1)
-    before = (after - 1).clip(0)
-    nearest = np.where(stamps - others[before] <= others[after] - stamps, before, after)
-    near = np.abs(others[nearest] - stamps) <= _DEPTH_MAX_DIFFERENCE
-    return [paths[index] if ok else None for index, ok in zip(nearest, near, strict=True)]
+def _nearest(stamps: np.ndarray, others: np.ndarray, paths: list[Path]) -> dict[int, Path]:
+    """Return for each timestamp, by its number, the path of the nearest other if it is near."""
+    found = {}
+    for index, stamp in enumerate(stamps):
+        apart = np.abs(others - stamp)
+        if apart.min(initial=np.inf) <= _DEPTH_MAX_DIFFERENCE:
+            found[index] = paths[apart.argmin()]
+    return found
 
 
-def _beside(folder: Path, paths: list[Path]) -> list[Path | None]:
-    """Return the PNG of the same stem in another folder for each path, None where missing."""
-    candidates = [folder / (path.stem + ".png") for path in paths]
-    return [path if path.is_file() else None for path in candidates]
+def _beside(folder: Path, paths: list[Path]) -> dict[int, Path]:
+    """Return the PNG of the same stem in another folder for each path, where there is one."""
+    candidates = enumerate(folder / f"{path.stem}.png" for path in paths)
+    return {index: path for index, path in candidates if path.is_file()}
 
 
 def _novel_views(folder: Path) -> list[tuple[np.ndarray, Path]]:

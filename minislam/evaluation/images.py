@@ -26,11 +26,7 @@ def psnr(
     squared = (image - reference) ** 2
     if mask is not None:
         mask = np.asarray(mask, dtype=bool)
-        if mask.shape != squared.shape[:2] or not mask.any():
-            raise InputError(
-                f"expected a mask of {squared.shape[:2]} with at least one pixel, found "
-                f"{mask.shape} with {int(mask.sum())}; choose another mask or leave it out"
-            )
+        assert mask.shape == squared.shape[:2] and mask.any(), (mask.shape, squared.shape)
         squared = squared[mask]
     error = float(squared.mean())
     return float("inf") if error == 0 else float(-10 * np.log10(error))
@@ -42,11 +38,7 @@ def ssim(
 ) -> float:  # at most 1
     """Return the mean structural similarity over all windows that lie inside the image."""
     x, y = _checked(image, reference)
-    if min(x.shape[:2]) < _SSIM_WINDOW:
-        raise InputError(
-            f"expected images of at least {_SSIM_WINDOW}x{_SSIM_WINDOW} px, found "
-            f"{x.shape[1]}x{x.shape[0]}; SSIM compares windows of that size"
-        )
+    assert min(x.shape[:2]) >= _SSIM_WINDOW, x.shape
     mean_x, mean_y = _window_mean(x), _window_mean(y)
     variance_x = _window_mean(x * x) - mean_x**2
     variance_y = _window_mean(y * y) - mean_y**2
@@ -69,11 +61,7 @@ def depth_l1(
     """
     depth, reference = np.asarray(depth, np.float64), np.asarray(reference, np.float64)
     hidden = np.zeros(depth.shape, bool) if moving is None else np.asarray(moving, bool)
-    if not depth.shape == reference.shape == hidden.shape:
-        raise InputError(
-            f"expected depths and mask of one size, found {depth.shape}, {reference.shape} and "
-            f"{hidden.shape}; render at the size of the reference"
-        )
+    assert depth.shape == reference.shape == hidden.shape, (depth.shape, reference.shape)
     known = (depth > 0) & (reference > 0) & ~hidden
     if not known.any():
         return None
@@ -114,10 +102,6 @@ def _window_mean(values: np.ndarray) -> np.ndarray:
 
 def _checked(image: ArrayLike, reference: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
-    if image.shape != reference.shape or image.ndim not in (2, 3):
-        raise InputError(
-            f"expected two images of one size, found {image.shape} and {reference.shape}; "
-            "render at the size of the reference"
-        )
+    assert image.shape == reference.shape and image.ndim in (2, 3), (image.shape, reference.shape)
     # A renderer may overshoot; what is shown and stored is clipped, so that is compared.
     return np.clip(image, 0, 1), np.clip(reference, 0, 1)

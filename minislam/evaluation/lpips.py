@@ -73,13 +73,9 @@ class Lpips:
     ) -> float:
         """Return the distance of two images, 0 for equal ones."""
         both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
-        shape, other = (tuple(x.shape) for x in both)
-        if shape != other or len(shape) != 3 or shape[2] != 3:
-            raise InputError(
-                f"expected two RGB images of one size, found {shape} and {other}; render at the "
-                "size of the reference"
-            )
-        self.require_size(shape[1], shape[0])
+        height, width, _ = shape = both[0].shape
+        assert both[1].shape == shape and shape[2] == 3, (shape, both[1].shape)
+        self.require_size(width, height)
         total = 0.0
         with torch.no_grad():
             for level, (a, b) in enumerate(zip(*map(self._features, both), strict=True)):

@@ -1,7 +1,7 @@
 """All measures of one run against the ground truth, as in the paper (Sec. 4)."""
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +10,12 @@ from minislam.errors import InputError
 from minislam.evaluation.images import auroc, depth_l1, psnr, ssim
 from minislam.evaluation.trajectory import (
     absolute_trajectory_error,
+    centres,
     oriented_truth_to_estimate,
+    paired,
     straight_line_error,
-    truth_to_estimate,
 )
+from minislam.geometry.alignment import umeyama
 from minislam.records import GroundTruth, Trajectory
 
 MAX_DIFFERENCE = 0.02  # second between a frame and its true pose; TUM stamps differ by 0.005
@@ -59,8 +61,12 @@ def measure_run(
         if metrics["ate_all_cm"] is not None:
             aligned = absolute_trajectory_error(trajectory, path, max_difference=MAX_DIFFERENCE)
             scale = aligned.similarity.scale
-            _compare_novel_views(values, truth.novel_views(), path, trajectory, render, lpips)
-    _compare_keyframes(values, truth, views, scale, render, lpips)
+            pair = paired(trajectory, path, MAX_DIFFERENCE)
+            for name, value in _novel_errors(truth.novel_views(), *pair, render, lpips):
+                values[name].append(value)
+    for view in views:
+        for name, value in _keyframe_errors(view, truth, scale, render, lpips):
+            values[name].append(value)
     metrics |= {name: float(np.mean(found)) for name, found in values.items()}
     metrics["beta_auroc"] = _beta_auroc(truth, views)
     return metrics
@@ -75,70 +81,65 @@ def ate_cm(estimate: Trajectory, truth: Trajectory) -> float | None:
     return CENTIMETRES * error.statistics["rmse"]
 
 
-def _compare_novel_views(
-    values: dict[str, list[float]],  # to be added to
+def _novel_errors(
     views: list[tuple[np.ndarray, np.ndarray]],  # T_world_camera, image
-    path: Trajectory,  # true
-    trajectory: Trajectory,
+    estimate: Trajectory,  # (N) as the path, paired
+    path: Trajectory,  # (N) true
     render: Render,
     lpips: ImageDistance | None,
-) -> None:
+) -> Iterator[tuple[str, float]]:
     """Compare held-out static views with renderings from their Sim(3)-aligned poses.
 
-    The paper aligns by camera centres. `psnr_novel_oriented_db` aligns by the orientations too,
-    so that errors of the alignment count less and errors of the map count more.
+    The paper aligns by camera centres, here into the world of the map, where the error counts.
+    `psnr_novel_oriented_db` aligns by the orientations too, so that errors of the alignment count
+    less and errors of the map count more.
     """
     if not views:
         return
-    by_centres = truth_to_estimate(trajectory, path, MAX_DIFFERENCE)
-    by_cameras = oriented_truth_to_estimate(trajectory, path, MAX_DIFFERENCE)
+    by_centres = umeyama(centres(path), centres(estimate))
+    by_cameras = oriented_truth_to_estimate(estimate, path)
     for pose, image in views:
         rendered = render(by_centres.transform_poses(pose))
-        values["psnr_novel_db"].append(psnr(rendered, image))
-        values["ssim_novel"].append(ssim(rendered, image))
+        yield "psnr_novel_db", psnr(rendered, image)
+        yield "ssim_novel", ssim(rendered, image)
         if lpips is not None:
-            values["lpips_novel"].append(lpips(rendered, image))
+            yield "lpips_novel", lpips(rendered, image)
         rendered = render(by_cameras.transform_poses(pose))
-        values["psnr_novel_oriented_db"].append(psnr(rendered, image))
+        yield "psnr_novel_oriented_db", psnr(rendered, image)
 
 
-def _compare_keyframes(
-    values: dict[str, list[float]],  # to be added to
+def _keyframe_errors(
+    view: MappedView,
     truth: GroundTruth,
-    views: list[MappedView],
     scale: float | None,  # of the truth per unit of the map, None: unknown
     render: Render,
     lpips: ImageDistance | None,
-) -> None:
-    """Compare the map, seen from the keyframes, with image and depth of the static scene.
+) -> Iterator[tuple[str, float]]:
+    """Compare the map, seen from a keyframe, with image and depth of the static scene.
 
     `psnr_masked_db` counts only pixels that a dynamic object covered: its ghost would be there.
     """
-    for view in views:
-        moving, static = truth.moving_mask(view.frame_index), truth.static_image(view.frame_index)
-        if static is not None:
-            rendered = render(view.T_world_camera)
-            values["psnr_input_db"].append(psnr(rendered, static))
-            if lpips is not None:
-                values["lpips_input"].append(lpips(rendered, static))
-            if moving is not None and moving.sum() >= MIN_MASK:
-                values["psnr_masked_db"].append(psnr(rendered, static, moving))
-        if scale is None or view.depth is None:
-            continue
-        depth = truth.depth(view.frame_index)
-        error = None if depth is None else depth_l1(view.depth, depth, scale, moving)
-        if error is not None:
-            values["depth_l1_cm"].append(CENTIMETRES * error)
+    moving, static = truth.moving_mask(view.frame_index), truth.static_image(view.frame_index)
+    if static is not None:
+        rendered = render(view.T_world_camera)
+        yield "psnr_input_db", psnr(rendered, static)
+        if lpips is not None:
+            yield "lpips_input", lpips(rendered, static)
+        if moving is not None and moving.sum() >= MIN_MASK:
+            yield "psnr_masked_db", psnr(rendered, static, moving)
+    if scale is None or view.depth is None:
+        return
+    depth = truth.depth(view.frame_index)
+    error = None if depth is None else depth_l1(view.depth, depth, scale, moving)
+    if error is not None:
+        yield "depth_l1_cm", CENTIMETRES * error
 
 
 def _beta_auroc(truth: GroundTruth, views: list[MappedView]) -> float | None:
     """Return how well beta separates moving from static pixels, over all keyframes together."""
-    scores, masks = [], []
-    for view in views:
-        mask = truth.moving_mask(view.frame_index)
-        if view.beta is not None and mask is not None:
-            scores.append(view.beta.ravel())
-            masks.append(mask.ravel())
-    if not any(mask.any() for mask in masks):
+    pairs = [(view.beta, truth.moving_mask(view.frame_index)) for view in views]
+    known = [(beta, mask) for beta, mask in pairs if beta is not None and mask is not None]
+    if not any(mask.any() for _, mask in known):
         return None
-    return auroc(np.concatenate(scores), np.concatenate(masks))
+    betas, moving = zip(*known, strict=True)
+    return auroc(np.stack(betas), np.stack(moving))

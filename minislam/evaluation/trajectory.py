@@ -38,10 +38,9 @@ def absolute_trajectory_error(
     truth: Trajectory,
     alignment: Alignment = Alignment.SIM3,
     max_difference: float = DEFAULT_MAX_DIFFERENCE,  # second
-    offset: float = 0.0,  # second, added to the timestamps of the estimate
 ) -> TrajectoryError:
     """Return the distances between estimated and true camera centres (ATE)."""
-    estimate, truth = paired(estimate, truth, max_difference, offset)
+    estimate, truth = paired(estimate, truth, max_difference)
     similarity = fit_alignment(estimate, truth, alignment)
     aligned = Trajectory(estimate.timestamps, similarity.transform_poses(estimate.T_world_camera))
     errors = np.linalg.norm(centres(aligned) - centres(truth), axis=1)
@@ -49,11 +48,9 @@ def absolute_trajectory_error(
 
 
 def relative_pose_error(
-    estimate: Trajectory,
-    truth: Trajectory,
+    estimate: Trajectory,  # (N) as the truth, paired
+    truth: Trajectory,  # (N)
     step: int = 1,  # poses between the two ends of each compared motion
-    max_difference: float = DEFAULT_MAX_DIFFERENCE,  # second
-    offset: float = 0.0,  # second, added to the timestamps of the estimate
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the motions between poses `step` apart (RPE).
 
@@ -61,14 +58,12 @@ def relative_pose_error(
     E = Q^-1 P. Returned are |translation of E| and the angle of E [rad], one per motion. The
     motions do not overlap. Where the scale is unknown, align it first.
     """
-    if step < 1:
-        raise InputError(f"expected a step of at least 1 pose, found {step}; choose a larger one")
-    estimate, truth = paired(estimate, truth, max_difference, offset)
-    first = np.arange(0, len(truth) - step, step)
-    if len(first) == 0:
+    if not 1 <= step < len(truth):
         raise InputError(
-            f"expected more than {step} paired poses, found {len(truth)}; choose a smaller step"
+            f"expected a step of 1 to {len(truth) - 1} of {len(truth)} paired poses, found {step}; "
+            "choose a step between"
         )
+    first = np.arange(0, len(truth) - step, step)
     true_motion, motion = (
         np.linalg.inv(poses[first]) @ poses[first + step]
         for poses in (truth.T_world_camera, estimate.T_world_camera)
@@ -91,10 +86,10 @@ def straight_line_error(truth: Trajectory) -> float:
 
 
 def paired(
-    estimate: Trajectory, truth: Trajectory, max_difference: float, offset: float = 0.0
+    estimate: Trajectory, truth: Trajectory, max_difference: float
 ) -> tuple[Trajectory, Trajectory]:
     """Return the poses of both trajectories that belong together, in order of time."""
-    pairs = associate(estimate.timestamps + offset, truth.timestamps, max_difference)
+    pairs = associate(estimate.timestamps, truth.timestamps, max_difference)
     if len(pairs[0]) == 0:
         raise InputError(
             f"expected timestamps of estimate and truth within {max_difference:g} s of each "
@@ -138,20 +133,9 @@ def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     return fitted
 
 
-def truth_to_estimate(
-    estimate: Trajectory, truth: Trajectory, max_difference: float = DEFAULT_MAX_DIFFERENCE
-) -> Similarity:
-    """Return the Sim(3) that maps true camera centres to estimated ones with least error.
-
-    It brings the poses of held-out views into the world of the map; fitted in this direction, the
-    error is least there. The error of the trajectory enters every measure taken at these views.
-    """
-    estimate, truth = paired(estimate, truth, max_difference)
-    return umeyama(centres(truth), centres(estimate))
-
-
 def oriented_truth_to_estimate(
-    estimate: Trajectory, truth: Trajectory, max_difference: float = DEFAULT_MAX_DIFFERENCE
+    estimate: Trajectory,  # (N) as the truth, paired
+    truth: Trajectory,  # (N)
 ) -> Similarity:
     """Return the Sim(3) from truth to estimate with the mean rotation between the cameras.
 
@@ -159,7 +143,6 @@ def oriented_truth_to_estimate(
     line, and 3 mrad of it move a held-out view by a pixel. The orientations determine it.
     Scale and translation come from the centres.
     """
-    estimate, truth = paired(estimate, truth, max_difference)
     turned = estimate.T_world_camera[:, :3, :3] @ truth.T_world_camera[:, :3, :3].mT
     rotation = Rotation.from_matrix(turned).mean().as_matrix()
     source, target = centres(truth), centres(estimate)

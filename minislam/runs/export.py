@@ -84,7 +84,7 @@ def export_depth(run: Run, folder: Path, frames: Iterable[int]) -> None:
 
 def export_masks(run: Run, folder: Path, frames: Iterable[int]) -> None:
     """Write a mask of every frame at the size of the source: 255 where static, 0 where it moves."""
-    camera = run.sequence.full_camera(run.camera)
+    camera = run.sequence.prepare.full_camera(run.camera)
     folder.mkdir(parents=True, exist_ok=True)
     for frame in frames:
         atomic_write(folder / _name(frame), encode_png(static_mask(run, frame, camera)))
@@ -116,7 +116,7 @@ def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera
         )
     for part in (IMAGES, MASKS, "sparse/0"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    camera, written = sequence.full_camera(run.camera), list[int]()
+    camera, written = sequence.prepare.full_camera(run.camera), list[int]()
     for frame in frames:
         image, mask = sequence.full_image(frame), static_mask(run, frame, camera)
         moved = run.displacement(frame)

@@ -13,8 +13,8 @@ from minislam import viz
 from minislam.config import PRESETS, SlamConfig, preset, settings_of
 from minislam.data import RunFolder
 from minislam.data.files import write_text
-from minislam.data.images import encode_jpeg
-from minislam.data.run_folder import REPORT, VIEWER
+from minislam.data.images import encode_jpeg, encode_png
+from minislam.data.run_folder import KEYFRAMES, PLOTS, REPORT, VIEWER
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.runs.facts import surface_depth
@@ -86,13 +86,13 @@ def write_pictures(
     figures = []
     for name, caption, figure in plots:
         figures.append((caption, figure_png(figure)))
-        folder.write_plot(name, figures[-1][1])
+        folder.write_picture(f"{PLOTS}/{name}.png", figures[-1][1])
 
     jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
     middle = _pictures(slam, len(slam.mapper.keyframes) // 2)
     parts = middle["input"], middle["beta"], middle["render"]
     overview = figure_png(viz.overview(*parts, estimate, true_path, unit))
-    folder.write_plot("overview", overview)
+    folder.write_picture(f"{PLOTS}/overview.png", overview)
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
@@ -174,7 +174,8 @@ def _write_keyframes(
         pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
         pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
         for kind, picture in pictures.items():
-            folder.write_keyframe_image(keyframe.frame_index, kind, picture)
+            name = f"{KEYFRAMES}/{keyframe.frame_index:06d}_{kind}.png"
+            folder.write_picture(name, encode_png(picture))
         if index in shown:
             small = [encode_jpeg(picture, LONGEST_SIDE) for picture in pictures.values()]
             jpegs[keyframe.frame_index] = small

@@ -14,8 +14,8 @@ import torch
 from minislam.config import SlamConfig
 from minislam.data import GaussianArrays, RunFolder
 from minislam.data import run_folder as names
-from minislam.data.files import write_json
-from minislam.data.ply import write_ply
+from minislam.data.files import atomic_write, write_json
+from minislam.data.ply import encode_ply
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, InputError
 from minislam.evaluation.lpips import Lpips
@@ -123,7 +123,7 @@ def _run(
         _write_trajectories(folder, slam)
         arrays = slam.mapper.gaussians.to_arrays()
         arrays.pop("anchor_keyframe")
-        write_ply(folder.path / names.MAP, GaussianArrays(**arrays))
+        atomic_write(folder.path / names.MAP, encode_ply(GaussianArrays(**arrays)))
         folder.write_mlp(slam.mapper.mlp.state_dict())
         write_json(folder.path / names.CAMERA, scene_of(slam))
         clip_is_written = slam.workers.start(write_clip, str(folder.path))

@@ -1,47 +1,34 @@
 """A flip book: pictures that a notebook plays, in one piece of HTML that needs nothing else.
 
-The player has neither ids nor a script of its own, only what its button and its slider do, so that
-many flip books on one page do not meet. Where a page runs no scripts, the first picture is seen.
+The player (flipbook.html beside this file) has neither ids nor a script of its own, only what its
+button and its slider do, so that many flip books on one page do not meet. Where a page runs no
+scripts, the first picture is seen.
 """
 
 import json
 from collections.abc import Sequence as Series
+from dataclasses import dataclass
 from html import escape
 from itertools import product
+from string import Template
 
 import cv2
 import numpy as np
 
 from minislam.errors import InputError
-from minislam.viz.viewer import picture_url
+from minislam.viz.viewer import picture_url, template
 
 LARGEST = 400_000  # bytes of a flip book
 _LEAST_WIDTH = 480  # px on the screen
 _QUALITIES = (80, 70, 60, 45, 30)  # of WebP, the first that fits is taken
 _SCALES = (1.0, 0.75, 0.5, 0.35)  # of the size, tried when no quality fits
 
-# What the slider does, and what the button does with it. `this` is the one that was used.
-_TURN = """
-var box = this.closest('[data-book]'), book = box.book || (box.book = JSON.parse(box.dataset.book));
-var now = +this.value, picture = box.querySelector('img'), text = book.captions[now];
-picture.src = book.pictures[now]; picture.alt = text;
-this.setAttribute('aria-valuetext', text); box.querySelector('output').textContent = text;
-"""
-_PLAY = """
-var button = this, slider = button.nextElementSibling;
-function stop() { clearInterval(button.timer); button.timer = 0; button.textContent = 'Play'; }
-if (button.timer) return stop();
-button.textContent = 'Pause';
-button.timer = setInterval(function () { if (!button.isConnected) return stop();
-slider.value = (+slider.value + 1) % (+slider.max + 1); slider.oninput(); }, MILLISECONDS);
-"""
 
-
+@dataclass(frozen=True)
 class FlipBook:
     """The HTML of a flip book; a notebook shows it."""
 
-    def __init__(self, html: str) -> None:
-        self.html = html
+    html: str
 
     def _repr_html_(self) -> str:
         return self.html
@@ -89,15 +76,8 @@ def _url(image: np.ndarray, scale: float, quality: int) -> str:
 
 
 def _player(urls: list[str], captions: list[str], width: int, rate: float) -> str:
-    book = escape(json.dumps({"pictures": urls, "captions": captions}, separators=(",", ":")))
-    play = escape(_PLAY.replace("MILLISECONDS", str(round(1000 / rate))).strip())
-    first, last = escape(captions[0]), len(urls) - 1
-    return (
-        f'<div data-book="{book}" style="width: {width}px; max-width: 100%">'
-        f'<img src="{urls[0]}" alt="{first}" style="width: 100%; display: block">'
-        '<div style="display: flex; gap: 8px; align-items: center">'
-        f'<button type="button" onclick="{play}">Play</button>'
-        f'<input type="range" min="0" max="{last}" value="0" aria-label="Picture" '
-        f'aria-valuetext="{first}" style="flex: 1" oninput="{escape(_TURN.strip())}">'
-        f'<output aria-live="off">{first}</output></div></div>'
-    )
+    book = json.dumps({"pictures": urls, "captions": captions}, separators=(",", ":"))
+    return Template(template("flipbook.html")).substitute(
+        book=escape(book), width=width, picture=urls[0], caption=escape(captions[0]),
+        last=len(urls) - 1, interval=round(1000 / rate),
+    )  # fmt: skip

@@ -5,13 +5,12 @@ from collections.abc import Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from html import escape
-from importlib.resources import files
 from string import Template
 
 import numpy as np
 
 from minislam.viz.style import beta_to_rgb, depth_to_rgb
-from minislam.viz.viewer import picture_url
+from minislam.viz.viewer import picture_url, template
 
 _STOPS = 9  # colours of a colour bar
 _TEXTS = "title folder state description command settings".split()  # of a report
@@ -40,14 +39,18 @@ class Report:
 
 def build_report(report: Report) -> str:
     """Return the HTML of a report."""
-    template = files("minislam.viz").joinpath("report.html").read_text(encoding="utf-8")
-    return Template(template).substitute(
+    pages = [(frame, list(map(picture_url, jpegs))) for frame, jpegs in report.keyframes.items()]
+    depths = np.linspace(*report.depth_limits, _STOPS)
+    betas = np.geomspace(*report.beta_limits, _STOPS)  # they are coloured by their logarithm
+    return Template(template("report.html")).substitute(
         {name: escape(getattr(report, name)) for name in _TEXTS},
         kind=report.state.partition(":")[0].replace(",", ""),
         warnings="\n".join(f'<p class="warning">{escape(text)}</p>' for text in report.warnings),
         overview=picture_url(report.overview),
         summary="\n".join(_row(*line) for line in report.summary),
-        keyframes=_keyframes(report) if report.keyframes else "",
+        keyframes=json.dumps(pages),
+        depth_scale=_scale(depth_to_rgb(depths[None], report.depth_limits), depths, report.unit),
+        beta_scale=_scale(beta_to_rgb(betas[None], report.beta_limits), betas, ""),
         figures="\n".join(_figure(caption, png) for caption, png in report.figures),
     )
 
@@ -75,33 +78,6 @@ def _row(what: str, value: str, verdict: str, meaning: str) -> str:
         f'<tr><th>{escape(what)}</th><td class="value">{escape(value)}</td>'
         f'<td class="verdict"><span class="{verdict}">{verdict}</span></td>'
         f'<td class="meaning dim">{escape(meaning)}</td></tr>'
-    )
-
-
-def _keyframes(report: Report) -> str:
-    """Return the slider over the keyframes, with the scales of the colours."""
-    pages = [(frame, list(map(picture_url, jpegs))) for frame, jpegs in report.keyframes.items()]
-    low, high = report.beta_limits
-    depths, betas = np.linspace(*report.depth_limits, _STOPS), np.geomspace(low, high, _STOPS)
-    depth_rgb = depth_to_rgb(depths[None], report.depth_limits)
-    beta_rgb = beta_to_rgb(betas[None], report.beta_limits)
-    scales = {
-        "input": "",
-        "depth of the map": _scale(depth_rgb, depths, report.unit),
-        "uncertainty \u03b2": _scale(beta_rgb, betas, ""),
-        "static map": "",
-    }
-    pictures = "".join(
-        f'<figure><img src="{url}" alt="{name}"><figcaption>{name}</figcaption>{scale}</figure>'
-        for url, (name, scale) in zip(pages[0][1], scales.items(), strict=True)
-    )
-    return (
-        f'<h2>Keyframes</h2><div class="four">{pictures}</div>'
-        f'<input type="range" id="keyframe" min="0" max="{len(pages) - 1}" value="0" '
-        f'aria-label="keyframe"><small>{len(pages)} keyframes; this one is frame '
-        f'<span id="frame">{pages[0][0]}</span>. Grey depth: the map shows nothing. Bright \u03b2: '
-        "something moves; from 1.4 on the map leaves it out.</small>"
-        f'<script type="application/json" id="pictures">{json.dumps(pages)}</script>'
     )
 
 

@@ -7,14 +7,13 @@ loads nothing: the map and the pictures stand in the page itself.
 import base64
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 
 import numpy as np
 
 from minislam.geometry import Camera
-
-_PLACE_OF_THE_DATA = "/*DATA*/"
 
 
 def build_viewer(
@@ -54,16 +53,15 @@ def build_viewer(
     }
     # "<" could end the script element that holds the data.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    template = files("minislam.viz").joinpath("viewer.html").read_text(encoding="utf-8")
-    return template.replace(_PLACE_OF_THE_DATA, text)
+    return template("viewer.html").replace("/*DATA*/", text)
 
 
+@dataclass(frozen=True)
 class Page:
     """A whole HTML page, shown inside a notebook's cell."""
 
-    def __init__(self, html: str, height: int) -> None:
-        self.html = html
-        self.height = height  # px
+    html: str
+    height: int  # px
 
     def _repr_html_(self) -> str:
         """Return the page in a frame of its own, so that its styles stay inside."""
@@ -73,12 +71,16 @@ class Page:
         )
 
 
+def template(name: str) -> str:
+    """Return an HTML file of this room."""
+    return files("minislam.viz").joinpath(name).read_text(encoding="utf-8")
+
+
 def picture_url(picture: bytes) -> str:
     """Return a PNG, JPEG or WebP as a page's address of it, the picture itself inside."""
-    kinds = {b"\x89PNG": "png", b"RIFF": "webp"}
-    kind = kinds.get(picture[:4], "jpeg")
-    return f"data:image/{kind};base64," + base64.b64encode(picture).decode("ascii")
+    kind = {b"\x89PNG": "png", b"RIFF": "webp"}.get(picture[:4], "jpeg")
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
 def _base64(values: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
+    return base64.b64encode(values.tobytes()).decode()

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from minislam.data import read_ply, read_trajectory
-from minislam.data.images import read_color
-from minislam.data.ply import GaussianArrays, write_ply
+from minislam.data.images import encode_png, read_color
+from minislam.data.ply import GaussianArrays, encode_ply
 from minislam.data.run_folder import RunFolder, locked
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
@@ -36,12 +36,12 @@ def fill(run: RunFolder) -> None:
     ones = np.ones((2, 3), np.float32)
     run.write_lost_frames([(7, 0.233333, "too few matches")])
     run.write_mlp({"0.weight": torch.arange(6.0).reshape(2, 3)})
-    run.write_keyframe_image(123, "input", picture(1) / 255)
-    run.write_plot("trajectory", b"png")
+    run.write_picture("keyframes/000123_input.png", encode_png(picture(1)))
+    run.write_picture("plots/trajectory.png", b"png")
     for name in ("trajectory.txt", "keyframe_trajectory.txt"):
         write_trajectory(run.path / name, trajectory)
     gaussians = GaussianArrays(ones, ones, np.ones((2, 4), np.float32), np.zeros(2), ones)
-    write_ply(run.path / "map.ply", gaussians)
+    (run.path / "map.ply").write_bytes(encode_ply(gaussians))
     for name, text in JSON.items():
         (run.path / name).write_text(json.dumps(text))
     (run.path / "report.html").write_text("<html></html>")
@@ -217,7 +217,6 @@ def test_a_file_or_a_missing_folder_is_no_run(tmp_path: Path):
 
 def test_names_cannot_leave_the_folder(tmp_path: Path):
     run = RunFolder.create(tmp_path / "out")
-    with pytest.raises(AssertionError):
-        run.write_plot("../escape", b"")
-    with pytest.raises(AssertionError):
-        run.write_keyframe_image(1, "../x", picture(0))
+    for name in ("../escape.png", "plots/../health.png", "keyframes/000001_other.png"):
+        with pytest.raises(AssertionError):
+            run.write_picture(name, b"")

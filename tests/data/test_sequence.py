@@ -180,15 +180,14 @@ def test_a_start_behind_the_end_is_refused(tmp_path: Path):
 
 def test_a_frame_outside_the_sequence_is_an_index_error(tmp_path: Path):
     sequence = open_sequence(str(tum_folder(tmp_path)))
-    for index in (-1, 6):
-        with pytest.raises(IndexError):
-            sequence.frame(index)
+    with pytest.raises(IndexError):
+        sequence.frame(6)
 
 
 def test_timestamps_that_files_cannot_tell_apart_are_refused_before_a_run(tmp_path: Path):
     for number in range(1, 4):
         save(tmp_path / f"close/0.{number:07d}.png", picture(number))
-    with pytest.raises(InputError, match="timestamps at least a microsecond apart"):
+    with pytest.raises(InputError, match="timestamps that increase by a microsecond"):
         open_sequence(str(tmp_path / "close"))
 
 

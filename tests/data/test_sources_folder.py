@@ -59,5 +59,5 @@ def test_an_empty_folder_is_refused_and_the_likely_mistake_named(tmp_path: Path)
 def test_two_files_with_one_stamp_are_refused(tmp_path: Path):
     save(tmp_path / "01.png", picture(0))
     save(tmp_path / "1.png", picture(0))
-    with pytest.raises(InputError, match=r"01\.png and 1\.png|1\.png and 01\.png"):
+    with pytest.raises(InputError, match=r"1\.0 s of .*1\.png before 1\.0 s of .*1\.png"):
         read_image_folder(tmp_path)

@@ -113,9 +113,9 @@ def test_evo_reads_what_is_written(tmp_path: Path):
 @pytest.mark.parametrize(
     "row, message",
     [
-        ("2 0 0 0 0 0 1", "8 columns.*found 7 in line 2 of .*gt.txt"),
+        ("2 0 0 0 0 0 1", "8 columns.*found 7, .* in line 2 of .*gt.txt"),
         ("2 0 0 0 0 0 0 1 9", "found 9"),
-        ("2,0,0,0,0,0,0,1", "found 1"),
+        ("2,0,0,0,0,0,0,1", "finite numbers.*found '2,0"),
         ("2 0 0 nan 0 0 0 1", "finite numbers in line 2 of .*gt.txt"),
         ("2 0 0 x 0 0 0 1", "finite"),
         ("2 0 0 0 0 0 0 0", "unit quaternion"),

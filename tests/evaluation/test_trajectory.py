@@ -131,13 +131,6 @@ def test_orientations_are_aligned_with_the_path():
     np.testing.assert_allclose(found.estimate.T_world_camera, truth.T_world_camera, atol=1e-12)
 
 
-def test_an_offset_of_time_is_undone():
-    truth = spiral(30)
-    late = Trajectory(truth.timestamps + 7.5, truth.T_world_camera)
-    found = absolute_trajectory_error(late, truth, offset=-7.5)
-    assert len(found.errors) == 30 and found.statistics["max"] < 1e-12
-
-
 def evo_statistics(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> dict:
     """Return what evo_ape and evo_rpe compute."""
     metrics = importlib.import_module("evo.core.metrics")
@@ -177,7 +170,7 @@ def test_equality_with_evo(alignment: Alignment):
     jitter = np.random.default_rng(4).uniform(-0.015, 0.015, 60)
     estimate = Trajectory(estimate.timestamps[kept] + jitter, estimate.T_world_camera[kept])
     found = absolute_trajectory_error(estimate, truth, alignment)
-    distances, angles = relative_pose_error(found.estimate, truth, step=3)
+    distances, angles = relative_pose_error(found.estimate, found.truth, step=3)
     expected = evo_statistics(estimate, truth, alignment)
     assert found.statistics == pytest.approx(expected["ape"], rel=1e-9, abs=1e-9)
     assert statistics(distances) == pytest.approx(expected["rpe"], rel=1e-9, abs=1e-9)
@@ -202,7 +195,7 @@ def test_a_single_pair_cannot_be_aligned():
         absolute_trajectory_error(spiral(1), spiral(10))
 
 
-@pytest.mark.parametrize("step, message", [(0, "at least 1"), (10, "more than 10")])
-def test_impossible_steps_are_refused(step: int, message: str):
-    with pytest.raises(InputError, match=message):
+@pytest.mark.parametrize("step", [0, 10])
+def test_impossible_steps_are_refused(step: int):
+    with pytest.raises(InputError, match="a step of 1 to 9 of 10 paired poses"):
         relative_pose_error(spiral(10), spiral(10), step)

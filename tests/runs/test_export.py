@@ -139,7 +139,7 @@ def test_images_and_masks_beside_poses_are_those_of_a_global_shutter(run, tmp_pa
     shift = np.float32([3.0, -2.0])  # px of the run's images, by which the spot is shown too far
     run.displacement = lambda frame: np.broadcast_to(shift, (64, 96, 2)) if frame == 5 else None
     export.export_nerfstudio(run, tmp_path / "undone", FRAMES)
-    scale = run.sequence.full_camera(run.camera).fx / run.camera.fx
+    scale = run.sequence.prepare.full_camera(run.camera).fx / run.camera.fx
     assert scale > 1.5
     for frame, moved in ((2, 0 * shift), (5, shift)):
         before, after = (exported(tmp_path / name, frame) for name in ("as filmed", "undone"))
@@ -166,10 +166,10 @@ def test_pycolmap_reads_what_we_write(run, tmp_path: Path):
 
 def test_a_refined_focal_length_reaches_the_full_size(run):
     sequence = run.sequence
-    full = sequence.full_camera(sequence.camera)
+    full = sequence.prepare.full_camera(sequence.camera)
     longer = SimpleNamespace(**vars(sequence.camera))
     longer.fx *= 1.1
-    refined = sequence.full_camera(type(full)(**vars(longer)))
+    refined = sequence.prepare.full_camera(type(full)(**vars(longer)))
     assert refined.fx == pytest.approx(1.1 * full.fx) and refined.cx == pytest.approx(full.cx)
     # The working camera sees the same ray at the pixel that the resizing moves it to.
     ray = full.rays(torch.tensor([60.0, 50.0], dtype=torch.float64))
@@ -207,7 +207,7 @@ def test_masks_of_a_static_scene_are_white(run, tmp_path: Path):
     run.beta = lambda frame: np.zeros((64, 96), np.float32)
     export.export_masks(run, tmp_path / "masks", [5])
     mask = cv2.imread(str(tmp_path / "masks/000005.png"), cv2.IMREAD_GRAYSCALE)
-    full = run.sequence.full_camera(run.camera)
+    full = run.sequence.prepare.full_camera(run.camera)
     assert (mask == 255).all() and mask.shape == (full.height, full.width)
 
 
