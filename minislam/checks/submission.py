@@ -22,9 +22,8 @@ DEFINITIONS = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.ClassDef)
 class Part:
     """What is kept of one cell, as Python text whose line numbers are the cell's."""
 
-    text: str
+    text: str  # the whole cell where Python cannot read it
     key: str = ""  # of the exercise, "" for another cell
-    error: str = ""  # why it cannot be run, "" if it can
 
 
 def exercises_of(notebook: dict, name: str) -> list[Exercise]:
@@ -61,10 +60,9 @@ def _code(notebook: dict) -> list[str]:
 def _part(text: str, exercises: list[Exercise]) -> Part:
     try:
         tree = ast.parse(text)
-    except (SyntaxError, ValueError) as error:
+    except (SyntaxError, ValueError):
         named = [e.key for e in exercises if re.search(rf"^checks\.{e.check}\(", text, re.M)]
-        place = f"line {getattr(error, 'lineno', '?')} of the cell: {error.args[0]}"
-        return Part("", named[0] if named else "", f"Python cannot read {place}")
+        return Part(text, named[0] if named else "")
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     for exercise in exercises:
         for call in calls:
