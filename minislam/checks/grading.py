@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,8 @@ SMALLEST = 1e-3  # an expected number below this counts as this: it may be a rou
 SECONDS = 10.0  # of the student's function, all cases together
 
 Function = Callable[..., Any]  # answers with numbers in any form, or with a tuple of such
-Hints = Sequence[tuple[Any, str]]  # (known mistake, the sentence that explains it)
+# A known mistake, or the `flaw` with which the reference makes it, and what explains it.
+Mistakes = Sequence[tuple[Any, str]]
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,7 @@ def check_function(
     reference: Function,
     cases: list[Case],
     tolerance: float = 1e-6,  # relative to the largest expected number; 1e-5 in float32
-    hints: Hints = (),
-    flaws: dict[str, str] | None = None,  # those that the reference makes where asked by `flaw=`
+    mistakes: Mistakes = (),
     returns: tuple[str, ...] = (),  # the names of the values, where there are several
 ) -> Verdict:
     """Compare a student's function with the reference on all cases, up to the first difference.
@@ -55,8 +54,6 @@ def check_function(
     MINISLAM_STRICT=1 raises WrongAnswer where the answer has not passed, so that nbmake and
     nbgrader see it.
     """
-    known = [(partial(reference, flaw=flaw), hint) for flaw, hint in (flaws or {}).items()]
-    known.extend(hints)
     seconds = SECONDS
     for case in cases:
         begin = time.process_time()
@@ -73,7 +70,11 @@ def check_function(
             allowed, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
         if found := difference(answer, expected, allowed, returns, smallest):
             smallest = max(smallest, largest(expected))
-            others = ((mistake(*case.arguments), hint) for mistake, hint in known)
+            inputs = case.arguments
+            others = (
+                (mistake(*inputs) if callable(mistake) else reference(*inputs, flaw=mistake), hint)
+                for mistake, hint in mistakes
+            )
             named = (h for x, h in others if not difference(answer, x, allowed, (), smallest))
             hint = next(named, "") or relation(answer, expected, allowed)
             return _verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)

@@ -55,7 +55,7 @@ def check_sampling(student: Function) -> Verdict:
         Case((20, [19, 18, 17, 16, 15, 14, 13, 12, 11, 10, 3, 2], 0.7), "the weight 0.7"),
         *drawn(draw),
     ]
-    hints = [
+    mistakes = [
         (unguarded, "While the window is most of the map, all keyframes are equally likely."),
         (uniform, "The window should get its weight, however many other keyframes there are."),
         (lambda n, w, s: shared(n, w, 1 / len(w), 0), "The others: the map would forget them."),
@@ -66,7 +66,7 @@ def check_sampling(student: Function) -> Verdict:
         (lambda n, w, s: right(n, [*range(n)][-len(w) :], s), "Not the newest, but the window."),
         (guarded_at_half, "Compare the window's share of all keyframes with the weight."),
     ]
-    return check_function(student, right, cases, 1e-6, hints)
+    return check_function(student, right, cases, 1e-6, mistakes)
 
 
 def check_deformed_means(student: Function) -> Verdict:
@@ -98,7 +98,7 @@ def check_deformed_means(student: Function) -> Verdict:
         case(torch.tensor([0, 1, 1, 0, 1]), "two keyframes that move apart"),
         *drawn(lambda seed: case(normals(seed, 6).argsort() % 3, "three keyframes", seed)),
     ]
-    hints = [
+    mistakes = [
         (lambda x, r, a, b: moved(se3_inverse(a) @ b, x, r), "The old pose comes first."),
         (lambda x, r, a, b: moved(b @ se3_inverse(a), x, r), "This moves points of a camera."),
         (lambda x, r, a, b: reference(x, 0 * r, a, b), "All follow the first keyframe."),
@@ -107,7 +107,7 @@ def check_deformed_means(student: Function) -> Verdict:
         (lambda *a: only(slice(0, 3), *a), "The translation is missing."),
         (lambda *a: only(slice(3, 4), *a), "The rotation is missing."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_insertion(student: Function) -> Verdict:
@@ -146,7 +146,7 @@ def check_insertion(student: Function) -> Verdict:
         Case((image, depth, weight, opacity, CAMERA, T, 3), "a map that covers a part"),
     ]
     corner = replace(CAMERA, cx=0.0, cy=0.0)
-    hints = [
+    mistakes = [
         (lambda *a: reference(*a, depth_at_least=0), "Depth 0 means unknown: insert nothing."),
         (lambda i, d, w, *a: reference(i, d, one, *a), "Weight 0 is a dynamic object: leave it."),
         (lambda *a: reference(*a[:3], zero, *a[4:]), "Parts of the map are opaque there already."),
@@ -156,7 +156,7 @@ def check_insertion(student: Function) -> Verdict:
         (lambda *a: reference(*a[:4], corner, *a[5:]), "A ray is (u - cx) / fx, (v - cy) / fy, 1."),
         (of_one_size, "A cell at depth z is cell * z / f wide."),
     ]
-    return check_function(student, reference, cases, 1e-6, hints)
+    return check_function(student, reference, cases, 1e-6, mistakes)
 
 
 def check_map_loss(student: Function) -> Verdict:
@@ -192,7 +192,7 @@ def check_map_loss(student: Function) -> Verdict:
         Case((color, depth, image, holes, weight, scales), "depth that is unknown in places"),
         Case((color, depth, image, holes, weight, needles), "thin Gaussians"),
     ]
-    hints = [
+    mistakes = [
         (lambda *a: reference(*a[:4], one, a[5]), "Each pixel has its weight."),
         (lambda *a: reference(*a[:4], a[4] / a[4].mean(), a[5]), "Divide by the number of pixels."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
@@ -201,7 +201,7 @@ def check_map_loss(student: Function) -> Verdict:
         (of_known, "The mean is over all pixels; one of unknown depth counts 0."),
         (with_unknown, "Where the reference depth is 0 it is unknown and costs nothing."),
     ]
-    return check_function(student, reference, cases, 1e-7, hints)
+    return check_function(student, reference, cases, 1e-7, mistakes)
 
 
 def check_followed_pose(student: Function) -> Verdict:
@@ -261,7 +261,7 @@ def check_followed_pose(student: Function) -> Verdict:
         (lambda *a: se3_inverse(motion(*a)) @ a[2], "The pose moves the other way."),
         (unweighted, "The camera follows the dynamic object: each pixel has its weight."),
     ]
-    hints = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
+    mistakes = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
     cases = [case for case, _ in pairs]
     answered, right = partial(pixels_of, student), partial(pixels_of, true_pose)
-    return check_function(answered, right, cases, 0.016, hints)
+    return check_function(answered, right, cases, 0.016, mistakes)

@@ -38,7 +38,7 @@ def check_ate(student: Function) -> Verdict:
         case(0.25, True, "an estimate in another unit and frame"),
         *drawn(lambda seed: case(0.5 + seed % 3, seed % 2 == 0, "another walk", seed)),
     ]
-    hints = [
+    mistakes = [
         (lambda e, t: rms(e - t), "The estimate is not aligned yet."),
         (lambda e, t: rms(distances(e, t, False)), "A monocular estimate has no scale: align it."),
         (lambda e, t: distances(e, t).mean(), "ATE is the root of the mean square."),
@@ -50,7 +50,7 @@ def check_ate(student: Function) -> Verdict:
         (lambda e, t: distances(e, t).max(), "ATE is no maximum."),
         (lambda e, t: rms(e - t - (e - t).mean(0)), "Centred, but neither turned nor scaled yet."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_separability(student: Function) -> Verdict:
@@ -76,7 +76,7 @@ def check_separability(student: Function) -> Verdict:
         case([0.5, 0.5, 0.8, 0.3], [1, 0, 1, 0], "a beta that does not tell two cells apart"),
         *drawn(draw),
     ]
-    hints = [
+    mistakes = [
         (lambda b, m: wins(b, ~m, 0.5), "The other way round: what moves has the larger beta."),
         (lambda b, m: wins(b, m, 0.0), "A pair with equal beta is worth one half."),
         (lambda b, m: wins(b, m, 1.0), "A pair with equal beta is worth one half."),
@@ -85,7 +85,7 @@ def check_separability(student: Function) -> Verdict:
         (lambda b, m: b[m].mean() - b[~m].mean(), "This is a difference of means, no fraction."),
         (lambda b, m: ((b > np.median(b)) == m).mean(), "No threshold: compare all pairs."),
     ]
-    return check_function(student, auroc, cases, 1e-9, hints)
+    return check_function(student, auroc, cases, 1e-9, mistakes)
 
 
 def check_alignment(student: Function) -> Verdict:
@@ -126,7 +126,7 @@ def check_alignment(student: Function) -> Verdict:
         case(2.0, 0.1, -1.0, 20, "points that a reflection would fit better"),
         case(2.0, 0.1, 1.0, 3, "three points"),
     ]
-    hints = [
+    mistakes = [
         (lambda e, t: reference(e, t, 1.0), "Monocular: the scale is unknown."),
         (mirrored, "A rotation has determinant +1: turn the last column of U if it is -1."),
         (by_spread, "With errors s is trace(D S) over the variance of the estimate."),
@@ -135,7 +135,7 @@ def check_alignment(student: Function) -> Verdict:
         (centred, "t maps the TURNED and scaled mean of the estimate to that of the truth."),
         (lambda e, t: matrix(1.0, reference(e, t)[:3, :3].T, e, t), "This is R^T."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_sign_test(student: Function) -> Verdict:
@@ -158,10 +158,10 @@ def check_sign_test(student: Function) -> Verdict:
         "no difference at all": [[1.0, 2.0, 1.5], [1.0, 2.0, 1.5]],
     }
     cases = [Case((*np.array(errors),), name) for name, errors in of_clips.items()]
-    hints = [
+    mistakes = [
         (lambda a, b: reference(a, b, sided=1), "A difference the other way is as surprising."),
         (lambda a, b: reference(a, b, -1e-12), "At least as far: the measured one counts as well."),
         (lambda a, b: 1 - reference(a, b), "This is the fraction of the others."),
         (lambda a, b: reference(a, b) * 2 ** len(a), "Divide by the number of choices, 2^N."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)

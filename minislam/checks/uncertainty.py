@@ -34,7 +34,7 @@ def check_mapping_weight(student: Function) -> Verdict:
         Case((doubles([0.0, 0.05, 0.1], [0.5, 0.5, 0.5]),), "beta below the floor"),
         *drawn(lambda seed: Case((1.2 * normals(seed, 2, 3).abs(),), "any beta")),
     ]
-    hints = [
+    mistakes = [
         (lambda b: uncapped(b).clamp_max(5), "Weights below 0.1 must be 0: little adds up."),
         (lambda b: cut(uncapped(b), 1e9), "No weight is above 5, that of a beta of a quarter."),
         (lambda b: uncapped(b).clamp(0.1, 5), "Weights below 0.1 become 0, not 0.1."),
@@ -43,7 +43,7 @@ def check_mapping_weight(student: Function) -> Verdict:
         (lambda beta: cut(2 * uncapped(beta)), "It is a half by beta_adj^2: 0.5 is missing."),
         (lambda beta: cut((0.5 * uncapped(beta)).sqrt()), "The adjusted beta must be squared."),
     ]
-    return check_function(student, lambda b: mapping_weight(b, camera), cases, 1e-5, hints)
+    return check_function(student, lambda b: mapping_weight(b, camera), cases, 1e-5, mistakes)
 
 
 def check_best_beta(student: Function) -> Verdict:
@@ -57,7 +57,7 @@ def check_best_beta(student: Function) -> Verdict:
         return Case((error, lambda_log), f"lambda_3 = {lambda_log}")
 
     cases = [case(2.0), case(0.5), *drawn(lambda seed: case(0.3 + 0.1 * (seed % 9), seed))]
-    hints = [
+    mistakes = [
         (lambda L, _: L.sqrt(), "lambda_3 is not in it: set the derivative to zero and solve."),
         (lambda L, x: (L / x).sqrt(), "A factor 2 is missing: d(L beta^-2) = -2 L beta^-3."),
         (lambda L, x: 2 * L / x, "This is beta squared: take the root."),
@@ -65,7 +65,7 @@ def check_best_beta(student: Function) -> Verdict:
         (lambda L, x: (2 * L * x).sqrt(), "lambda_3 belongs below the line: it makes beta small."),
         (lambda L, x: reference(L, x).clamp_min(0.1), "No floor is asked for: 0 stays 0."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_feature_variance(student: Function) -> Verdict:
@@ -97,7 +97,7 @@ def check_feature_variance(student: Function) -> Verdict:
         *drawn(lambda seed: Case((normals(seed, 7).abs(), normals(seed, 7, 2)), "seven cells")),
     ]
     lengths = "Divide each feature by its length: the cosine has no unit."
-    hints = [
+    mistakes = [
         (lambda b, f: masked(b, f.new_ones(len(b), len(b))).mean(), "Compare only similar cells."),
         (lambda b, f: masked(b, near(f)).mean(), lengths),
         (lambda b, f: masked(b, similar(f)).sqrt().mean(), "The variance is the square of this."),
@@ -107,7 +107,7 @@ def check_feature_variance(student: Function) -> Verdict:
         (lambda b, f: masked(b, similar(f)).sum(), "The mean over the cells is asked for."),
     ]
     right = partial(variance_regulariser, config=config)
-    return check_function(student, right, cases, 1e-9, hints)
+    return check_function(student, right, cases, 1e-9, mistakes)
 
 
 def check_training(student: Function) -> Verdict:
@@ -154,14 +154,14 @@ def check_training(student: Function) -> Verdict:
         case(holes, 4, "four steps on two views"),
         *drawn(lambda seed: case(holes, 3, f"features {seed}", seed)),
     ]
-    flaws = {
-        "lambda_depth": "L_depth is missing in the error.",
-        "lambda_variance": "L_reg_V is missing.",
-        "lambda_log": "The price of a large beta is missing: 0.5 log beta.",
-        "holes": "A cell of opacity below 0.9 has no loss.",
-        "first": "The views take turns: step s looks at view s modulo T.",
-        "gathered": "Gradients add up: call zero_grad before backward.",
-        "still": "The MLP did not change: call optimizer.step().",
-    }
+    mistakes = [
+        ("lambda_depth", "L_depth is missing in the error."),
+        ("lambda_variance", "L_reg_V is missing."),
+        ("lambda_log", "The price of a large beta is missing: 0.5 log beta."),
+        ("holes", "A cell of opacity below 0.9 has no loss."),
+        ("first", "The views take turns: step s looks at view s modulo T."),
+        ("gathered", "Gradients add up: call zero_grad before backward."),
+        ("still", "The MLP did not change: call optimizer.step()."),
+    ]
     answered, right = partial(outcome, student), partial(outcome, trained)
-    return check_function(answered, right, cases, 1e-6, flaws=flaws)
+    return check_function(answered, right, cases, 1e-6, mistakes)
