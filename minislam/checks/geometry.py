@@ -104,10 +104,7 @@ def check_warped_photo(student: Function) -> Verdict:
         ("inverted", "This is the inverse motion: T_source_target takes points to the source."),
         ("disparity", "This takes the depth for a disparity: the point is depth times the ray."),
         ("behind", "Points behind the source camera (z <= 0) are not in its photo."),
-        (
-            "unmasked",
-            "Where the source sees nothing it is 0: outside its photo, or behind.",
-        ),
+        ("unmasked", "Where the source sees nothing it is 0: outside its photo, or behind."),
         ("rounded", "This takes the nearest pixel: mix the four around the position."),
         ("turned", "The weights are exchanged: the nearer of two pixels has the larger weight."),
     ]

@@ -66,7 +66,8 @@ def check_function(
         if answer is None:
             return _verdict(NOT_YET, f"for {case.description} the function returns nothing.")
         expected, smallest, allowed = reference(*case.arguments), SMALLEST, tolerance
-        if is_single((answer, given)):  # rounding errors are those of the largest number
+        if any(x.dtype in SINGLE for x in real_tensors((answer, given))):
+            # Rounding errors are those of the largest number.
             allowed, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
         if found := difference(answer, expected, allowed, returns, smallest):
             smallest = max(smallest, largest(expected))
@@ -102,22 +103,18 @@ def is_written(function: Function) -> bool:
     return not (is_stub or is_empty)
 
 
-def is_single(value: Any) -> bool:
-    """Say whether some of the numbers have less than double precision."""
+def real_tensors(value: Any) -> list[Tensor]:
+    """Return the tensors and arrays of real numbers in a value, or in lists of values."""
     if isinstance(value, list | tuple):
-        return any(map(is_single, value))
-    if isinstance(value, np.ndarray | np.generic):
-        return value.dtype in (np.float32, np.float16)
-    return isinstance(value, Tensor) and value.dtype in SINGLE
+        return [tensor for part in value for tensor in real_tensors(part)]
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind == "f":
+        value = torch.from_numpy(np.array(value))
+    return [value] if isinstance(value, Tensor) and value.is_floating_point() else []
 
 
 def largest(value: Any) -> float:
     """Return the largest absolute value of all real tensors, 0 if there are none."""
-    if isinstance(value, list | tuple):
-        return max(map(largest, value), default=0.0)
-    if not isinstance(value, Tensor) or not value.is_floating_point() or not value.numel():
-        return 0.0
-    return float(value.abs().max())
+    return max((float(x.abs().max()) for x in real_tensors(value) if x.numel()), default=0.0)
 
 
 def as_numbers(answer: Any) -> Tensor:

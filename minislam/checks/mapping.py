@@ -39,9 +39,6 @@ def check_sampling(student: Function) -> Verdict:
     def unguarded(n: int, window: list[int], weight: float) -> Tensor:
         return shared(n, window, weight / len(window), (1 - weight) / max(n - len(window), 1))
 
-    def guarded_at_half(n: int, window: list[int], weight: float) -> Tensor:
-        return (uniform if len(window) > 0.5 * n else unguarded)(n, window, weight)
-
     def draw(seed: int) -> Case:
         count, weight = 20 + seed % 7, (0.3, 0.6, 0.8)[seed % 3]
         window = normals(seed, count).argsort()[: 4 + seed % 2].tolist()
@@ -55,6 +52,7 @@ def check_sampling(student: Function) -> Verdict:
         Case((20, [19, 18, 17, 16, 15, 14, 13, 12, 11, 10, 3, 2], 0.7), "the weight 0.7"),
         *drawn(draw),
     ]
+    at_half = "Compare the window's share of all keyframes with the weight."
     mistakes = [
         (unguarded, "While the window is most of the map, all keyframes are equally likely."),
         (uniform, "The window should get its weight, however many other keyframes there are."),
@@ -64,7 +62,7 @@ def check_sampling(student: Function) -> Verdict:
         (lambda n, w, s: unguarded(n, w, 1 - s), "The weight belongs to the window."),
         (lambda n, w, s: right(n, w, 0.5), "One half is one weight of many."),
         (lambda n, w, s: right(n, [*range(n)][-len(w) :], s), "Not the newest, but the window."),
-        (guarded_at_half, "Compare the window's share of all keyframes with the weight."),
+        (lambda n, w, s: (uniform if 2 * len(w) > n else unguarded)(n, w, s), at_half),
     ]
     return check_function(student, right, cases, 1e-6, mistakes)
 
@@ -117,19 +115,16 @@ def check_insertion(student: Function) -> Verdict:
     known, the weight positive and the map transparent.
     """
 
-    def reference(*a: Any, depth_at_least: float = 1e-9) -> Tensor:
+    def reference(*a: Any, flaw: str = "") -> Tensor:
         image, depth, weight, opacity, camera, T, cell = a
-        allowed = (depth >= depth_at_least) & (weight > 0) & (opacity < EXPLAINED_OPACITY)
+        known = (depth > 0) | (flaw == "unknown")
+        allowed = known & (weight > 0) & (opacity < EXPLAINED_OPACITY)
         middle = torch.zeros_like(allowed)
         middle[cell // 2 :: cell, cell // 2 :: cell] = True
         pixels = (allowed & middle).nonzero().flip(-1)
         new = gaussians_at_pixels(pixels, image, depth, camera, T, 0, InsertionConfig(cell))
-        return torch.cat([new.means, new.scales[:, :1], new.colors], -1)
-
-    def of_one_size(*a: Any) -> Tensor:
-        answer = reference(*a)
-        answer[:, 3] /= transform_points(a[5], answer[:, :3])[:, 2]
-        return answer
+        far = transform_points(T, new.means)[:, 2:] if flaw == "one size" else 1
+        return torch.cat([new.means, new.scales[:, :1] / far, new.colors], -1)
 
     shape = CAMERA.height, CAMERA.width
     values = random(torch.Generator().manual_seed(0), 7, *shape)
@@ -147,14 +142,14 @@ def check_insertion(student: Function) -> Verdict:
     ]
     corner = replace(CAMERA, cx=0.0, cy=0.0)
     mistakes = [
-        (lambda *a: reference(*a, depth_at_least=0), "Depth 0 means unknown: insert nothing."),
+        ("unknown", "Depth 0 means unknown: insert nothing."),
         (lambda i, d, w, *a: reference(i, d, one, *a), "Weight 0 is a dynamic object: leave it."),
         (lambda *a: reference(*a[:3], zero, *a[4:]), "Parts of the map are opaque there already."),
         (lambda *a: reference(*a[:3], 1.6 - a[3], *a[4:]), "Insert where the map is transparent."),
         (lambda *a: reference(*a[:5], se3_inverse(a[5]), a[6]), "From camera to world: T^-1."),
         (lambda *a: reference(*a[:5], start, a[6]), "These means are in the camera's frame."),
         (lambda *a: reference(*a[:4], corner, *a[5:]), "A ray is (u - cx) / fx, (v - cy) / fy, 1."),
-        (of_one_size, "A cell at depth z is cell * z / f wide."),
+        ("one size", "A cell at depth z is cell * z / f wide."),
     ]
     return check_function(student, reference, cases, 1e-6, mistakes)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ast
 import re
-from collections import Counter
 from dataclasses import dataclass
+from statistics import mode
 
 from minislam.checks.points import EXERCISES, Exercise
 from minislam.errors import InputError
@@ -28,16 +28,17 @@ class Part:
 
 def exercises_of(notebook: dict, name: str) -> list[Exercise]:
     """Return the exercises that a notebook should hold, told by its checks or else by its name."""
-    called = " ".join(re.findall(r"\bcheck_\w+", "\n".join(_code(notebook))))
-    votes = Counter(e.notebook for e in EXERCISES if re.search(rf"\b{e.check}\b", called))
+    called = re.findall(r"\bcheck_\w+", "\n".join(_code(notebook)))
     number = name.split("_")[0]
-    votes.update(e.notebook for e in EXERCISES if not votes and e.notebook.split("_")[0] == number)
+    votes = [e.notebook for e in EXERCISES if e.check in called] or [
+        e.notebook for e in EXERCISES if e.notebook.split("_")[0] == number
+    ]
     if not votes:
         raise InputError(
             f"expected a notebook of the course, found none of its exercises in {name}; give one "
             "that `minislam notebooks` has made"
         )
-    return [e for e in EXERCISES if e.notebook == votes.most_common(1)[0][0]]
+    return [e for e in EXERCISES if e.notebook == mode(votes)]
 
 
 def parts_of(notebook: dict, exercises: list[Exercise]) -> list[Part]:

@@ -72,22 +72,17 @@ def check_feature_variance(student: Function) -> Verdict:
     """Check (beta (n,), features (n, C)) -> L_reg_V () with the neighbours of cosine > 0.75."""
     config = UncertaintyConfig()
 
-    def masked(beta: Tensor, near: Tensor, lost: int = 0) -> Tensor:
-        count = near.sum(1)
-        squares = (beta - (near @ beta / count)[:, None]) ** 2
-        return (near * squares).sum(1) / (count - lost).clamp_min(lost)
-
-    def near(features: Tensor) -> Tensor:
-        return (features @ features.T > config.similarity).to(features)
-
-    def similar(features: Tensor) -> Tensor:
-        return near(functional.normalize(features, dim=-1))
-
-    def without_itself(beta: Tensor, features: Tensor) -> Tensor:
-        return masked(beta, similar(features).fill_diagonal_(0)).nan_to_num().mean()
-
-    def around_all(beta: Tensor, features: Tensor) -> Tensor:
-        return (similar(features) @ (beta - beta.mean()) ** 2 / similar(features).sum(1)).mean()
+    def variance(beta: Tensor, features: Tensor, flaw: str = "") -> Tensor:
+        if not flaw:
+            return variance_regulariser(beta, features, config)
+        unit = features if flaw == "long" else functional.normalize(features, dim=-1)
+        near = (unit @ unit.T > (-2 if flaw == "all" else config.similarity)).to(beta)
+        near = near.fill_diagonal_(0) if flaw == "others" else near
+        count = near.sum(1, keepdim=True)
+        means = beta.mean() if flaw == "one mean" else near @ beta[:, None] / count
+        variances = (near * (beta - means) ** 2 / (count - int(flaw == "one less"))).sum(1)
+        variances = variances.nan_to_num().sqrt() if flaw == "root" else variances.nan_to_num()
+        return variances.sum() if flaw == "sum" else variances.mean()
 
     beta = doubles(0.2, 1.4, 0.5, 2.0, 0.9)
     features = doubles([3.0, 0.0], [2.0, 1.0], [0.0, 0.5], [0.1, 0.5], [1.0, -1.0])
@@ -96,18 +91,16 @@ def check_feature_variance(student: Function) -> Verdict:
         Case((beta, features), "five cells in three groups"),
         *drawn(lambda seed: Case((normals(seed, 7).abs(), normals(seed, 7, 2)), "seven cells")),
     ]
-    lengths = "Divide each feature by its length: the cosine has no unit."
     mistakes = [
-        (lambda b, f: masked(b, f.new_ones(len(b), len(b))).mean(), "Compare only similar cells."),
-        (lambda b, f: masked(b, near(f)).mean(), lengths),
-        (lambda b, f: masked(b, similar(f)).sqrt().mean(), "The variance is the square of this."),
-        (without_itself, "A cell is one of its own neighbours."),
-        (lambda b, f: masked(b, similar(f), 1).mean(), "Divide by the number, not by one less."),
-        (around_all, "The mean is that of the similar cells, not that of all."),
-        (lambda b, f: masked(b, similar(f)).sum(), "The mean over the cells is asked for."),
+        ("all", "Compare only similar cells."),
+        ("long", "Divide each feature by its length: the cosine has no unit."),
+        ("root", "The variance is the square of this."),
+        ("others", "A cell is one of its own neighbours."),
+        ("one less", "Divide by the number, not by one less."),
+        ("one mean", "The mean is that of the similar cells, not that of all."),
+        ("sum", "The mean over the cells is asked for."),
     ]
-    right = partial(variance_regulariser, config=config)
-    return check_function(student, right, cases, 1e-9, mistakes)
+    return check_function(student, variance, cases, 1e-9, mistakes)
 
 
 def check_training(student: Function) -> Verdict:

@@ -93,8 +93,8 @@ def _graded(path: Path, seed: int | None, without_package: bool) -> dict[str, An
     for exercise in exercises:
         verdict = verdicts[exercise.key]
         points = exercise.points if verdict["status"] == PASSED else 0
-        about = {"key": exercise.key, "check": exercise.check, "points": points}
-        rows.append({**about, "of": exercise.points, **verdict})  # in the columns' order
+        about = {"check": exercise.check, "points": points, "of": exercise.points}
+        rows.append({"key": exercise.key, **about, **verdict})  # in the columns' order
     points, of = sum(row["points"] for row in rows), sum(row["of"] for row in rows)
     about = {"file": str(path), "notebook": exercises[0].notebook}
     return {**about, "points": points, "of": of, "exercises": rows}

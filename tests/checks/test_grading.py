@@ -6,7 +6,7 @@ import torch
 
 from minislam.checks import PASSED, WRONG, Case, check_function, is_written
 from minislam.checks.cases import normals
-from minislam.checks.grading import WrongAnswer, as_numbers, difference, is_single, relation
+from minislam.checks.grading import WrongAnswer, as_numbers, difference, real_tensors, relation
 from tests.helpers import unfinished
 
 RIGHT = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 4.0]], dtype=torch.float64)
@@ -101,7 +101,10 @@ def test_numbers_in_any_form_are_compared(answer):
 def test_one_number_is_one_number_in_any_shape():
     for answer in (0.369, np.float64(0.369), [0.369], RIGHT.new_tensor([[0.369]])):
         assert difference(answer, 0.369, 1e-9) == "", answer
-    assert not is_single(0.369) and is_single([1.0, torch.ones(1)]) and is_single(np.float32(1))
+    assert [x.dtype for x in real_tensors([0.369, torch.ones(1), np.float16(1)])] == [
+        torch.float32,
+        torch.float16,
+    ]
 
 
 def test_numbers_that_print_alike_print_their_difference():
