@@ -209,13 +209,6 @@ def check_motion_memory(student: Function) -> Verdict:
         weight = motion_memory.update_motion_weight(grid, matches, *rest)
         return motion_memory.inherit_motion_weight(grid, matches, weight)
 
-    def zeros_left(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
-        cells = (matches.targets[0] / grid.stride).round().long().flip(0)
-        inside = (cells >= 0).all(0) & (cells < torch.tensor(grid.shape)[:, None]).all(0)
-        filled = torch.zeros(grid.shape)
-        filled[tuple(cells[:, inside & (matches.confidences[0, 0] > 0.1)])] = 1
-        return reference(grid, matches, *rest) * filled.flatten()
-
     def case(twist: list[float], aside: float, sure: float, what: str, seed: int = 3) -> Case:
         random = normals(seed, 4, len(grid.rays)).erf().abs().to(grid.rays)  # in [0, 1)
         disparities, motion = 0.2 + 0.3 * random[0], se3_exp(torch.tensor(twist))
@@ -231,16 +224,17 @@ def check_motion_memory(student: Function) -> Verdict:
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
         *drawn(lambda seed: case(any_twist(seed, 0.025), 6.0, 0.8, "a drawn motion", seed)),
     ]
-    constants: dict[str, dict[str, Any]] = {
+    nearest = "A cell to which nothing flows takes the weight of the nearest one."
+    changed: dict[str, dict[str, Any]] = {
         "It falls fast and recovers slowly.": {"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9},
         "The rate is 0.9 only where the weight falls.": {"RECOVERY_RATE": 0.9},
         "c_m^2 also holds a hundredth of the squared parallax.": {"DEPTH_ERROR": 0.0},
         "Cells with a confidence of at most 0.1 say nothing.": {"MIN_CONFIDENCE": -1.0},
+        nearest: {"filled_from_nearest": lambda x, empty: x.masked_fill(empty, 0).flatten()},
     }
     handed_on = "These are the weights of the source cells: hand them on along the flow."
     mistakes = [
-        *((patch.multiple(motion_memory, **c)(reference), hint) for hint, c in constants.items()),
+        *((patch.multiple(motion_memory, **c)(reference), hint) for hint, c in changed.items()),
         (motion_memory.update_motion_weight, handed_on),
-        (zeros_left, "A cell to which nothing flows takes the weight of the nearest one."),
     ]
     return check_function(student, reference, cases, 1e-4, mistakes)
