@@ -158,7 +158,7 @@ def check_map_loss(student: Function) -> Verdict:
     """Check (colour, depth, image, reference depth, weight, scales) -> Eq. (6) without SSIM."""
     config = MappingConfig(lambda_ssim=0.0)
 
-    def reference(*a: Tensor, shares: tuple[float, float, float] = (0.8, 0.2, 10.0)) -> Tensor:
+    def reference(*a: Tensor, shares: Any = (0.8, 0.2, 10.0), flaw: str = "") -> Tensor:
         color, depth, image, reference_depth, weight, scales = a
         none = depth.new_zeros(len(scales))
         points, quats = none[:, None].expand(-1, 3), none[:, None].expand(-1, 4)
@@ -166,14 +166,11 @@ def check_map_loss(student: Function) -> Verdict:
         rendering = Rendering(color, depth, torch.zeros_like(depth), none, none)
         view = image, reference_depth, weight
         loss = render_loss(gaussians, rendering, *view, METRIC_MEDIAN, config)
-        return shares[0] * loss.color + shares[1] * loss.depth + shares[2] * loss.isotropic
-
-    def of_known(*a: Tensor) -> Tensor:
-        known = (a[3] > 0).double().mean()
-        return reference(*a, shares=(0.8, 0.2 / float(known), 10))
-
-    def with_unknown(*a: Tensor) -> Tensor:
-        return reference(*a) + 0.2 * (a[4] * (a[3] == 0) * a[1]).mean()
+        unknown = (reference_depth == 0).double()
+        depth_loss = loss.depth / (1 - unknown.mean()) if flaw == "of known" else loss.depth
+        if flaw == "with unknown":
+            depth_loss = depth_loss + (weight * unknown * depth).mean()
+        return shares[0] * loss.color + shares[1] * depth_loss + shares[2] * loss.isotropic
 
     source = torch.Generator().manual_seed(1)
     (color, image), (weight, hidden) = random(source, 2, 5, 6, 3), random(source, 2, 5, 6)
@@ -193,8 +190,8 @@ def check_map_loss(student: Function) -> Verdict:
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 1)), "L_iso is multiplied by 10."),
         (lambda *a: reference(*a, shares=(0.2, 0.8, 10)), "0.8 is for colour, 0.2 for depth."),
-        (of_known, "The mean is over all pixels; one of unknown depth counts 0."),
-        (with_unknown, "Where the reference depth is 0 it is unknown and costs nothing."),
+        ("of known", "The mean is over all pixels; one of unknown depth counts 0."),
+        ("with unknown", "Where the reference depth is 0 it is unknown and costs nothing."),
     ]
     return check_function(student, reference, cases, 1e-7, mistakes)
 
