@@ -17,6 +17,7 @@ from minislam.checks.cases import Case
 
 PASSED, NOT_YET, WRONG = "passed", "not yet", "wrong"
 SINGLE = (torch.float32, torch.float16, torch.bfloat16)
+ARRAYS = (np.float64, np.float32, np.float16)  # torch knows no other real numbers
 SMALLEST = 1e-3  # an expected number below this counts as this: it may be a rounded zero
 SECONDS = 10.0  # of the student's function, all cases together
 
@@ -107,7 +108,7 @@ def real_tensors(value: Any) -> list[Tensor]:
     """Return the tensors and arrays of real numbers in a value, or in lists of values."""
     if isinstance(value, list | tuple):
         return [tensor for part in value for tensor in real_tensors(part)]
-    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind == "f":
+    if isinstance(value, np.ndarray | np.generic) and value.dtype in ARRAYS:
         value = torch.from_numpy(np.array(value))
     return [value] if isinstance(value, Tensor) and value.is_floating_point() else []
 

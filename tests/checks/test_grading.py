@@ -115,6 +115,7 @@ def test_numbers_that_print_alike_print_their_difference():
 def test_what_is_not_an_answer_is_said():
     assert difference("3", RIGHT, 1e-6) == "it returns a str, expected a tensor"
     assert "rows of different lengths" in difference([[1.0], [1.0, 2.0]], RIGHT, 1e-6)
+    assert real_tensors([np.longdouble(1), np.array(["3"]), None]) == []
     assert "returns complex numbers, " in difference(RIGHT + 0j, RIGHT, 1e-6)
     assert difference(RIGHT[0], RIGHT, 1e-6) == "the shape is (3,), expected (2, 3)"
     pair = RIGHT[0], RIGHT[1]
