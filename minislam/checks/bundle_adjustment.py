@@ -44,7 +44,7 @@ def check_target_jacobian(student: Function) -> Verdict:
         case(doubles(0.0, 0.0, 0.0), "points at infinity"),
         *drawn(lambda seed: case(normals(seed, 3).abs(), "another motion", seed)),
     ]
-    hints = [
+    mistakes = [
         (lambda X, d, c: reference(X, d**0, c), "X is d times the point: it moves by d rho."),
         (lambda *a: reference(*a, turn=-1), "The rotation is the wrong way round: -hat(X) phi."),
         (lambda *a: -reference(*a), "This is the derivative of the residual p~ - p."),
@@ -53,7 +53,7 @@ def check_target_jacobian(student: Function) -> Verdict:
         (lambda *a: reference(*a, turn=0), "The rotation is missing: columns 3 to 5."),
         (lambda *a: reference(*a, slide=0), "The translation is missing: columns 0 to 2."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_schur_step(student: Function) -> Verdict:
@@ -80,16 +80,16 @@ def check_schur_step(student: Function) -> Verdict:
         case(3, 20, "three poses and 20 cells"),
         *drawn(lambda seed: case(2, 8 + seed % 5, f"two poses and {8 + seed % 5} cells", seed)),
     ]
-    flaws = {
-        "alone": "The disparities do not stand still: subtract E C^-1 E^T from H.",
-        "old": "The right-hand side changes too: g - E C^-1 s.",
-        "still": "The disparities must follow the poses: s - E^T xi.",
-        "added": "E C^-1 E^T is subtracted from H, not added.",
-        "unscaled": "C^-1 is missing between E and E^T, and between E and s.",
-        "undivided": "The steps of the disparities are divided by C, one by one.",
-    }
-    hints = [(lambda *a: solved(*a)[::-1], "The poses come first: xi, then delta.")]
-    return check_function(student, solved, cases, 1e-9, hints, flaws, ("xi", "delta"))
+    mistakes = [
+        ("alone", "The disparities do not stand still: subtract E C^-1 E^T from H."),
+        ("old", "The right-hand side changes too: g - E C^-1 s."),
+        ("still", "The disparities must follow the poses: s - E^T xi."),
+        ("added", "E C^-1 E^T is subtracted from H, not added."),
+        ("unscaled", "C^-1 is missing between E and E^T, and between E and s."),
+        ("undivided", "The steps of the disparities are divided by C, one by one."),
+        (lambda *a: solved(*a)[::-1], "The poses come first: xi, then delta."),
+    ]
+    return check_function(student, solved, cases, 1e-9, mistakes, ("xi", "delta"))
 
 
 def check_bundle_adjustment(student: Function) -> Verdict:
@@ -115,9 +115,8 @@ def check_bundle_adjustment(student: Function) -> Verdict:
 
     def answered(*arguments: Any) -> Any:
         state = student(*arguments)
-        if isinstance(state, BundleState):
-            return state.T_camera_world, state.disparities
-        return state
+        is_whole = isinstance(state, BundleState)
+        return (state.T_camera_world, state.disparities) if is_whole else state
 
     def case(steps: int, held: int, weights: Tensor, description: str, seed: int = 1) -> Case:
         xi, start, noise, scatter = normals(seed, 4, 3, len(rays)).clamp(-2, 2)
@@ -142,19 +141,17 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         case(3, 2, some(5), "three steps"),
         *drawn(lambda seed: case(1 + seed % 2, 1, some(seed), "drawn weights", seed)),
     ]
-    flaws = {
-        "weights": "Each residual counts with its weight: J^T W J and J^T W r.",
-        "held": "A pose that is not free must not move.",
-        "uphill": "The step points uphill: with r = p~ - p it is added.",
-        "right": "The step stands on the left: exp(xi) T_camera_world.",
-        "damping": "Add the damping to the diagonals of H and of C.",
-        "one": "Repeat the step: each one linearises at the state the last one left.",
-    }
-    hints = [
+    mistakes = [
+        ("weights", "Each residual counts with its weight: J^T W J and J^T W r."),
+        ("held", "A pose that is not free must not move."),
+        ("uphill", "The step points uphill: with r = p~ - p it is added."),
+        ("right", "The step stands on the left: exp(xi) T_camera_world."),
+        ("damping", "Add the damping to the diagonals of H and of C."),
+        ("one", "Repeat the step: each one linearises at the state the last one left."),
         (lambda *a: (loop(*a)[0], a[1].disparities), "The disparities move as well: + delta."),
         (lambda *a: (a[1].T_camera_world, loop(*a)[1]), "The poses move as well: exp(xi) T."),
     ]
-    return check_function(answered, loop, cases, 1e-7, hints, flaws, ("poses", "disparities"))
+    return check_function(answered, loop, cases, 1e-7, mistakes, ("poses", "disparities"))
 
 
 def check_robust_weight(student: Function) -> Verdict:
@@ -168,7 +165,7 @@ def check_robust_weight(student: Function) -> Verdict:
         Case((2 * normals(1, 6, 2), 1.5, 2.0), "c = 1.5 px and k = 2"),
         *drawn(lambda seed: Case((normals(seed, 5, 2), 0.5, 1.5), "c = 0.5 px and k = 1.5")),
     ]
-    hints = [
+    mistakes = [
         (lambda r, c, k: reference(r, c, 1.0), "The power k is an argument."),
         (lambda r, c, k: reference(r, 1.0, k), "The residual is divided by c."),
         (lambda r, c, k: reference(r, c**0.5, k), "c is squared, like the residual."),
@@ -177,7 +174,7 @@ def check_robust_weight(student: Function) -> Verdict:
         (lambda r, c, k: RobustKernel(c, k).weight(r**2), "A cell has one weight: sum over u, v."),
         (lambda r, c, k: RobustKernel(c, k).weight(r.norm(dim=1)), "r is squared, like c."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_prior_mask(student: Function) -> Verdict:
@@ -214,7 +211,7 @@ def check_prior_mask(student: Function) -> Verdict:
         *drawn(lambda seed: case(3, 0.8, "three drawn views", seed)),
     ]
     back = "T_this_other takes points of the other view to this one, not back."
-    hints = [
+    mistakes = [
         (lambda *a: reference(*a, seen=0), "Where fewer than two views have a depth, M stays 1."),
         (lambda *a: 1 - reference(*a), "M is 1 where the prior counts, 0 where views contradict."),
         (lambda d, o, *a: reference(d, [(x, se3_inverse(T)) for x, T in o], *a), back),
@@ -222,4 +219,4 @@ def check_prior_mask(student: Function) -> Verdict:
         # Where all depths are near 3 m, an absolute error is a third of it, relatively.
         (lambda *a: reference(*a[:2], a[-1] / 3), "Divide the difference by the other's depth."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)

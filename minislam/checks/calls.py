@@ -21,6 +21,7 @@ from minislam.geometry import Camera
 
 # Code that is not the student's.
 LIBRARIES = (
+    "<frozen ",  # modules of Python itself, like runpy
     str(Path(minislam.__file__).parent),
     *map(sysconfig.get_path, ("stdlib", "purelib", "platlib")),
 )

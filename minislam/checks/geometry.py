@@ -30,7 +30,7 @@ def check_resized_intrinsics(student: Function) -> Verdict:
     cases = [case(101, 53, "the same size"), case(202, 106, "twice the size"), case(33, 26)]
     cases += drawn(lambda seed: case(20 + 37 * seed % 300, 30 + 23 * seed % 200))
     right = partial(shifted, 0.5, -0.5)
-    hints = [
+    mistakes = [
         (lambda *a: shifted(0, 0, *a), "The image starts at -0.5: (cx + 0.5) * scale - 0.5."),
         (lambda *a: shifted(-0.5, 0.5, *a), "The image starts at -0.5: both signs are wrong."),
         (lambda *a: shifted(0.5, 0, *a), "Take 0.5 off after scaling: it starts at -0.5, too."),
@@ -39,7 +39,7 @@ def check_resized_intrinsics(student: Function) -> Verdict:
         (lambda c, _, h: right(c, c.width * h / c.height, h), "Width and height: a scale each."),
         (lambda c, w, h: right(c, c.width**2 / w, c.height**2 / h), "Scale by new over old size."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_reproject(student: Function) -> Verdict:
@@ -60,14 +60,14 @@ def check_reproject(student: Function) -> Verdict:
         case(doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1), "any motion"),
         *drawn(lambda seed: case(0.1 * normals(seed, 6), "4 pixels", seed)),
     ]
-    hints = [
+    mistakes = [
         (lambda p, d, c, T: reference(p, d, c, se3_inverse(T)), "This is the inverse motion."),
         (lambda p, d, *a: reference(p, 1 / d, *a), "These are no depths: depth = 1 / disparity."),
         (lambda p, d, *a: reference(p, d**0, *a), "The disparities are not used: depth is 1."),
         (lambda p, d, *a: reference(p, 1e-12 * d, *a), "The translation is missing."),
         (lambda *a: reference(*a).flip(-1), "u and v are exchanged: a pixel is (column, row)."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_warped_photo(student: Function) -> Verdict:
@@ -100,12 +100,12 @@ def check_warped_photo(student: Function) -> Verdict:
         case(se3_exp(doubles(0.1, 0, 0, 0, 3.0, 0)), "a source camera that looks back"),
         *drawn(lambda seed: case(any_pose(seed), f"motion {seed}")),
     ]
-    flaws = {
-        "inverted": "This is the inverse motion: T_source_target takes points to the source.",
-        "disparity": "This takes the depth for a disparity: the point is depth times the ray.",
-        "behind": "Points behind the source camera (z <= 0) are not in its photo.",
-        "unmasked": "Where the source sees nothing the answer is 0: outside the photo, or behind.",
-        "rounded": "This takes the nearest pixel: mix the four around the position.",
-        "turned": "The weights are exchanged: the nearer of two pixels has the larger weight.",
-    }
-    return check_function(student, warped, cases, 1e-9, flaws=flaws)
+    mistakes = [
+        ("inverted", "This is the inverse motion: T_source_target takes points to the source."),
+        ("disparity", "This takes the depth for a disparity: the point is depth times the ray."),
+        ("behind", "Points behind the source camera (z <= 0) are not in its photo."),
+        ("unmasked", "Where the source sees nothing it is 0: outside its photo, or behind."),
+        ("rounded", "This takes the nearest pixel: mix the four around the position."),
+        ("turned", "The weights are exchanged: the nearer of two pixels has the larger weight."),
+    ]
+    return check_function(student, warped, cases, 1e-9, mistakes)

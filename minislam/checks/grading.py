@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,13 @@ from minislam.checks.cases import Case
 
 PASSED, NOT_YET, WRONG = "passed", "not yet", "wrong"
 SINGLE = (torch.float32, torch.float16, torch.bfloat16)
+ARRAYS = (np.float64, np.float32, np.float16)  # torch knows no other real numbers
 SMALLEST = 1e-3  # an expected number below this counts as this: it may be a rounded zero
 SECONDS = 10.0  # of the student's function, all cases together
 
 Function = Callable[..., Any]  # answers with numbers in any form, or with a tuple of such
-Hints = Sequence[tuple[Any, str]]  # (known mistake, the sentence that explains it)
+# A known mistake, or the `flaw` with which the reference makes it, and what explains it.
+Mistakes = Sequence[tuple[Any, str]]
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,7 @@ def check_function(
     reference: Function,
     cases: list[Case],
     tolerance: float = 1e-6,  # relative to the largest expected number; 1e-5 in float32
-    hints: Hints = (),
-    flaws: dict[str, str] | None = None,  # those that the reference makes where asked by `flaw=`
+    mistakes: Mistakes = (),
     returns: tuple[str, ...] = (),  # the names of the values, where there are several
 ) -> Verdict:
     """Compare a student's function with the reference on all cases, up to the first difference.
@@ -55,8 +55,6 @@ def check_function(
     MINISLAM_STRICT=1 raises WrongAnswer where the answer has not passed, so that nbmake and
     nbgrader see it.
     """
-    known = [(partial(reference, flaw=flaw), hint) for flaw, hint in (flaws or {}).items()]
-    known.extend(hints)
     seconds = SECONDS
     for case in cases:
         begin = time.process_time()
@@ -69,11 +67,16 @@ def check_function(
         if answer is None:
             return _verdict(NOT_YET, f"for {case.description} the function returns nothing.")
         expected, smallest, allowed = reference(*case.arguments), SMALLEST, tolerance
-        if is_single((answer, given)):  # rounding errors are those of the largest number
+        if any(x.dtype in SINGLE for x in real_tensors((answer, given))):
+            # Rounding errors are those of the largest number.
             allowed, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
         if found := difference(answer, expected, allowed, returns, smallest):
             smallest = max(smallest, largest(expected))
-            others = ((mistake(*case.arguments), hint) for mistake, hint in known)
+            inputs = case.arguments
+            others = (
+                (mistake(*inputs) if callable(mistake) else reference(*inputs, flaw=mistake), hint)
+                for mistake, hint in mistakes
+            )
             named = (h for x, h in others if not difference(answer, x, allowed, (), smallest))
             hint = next(named, "") or relation(answer, expected, allowed)
             return _verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)
@@ -101,22 +104,18 @@ def is_written(function: Function) -> bool:
     return not (is_stub or is_empty)
 
 
-def is_single(value: Any) -> bool:
-    """Say whether some of the numbers have less than double precision."""
+def real_tensors(value: Any) -> list[Tensor]:
+    """Return the tensors and arrays of real numbers in a value, or in lists of values."""
     if isinstance(value, list | tuple):
-        return any(map(is_single, value))
-    if isinstance(value, np.ndarray | np.generic):
-        return value.dtype in (np.float32, np.float16)
-    return isinstance(value, Tensor) and value.dtype in SINGLE
+        return [tensor for part in value for tensor in real_tensors(part)]
+    if isinstance(value, np.ndarray | np.generic) and value.dtype in ARRAYS:
+        value = torch.from_numpy(np.array(value))
+    return [value] if isinstance(value, Tensor) and value.is_floating_point() else []
 
 
 def largest(value: Any) -> float:
     """Return the largest absolute value of all real tensors, 0 if there are none."""
-    if isinstance(value, list | tuple):
-        return max(map(largest, value), default=0.0)
-    if not isinstance(value, Tensor) or not value.is_floating_point() or not value.numel():
-        return 0.0
-    return float(value.abs().max())
+    return max((float(x.abs().max()) for x in real_tensors(value) if x.numel()), default=0.0)
 
 
 def as_numbers(answer: Any) -> Tensor:

@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,9 +22,9 @@ from typing import Any
 import minislam
 from minislam import checks
 from minislam.checks.calls import Stopped, call
-from minislam.checks.grading import SECONDS, WRONG
+from minislam.checks.grading import SECONDS, WRONG, Verdict
 from minislam.checks.points import EXERCISES, MAY_CALL, MAY_NOT_CALL, Exercise
-from minislam.checks.submission import SUBMITTED
+from minislam.checks.submission import SUBMITTED, Part, parts_of
 
 REFUSED = "refused"
 PACKAGE = str(Path(minislam.__file__).parent)
@@ -31,7 +32,8 @@ BY_KEY = {exercise.key: exercise for exercise in EXERCISES}
 
 
 def judge(
-    files: list[tuple[str, str]],  # (path of a part, key of its exercise or ""), in order
+    parts: list[Part],
+    folder: Path,  # in which they run
     wanted: list[str],  # keys to judge; the others are only defined
     without_package: bool,
     report: Callable[[dict[str, Any]], object],
@@ -39,39 +41,41 @@ def judge(
     """Run the parts in order and report {"key": k} before, and the verdict after each exercise."""
     namespace: dict[str, Any] = {}
     installed = _functions()
-    for path, key in files:
-        exercise = BY_KEY[key] if key in wanted else None
-        if exercise is not None:
-            report({"key": key})
-        begin = time.perf_counter()
+    for key in set(wanted) - {part.key for part in parts}:
+        lacking = f"the cell with checks.{BY_KEY[key].check}(...) is missing: put it back."
+        report({"key": key, **vars(Verdict("missing", lacking)), "seconds": 0.0})
+    for number, part in enumerate(parts, start=1):
+        path = folder / f"cell_{number}.py"
+        path.write_text(part.text, encoding="utf-8")
+        known = {name: value for name, value in namespace.items() if not name.startswith("__")}
+        if part.key in wanted:
+            report({"key": part.key})
+        begin, verdict = time.perf_counter(), None
         try:
-            known = {name: value for name, value in namespace.items() if not name.startswith("__")}
-            namespace = call(lambda p=path, k=known: runpy.run_path(p, k), (), SECONDS)[0]
-            function, failure = namespace.get(SUBMITTED), ""
+            namespace, _ = call(partial(runpy.run_path, str(path), known), (), SECONDS)
         except (Stopped, NotImplementedError) as stop:
-            function, failure = None, f"the cell {stop or 'is not written yet'}."
-        if exercise is None:
+            verdict = Verdict(WRONG, f"the cell {str(stop) or 'is not written yet'}.")
+        if part.key not in wanted:
             continue
-        status, sentence, hint = WRONG, failure, ""
-        if not failure:
-            status, sentence, hint = _verdict(exercise, function, without_package)
+        verdict = verdict or _verdict(BY_KEY[part.key], namespace.get(SUBMITTED), without_package)
         changed = [name for name, i in _functions().items() if installed.get(name, i) != i]
         if changed:
-            status, sentence = REFUSED, f"the notebook replaces {changed[0]} of the package."
-        row = {"key": key, "status": status, "sentence": sentence, "hint": hint}
-        report({**row, "seconds": round(time.perf_counter() - begin, 2)})
+            replaced = f"the notebook replaces {changed[0]} of the package."
+            verdict = Verdict(REFUSED, replaced, verdict.hint)
+        seconds = round(time.perf_counter() - begin, 2)
+        report({"key": part.key, **vars(verdict), "seconds": seconds})
 
 
-def _verdict(exercise: Exercise, function: Any, without_package: bool) -> tuple[str, str, str]:
+def _verdict(exercise: Exercise, function: Any, without_package: bool) -> Verdict:
     used: set[str] = set()
     answer = _watched(function, exercise, used) if without_package else function
     try:
         verdict = getattr(checks, exercise.check)(answer)
     except Exception as error:  # a check that the answer has confused
-        return WRONG, f"the check stops with {type(error).__name__}: {error}.", ""
+        return Verdict(WRONG, f"the check stops with {type(error).__name__}: {error}.")
     if used:
-        return REFUSED, f"the answer calls {min(used)} of minislam: write it yourself.", ""
-    return verdict.status, verdict.sentence, verdict.hint
+        return Verdict(REFUSED, f"the answer calls {min(used)} of minislam: write it yourself.")
+    return verdict
 
 
 def _functions() -> dict[str, int]:
@@ -123,7 +127,8 @@ def main(folder: Path) -> None:
         with open(folder / "verdicts.txt", "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
-    judge([tuple(pair) for pair in job["files"]], job["wanted"], job["without_package"], report)
+    parts = parts_of(job["notebook"], [BY_KEY[key] for key in job["keys"]])
+    judge(parts, folder, job["wanted"], job["without_package"], report)
 
 
 if __name__ == "__main__":

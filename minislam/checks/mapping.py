@@ -39,9 +39,6 @@ def check_sampling(student: Function) -> Verdict:
     def unguarded(n: int, window: list[int], weight: float) -> Tensor:
         return shared(n, window, weight / len(window), (1 - weight) / max(n - len(window), 1))
 
-    def guarded_at_half(n: int, window: list[int], weight: float) -> Tensor:
-        return (uniform if len(window) > 0.5 * n else unguarded)(n, window, weight)
-
     def draw(seed: int) -> Case:
         count, weight = 20 + seed % 7, (0.3, 0.6, 0.8)[seed % 3]
         window = normals(seed, count).argsort()[: 4 + seed % 2].tolist()
@@ -55,7 +52,8 @@ def check_sampling(student: Function) -> Verdict:
         Case((20, [19, 18, 17, 16, 15, 14, 13, 12, 11, 10, 3, 2], 0.7), "the weight 0.7"),
         *drawn(draw),
     ]
-    hints = [
+    at_half = "Compare the window's share of all keyframes with the weight."
+    mistakes = [
         (unguarded, "While the window is most of the map, all keyframes are equally likely."),
         (uniform, "The window should get its weight, however many other keyframes there are."),
         (lambda n, w, s: shared(n, w, 1 / len(w), 0), "The others: the map would forget them."),
@@ -64,9 +62,9 @@ def check_sampling(student: Function) -> Verdict:
         (lambda n, w, s: unguarded(n, w, 1 - s), "The weight belongs to the window."),
         (lambda n, w, s: right(n, w, 0.5), "One half is one weight of many."),
         (lambda n, w, s: right(n, [*range(n)][-len(w) :], s), "Not the newest, but the window."),
-        (guarded_at_half, "Compare the window's share of all keyframes with the weight."),
+        (lambda n, w, s: (uniform if 2 * len(w) > n else unguarded)(n, w, s), at_half),
     ]
-    return check_function(student, right, cases, 1e-6, hints)
+    return check_function(student, right, cases, 1e-6, mistakes)
 
 
 def check_deformed_means(student: Function) -> Verdict:
@@ -98,7 +96,7 @@ def check_deformed_means(student: Function) -> Verdict:
         case(torch.tensor([0, 1, 1, 0, 1]), "two keyframes that move apart"),
         *drawn(lambda seed: case(normals(seed, 6).argsort() % 3, "three keyframes", seed)),
     ]
-    hints = [
+    mistakes = [
         (lambda x, r, a, b: moved(se3_inverse(a) @ b, x, r), "The old pose comes first."),
         (lambda x, r, a, b: moved(b @ se3_inverse(a), x, r), "This moves points of a camera."),
         (lambda x, r, a, b: reference(x, 0 * r, a, b), "All follow the first keyframe."),
@@ -107,7 +105,7 @@ def check_deformed_means(student: Function) -> Verdict:
         (lambda *a: only(slice(0, 3), *a), "The translation is missing."),
         (lambda *a: only(slice(3, 4), *a), "The rotation is missing."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_insertion(student: Function) -> Verdict:
@@ -117,19 +115,16 @@ def check_insertion(student: Function) -> Verdict:
     known, the weight positive and the map transparent.
     """
 
-    def reference(*a: Any, depth_at_least: float = 1e-9) -> Tensor:
+    def reference(*a: Any, flaw: str = "") -> Tensor:
         image, depth, weight, opacity, camera, T, cell = a
-        allowed = (depth >= depth_at_least) & (weight > 0) & (opacity < EXPLAINED_OPACITY)
+        known = (depth > 0) | (flaw == "unknown")
+        allowed = known & (weight > 0) & (opacity < EXPLAINED_OPACITY)
         middle = torch.zeros_like(allowed)
         middle[cell // 2 :: cell, cell // 2 :: cell] = True
         pixels = (allowed & middle).nonzero().flip(-1)
         new = gaussians_at_pixels(pixels, image, depth, camera, T, 0, InsertionConfig(cell))
-        return torch.cat([new.means, new.scales[:, :1], new.colors], -1)
-
-    def of_one_size(*a: Any) -> Tensor:
-        answer = reference(*a)
-        answer[:, 3] /= transform_points(a[5], answer[:, :3])[:, 2]
-        return answer
+        far = transform_points(T, new.means)[:, 2:] if flaw == "one size" else 1
+        return torch.cat([new.means, new.scales[:, :1] / far, new.colors], -1)
 
     shape = CAMERA.height, CAMERA.width
     values = random(torch.Generator().manual_seed(0), 7, *shape)
@@ -146,24 +141,24 @@ def check_insertion(student: Function) -> Verdict:
         Case((image, depth, weight, opacity, CAMERA, T, 3), "a map that covers a part"),
     ]
     corner = replace(CAMERA, cx=0.0, cy=0.0)
-    hints = [
-        (lambda *a: reference(*a, depth_at_least=0), "Depth 0 means unknown: insert nothing."),
+    mistakes = [
+        ("unknown", "Depth 0 means unknown: insert nothing."),
         (lambda i, d, w, *a: reference(i, d, one, *a), "Weight 0 is a dynamic object: leave it."),
         (lambda *a: reference(*a[:3], zero, *a[4:]), "Parts of the map are opaque there already."),
         (lambda *a: reference(*a[:3], 1.6 - a[3], *a[4:]), "Insert where the map is transparent."),
         (lambda *a: reference(*a[:5], se3_inverse(a[5]), a[6]), "From camera to world: T^-1."),
         (lambda *a: reference(*a[:5], start, a[6]), "These means are in the camera's frame."),
         (lambda *a: reference(*a[:4], corner, *a[5:]), "A ray is (u - cx) / fx, (v - cy) / fy, 1."),
-        (of_one_size, "A cell at depth z is cell * z / f wide."),
+        ("one size", "A cell at depth z is cell * z / f wide."),
     ]
-    return check_function(student, reference, cases, 1e-6, hints)
+    return check_function(student, reference, cases, 1e-6, mistakes)
 
 
 def check_map_loss(student: Function) -> Verdict:
     """Check (colour, depth, image, reference depth, weight, scales) -> Eq. (6) without SSIM."""
     config = MappingConfig(lambda_ssim=0.0)
 
-    def reference(*a: Tensor, shares: tuple[float, float, float] = (0.8, 0.2, 10.0)) -> Tensor:
+    def reference(*a: Tensor, shares: Any = (0.8, 0.2, 10.0), flaw: str = "") -> Tensor:
         color, depth, image, reference_depth, weight, scales = a
         none = depth.new_zeros(len(scales))
         points, quats = none[:, None].expand(-1, 3), none[:, None].expand(-1, 4)
@@ -171,14 +166,11 @@ def check_map_loss(student: Function) -> Verdict:
         rendering = Rendering(color, depth, torch.zeros_like(depth), none, none)
         view = image, reference_depth, weight
         loss = render_loss(gaussians, rendering, *view, METRIC_MEDIAN, config)
-        return shares[0] * loss.color + shares[1] * loss.depth + shares[2] * loss.isotropic
-
-    def of_known(*a: Tensor) -> Tensor:
-        known = (a[3] > 0).double().mean()
-        return reference(*a, shares=(0.8, 0.2 / float(known), 10))
-
-    def with_unknown(*a: Tensor) -> Tensor:
-        return reference(*a) + 0.2 * (a[4] * (a[3] == 0) * a[1]).mean()
+        unknown = (reference_depth == 0).double()
+        depth_loss = loss.depth / (1 - unknown.mean()) if flaw == "of known" else loss.depth
+        if flaw == "with unknown":
+            depth_loss = depth_loss + (weight * unknown * depth).mean()
+        return shares[0] * loss.color + shares[1] * depth_loss + shares[2] * loss.isotropic
 
     source = torch.Generator().manual_seed(1)
     (color, image), (weight, hidden) = random(source, 2, 5, 6, 3), random(source, 2, 5, 6)
@@ -192,16 +184,16 @@ def check_map_loss(student: Function) -> Verdict:
         Case((color, depth, image, holes, weight, scales), "depth that is unknown in places"),
         Case((color, depth, image, holes, weight, needles), "thin Gaussians"),
     ]
-    hints = [
+    mistakes = [
         (lambda *a: reference(*a[:4], one, a[5]), "Each pixel has its weight."),
         (lambda *a: reference(*a[:4], a[4] / a[4].mean(), a[5]), "Divide by the number of pixels."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 1)), "L_iso is multiplied by 10."),
         (lambda *a: reference(*a, shares=(0.2, 0.8, 10)), "0.8 is for colour, 0.2 for depth."),
-        (of_known, "The mean is over all pixels; one of unknown depth counts 0."),
-        (with_unknown, "Where the reference depth is 0 it is unknown and costs nothing."),
+        ("of known", "The mean is over all pixels; one of unknown depth counts 0."),
+        ("with unknown", "Where the reference depth is 0 it is unknown and costs nothing."),
     ]
-    return check_function(student, reference, cases, 1e-7, hints)
+    return check_function(student, reference, cases, 1e-7, mistakes)
 
 
 def check_followed_pose(student: Function) -> Verdict:
@@ -261,7 +253,7 @@ def check_followed_pose(student: Function) -> Verdict:
         (lambda *a: se3_inverse(motion(*a)) @ a[2], "The pose moves the other way."),
         (unweighted, "The camera follows the dynamic object: each pixel has its weight."),
     ]
-    hints = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
+    mistakes = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
     cases = [case for case, _ in pairs]
     answered, right = partial(pixels_of, student), partial(pixels_of, true_pose)
-    return check_function(answered, right, cases, 0.016, hints)
+    return check_function(answered, right, cases, 0.016, mistakes)

@@ -30,7 +30,7 @@ def check_gains(student: Function) -> Verdict:
         case(2, 0.8, "a colder one"),
         *drawn(lambda seed: case(seed + 9, 1.1, "drawn colours")),
     ]
-    hints = [
+    mistakes = [
         (lambda a, b: reference(a, b, -1.0, 2.0), "Saturated or dark values are no proportion."),
         (lambda a, b: reference(a, b, -1.0), "Values below 0.05 are nearly all noise."),
         (lambda a, b: reference(a, b, high=2.0), "Values above 0.95 are cut off."),
@@ -38,7 +38,7 @@ def check_gains(student: Function) -> Verdict:
         (lambda a, b: (b / a).mean(0), "A mean follows what moves: take the median."),
         (lambda a, b: reference(a, b).mean().expand(3), "Each channel has a gain of its own."),
     ]
-    return check_function(student, reference, cases, 1e-6, hints)
+    return check_function(student, reference, cases, 1e-6, mistakes)
 
 
 def check_stride(student: Function) -> Verdict:
@@ -89,17 +89,17 @@ def check_stride(student: Function) -> Verdict:
         case(5, 4.0, 1.0, "a camera that runs"),
         *drawn(lambda seed: case(seed + 20, 0.7, 1.5, "a drawn walk")),
     ]
-    flaws = {
-        "once": "Weigh by 1/max(residual, 0.5) and fit anew, ten times in all.",
-        "squared": "The weight is 1/residual, not 1/residual^2.",
-        "no roll": "The third column, a roll about the viewing axis, is missing.",
-        "flat": "Away from the centre a turn moves a point more: 1 + x^2, 1 + y^2.",
-        "whole": "This is the whole flow: take away what a turn explains.",
-        "shifted": "A turn is not the mean flow.",
-        "mean": "Take medians: the mean follows what moves.",
-        "largest": "The smallest stride that suffices, please.",
-        "never 0": "Where no stride suffices, the answer is 0.",
-        "place": "Not its place in the list: the stride.",
-    }
+    mistakes = [
+        ("once", "Weigh by 1/max(residual, 0.5) and fit anew, ten times in all."),
+        ("squared", "The weight is 1/residual, not 1/residual^2."),
+        ("no roll", "The third column, a roll about the viewing axis, is missing."),
+        ("flat", "Away from the centre a turn moves a point more: 1 + x^2, 1 + y^2."),
+        ("whole", "This is the whole flow: take away what a turn explains."),
+        ("shifted", "A turn is not the mean flow."),
+        ("mean", "Take medians: the mean follows what moves."),
+        ("largest", "The smallest stride that suffices, please."),
+        ("never 0", "Where no stride suffices, the answer is 0."),
+        ("place", "Not its place in the list: the stride."),
+    ]
     returns = "the parallax of each stride", "the stride"
-    return check_function(student, found, cases, 1e-4, flaws=flaws, returns=returns)
+    return check_function(student, found, cases, 1e-4, mistakes, returns=returns)

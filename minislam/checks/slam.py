@@ -38,7 +38,7 @@ def check_ate(student: Function) -> Verdict:
         case(0.25, True, "an estimate in another unit and frame"),
         *drawn(lambda seed: case(0.5 + seed % 3, seed % 2 == 0, "another walk", seed)),
     ]
-    hints = [
+    mistakes = [
         (lambda e, t: rms(e - t), "The estimate is not aligned yet."),
         (lambda e, t: rms(distances(e, t, False)), "A monocular estimate has no scale: align it."),
         (lambda e, t: distances(e, t).mean(), "ATE is the root of the mean square."),
@@ -50,7 +50,7 @@ def check_ate(student: Function) -> Verdict:
         (lambda e, t: distances(e, t).max(), "ATE is no maximum."),
         (lambda e, t: rms(e - t - (e - t).mean(0)), "Centred, but neither turned nor scaled yet."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_separability(student: Function) -> Verdict:
@@ -76,7 +76,7 @@ def check_separability(student: Function) -> Verdict:
         case([0.5, 0.5, 0.8, 0.3], [1, 0, 1, 0], "a beta that does not tell two cells apart"),
         *drawn(draw),
     ]
-    hints = [
+    mistakes = [
         (lambda b, m: wins(b, ~m, 0.5), "The other way round: what moves has the larger beta."),
         (lambda b, m: wins(b, m, 0.0), "A pair with equal beta is worth one half."),
         (lambda b, m: wins(b, m, 1.0), "A pair with equal beta is worth one half."),
@@ -85,32 +85,22 @@ def check_separability(student: Function) -> Verdict:
         (lambda b, m: b[m].mean() - b[~m].mean(), "This is a difference of means, no fraction."),
         (lambda b, m: ((b > np.median(b)) == m).mean(), "No threshold: compare all pairs."),
     ]
-    return check_function(student, auroc, cases, 1e-9, hints)
+    return check_function(student, auroc, cases, 1e-9, mistakes)
 
 
 def check_alignment(student: Function) -> Verdict:
     """Check (estimated (N, 3), true centres (N, 3)) -> the best Sim(3) as [s R, t; 0, 1] (4, 4)."""
 
-    def matrix(scale: float, R: np.ndarray, estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    def aligned(e: np.ndarray, t: np.ndarray, flaw: str = "") -> np.ndarray:
+        best, centred = umeyama(e, t), e - e.mean(0)
+        R, scale, spread = best.rotation, best.scale, (centred**2).sum()
+        if flaw == "mirrored":
+            u, d, v = np.linalg.svd((t - t.mean(0)).T @ centred)
+            R, scale = u @ v, d.sum() / spread
+        scale = {"spread": np.sqrt(len(t) * t.var(0).sum() / spread), "1": 1.0}.get(flaw, scale)
         A = np.eye(4)
-        A[:3, :3] = scale * R
-        A[:3, 3] = truth.mean(0) - A[:3, :3] @ estimate.mean(0)
-        return A
-
-    def reference(e: np.ndarray, t: np.ndarray, scale: float = 0.0) -> np.ndarray:
-        best = umeyama(e, t)
-        return matrix(scale or best.scale, best.rotation, e, t)
-
-    def mirrored(e: np.ndarray, t: np.ndarray) -> np.ndarray:
-        u, d, v = np.linalg.svd((t - t.mean(0)).T @ (e - e.mean(0)))
-        return matrix(d.sum() / ((e - e.mean(0)) ** 2).sum(), u @ v, e, t)
-
-    def by_spread(e: np.ndarray, t: np.ndarray) -> np.ndarray:
-        return reference(e, t, np.sqrt(t.var(0).sum() / e.var(0).sum()))
-
-    def centred(e: np.ndarray, t: np.ndarray) -> np.ndarray:
-        A = reference(e, t)
-        A[:3, 3] = t.mean(0) - e.mean(0)
+        A[:3, :3] = scale * (R.T if flaw == "transposed" else R)
+        A[:3, 3] = t.mean(0) - (e.mean(0) if flaw == "unturned" else A[:3, :3] @ e.mean(0))
         return A
 
     def case(scale: float, noise: float, mirror: float, count: int, description: str) -> Case:
@@ -126,16 +116,16 @@ def check_alignment(student: Function) -> Verdict:
         case(2.0, 0.1, -1.0, 20, "points that a reflection would fit better"),
         case(2.0, 0.1, 1.0, 3, "three points"),
     ]
-    hints = [
-        (lambda e, t: reference(e, t, 1.0), "Monocular: the scale is unknown."),
-        (mirrored, "A rotation has determinant +1: turn the last column of U if it is -1."),
-        (by_spread, "With errors s is trace(D S) over the variance of the estimate."),
-        (lambda e, t: np.linalg.inv(reference(e, t)), "This maps the truth to the estimate."),
-        (lambda e, t: reference(t, e), "This maps the truth to the estimate."),
-        (centred, "t maps the TURNED and scaled mean of the estimate to that of the truth."),
-        (lambda e, t: matrix(1.0, reference(e, t)[:3, :3].T, e, t), "This is R^T."),
+    mistakes = [
+        ("1", "Monocular: the scale is unknown."),
+        ("mirrored", "A rotation has determinant +1: turn the last column of U if it is -1."),
+        ("spread", "With errors s is trace(D S) over the variance of the estimate."),
+        (lambda e, t: np.linalg.inv(aligned(e, t)), "This maps the truth to the estimate."),
+        (lambda e, t: aligned(t, e), "This maps the truth to the estimate."),
+        ("unturned", "t maps the TURNED and scaled mean of the estimate to that of the truth."),
+        ("transposed", "This is R^T."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, aligned, cases, 1e-9, mistakes)
 
 
 def check_sign_test(student: Function) -> Verdict:
@@ -158,10 +148,10 @@ def check_sign_test(student: Function) -> Verdict:
         "no difference at all": [[1.0, 2.0, 1.5], [1.0, 2.0, 1.5]],
     }
     cases = [Case((*np.array(errors),), name) for name, errors in of_clips.items()]
-    hints = [
+    mistakes = [
         (lambda a, b: reference(a, b, sided=1), "A difference the other way is as surprising."),
         (lambda a, b: reference(a, b, -1e-12), "At least as far: the measured one counts as well."),
         (lambda a, b: 1 - reference(a, b), "This is the fraction of the others."),
         (lambda a, b: reference(a, b) * 2 ** len(a), "Divide by the number of choices, 2^N."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)

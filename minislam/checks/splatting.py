@@ -39,7 +39,7 @@ def check_projected_covariance(student: Function) -> Verdict:
     low_pass = LOW_PASS_VARIANCE * torch.eye(2).double()
     off_diagonal = LOW_PASS_VARIANCE - low_pass
     at_world = "J is taken at the world point: move the mean into the camera frame first."
-    hints = [
+    mistakes = [
         (lambda *a: reference(*a) - low_pass, "The low-pass filter is missing: add 0.3 I."),
         (lambda *a: turned(1, *a), "Sigma is still in the world frame: turn it by W before J."),
         (lambda *a: turned(2, *a), "This turns Sigma the wrong way: it is W Sigma W^T."),
@@ -47,7 +47,7 @@ def check_projected_covariance(student: Function) -> Verdict:
         (lambda *a: torch.linalg.inv(reference(*a)), "This is the conic, the inverse of Sigma'."),
         (lambda S, x, *a: project_covariances(S[None], x[None], *a)[0], at_world),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_pixel_color(student: Function) -> Verdict:
@@ -73,17 +73,16 @@ def check_pixel_color(student: Function) -> Verdict:
         case(0, "no Gaussian at all", grey),
         *drawn(lambda seed: case(1 + seed % 5, f"a list of {1 + seed % 5}, on blue", blue, seed)),
     ]
-    flaws = {
-        "no background": "The background is missing: add T_end times its colour.",
-        "itself": "T_i holds only the Gaussians in front of i, not i itself.",
-        "unattenuated": "The background shines through T_end only: multiply it.",
-        "opaque": "Each colour counts T_i times its own alpha_i.",
-        "sum": "The light that is left is a product of (1 - alpha), not 1 minus a sum.",
-        "unshaded": "T_i is missing: what stands in front takes light away.",
-    }
-    farthest = "This starts with the farthest: the list is sorted nearest first."
-    hints = [(lambda a, c, b: blended(a.flip(0), c.flip(0), b), farthest)]
-    return check_function(student, blended, cases, 1e-9, hints, flaws)
+    mistakes = [
+        ("no background", "The background is missing: add T_end times its colour."),
+        ("itself", "T_i holds only the Gaussians in front of i, not i itself."),
+        ("unattenuated", "The background shines through T_end only: multiply it."),
+        ("opaque", "Each colour counts T_i times its own alpha_i."),
+        ("sum", "The light that is left is a product of (1 - alpha), not 1 minus a sum."),
+        ("unshaded", "T_i is missing: what stands in front takes light away."),
+        (lambda a, c, b: blended(a.flip(0), c.flip(0), b), "The list is sorted nearest first."),
+    ]
+    return check_function(student, blended, cases, 1e-9, mistakes)
 
 
 def check_rendered_image(student: Function) -> Verdict:
@@ -117,15 +116,15 @@ def check_rendered_image(student: Function) -> Verdict:
         case(5, turned, "five Gaussians, one behind the camera"),
         *drawn(lambda seed: case(5, any_pose(seed), f"five Gaussians and pose {seed}")),
     ]
-    flaws = {
-        "unsorted": "Sort by the depth in the camera frame: the list has no order.",
-        "far first": "This is sorted the wrong way: the nearest Gaussian comes first.",
-        "behind": "A Gaussian behind the camera (z < 0.05) is not seen: leave it out.",
-        "sharp": "The low-pass filter is missing: add 0.3 I to Sigma'.",
-        "whole": "The exponent is -1/2 of the squared distance.",
-        "added": "Light is used up on its way: multiply T by 1 - alpha after each Gaussian.",
-    }
-    return check_function(student, rendered, cases, 1e-6, flaws=flaws)
+    mistakes = [
+        ("unsorted", "Sort by the depth in the camera frame: the list has no order."),
+        ("far first", "This is sorted the wrong way: the nearest Gaussian comes first."),
+        ("behind", "A Gaussian behind the camera (z < 0.05) is not seen: leave it out."),
+        ("sharp", "The low-pass filter is missing: add 0.3 I to Sigma'."),
+        ("whole", "The exponent is -1/2 of the squared distance."),
+        ("added", "Light is used up on its way: multiply T by 1 - alpha after each Gaussian."),
+    ]
+    return check_function(student, rendered, cases, 1e-6, mistakes)
 
 
 def check_conic_vjp(student: Function) -> Verdict:
@@ -155,7 +154,7 @@ def check_conic_vjp(student: Function) -> Verdict:
         case(normals(7, 2, 3, 3) + V, normals(8, 3, 3), "three Gaussians"),
         *drawn(draw),
     ]
-    hints = [
+    mistakes = [
         (lambda *a: -reference(*a), "The sign is flipped: d(M^-1) = -M^-1 dM M^-1."),
         (lambda *a: reference(*a) / 2, "A factor 2 is missing: V appears twice in V V^T."),
         (lambda *a: product("QGQ", 1, 1, *a), "b is counted twice: each place gets v_b / 2."),
@@ -165,7 +164,7 @@ def check_conic_vjp(student: Function) -> Verdict:
         (lambda V, *a: 0 * V + reference(V, *a).sum(-1, True), "Do not sum over the N Gaussians."),
         (lambda V, *a: 0 * V + reference(V, *a)[..., :1], "Each Gaussian has its own gradient."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_twist_vjp(student: Function) -> Verdict:
@@ -187,7 +186,7 @@ def check_twist_vjp(student: Function) -> Verdict:
         *drawn(lambda seed: case(3 - seed % 3, f"N = {3 - seed % 3}", seed)),
     ]
     turning = "The factors turn with the camera as well: B x v_B."
-    hints = [
+    mistakes = [
         (lambda x, B, v, u: right(x, B, v, 0 * u), turning),
         (lambda *a: exchanged * right(*a), "The wrong way round: v_phi = x cross v_x."),
         (lambda *a: right(*a).roll(3), "The order is (rho, phi), translation first."),
@@ -195,7 +194,7 @@ def check_twist_vjp(student: Function) -> Verdict:
         (lambda x, *a: right(0 * x, *a), "The means turn with the camera as well: x cross v_x."),
         (moves_factors, "A translation moves the means only: the factors have no place."),
     ]
-    return check_function(student, right, cases, 1e-9, hints)
+    return check_function(student, right, cases, 1e-9, mistakes)
 
 
 def check_picture_gradient(student: Function) -> Verdict:
@@ -232,7 +231,7 @@ def check_picture_gradient(student: Function) -> Verdict:
         *drawn(lambda seed: case(3, f"three Gaussians, {seed}", seed)),
     ]
     returns = "the image", "the gradient"
-    hints = [
+    mistakes = [
         (scaled(-1), "The sign is flipped: v = 2 (image - target)."),
         (scaled(0.5), "A factor 2 is missing: L is the sum of the squares."),
         (scaled(1 / target.numel()), "L is a sum over the pixels, not a mean."),
@@ -240,4 +239,4 @@ def check_picture_gradient(student: Function) -> Verdict:
         (scaled(0.5, slice(3, 4)), "b stands twice in the quadratic form: v_b = -sum g du dv."),
         (partial(reference, fixed_light=True), "A Gaussian also hides what is behind it: R_{k+1}."),
     ]
-    return check_function(student, reference, cases, 1e-7, hints, returns=returns)
+    return check_function(student, reference, cases, 1e-7, mistakes, returns=returns)

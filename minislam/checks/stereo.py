@@ -36,7 +36,7 @@ def check_plane_homography(student: Function) -> Verdict:
         Case((K, se3_inverse(T), 0.8), "a camera that moves the other way"),
         *drawn(draw),
     ]
-    hints = [
+    mistakes = [
         (lambda K, T, q: reference(K, se3_inverse(T), q), "This is the way back."),
         (lambda K, T, q: reference(K, T, q and 1 / q), "q is an inverse depth: t times q."),
         (lambda K, *a: K.inverse() @ reference(K, *a) @ K, "H needs K on both sides: for pixels."),
@@ -46,7 +46,7 @@ def check_plane_homography(student: Function) -> Verdict:
         (lambda K, T, q: torch.linalg.inv(reference(K, T, q)), "This maps the other image to us."),
         (lambda K, T, q: reference(K, T, q) @ K @ K, "The last factor is K^-1, not K."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_plane_cost(student: Function) -> Verdict:
@@ -78,12 +78,12 @@ def check_plane_cost(student: Function) -> Verdict:
         Case((gray, warped[:3]), "three views, of which two are the better half"),
         Case((gray, partly), "views that do not see every pixel"),
     ]
-    flaws = {
-        "every": "Only the better half of the views is averaged.",
-        "worse": "This is the worse half.",
-        "pixel": "Average over the 5x5 px around the pixel.",
-        "down": "Of three views two are the half: round up.",
-        "unseen": "A pixel that no view sees costs 1.",
-        "outside": "A negative value is outside of the image: that view does not count there.",
-    }
-    return check_function(student, reference, cases, 1e-6, flaws=flaws)
+    mistakes = [
+        ("every", "Only the better half of the views is averaged."),
+        ("worse", "This is the worse half."),
+        ("pixel", "Average over the 5x5 px around the pixel."),
+        ("down", "Of three views two are the half: round up."),
+        ("unseen", "A pixel that no view sees costs 1."),
+        ("outside", "A negative value is outside of the image: that view does not count there."),
+    ]
+    return check_function(student, reference, cases, 1e-6, mistakes)

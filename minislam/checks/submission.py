@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ast
 import re
-from collections import Counter
 from dataclasses import dataclass
+from statistics import mode
 
 from minislam.checks.points import EXERCISES, Exercise
 from minislam.errors import InputError
@@ -22,23 +22,23 @@ DEFINITIONS = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.ClassDef)
 class Part:
     """What is kept of one cell, as Python text whose line numbers are the cell's."""
 
-    text: str
+    text: str  # the whole cell where Python cannot read it
     key: str = ""  # of the exercise, "" for another cell
-    error: str = ""  # why it cannot be run, "" if it can
 
 
 def exercises_of(notebook: dict, name: str) -> list[Exercise]:
     """Return the exercises that a notebook should hold, told by its checks or else by its name."""
-    called = " ".join(re.findall(r"\bcheck_\w+", "\n".join(_code(notebook))))
-    votes = Counter(e.notebook for e in EXERCISES if re.search(rf"\b{e.check}\b", called))
+    called = re.findall(r"\bcheck_\w+", "\n".join(_code(notebook)))
     number = name.split("_")[0]
-    votes.update(e.notebook for e in EXERCISES if not votes and e.notebook.split("_")[0] == number)
+    votes = [e.notebook for e in EXERCISES if e.check in called] or [
+        e.notebook for e in EXERCISES if e.notebook.split("_")[0] == number
+    ]
     if not votes:
         raise InputError(
             f"expected a notebook of the course, found none of its exercises in {name}; give one "
             "that `minislam notebooks` has made"
         )
-    return [e for e in EXERCISES if e.notebook == votes.most_common(1)[0][0]]
+    return [e for e in EXERCISES if e.notebook == mode(votes)]
 
 
 def parts_of(notebook: dict, exercises: list[Exercise]) -> list[Part]:
@@ -61,10 +61,9 @@ def _code(notebook: dict) -> list[str]:
 def _part(text: str, exercises: list[Exercise]) -> Part:
     try:
         tree = ast.parse(text)
-    except (SyntaxError, ValueError) as error:
+    except (SyntaxError, ValueError):
         named = [e.key for e in exercises if re.search(rf"^checks\.{e.check}\(", text, re.M)]
-        place = f"line {getattr(error, 'lineno', '?')} of the cell: {error.args[0]}"
-        return Part("", named[0] if named else "", f"Python cannot read {place}")
+        return Part(text, named[0] if named else "")
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     for exercise in exercises:
         for call in calls:

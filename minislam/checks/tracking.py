@@ -60,7 +60,7 @@ def check_flow_distance(student: Function) -> Verdict:
         case([0.3, 0.1, 0.2, 0.02, -0.05, 0.03], 0.75, "a camera that does both"),
         *drawn(lambda seed: case(any_twist(seed, 0.03), 0.3, "another motion, beta = 0.3")),
     ]
-    hints = [
+    mistakes = [
         (lambda *a: reference(*a[:-1], 1.0), "The flow without rotation has the weight 1 - beta."),
         (lambda *a: reference(*a[:-1], 0.0), "This is the flow without rotation alone."),
         (lambda *a: reference(*a[:-1], 1 - a[-1]), "beta and 1 - beta are exchanged."),
@@ -74,7 +74,7 @@ def check_flow_distance(student: Function) -> Verdict:
         (changed(lambda f: f.square().sum(1).mean()), "A length is the root of u^2 + v^2."),
         (changed(lambda f: f.norm(dim=1).mean(), True), "Without rotation, not translation."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_suppressed(student: Function) -> Verdict:
@@ -109,7 +109,7 @@ def check_suppressed(student: Function) -> Verdict:
         Case((5, 4, 11, 2), "two neighbours"),
         *drawn(draw),
     ]
-    hints = [
+    mistakes = [
         (of_radius(lambda n, most: max(min(n - 2, most), 0), torch.inf), "A diamond: |a| + |b|."),
         (of_radius(lambda n, most: most), "Near the diagonal the radius shrinks: |i - j| - 2."),
         (lambda *a: reference(*a) + reference(*a).T, "Only pairs (newer, older), a > b."),
@@ -120,7 +120,7 @@ def check_suppressed(student: Function) -> Verdict:
         (of_radius(lambda n, most: 0), "Only the pair itself: its neighbours are left out, too."),
         (lambda *a: (1 - reference(*a)).tril(-1), "True stands for the pairs that are left out."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_keyframes(student: Function) -> Verdict:
@@ -167,16 +167,14 @@ def check_keyframes(student: Function) -> Verdict:
         Case((shown(slide[:6], blinking=True), 6.9, 20), "a screen that blinks"),
         *drawn(draw),
     ]
-    flaws = {
-        "equal": "The mean is weighted by the confidence of each cell.",
-        "unmatched": "A frame of which too little is matched is kept as well.",
-        "no restart": "The flow starts anew, from the frame that was kept last.",
-    }
-    hints = [
+    mistakes = [
+        ("equal", "The mean is weighted by the confidence of each cell."),
+        ("unmatched", "A frame of which too little is matched is kept as well."),
+        ("no restart", "The flow starts anew, from the frame that was kept last."),
         (lambda a, b, _: choice(a, b, 99), "At the latest `interval` frames after the last one."),
         (lambda *a: choice(*a)[1:], "Frame 0 is the first that is kept."),
     ]
-    return check_function(student, choice, cases, 1e-9, hints, flaws)
+    return check_function(student, choice, cases, 1e-9, mistakes)
 
 
 def check_bounded_loss(student: Function) -> Verdict:
@@ -190,7 +188,7 @@ def check_bounded_loss(student: Function) -> Verdict:
         Case((doubles(0, 0.5, 3, 40), 2.0, 2), "k = 2 and c = 2 px"),
         *drawn(lambda seed: Case((normals(seed, 5).abs(), 0.5, 1 + seed % 2), "c = 0.5 px")),
     ]
-    hints = [
+    mistakes = [
         (lambda r, c, k: reference(r, c, 1), "With k = 2 the loss is bounded: L_2."),
         (lambda r, c, k: reference(r, c, 2), "With k = 1 the loss is a logarithm: L_1."),
         (lambda r, c, k: reference(r, c, k) / c**2, "The factor c^2 in front is missing."),
@@ -199,7 +197,7 @@ def check_bounded_loss(student: Function) -> Verdict:
         (lambda r, c, k: RobustKernel(c, k).loss(r * c), "r / c is squared."),
         (lambda r, c, k: reference(r, c, k) / 2, "This is half of the loss."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_motion_memory(student: Function) -> Verdict:
@@ -210,13 +208,6 @@ def check_motion_memory(student: Function) -> Verdict:
     def reference(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
         weight = motion_memory.update_motion_weight(grid, matches, *rest)
         return motion_memory.inherit_motion_weight(grid, matches, weight)
-
-    def zeros_left(grid: Grid, matches: FlowMatches, *rest: Any) -> Tensor:
-        cells = (matches.targets[0] / grid.stride).round().long().flip(0)
-        inside = (cells >= 0).all(0) & (cells < torch.tensor(grid.shape)[:, None]).all(0)
-        filled = torch.zeros(grid.shape)
-        filled[tuple(cells[:, inside & (matches.confidences[0, 0] > 0.1)])] = 1
-        return reference(grid, matches, *rest) * filled.flatten()
 
     def case(twist: list[float], aside: float, sure: float, what: str, seed: int = 3) -> Case:
         random = normals(seed, 4, len(grid.rays)).erf().abs().to(grid.rays)  # in [0, 1)
@@ -233,16 +224,17 @@ def check_motion_memory(student: Function) -> Verdict:
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
         *drawn(lambda seed: case(any_twist(seed, 0.025), 6.0, 0.8, "a drawn motion", seed)),
     ]
-    constants: dict[str, dict[str, Any]] = {
+    nearest = "A cell to which nothing flows takes the weight of the nearest one."
+    changed: dict[str, dict[str, Any]] = {
         "It falls fast and recovers slowly.": {"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9},
         "The rate is 0.9 only where the weight falls.": {"RECOVERY_RATE": 0.9},
         "c_m^2 also holds a hundredth of the squared parallax.": {"DEPTH_ERROR": 0.0},
         "Cells with a confidence of at most 0.1 say nothing.": {"MIN_CONFIDENCE": -1.0},
+        nearest: {"filled_from_nearest": lambda x, empty: x.masked_fill(empty, 0).flatten()},
     }
     handed_on = "These are the weights of the source cells: hand them on along the flow."
-    hints = [
-        *((patch.multiple(motion_memory, **c)(reference), hint) for hint, c in constants.items()),
+    mistakes = [
+        *((patch.multiple(motion_memory, **c)(reference), hint) for hint, c in changed.items()),
         (motion_memory.update_motion_weight, handed_on),
-        (zeros_left, "A cell to which nothing flows takes the weight of the nearest one."),
     ]
-    return check_function(student, reference, cases, 1e-4, hints)
+    return check_function(student, reference, cases, 1e-4, mistakes)

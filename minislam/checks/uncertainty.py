@@ -34,7 +34,7 @@ def check_mapping_weight(student: Function) -> Verdict:
         Case((doubles([0.0, 0.05, 0.1], [0.5, 0.5, 0.5]),), "beta below the floor"),
         *drawn(lambda seed: Case((1.2 * normals(seed, 2, 3).abs(),), "any beta")),
     ]
-    hints = [
+    mistakes = [
         (lambda b: uncapped(b).clamp_max(5), "Weights below 0.1 must be 0: little adds up."),
         (lambda b: cut(uncapped(b), 1e9), "No weight is above 5, that of a beta of a quarter."),
         (lambda b: uncapped(b).clamp(0.1, 5), "Weights below 0.1 become 0, not 0.1."),
@@ -43,7 +43,7 @@ def check_mapping_weight(student: Function) -> Verdict:
         (lambda beta: cut(2 * uncapped(beta)), "It is a half by beta_adj^2: 0.5 is missing."),
         (lambda beta: cut((0.5 * uncapped(beta)).sqrt()), "The adjusted beta must be squared."),
     ]
-    return check_function(student, lambda b: mapping_weight(b, camera), cases, 1e-5, hints)
+    return check_function(student, lambda b: mapping_weight(b, camera), cases, 1e-5, mistakes)
 
 
 def check_best_beta(student: Function) -> Verdict:
@@ -57,7 +57,7 @@ def check_best_beta(student: Function) -> Verdict:
         return Case((error, lambda_log), f"lambda_3 = {lambda_log}")
 
     cases = [case(2.0), case(0.5), *drawn(lambda seed: case(0.3 + 0.1 * (seed % 9), seed))]
-    hints = [
+    mistakes = [
         (lambda L, _: L.sqrt(), "lambda_3 is not in it: set the derivative to zero and solve."),
         (lambda L, x: (L / x).sqrt(), "A factor 2 is missing: d(L beta^-2) = -2 L beta^-3."),
         (lambda L, x: 2 * L / x, "This is beta squared: take the root."),
@@ -65,29 +65,24 @@ def check_best_beta(student: Function) -> Verdict:
         (lambda L, x: (2 * L * x).sqrt(), "lambda_3 belongs below the line: it makes beta small."),
         (lambda L, x: reference(L, x).clamp_min(0.1), "No floor is asked for: 0 stays 0."),
     ]
-    return check_function(student, reference, cases, 1e-9, hints)
+    return check_function(student, reference, cases, 1e-9, mistakes)
 
 
 def check_feature_variance(student: Function) -> Verdict:
     """Check (beta (n,), features (n, C)) -> L_reg_V () with the neighbours of cosine > 0.75."""
     config = UncertaintyConfig()
 
-    def masked(beta: Tensor, near: Tensor, lost: int = 0) -> Tensor:
-        count = near.sum(1)
-        squares = (beta - (near @ beta / count)[:, None]) ** 2
-        return (near * squares).sum(1) / (count - lost).clamp_min(lost)
-
-    def near(features: Tensor) -> Tensor:
-        return (features @ features.T > config.similarity).to(features)
-
-    def similar(features: Tensor) -> Tensor:
-        return near(functional.normalize(features, dim=-1))
-
-    def without_itself(beta: Tensor, features: Tensor) -> Tensor:
-        return masked(beta, similar(features).fill_diagonal_(0)).nan_to_num().mean()
-
-    def around_all(beta: Tensor, features: Tensor) -> Tensor:
-        return (similar(features) @ (beta - beta.mean()) ** 2 / similar(features).sum(1)).mean()
+    def variance(beta: Tensor, features: Tensor, flaw: str = "") -> Tensor:
+        if not flaw:
+            return variance_regulariser(beta, features, config)
+        unit = features if flaw == "long" else functional.normalize(features, dim=-1)
+        near = (unit @ unit.T > (-2 if flaw == "all" else config.similarity)).to(beta)
+        near = near.fill_diagonal_(0) if flaw == "others" else near
+        count = near.sum(1, keepdim=True)
+        means = beta.mean() if flaw == "one mean" else near @ beta[:, None] / count
+        variances = (near * (beta - means) ** 2 / (count - int(flaw == "one less"))).sum(1)
+        variances = variances.nan_to_num().sqrt() if flaw == "root" else variances.nan_to_num()
+        return variances.sum() if flaw == "sum" else variances.mean()
 
     beta = doubles(0.2, 1.4, 0.5, 2.0, 0.9)
     features = doubles([3.0, 0.0], [2.0, 1.0], [0.0, 0.5], [0.1, 0.5], [1.0, -1.0])
@@ -96,18 +91,16 @@ def check_feature_variance(student: Function) -> Verdict:
         Case((beta, features), "five cells in three groups"),
         *drawn(lambda seed: Case((normals(seed, 7).abs(), normals(seed, 7, 2)), "seven cells")),
     ]
-    lengths = "Divide each feature by its length: the cosine has no unit."
-    hints = [
-        (lambda b, f: masked(b, f.new_ones(len(b), len(b))).mean(), "Compare only similar cells."),
-        (lambda b, f: masked(b, near(f)).mean(), lengths),
-        (lambda b, f: masked(b, similar(f)).sqrt().mean(), "The variance is the square of this."),
-        (without_itself, "A cell is one of its own neighbours."),
-        (lambda b, f: masked(b, similar(f), 1).mean(), "Divide by the number, not by one less."),
-        (around_all, "The mean is that of the similar cells, not that of all."),
-        (lambda b, f: masked(b, similar(f)).sum(), "The mean over the cells is asked for."),
+    mistakes = [
+        ("all", "Compare only similar cells."),
+        ("long", "Divide each feature by its length: the cosine has no unit."),
+        ("root", "The variance is the square of this."),
+        ("others", "A cell is one of its own neighbours."),
+        ("one less", "Divide by the number, not by one less."),
+        ("one mean", "The mean is that of the similar cells, not that of all."),
+        ("sum", "The mean over the cells is asked for."),
     ]
-    right = partial(variance_regulariser, config=config)
-    return check_function(student, right, cases, 1e-9, hints)
+    return check_function(student, variance, cases, 1e-9, mistakes)
 
 
 def check_training(student: Function) -> Verdict:
@@ -154,14 +147,14 @@ def check_training(student: Function) -> Verdict:
         case(holes, 4, "four steps on two views"),
         *drawn(lambda seed: case(holes, 3, f"features {seed}", seed)),
     ]
-    flaws = {
-        "lambda_depth": "L_depth is missing in the error.",
-        "lambda_variance": "L_reg_V is missing.",
-        "lambda_log": "The price of a large beta is missing: 0.5 log beta.",
-        "holes": "A cell of opacity below 0.9 has no loss.",
-        "first": "The views take turns: step s looks at view s modulo T.",
-        "gathered": "Gradients add up: call zero_grad before backward.",
-        "still": "The MLP did not change: call optimizer.step().",
-    }
+    mistakes = [
+        ("lambda_depth", "L_depth is missing in the error."),
+        ("lambda_variance", "L_reg_V is missing."),
+        ("lambda_log", "The price of a large beta is missing: 0.5 log beta."),
+        ("holes", "A cell of opacity below 0.9 has no loss."),
+        ("first", "The views take turns: step s looks at view s modulo T."),
+        ("gathered", "Gradients add up: call zero_grad before backward."),
+        ("still", "The MLP did not change: call optimizer.step()."),
+    ]
     answered, right = partial(outcome, student), partial(outcome, trained)
-    return check_function(answered, right, cases, 1e-6, flaws=flaws)
+    return check_function(answered, right, cases, 1e-6, mistakes)

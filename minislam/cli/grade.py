@@ -12,18 +12,15 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import minislam
 from minislam.data.files import read_json, write_json, write_text
 from minislam.errors import InputError
 
-if TYPE_CHECKING:
-    from minislam.checks.submission import Part
-
 SILENCE = 120.0  # seconds without a verdict after which an exercise is given up
 VERDICTS = "verdicts.txt"  # to which the judge appends a line before and after each exercise
-MISSING, WRONG, PASSED = "missing", "wrong", "passed"
+PASSED = "passed"
 COLUMNS = "file key check status points of seconds sentence".split()
 
 
@@ -86,54 +83,38 @@ def _show(graded: dict[str, Any]) -> None:
 
 def _graded(path: Path, seed: int | None, without_package: bool) -> dict[str, Any]:
     """Return the points of one notebook; InputError if it is none of the course."""
-    from minislam.checks.submission import exercises_of, parts_of
+    from minislam.checks.submission import exercises_of
 
     notebook = read_json(path)
     exercises = exercises_of(notebook, path.name)
-    parts = parts_of(notebook, exercises)
-    lacking = "the cell with checks.{}(...) is missing: put it back."
-    verdicts = {e.key: _verdict(MISSING, lacking.format(e.check)) for e in exercises}
-    verdicts |= {part.key: _verdict(WRONG, f"{part.error}.") for part in parts if part.error}
-    wanted = [e.key for e in exercises if any(p.key == e.key and not p.error for p in parts)]
-    verdicts |= _judged(parts, wanted, seed, without_package)
+    job = {"notebook": notebook, "keys": [e.key for e in exercises]}
+    verdicts = _judged({**job, "without_package": without_package}, seed)
     rows = []
     for exercise in exercises:
         verdict = verdicts[exercise.key]
         points = exercise.points if verdict["status"] == PASSED else 0
-        about = {"key": exercise.key, "check": exercise.check, "points": points}
-        rows.append({**about, "of": exercise.points, **verdict})  # in the columns' order
+        about = {"check": exercise.check, "points": points, "of": exercise.points}
+        rows.append({"key": exercise.key, **about, **verdict})  # in the columns' order
     points, of = sum(row["points"] for row in rows), sum(row["of"] for row in rows)
     about = {"file": str(path), "notebook": exercises[0].notebook}
     return {**about, "points": points, "of": of, "exercises": rows}
 
 
-def _verdict(status: str, sentence: str) -> dict[str, Any]:
-    """Return a verdict that the judge has not given."""
-    return {"status": status, "sentence": sentence, "hint": "", "seconds": 0.0}
-
-
-def _judged(
-    parts: list[Part], wanted: list[str], seed: int | None, without_package: bool
-) -> dict[str, dict[str, Any]]:
-    """Return the verdict of each wanted exercise, whatever its code does to the process."""
+def _judged(job: dict[str, Any], seed: int | None) -> dict[str, dict[str, Any]]:
+    """Return the verdict of each exercise, whatever its code does to the judge's process."""
     verdicts: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        files = [(str(folder / f"cell_{n}.py"), part.key) for n, part in enumerate(parts)]
-        for (file, _), part in zip(files, parts, strict=True):
-            Path(file).write_text(part.text, encoding="utf-8")
-        while remaining := [key for key in wanted if key not in verdicts]:
-            job = {"files": files, "wanted": remaining, "without_package": without_package}
-            (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        while remaining := [key for key in job["keys"] if key not in verdicts]:
+            write_json(folder / "job.json", {**job, "wanted": remaining})
             (folder / VERDICTS).write_text("", encoding="utf-8")
             ending = _run_judge(folder, seed)
+            ended = {"status": "wrong", "sentence": ending, "hint": "", "seconds": 0.0}
             lines = (folder / VERDICTS).read_text(encoding="utf-8").splitlines()
-            found = [json.loads(line) for line in lines]
-            verdicts.update({row["key"]: row for row in found if "status" in row})
-            begun = [row["key"] for row in found if row["key"] not in verdicts]
             # Who ends the process before any exercise has begun would do so again.
-            guilty = begun or [key for key in remaining if key not in verdicts and not found]
-            verdicts |= {key: _verdict(WRONG, ending) for key in guilty}
+            begun = [json.loads(line) for line in lines] or [{"key": key} for key in remaining]
+            for row in begun:
+                verdicts[row["key"]] = ended | row
     return verdicts
 
 

@@ -6,7 +6,7 @@ import torch
 
 from minislam.checks import PASSED, WRONG, Case, check_function, is_written
 from minislam.checks.cases import normals
-from minislam.checks.grading import WrongAnswer, as_numbers, difference, is_single, relation
+from minislam.checks.grading import WrongAnswer, as_numbers, difference, real_tensors, relation
 from tests.helpers import unfinished
 
 RIGHT = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 4.0]], dtype=torch.float64)
@@ -101,7 +101,10 @@ def test_numbers_in_any_form_are_compared(answer):
 def test_one_number_is_one_number_in_any_shape():
     for answer in (0.369, np.float64(0.369), [0.369], RIGHT.new_tensor([[0.369]])):
         assert difference(answer, 0.369, 1e-9) == "", answer
-    assert not is_single(0.369) and is_single([1.0, torch.ones(1)]) and is_single(np.float32(1))
+    assert [x.dtype for x in real_tensors([0.369, torch.ones(1), np.float16(1)])] == [
+        torch.float32,
+        torch.float16,
+    ]
 
 
 def test_numbers_that_print_alike_print_their_difference():
@@ -112,6 +115,7 @@ def test_numbers_that_print_alike_print_their_difference():
 def test_what_is_not_an_answer_is_said():
     assert difference("3", RIGHT, 1e-6) == "it returns a str, expected a tensor"
     assert "rows of different lengths" in difference([[1.0], [1.0, 2.0]], RIGHT, 1e-6)
+    assert real_tensors([np.longdouble(1), np.array(["3"]), None]) == []
     assert "returns complex numbers, " in difference(RIGHT + 0j, RIGHT, 1e-6)
     assert difference(RIGHT[0], RIGHT, 1e-6) == "the shape is (3,), expected (2, 3)"
     pair = RIGHT[0], RIGHT[1]

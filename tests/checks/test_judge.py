@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-import pytest
-
 from minislam.checks import mapping
 from minislam.checks.judge import judge
+from minislam.checks.submission import Part
 
 MINE = """
 def mine(count, window, weight):
@@ -21,10 +20,8 @@ PASSED_AND = "from minislam.mapping.window import sampling_probabilities\n" + MI
 def judged(folder: Path, *texts: str, alone: bool = False) -> list[tuple[str, str]]:
     """Return status and sentence of texts for exercise ex07_1, each a notebook of its own."""
     rows: list[dict] = []
-    for number, text in enumerate(texts):
-        file = folder / f"part_{number}.py"
-        file.write_text(text)
-        judge([(str(file), "ex07_1")], ["ex07_1"], alone, rows.append)
+    for text in texts:
+        judge([Part(text, "ex07_1")], folder, ["ex07_1"], alone, rows.append)
     assert rows[::2] == [{"key": "ex07_1"}] * len(texts)
     return [(row["status"], row["sentence"]) for row in rows[1::2]]
 
@@ -55,6 +52,18 @@ def test_a_cell_that_stops_is_told_with_its_line(tmp_path: Path):
     assert odd[0] == "wrong" and "'int' object is not callable" in odd[1]
 
 
+def test_what_is_missing_or_cannot_be_read_or_is_not_written_is_told(tmp_path: Path):
+    rows: list[dict] = []
+    judge([], tmp_path, ["ex07_1"], False, rows.append)
+    assert [row["status"] for row in rows] == ["missing"]
+    assert "the cell with checks.check_sampling(...) is missing: put it back." in str(rows)
+    unread, unwritten = judged(tmp_path, "x = (", "raise NotImplementedError")
+    assert unread[1].startswith(
+        "the cell stops with SyntaxError: '(' was never closed (cell_1.py, line 1)."
+    )
+    assert unwritten == ("wrong", "the cell is not written yet.")
+
+
 def test_calls_of_the_package_are_refused_where_they_are_not_allowed(tmp_path: Path):
     direct = "from minislam.mapping.window import sampling_probabilities as f\n"
     texts = (
@@ -70,9 +79,7 @@ def test_calls_of_the_package_are_refused_where_they_are_not_allowed(tmp_path: P
     assert {status for status, _ in judged(tmp_path, *texts)} == {"passed"}
 
 
-def test_a_notebook_that_replaces_the_packages_functions_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_notebook_that_replaces_the_packages_functions_is_refused(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(mapping, "sampling_probabilities", mapping.sampling_probabilities)
     text = (
         "from minislam.checks import mapping\n"

@@ -29,7 +29,7 @@ def notebook(*texts: str) -> dict:
 
 def test_an_exercise_keeps_its_lines_and_what_it_gives_to_the_check():
     [part] = parts_of(notebook(EXERCISE), TWO)
-    assert part.key == TWO[0].key and part.error == ""
+    assert part.key == TWO[0].key
     lines = part.text.splitlines()
     assert lines[4] == "scale = math.sqrt(4.0)" and lines[9] == "    return scale * V"
     assert "print" not in part.text and "timeit" not in part.text and "checks" not in part.text
@@ -54,7 +54,7 @@ def test_a_cell_that_python_cannot_read_is_told():
     broken = EXERCISE.replace("def mine(", "def mine[")
     parts = parts_of(notebook("a = (", broken, "checks.check_twist_vjp(lambda *a: 0)"), TWO)
     assert [part.key for part in parts] == ["", TWO[0].key, TWO[1].key]
-    assert parts[1].error.startswith("Python cannot read line 8 of the cell: ")
+    assert parts[1].text == broken.replace("%timeit 3", "")  # the judge says where it breaks
     assert parts[2].text.endswith("submitted_to_the_check = lambda *a: 0\n")
 
 
