@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from minislam.cli.progress import ProgressLine, ending_signals, plan_of
+from minislam.cli.progress import ProgressLine, SilentProgress, ending_signals, plan_of
 from minislam.config import preset as preset_of
 from minislam.config import with_settings
 from minislam.data import InputOptions, open_sequence
@@ -19,7 +19,6 @@ from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run
 from minislam.runs.run import default_output, run_in_folder
-from minislam.state.steps import SilentObserver
 
 _INPUTS = {field.name for field in fields(InputOptions)}
 _PRIORS = {field.name for field in fields(PriorChoice)}
@@ -52,12 +51,11 @@ def run(
     choice = PriorChoice(**{"depth": default_depth(str(source))} | priors)
     sequence = open_sequence(str(source), InputOptions(**inputs))
     output = output or default_output(sequence)
-    progress = ProgressLine()
+    progress = SilentProgress() if quiet else ProgressLine()
     progress.plan = plan_of(config, choice, sequence)
     with ending_signals(progress.interrupt):
-        observer = SilentObserver() if quiet else progress
         run_in_folder(
-            sequence, config, choice, Path(output), observer, overwrite=overwrite, workers=workers
+            sequence, config, choice, Path(output), progress, overwrite=overwrite, workers=workers
         )
     return Run(output)
 

@@ -171,6 +171,16 @@ class ProgressLine:
         self._should_stop = True
 
 
+class SilentProgress(ProgressLine):
+    """Says nothing; a signal ends the run as with a line."""
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Say nothing of a step."""
+
+    def warn(self, text: str) -> None:
+        """Say nothing of a warning; run.json has it."""
+
+
 def _duration(seconds: float) -> str:
     """Return a rough duration for people, rounded so that it does not flicker."""
     if seconds < 117:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from minislam.data import open_sequence
 from minislam.data.files import write_json
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.mapping import Mapper
 from minislam.tracking.grid import Grid
 from minislam.tracking.safeguards.rolling_shutter import ImageMotion
 
@@ -148,3 +150,19 @@ def test_the_door_shows_what_is_stable():
     assert set(minislam.__all__) - {"__version__"} == set(api.__all__) and dir(minislam)
     with pytest.raises(AttributeError):
         minislam.Slam  # noqa: B018
+
+
+def test_ctrl_c_ends_a_quiet_run_after_the_present_step(root: Path, monkeypatch, capsys):
+    refine = Mapper.refine
+
+    def interrupted(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return refine(*arguments)
+
+    monkeypatch.setattr(Mapper, "refine", interrupted)
+    done = minislam.run(
+        "synth:person", root / "quiet", preset="test", stride=3, max_frames=10, size=(96, 72),
+        quiet=True,
+    )  # fmt: skip
+    assert done.folder.read_run()["state"] == "interrupted"
+    assert capsys.readouterr() == ("", "")
