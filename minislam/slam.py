@@ -37,7 +37,7 @@ from minislam.tracking.safeguards.focal_length import (
 )
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
-from minislam.uncertainty import beta_of_mask, tracking_weight
+from minislam.uncertainty.weights import beta_of_mask, relative_weight, tracking_weight
 from minislam.workers import Workers
 
 FRAMES_AT_ONCE = 8  # between two keyframes, refined side by side: more make Ctrl-C wait
@@ -208,16 +208,15 @@ class Slam(Stateful):
         """Return the static weight (h, w) of the cells of a keyframe, in (0, 1], by the MLP.
 
         The tracker asks for it when a keyframe comes, at the end of the warm-up and in the final
-        adjustment, so online a keyframe keeps the beta that it had when it came. Without a depth
-        prior there is no map online, hence no beta. Then only given masks are used.
+        adjustment. Without a depth prior there is no map online, hence no beta: masks alone count.
         """
-        keyframes = self.tracker.keyframes
-        uncertainty = self.config.uncertainty
+        keyframes, uncertainty = self.tracker.keyframes, self.config.uncertainty
         is_known = uncertainty.given_masks or bool(self.mapper.keyframes)
         if not (uncertainty.enabled and is_known):
             return torch.ones(self.tracker.grid.shape, device=self.device)
         beta = self._beta(keyframes.frames[index], keyframes.features[index])
-        return tracking_weight(beta, self.sequence.camera, self._stride)
+        weight = tracking_weight(beta, self.sequence.camera, self._stride)
+        return weight if uncertainty.given_masks else relative_weight(weight)
 
     def _beta(self, frame: Frame, features: Tensor | None) -> Tensor:
         """Return the raw beta (h', w') of a frame: from its given mask, or from the MLP."""

@@ -26,6 +26,7 @@ BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: the largest t
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
 BETA_CUT = 1.41  # the beta_raw of that weight
+STATIC_FRACTION = 0.1  # ours: so much of a frame counts fully in tracking, whatever its beta [-]
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
 
 
@@ -76,3 +77,11 @@ def tracking_weight(
     """Return the weight of each tracker cell in Eq. (5), sampled at pixels (stride i, stride j)."""
     weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera)[::stride, ::stride] ** 2
     return weight.clamp_max(TRACKING_CAP)
+
+
+def relative_weight(weight: Tensor) -> Tensor:  # both (h, w) in (0, 1]
+    """Return the weights of a frame relative to those of its most static tenth (ours).
+
+    A map that explains nothing well yet makes beta large everywhere; its contrast tells what moves.
+    """
+    return (weight / weight.quantile(1 - STATIC_FRACTION)).clamp_max(TRACKING_CAP)

@@ -9,6 +9,7 @@ from minislam.uncertainty.weights import (
     beta_of_mask,
     clipped_beta,
     mapping_weight,
+    relative_weight,
     schlick_bias,
     tracking_weight,
 )
@@ -72,7 +73,22 @@ def test_a_given_mask_gives_the_full_weight_or_almost_none():
     assert (weight[:, [0, 2, 3]] == 1).all() and (weight[:, 1] < 0.02).all()
 
 
+def test_the_most_static_tenth_of_a_frame_counts_fully_and_the_others_relative_to_it():
+    weight = torch.linspace(0.001, 0.2, 200).reshape(10, 20)  # a beta that is large everywhere
+    relative = relative_weight(weight)
+    assert int((relative == 1).sum()) == 20
+    assert float(relative[0, 0]) == pytest.approx(0.001 / 0.18, rel=0.01)
+    assert torch.equal(relative_weight(torch.full((3, 4), 0.03)), torch.ones(3, 4))
+
+
 # Identities
+
+
+def test_relative_weights_do_not_depend_on_the_level_and_leave_a_well_explained_frame_alone():
+    weight = torch.rand(6, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.allclose(relative_weight(0.01 * weight), relative_weight(weight))
+    weight[:2] = 1  # a quarter of the cells
+    assert torch.equal(relative_weight(weight), weight)
 
 
 def test_bias_with_slope_one_half_is_the_identity():
