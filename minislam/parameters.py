@@ -94,10 +94,9 @@ def _converted(name: str, value: Any, present: Any, entry: Field[Any]) -> Any:
             raise ValueError
         return converted
     except (KeyError, OverflowError, TypeError, ValueError):
+        wanted = "a finite number" if kind is float else f"of type {kind.__name__}"
         like = "" if present is None else f" like {present!r}"
-        raise InputError(
-            f"expected {name} to be of type {kind.__name__}{like}, found {value!r}"
-        ) from None
+        raise InputError(f"expected {name} to be {wanted}{like}, found {value!r}") from None
 
 
 def flattened(tree: Any, prefix: str = "") -> dict[str, Any]:

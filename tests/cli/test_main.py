@@ -206,7 +206,7 @@ def test_a_wrong_depth_costs_no_earlier_run_its_files(depth: str, tmp_path: Path
         (["--config", "nowhere.json"], "a readable file nowhere.json"),
         (["--stride", "0"], "stride of at least 1 and at most 1e+09, found 0"),
         (["--start", "5"], "frames from number 5 on, but input has 2"),
-        (["--fx", "nan"], "fx to be of type float, found nan"),
+        (["--fx", "nan"], "fx to be a finite number, found nan"),
         (["--preset", ""], "a preset among laptop"),
         (["--seed", "-1"], "seed of at least 0"),
         (["--seed", "9" * 23], "seed of at least 0 and at most"),
