@@ -102,7 +102,7 @@ def adjust_confirmed(
     )
     weights = keyframes.static_weights * confirmation.clamp_min(UNCONFIRMED_WEIGHT)
     for index, weight in enumerate(weights):
-        keyframes.set_static_weight(index, weight)
+        keyframes.static_weights[index] = weight
     disparities = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), keyframes.disparities)
     keyframes.set_geometry(keyframes.T_camera_world, disparities)
     final_global_ba(graph, progress)
