@@ -57,7 +57,7 @@ class GaussianMap:
     ) -> "GaussianMap":
         """Return a map of no Gaussians."""
         tensors = [torch.zeros(0, *row, dtype=dtype, device=device) for row in ROWS]
-        return cls(*tensors[:-1], tensors[-1].long())
+        return cls(*[*tensors[:-1], tensors[-1].long()])
 
     def concatenate(self, other: "GaussianMap") -> "GaussianMap":
         """Return the map of both: the rows of `other` come last."""
