@@ -54,11 +54,6 @@ class FrameGraph(Stateful):
         for column in (self.edges, self.targets, self.confidences, self.matched_ratios):
             del column[len(column) - count :]
 
-    def move_targets(self, displacements: Tensor) -> None:
-        """Displace the targets of all edges (E, 2, N) [px]."""
-        moved = torch.stack(self.targets) + displacements
-        self.targets = list(moved.unbind(0))
-
     def flow_from(self, source: int) -> list[tuple[Tensor, Tensor]]:
         """Return targets [px] and confidences, each (N, 2), of the edges that leave a keyframe."""
         leaving = [p for p, edge in enumerate(self.edges) if edge[0] == source]
