@@ -174,8 +174,7 @@ class MappingHistory:
 
     def add(self, parts: list[float], uncertainty: float, gaussians: int) -> None:
         """Append one iteration, with the first four numbers in `parts`."""
-        columns = self.render, self.color, self.depth, self.isotropic
-        for column, part in zip(columns, parts, strict=True):
-            column.append(part)
-        self.uncertainty.append(uncertainty)
-        self.gaussians.append(gaussians)
+        for column, value in zip(
+            vars(self).values(), [*parts, uncertainty, gaussians], strict=True
+        ):
+            column.append(value)

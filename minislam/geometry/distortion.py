@@ -28,11 +28,8 @@ class BrownDistortion:
 
     def undistortion_maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the two maps of cv2.remap that turn a raw image into that of `camera`."""
-        matrix = camera_matrix(camera)
-        size = (camera.width, camera.height)
-        return cv2.initUndistortRectifyMap(
-            matrix, self.coefficients, None, matrix, size, cv2.CV_32FC1
-        )
+        K, size = camera_matrix(camera), (camera.width, camera.height)
+        return cv2.initUndistortRectifyMap(K, self.coefficients, None, K, size, cv2.CV_32FC1)
 
 
 def camera_matrix(camera: Camera) -> np.ndarray:

@@ -62,28 +62,21 @@ def quaternion_from_rotation(rotations: Tensor) -> Tensor:
     Of the four equivalent formulas it takes the one that divides by the largest component
     (Shepperd's method), so no rotation, 180 degrees included, loses digits.
     """
-    m = rotations
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotations.flatten(-2).unbind(-1)
+    trace = m00 + m11 + m22
+    wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
+    xy, xz, yz = m10 + m01, m20 + m02, m21 + m12
     # Row k is 4 q_k q, for k = w, x, y, z.
-    w_row = torch.stack(
-        [
-            1 + trace,
-            m[..., 2, 1] - m[..., 1, 2],
-            m[..., 0, 2] - m[..., 2, 0],
-            m[..., 1, 0] - m[..., 0, 1],
-        ],
-        -1,
-    )
-    xy = m[..., 1, 0] + m[..., 0, 1]
-    xz = m[..., 2, 0] + m[..., 0, 2]
-    yz = m[..., 2, 1] + m[..., 1, 2]
-    x_row = torch.stack([w_row[..., 1], 1 + 2 * m[..., 0, 0] - trace, xy, xz], -1)
-    y_row = torch.stack([w_row[..., 2], xy, 1 + 2 * m[..., 1, 1] - trace, yz], -1)
-    z_row = torch.stack([w_row[..., 3], xz, yz, 1 + 2 * m[..., 2, 2] - trace], -1)
-    rows = torch.stack([w_row, x_row, y_row, z_row], -2)
-    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    rows = [
+        1 + trace, wx, wy, wz,
+        wx, 1 + 2 * m00 - trace, xy, xz,
+        wy, xy, 1 + 2 * m11 - trace, yz,
+        wz, xz, yz, 1 + 2 * m22 - trace,
+    ]  # fmt: skip
+    products = torch.stack(rows, -1).unflatten(-1, (4, 4))
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(-1)
     index = largest[..., None, None].expand(*largest.shape, 1, 4)
-    chosen = rows.gather(-2, index).squeeze(-2)
+    chosen = products.gather(-2, index).squeeze(-2)
     return chosen / chosen.norm(dim=-1, keepdim=True)
 
 

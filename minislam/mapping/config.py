@@ -109,16 +109,9 @@ class MappingConfig:
         0.2, "last step over the first one in the refinement, all parameters; official 1"
     )
 
-    insertion: InsertionConfig = field(
-        default_factory=InsertionConfig, metadata={"meaning": "how Gaussians are inserted"}
-    )
-    density: DensityConfig = field(
-        default_factory=DensityConfig, metadata={"meaning": "cloning, splitting and pruning"}
-    )
-    pose_refinement: PoseRefinementConfig = field(
-        default_factory=PoseRefinementConfig,
-        metadata={"meaning": "photometric refinement of the poses between the keyframes"},
-    )
+    insertion: InsertionConfig = field(default_factory=InsertionConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+    pose_refinement: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
 
     def rates_at(
         self,

@@ -1,6 +1,6 @@
 """Clone, split and prune Gaussians, so that there are more of them where detail is missing."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -65,8 +65,7 @@ def densify(
 
 def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
     """Return two children per parent, drawn from its distribution and 1.6 times smaller."""
-    rows = [getattr(parents, f.name).repeat_interleave(CHILDREN, 0) for f in fields(parents)]
-    doubled = GaussianMap(*rows)
+    doubled = GaussianMap(*(t.repeat_interleave(CHILDREN, 0) for t in vars(parents).values()))
     normal = torch.randn(doubled.means.shape, generator=generator).to(doubled.means)
     rotations = rotation_from_quaternion(doubled.quats_wxyz)
     offsets = (rotations @ (doubled.scales * normal)[..., None]).squeeze(-1)

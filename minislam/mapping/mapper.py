@@ -10,7 +10,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
@@ -35,8 +34,7 @@ class Mapper(JointOptimisation):
         exposures: Tensor | None = None,  # (K, 3) how bright the keyframes are, if they differ
     ) -> None:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
-        if not keyframes:
-            raise InputError("expected at least one keyframe to start the map from, found none")
+        assert keyframes, "a map starts from at least one keyframe"
         self.median_depth = median_depth(keyframes)
         self.keyframes = [MappedKeyframe.from_record(keyframe) for keyframe in keyframes]
         if exposures is not None:
@@ -57,8 +55,7 @@ class Mapper(JointOptimisation):
 
     def integrate(self, keyframe: Keyframe) -> None:
         """Add one keyframe: window, insertion, then optimisation of map and MLP."""
-        if not self.keyframes:
-            raise InputError("expected an initialised map, found none; call initialise first")
+        assert self.keyframes, "call initialise first"
         self.keyframes.append(MappedKeyframe.from_record(keyframe))
         new = len(self.keyframes) - 1
         poses = torch.stack([k.T_camera_world for k in self.keyframes])
@@ -82,11 +79,7 @@ class Mapper(JointOptimisation):
 
         Adam's moments are kept, because a bundle adjustment moves the map by little.
         """
-        if len(T_camera_world) != len(self.keyframes):
-            raise InputError(
-                f"expected poses of the {len(self.keyframes)} keyframes in the map, found "
-                f"{len(T_camera_world)}; give all of them in the order of their integration"
-            )
+        assert len(T_camera_world) == len(self.keyframes), len(T_camera_world)
         old = torch.stack([keyframe.T_camera_world for keyframe in self.keyframes])
         new = T_camera_world.double()
         self._optimizer.replace(deform_rigidly(self.gaussians, self.anchor_rows(), old, new))

@@ -143,9 +143,7 @@ class JointOptimisation(Stateful):
     def _drawn(self, probabilities: Tensor, count: int) -> list[int]:
         """Draw keyframes at random, none twice unless there are too few."""
         repeats = int((probabilities > 0).sum()) < count
-        drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)
-        positions: list[int] = drawn.tolist()
-        return positions
+        return torch.multinomial(probabilities, count, repeats, generator=self._generator).tolist()
 
     def _step(self, positions: list[int], camera: Camera, rate_factor: float) -> None:
         """Take one step of the map on the mean L_render of some keyframes, then train the MLP.

@@ -78,10 +78,8 @@ def in_turn(iterations: range, count: int, seed: int) -> list[int]:
 
     Drawn one by one, some would be rendered half as often as others.
     """
-    orders = {turn: _order(turn, count, seed) for turn in {i // count for i in iterations}}
-    return [orders[i // count][i % count] for i in iterations]
-
-
-def _order(turn: int, count: int, seed: int) -> list[int]:
-    generator = torch.Generator().manual_seed(seed + turn)
-    return torch.randperm(count, generator=generator).tolist()
+    orders = {}
+    for turn in {iteration // count for iteration in iterations}:
+        generator = torch.Generator().manual_seed(seed + turn)
+        orders[turn] = torch.randperm(count, generator=generator).tolist()
+    return [orders[iteration // count][iteration % count] for iteration in iterations]

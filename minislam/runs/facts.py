@@ -134,7 +134,7 @@ def _ties(slam: Slam) -> dict[str, float | None]:
     """Return how long the path is and how well poses, depths and flow agree, without any truth."""
     graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
     parallaxes = [keyframe.parallax for keyframe in slam.tracker.watch.diagnostics]
-    links, error = range(len(graph.links.edges())), None
+    links, error = range(len(graph.links)), None
     if links:
         problem = bundle_problem(graph, links, 0, 0.0)
         distances = lengths(residuals(problem, graph.state)[0])

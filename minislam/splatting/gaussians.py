@@ -1,6 +1,6 @@
 """The map: one row per Gaussian in six tensors, and an Adam whose moments follow the rows."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,6 +9,8 @@ from torch import Tensor
 from minislam.errors import InputError
 from minislam.parameters import parameter
 from minislam.state.stateful import FrameOf, Stateful, Tree
+
+ROWS = [(3,), (4,), (3,), (), (3,), ()]  # shape of a Gaussian's row in each tensor of a map
 
 
 @dataclass(frozen=True)
@@ -24,13 +26,11 @@ class GaussianMap:
 
     def __post_init__(self) -> None:
         count = len(self.means)
-        expected = [(count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,)]
-        for tensor_field, shape in zip(fields(self), expected, strict=True):
-            found = tuple(getattr(self, tensor_field.name).shape)
-            if found != shape:
+        for (name, tensor), row in zip(vars(self).items(), ROWS, strict=True):
+            if tensor.shape != (count, *row):
                 raise InputError(
-                    f"expected {tensor_field.name} of shape {shape} in a map of {count} "
-                    f"Gaussians, found {found}; give one row per Gaussian in every tensor"
+                    f"expected {name} of shape {(count, *row)} in a map of {count} Gaussians, "
+                    f"found {tuple(tensor.shape)}; give one row per Gaussian in every tensor"
                 )
 
     def __len__(self) -> int:
@@ -49,36 +49,33 @@ class GaussianMap:
     @property
     def parameters(self) -> dict[str, Tensor]:
         """Return the tensors that are optimised, by name: all but `anchor_keyframe`."""
-        names = [tensor_field.name for tensor_field in fields(self)][:-1]
-        return {name: getattr(self, name) for name in names}
+        return {name: t for name, t in vars(self).items() if name != "anchor_keyframe"}
 
     @classmethod
     def empty(
         cls, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
     ) -> "GaussianMap":
         """Return a map of no Gaussians."""
-        shapes = [(0, 3), (0, 4), (0, 3), (0,), (0, 3)]
-        tensors = [torch.zeros(shape, dtype=dtype, device=device) for shape in shapes]
-        return cls(*[*tensors, torch.zeros(0, dtype=torch.int64, device=device)])
+        tensors = [torch.zeros(0, *row, dtype=dtype, device=device) for row in ROWS]
+        return cls(*[*tensors[:-1], tensors[-1].long()])
 
     def concatenate(self, other: "GaussianMap") -> "GaussianMap":
         """Return the map of both: the rows of `other` come last."""
-        pairs = zip(_tensors(self), _tensors(other), strict=True)
-        return GaussianMap(*[torch.cat(pair) for pair in pairs])
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return GaussianMap(*map(torch.cat, pairs))
 
     def prune(self, keep: Tensor) -> "GaussianMap":
         """Return the map of the rows where `keep` (N,) bool is True, in the same order."""
-        _check_mask(keep, len(self))
-        return GaussianMap(*[tensor[keep] for tensor in _tensors(self)])
+        assert keep.dtype == torch.bool and keep.shape == (len(self),), (keep.dtype, keep.shape)
+        return GaussianMap(*(tensor[keep] for tensor in vars(self).values()))
 
     def detach(self) -> "GaussianMap":
         """Return the same values cut from any graph."""
-        return GaussianMap(*[tensor.detach() for tensor in _tensors(self)])
+        return GaussianMap(*(tensor.detach() for tensor in vars(self).values()))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of all six tensors as numpy arrays, by name."""
-        names = [tensor_field.name for tensor_field in fields(self)]
-        return {name: getattr(self, name).detach().cpu().numpy().copy() for name in names}
+        return {name: t.detach().cpu().numpy().copy() for name, t in vars(self).items()}
 
 
 @dataclass(frozen=True)
@@ -171,21 +168,5 @@ class MapOptimizer(Stateful):
 
     def replace(self, gaussians: GaussianMap) -> None:
         """Set new values for the same rows, for instance after a deformation of the map."""
-        if len(gaussians) != len(self.gaussians):
-            raise InputError(
-                f"expected {len(self.gaussians)} Gaussians, found {len(gaussians)}; "
-                "use append or prune to change the number of rows"
-            )
+        assert len(gaussians) == len(self.gaussians), (len(gaussians), len(self.gaussians))
         self._set_rows(gaussians)
-
-
-def _tensors(gaussians: GaussianMap) -> list[Tensor]:
-    return [getattr(gaussians, tensor_field.name) for tensor_field in fields(gaussians)]
-
-
-def _check_mask(keep: Tensor, count: int) -> None:
-    if keep.dtype != torch.bool or tuple(keep.shape) != (count,):
-        raise InputError(
-            f"expected a bool mask of shape ({count},), found {keep.dtype} of shape "
-            f"{tuple(keep.shape)}; give True for every Gaussian to keep"
-        )

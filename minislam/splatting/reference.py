@@ -6,8 +6,6 @@ the names of their fast twins. Its arrays have one row per Gaussian, (N, 3), whe
 are component-first, (3, N).
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -22,15 +20,6 @@ from minislam.splatting.constants import (
     tangent_limits,
 )
 from minislam.splatting.gaussians import GaussianMap
-
-
-class ProjectedGaussians(NamedTuple):
-    """The Gaussians in front of the camera, nearest first."""
-
-    rows: Tensor  # (V,) int64, row in the map
-    points_camera: Tensor  # (V, 3) world units
-    means2d: Tensor  # (V, 2) px
-    covariances2d: Tensor  # (V, 2, 2) px^2
 
 
 def render_reference(
@@ -72,8 +61,8 @@ def project_gaussians(
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4)
     screen_offsets: Tensor | None,  # (N, 2) px
-) -> ProjectedGaussians:
-    """Project the Gaussians in front of the camera, in order of depth (Sec. 3.1).
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # (V,) int64, (V, 3), (V, 2) px, (V, 2, 2) px^2
+    """Return rows, points, means and covariances of what is in front, nearest first (Sec. 3.1).
 
     Fast twin: visible.project_gaussians, which also drops what lies outside the image.
     """
@@ -87,7 +76,7 @@ def project_gaussians(
     covariances2d = project_covariances(
         covariances(gaussians)[rows], points_camera, T_camera_world, camera
     )
-    return ProjectedGaussians(rows, points_camera, means2d, covariances2d)
+    return rows, points_camera, means2d, covariances2d
 
 
 def covariances(gaussians: GaussianMap) -> Tensor:  # (N, 3, 3) world units^2

@@ -95,38 +95,27 @@ class _Render(torch.autograd.Function):
         _v_weight_sums: Tensor,
     ) -> tuple[Tensor | None, ...]:
         visible, (groups, workspace), T, background, camera, count, twist = ctx.state
-        needs_means, needs_quats, needs_scales, needs_opacities, needs_colors = (
-            ctx.needs_input_grad[:5]
-        )
-        needs_twist, needs_offsets2d = ctx.needs_input_grad[5:7]
+        needs = ctx.needs_input_grad  # in the order of the inputs of `forward`
         v_image = torch.cat([v_color.permute(2, 0, 1), v_depth[None]])
         with _denormals_flushed():
             moments, v_channels = composite_image_vjp(
                 groups, workspace, len(visible.rows), background, v_image, v_opacity, camera
             )
-            v = project_gaussians_vjp(
-                visible, moments, v_channels[3], T, camera, needs_quats or needs_scales
-            )
+            needs_shape = needs[1] or needs[2]
+            v = project_gaussians_vjp(visible, moments, v_channels[3], T, camera, needs_shape)
 
-        def spread(values: Tensor | None, needed: bool) -> Tensor | None:
+        def spread(values: Tensor) -> Tensor:
             """Write (C, V) or (V,) to the rows of the map; invisible rows are zero."""
-            if values is None or not needed:
-                return None
             values = values.T if values.dim() == 2 else values
             return values.new_zeros(count, *values.shape[1:]).index_copy_(0, visible.rows, values)
 
-        return (
-            spread(v.means, needs_means),
-            spread(v.quats, needs_quats),
-            spread(v.scales, needs_scales),
-            spread(v.opacities, needs_opacities),
-            spread(v_channels[:3], needs_colors),
-            _at_twist(v.twist, twist) if needs_twist else None,
-            spread(v.means2d, needs_offsets2d),
-            None,
-            None,
-            None,
+        by_gaussian = v.means, v.quats, v.scales, v.opacities, v_channels[:3], v.means2d
+        *v_parameters, v_offsets2d = (
+            spread(values) if needed and values is not None else None
+            for values, needed in zip(by_gaussian, (*needs[:5], needs[6]), strict=True)
         )
+        v_twist = _at_twist(v.twist, twist) if needs[5] else None
+        return *v_parameters, v_twist, v_offsets2d, None, None, None
 
 
 def _at_twist(v_left: Tensor, twist: Tensor) -> Tensor:  # (6,), (6,) -> (6,)

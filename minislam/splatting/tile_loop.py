@@ -60,15 +60,16 @@ def composite_image(
     canvas = background[:, None].repeat(len(inside), 1, PIXELS)  # (tiles, 4, P)
     opacities = torch.zeros_like(inside)
     weight_sums = channels.new_zeros(len(channels))
-    workspace = compositing.Workspace(lists.largest_group, channels)
+    largest_group = max((len(tiles) for tiles, _ in lists), default=0)
+    workspace = compositing.Workspace(largest_group, channels)
     groups = []
-    for tiles, length, span in lists.groups:
-        gaussians = lists.slot_gaussian[span]
+    for tiles, slot_gaussians in lists:
+        gaussians = slot_gaussians.view(-1)
         slots = table.index_select(1, gaussians)
-        offsets = slots[:2].view(2, length, -1) - centres[:, None, tiles]
+        offsets = slots[:2].view(2, *slot_gaussians.shape) - centres[:, None, tiles]
         offsets = offsets.view(2, -1)
         coefficients = compositing.log_alpha_coefficients(offsets, slots[2:5], slots[5])
-        group_channels = channels.index_select(0, gaussians).view(length, -1, 4)
+        group_channels = channels.index_select(0, gaussians).view(*slot_gaussians.shape, 4)
         out = compositing.composite(
             coefficients, group_channels, background, inside[tiles], workspace
         )

@@ -16,29 +16,13 @@ GROUP = 256
 
 
 class TileGroup(NamedTuple):
-    """Tiles with lists of similar length, padded to the longest."""
+    """Tiles with lists of similar length, padded to the longest.
+
+    A padding slot holds the index N, one past the last Gaussian.
+    """
 
     tiles: Tensor  # (B,) int64, tile index, row by row
-    length: int  # K, slots per tile
-    span: slice  # of its K * B slots, slot-major: (K, B)
-
-
-class TileLists(NamedTuple):
-    """All slots of all groups. A padding slot holds the index N, one past the last Gaussian."""
-
-    groups: list[TileGroup]
-    slot_gaussian: Tensor  # (S,) int64
-
-    @property
-    def slot_tile(self) -> Tensor:
-        """Return the tile of each slot, (S,) int64."""
-        tiles = [group.tiles.repeat(group.length) for group in self.groups]
-        return torch.cat([self.slot_gaussian[:0], *tiles])
-
-    @property
-    def largest_group(self) -> int:
-        """Return the number of tiles in the largest group."""
-        return max((len(group.tiles) for group in self.groups), default=0)
+    gaussians: Tensor  # (K, B) int64, in the K slots of each tile
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
@@ -77,7 +61,7 @@ def build_tile_lists(
     covariances2d: Tensor,  # (3, N) px^2
     opacities: Tensor,  # (N,)
     camera: Camera,
-) -> TileLists:
+) -> list[TileGroup]:
     """List the Gaussians of every tile, keeping their order from front to back."""
     gaussian, tile = _entries(means2d, conics, covariances2d, opacities, camera)
     rows, columns = tile_grid(camera)
@@ -89,20 +73,15 @@ def build_tile_lists(
     # Sorted by length, neighbouring tiles have lists of similar length and need little padding.
     by_length = counts.argsort(stable=True)
     by_length = by_length[counts[by_length] > 0]
-    if len(by_length) == 0:
-        return TileLists([], gaussian)
     padding = torch.full((1,), means2d.shape[1], dtype=torch.int64, device=tile.device)
     gaussian_or_padding = torch.cat([gaussian, padding])
-    groups, slot_gaussians, first_slot = [], [], 0
-    for tiles in by_length.split(GROUP):
-        length = int(counts[tiles[-1]])
-        position = torch.arange(length, device=tile.device)[:, None]
+    groups = []
+    for tiles in by_length.split(GROUP) if len(by_length) else ():
+        position = torch.arange(int(counts[tiles[-1]]), device=tile.device)[:, None]
         entry = torch.where(position < counts[tiles], starts[tiles] + position, len(gaussian))
-        end = first_slot + length * len(tiles)
-        groups.append(TileGroup(tiles, length, slice(first_slot, end)))
-        slot_gaussians.append(gaussian_or_padding.index_select(0, entry.view(-1)))
-        first_slot = end
-    return TileLists(groups, torch.cat(slot_gaussians))
+        slots = gaussian_or_padding.index_select(0, entry.view(-1))
+        groups.append(TileGroup(tiles, slots.view_as(entry)))
+    return groups
 
 
 def _entries(

@@ -38,7 +38,7 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
     def blurred(keyframe: int) -> np.ndarray:  # (H, W, 3)
         return cv2.GaussianBlur(frames[keyframe].image.cpu().numpy(), (0, 0), BLUR)
 
-    for link, (source, target) in enumerate(links.edges()):
+    for link, (source, target) in enumerate(links.edges):
         matches, stride = links.targets[link], graph.grid.stride
         here = torch.from_numpy(blurred(source)[::stride, ::stride].reshape(-1, 3))
         u, v = matches.cpu().numpy()
@@ -54,7 +54,7 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
     least = LEAST_WEIGHT * max(weights, default=0.0)
     telling = [link for link, weight in enumerate(weights) if weight > least]
     axes = np.eye(len(frames))
-    steady, edges = np.diff(axes, axis=0), links.edges()
+    steady, edges = np.diff(axes, axis=0), links.edges
     steps = [*steady, *(axes[edges[k][1]] - axes[edges[k][0]] for k in telling)]
     values = [[0.0] * 3] * len(steady) + [ratios[k] for k in telling]
     root = np.sqrt([STEADY] * len(steady) + [weights[k] for k in telling])[:, None]

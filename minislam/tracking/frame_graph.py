@@ -7,7 +7,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowMatches
-from minislam.state.stateful import FrameOf, Stateful, Tree
+from minislam.state.stateful import Stateful
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
 # Fraction of cells that must stay in view, else a pair has no meaningful distance. DROID-SLAM: 0.75
@@ -22,25 +22,13 @@ KEPT_FRACTION = 0.8
 class FrameGraph(Stateful):
     """Directed edges (source, target) between keyframes, each with its flow measurement."""
 
-    edges_source: list[int] = field(default_factory=list)
-    edges_target: list[int] = field(default_factory=list)
+    edges: list[tuple[int, int]] = field(default_factory=list)
     targets: list[Tensor] = field(default_factory=list)  # per edge (2, N) px
     confidences: list[Tensor] = field(default_factory=list)  # per edge (2, N) in [0, 1]
     matched_ratios: list[float] = field(default_factory=list)  # per edge, in [0, 1]
 
-    def __post_init__(self) -> None:
-        self._position: dict[tuple[int, int], int] = {}
-
     def __len__(self) -> int:
-        return len(self.edges_source)
-
-    def __contains__(self, edge: tuple[int, int]) -> bool:
-        return edge in self._position
-
-    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
-        super().restore_state(state, frame_of)
-        self._position = {edge: position for position, edge in enumerate(self.edges())}
+        return len(self.edges)
 
     def record(self, edges: list[tuple[int, int]], matches: FlowMatches) -> None:
         """Store the matches of these edges, adding the edges that are new.
@@ -49,11 +37,11 @@ class FrameGraph(Stateful):
         wrong pose fails, and the old flow is needed to correct that pose.
         """
         measured = matches.targets, matches.confidences, matches.matched_ratios.tolist()
+        position_of = {edge: position for position, edge in enumerate(self.edges)}
         for edge, target, confidence, ratio in zip(edges, *measured, strict=True):
-            position = self._position.setdefault(edge, len(self))
+            position = position_of.setdefault(edge, len(self))
             if position == len(self):
-                self.edges_source.append(edge[0])
-                self.edges_target.append(edge[1])
+                self.edges.append(edge)
                 self.targets.append(target)
                 self.confidences.append(confidence)
                 self.matched_ratios.append(ratio)
@@ -63,28 +51,17 @@ class FrameGraph(Stateful):
 
     def remove_newest(self, count: int) -> None:
         """Remove the `count` edges that were added last."""
-        for _ in range(count):
-            del self._position[self.edges_source.pop(), self.edges_target.pop()]
-            for column in (self.targets, self.confidences, self.matched_ratios):
-                column.pop()
-
-    def move_targets(self, displacements: Tensor) -> None:
-        """Displace the targets of all edges (E, 2, N) [px]."""
-        moved = torch.stack(self.targets) + displacements
-        self.targets = list(moved.unbind(0))
-
-    def edges(self) -> list[tuple[int, int]]:
-        """Return all edges, in the order they were added."""
-        return list(zip(self.edges_source, self.edges_target, strict=True))
+        for column in (self.edges, self.targets, self.confidences, self.matched_ratios):
+            del column[len(column) - count :]
 
     def flow_from(self, source: int) -> list[tuple[Tensor, Tensor]]:
         """Return targets [px] and confidences, each (N, 2), of the edges that leave a keyframe."""
-        leaving = [p for p, edge in enumerate(self.edges()) if edge[0] == source]
+        leaving = [p for p, edge in enumerate(self.edges) if edge[0] == source]
         return [(self.targets[p].mT, self.confidences[p].mT) for p in leaving]
 
     def select(self, first: int) -> list[int]:
         """Return the positions of the edges with an end at keyframe `first` or later."""
-        return [p for p, edge in enumerate(self.edges()) if max(edge) >= first]
+        return [p for p, edge in enumerate(self.edges) if max(edge) >= first]
 
 
 def neighbourhood_edges(first: int, count: int, radius: int) -> list[tuple[int, int]]:

@@ -253,7 +253,7 @@ class KeyframeGraph(Stateful):
         limit *= self.pixel_scale
         shifted = range(newer.start - start, newer.stop - start)
         distances = self.distances(start, shifted, limit)
-        existing = self.links.edges() + planned
+        existing = self.links.edges + planned
         taken = [(i - start, j - start) for i, j in existing if min(i, j) >= start]
         pairs = proximity_pairs(distances, taken, shifted, limit, links)
         return self.filter_confirmed(both_directions([(i + start, j + start) for i, j in pairs]))

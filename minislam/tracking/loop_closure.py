@@ -43,7 +43,7 @@ def close_loops(graph: KeyframeGraph) -> bool:
         return False
     limits = config.loop_distance * graph.pixel_scale, config.loop_min_gap, config.loop_edges
     distances = graph.distances(rows=range(newest, newest + 1), limit=limits[0])
-    pairs = loop_pairs(distances, graph.links.edges(), newest, *limits, LOOP_SUPPRESSION)
+    pairs = loop_pairs(distances, graph.links.edges, newest, *limits, LOOP_SUPPRESSION)
     edges = graph.filter_confirmed(both_directions(pairs))
     if not edges:
         return False

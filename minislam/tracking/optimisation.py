@@ -35,7 +35,7 @@ def local_ba(graph: KeyframeGraph) -> None:
         adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
     edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
     mask_priors(graph.keyframes, graph.grid, edges, config, first=newest)
-    edges += graph.links.edges()[max(0, len(graph.links) + len(edges) - config.active_edges) :]
+    edges += graph.links.edges[max(0, len(graph.links) + len(edges) - config.active_edges) :]
     for _ in range(config.rounds):
         graph.match(edges)
         adjust(graph, first_free, config.iterations)
@@ -52,7 +52,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
 def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:
     """Adjust all keyframes on fresh flow, without the prior: many views know depth better."""
     config = graph.config
-    edges = graph.links.edges() + graph.global_edges()
+    edges = graph.links.edges + graph.global_edges()
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
     for done in range(config.final_rounds):
         graph.match(edges)
@@ -137,7 +137,7 @@ def bundle_problem(
 ) -> BundleProblem:
     """Collect links of the graph into the bundle problem of Eq. (5)."""
     keyframes, links, grid = graph.keyframes, graph.links, graph.grid
-    ends = [(links.edges_source[p], links.edges_target[p]) for p in positions]
+    ends = [links.edges[p] for p in positions]
     sources, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
     targets = torch.stack([links.targets[p] for p in positions])
     confidences = torch.stack([links.confidences[p] for p in positions])

@@ -12,7 +12,7 @@ from minislam.tracking.bundle_adjustment import (
     edge_costs,
 )
 from minislam.tracking.grid import Grid
-from minislam.tracking.reprojection import splat_disparities
+from minislam.tracking.reprojection import reproject, scaled_points
 from minislam.tracking.safeguards.robust import RobustKernel
 
 INVERSION_STEPS = 4  # of a fixed point; the flow estimator corrects what is left
@@ -102,12 +102,24 @@ def warp_disparities(
 
     A cell that no point reaches takes the nearest cell's value; disparity zero is not warped.
     """
-    warped = splat_disparities(
-        T_target_source, disparities, grid.rays, grid.camera, grid.shape, grid.stride
-    ).reshape(grid.shape)
+    warped = splat_disparities(grid, T_target_source, disparities).reshape(grid.shape)
     if not warped.any():
         return disparities[disparities > 0].median().expand(len(disparities)).clone()
     return filled_from_nearest(warped, warped == 0)
+
+
+def splat_disparities(
+    grid: Grid, T_target_source: Tensor, disparities: Tensor
+) -> Tensor:  # (N,) of the target, 0 in cells that no point falls on
+    """Warp the disparities (N,) of a source; where several fall on a cell, the nearest wins."""
+    cells = T_target_source[None].to(disparities.dtype), disparities[None], grid.rays
+    depth_ratio = scaled_points(*cells)[0, 2]
+    positions, valid = reproject(*cells, grid.camera)
+    column, row = (positions[0] / grid.stride).round().long()
+    height, width = grid.shape
+    kept = valid[0] & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    warped, nearness = torch.zeros_like(disparities), disparities / depth_ratio
+    return warped.scatter_reduce_(0, (row * width + column)[kept], nearness[kept], "amax")
 
 
 def filled_from_nearest(values: Tensor, empty: Tensor) -> Tensor:  # (h, w), (h, w) bool -> (N,)

@@ -115,24 +115,3 @@ def reproject_with_jacobians(
     positions = torch.stack([camera.fx * ray_x + camera.cx, camera.fy * ray_y + camera.cy], 1)
     J_disparity = torch.stack([J_u, J_v], 1)
     return Linearisation(positions, valid, J_target, J_disparity)
-
-
-def splat_disparities(
-    T_target_source: Tensor,  # (4, 4)
-    disparities: Tensor,  # (N,) of the source
-    rays: Tensor,  # (N, 3)
-    camera: Camera,
-    grid: tuple[int, int],  # (h, w)
-    stride: int,  # px
-) -> Tensor:  # (N,) of the target, 0 in cells that no point falls on
-    """Warp disparities to another view; where several points fall on a cell, the nearest wins."""
-    transform = T_target_source[None].to(disparities.dtype)
-    depth_ratio = scaled_points(transform, disparities[None], rays)[0, 2]
-    positions, valid = reproject(transform, disparities[None], rays, camera)
-    column, row = (positions[0] / stride).round().long()
-    height, width = grid
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    kept = inside & valid[0]
-    warped = torch.zeros_like(disparities)
-    cells = row[kept] * width + column[kept]
-    return warped.scatter_reduce_(0, cells, (disparities / depth_ratio)[kept], "amax")

@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from minislam.splatting.reference import gaussian_alphas
-from minislam.splatting.tiles import TILE, TileLists, build_tile_lists, tile_grid
+from minislam.splatting.tiles import TILE, TileGroup, build_tile_lists, tile_grid
 from minislam.splatting.visible import project_gaussians
 from tests.splatting.scenes import KINDS, random_camera, random_map, random_pose
 
 
-def lists_and_truth(kind: str, seed: int) -> tuple[TileLists, torch.Tensor, int]:
+def lists_and_truth(kind: str, seed: int) -> tuple[list[TileGroup], torch.Tensor, int]:
     """Return the lists of a random view, and which (Gaussian, tile) pairs truly overlap."""
     gaussians, camera, pose = random_map(kind, 40, seed), random_camera(seed), random_pose(seed)
     projected = project_gaussians(
@@ -29,11 +29,16 @@ def lists_and_truth(kind: str, seed: int) -> tuple[TileLists, torch.Tensor, int]
     return lists, tiled > 0, len(projected.rows)
 
 
-def listed_pairs(lists: TileLists, shape: torch.Size, count: int) -> torch.Tensor:
+def listed_pairs(lists: list[TileGroup], shape: torch.Size, count: int) -> torch.Tensor:
     pairs = torch.zeros(shape, dtype=torch.bool)
-    real = lists.slot_gaussian < count
-    pairs[lists.slot_gaussian[real], lists.slot_tile[real]] = True
+    for group in lists:
+        real = group.gaussians < count
+        pairs[group.gaussians[real], group.tiles.expand_as(real)[real]] = True
     return pairs
+
+
+def slots_in_use(lists: list[TileGroup], count: int) -> int:
+    return sum(int((group.gaussians < count).sum()) for group in lists)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -42,8 +47,7 @@ def test_every_pair_that_shows_is_listed_once(kind: str, seed: int):
     lists, overlaps, count = lists_and_truth(kind, seed)
     pairs = listed_pairs(lists, overlaps.shape, count)
     assert not (overlaps & ~pairs).any()
-    real = lists.slot_gaussian < count
-    assert int(real.sum()) == int(pairs.sum())
+    assert slots_in_use(lists, count) == int(pairs.sum())
 
 
 def test_few_pairs_are_listed_in_vain():
@@ -51,7 +55,7 @@ def test_few_pairs_are_listed_in_vain():
     listed = overlapping = 0
     for seed in range(30):
         lists, overlaps, count = lists_and_truth("ordinary", seed)
-        listed += int((lists.slot_gaussian < count).sum())
+        listed += slots_in_use(lists, count)
         overlapping += int(overlaps.sum())
     assert listed <= 1.03 * overlapping
 
@@ -59,13 +63,11 @@ def test_few_pairs_are_listed_in_vain():
 @pytest.mark.parametrize("seed", range(6))
 def test_lists_run_from_front_to_back(seed: int):
     lists, _, count = lists_and_truth("crowded", seed)
-    for group in lists.groups:
-        slots = lists.slot_gaussian[group.span].view(group.length, -1)
+    for _, slots in lists:
         assert (slots.diff(dim=0)[slots[1:] < count] > 0).all()  # padding comes last
         assert (slots.diff(dim=0) >= 0).all()
 
 
 def test_no_gaussian_gives_no_group():
     empty = torch.zeros(3, 0)
-    lists = build_tile_lists(empty[:2], empty, empty, empty[0], random_camera(0))
-    assert lists.groups == [] and lists.largest_group == 0
+    assert build_tile_lists(empty[:2], empty, empty, empty[0], random_camera(0)) == []

@@ -93,7 +93,7 @@ class Watch(Stateful):
 def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
     """Return the diagnostics of a keyframe by its links and by its predecessors."""
     frame_index = graph.keyframes.frames[keyframe].frame_index
-    edges = graph.links.edges()
+    edges = graph.links.edges
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]
     explained, depth_error = tie_to_predecessors(graph, keyframe)
     sources, targets = ([edges[p][end] for p in positions] for end in (0, 1))
@@ -110,7 +110,7 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     cells that count in the adjustment. None: no link.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
-    edges = graph.links.edges()
+    edges = graph.links.edges
     positions = [p for p, edge in enumerate(edges) if edge in near]
     if not positions:
         return None, None

@@ -81,7 +81,7 @@ def check_focal_length(
 
 def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) -> FocalLengthFit:
     """Return the focal length that the links among some keyframes fit."""
-    edges = enumerate(graph.links.edges())
+    edges = enumerate(graph.links.edges)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return FocalLengthFit(graph.grid.camera.fx, None, 0.0)
@@ -145,7 +145,7 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     A sensor is read along one axis: the readout that displaces the flow more is set, and the
     adjustments of all keyframes refine it from then on.
     """
-    shutter, edges = graph.shutter, enumerate(graph.links.edges())
+    shutter, edges = graph.shutter, enumerate(graph.links.edges)
     positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
     columns = shutter.link_columns(positions)
     if columns is None or shutter.axis is not None:

@@ -45,7 +45,7 @@ class MotionMemory:
         keyframes = self._keyframes
         for index, matches in enumerate([None, *flow_to_next]):
             if matches is None:
-                keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
+                keyframes.motion_weights[index] = torch.ones_like(keyframes.disparities[index])
             else:
                 self.remember(matches, keyframes.T_camera_world[index], index - 1)
                 self.inherit(matches, index)
@@ -69,13 +69,13 @@ class MotionMemory:
         known = keyframes.disparities[index], motion, before, self.scale
         after = update_motion_weight(self._grid, matches, *known)
         weight = after if settled is None else torch.where(settled, after, before)
-        keyframes.set_motion_weight(index, weight)
+        keyframes.motion_weights[index] = weight
 
     def inherit(self, matches: FlowMatches, index: int = -1) -> None:
         """Set the motion weights of a keyframe from those of the keyframe before it."""
         before = self._keyframes.motion_weights[index - 1]
         weight = inherit_motion_weight(self._grid, matches, before)
-        self._keyframes.set_motion_weight(index, weight)
+        self._keyframes.motion_weights[index] = weight
 
 
 def update_motion_weight(

@@ -128,7 +128,7 @@ class RollingShutter(Stateful):
         """Return c of the links at these positions in the graph, None if nothing is estimated."""
         if not (self.is_on and positions):
             return None
-        edges = self._links.edges()
+        edges = self._links.edges
         targets = torch.stack([self._links.targets[position] for position in positions])
         columns = self.columns([edges[position] for position in positions], targets)
         if self.axis is not None:
@@ -139,12 +139,13 @@ class RollingShutter(Stateful):
         """Make the readouts longer, and correct the flow along all links accordingly."""
         if not any(seconds):
             return
-        columns = self.columns(self._links.edges(), torch.stack(self._links.targets))
+        targets = torch.stack(self._links.targets)
+        columns = self.columns(self._links.edges, targets)
         before, longest = self.readout, self.motion.shortest_step
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
         moved = displacements(columns, self.readout) - displacements(columns, before)
-        self._links.move_targets(moved)
+        self._links.targets = list(targets + moved)
 
     def undone(self, frame: Frame) -> Frame:
         """Return a frame as a global shutter would have seen it."""

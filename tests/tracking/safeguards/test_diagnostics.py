@@ -58,7 +58,7 @@ def test_what_contradicts_a_pose_counts_although_the_memory_takes_it_for_motion(
     graph = true_graph([0, 1, 2])
     graph.match(neighbourhood_edges(0, 3, 2))
     contradicts = GRID.pixels[:, 0] < 0.7 * CAMERA.width
-    last = [p for p, edge in enumerate(graph.links.edges()) if edge[1] == 2]
+    last = [p for p, edge in enumerate(graph.links.edges) if edge[1] == 2]
     for targets in [*(graph.links.targets[p] for p in last), graph.flow_to_next[1].targets[0]]:
         targets[:, contradicts] += 8  # px
     MotionMemory(graph.grid, graph.keyframes, scale=0.5).judge_all(graph.flow_to_next)

@@ -194,7 +194,7 @@ def linked(is_on: bool = True) -> tuple[RollingShutter, FrameGraph]:
 def test_a_longer_readout_moves_the_targets_of_all_links():
     shutter, links = linked()
     before = torch.stack(links.targets)
-    columns = shutter.columns(links.edges(), before)
+    columns = shutter.columns(links.edges, before)
     shutter.lengthen((0.01, -0.02))
     assert shutter.readout == (0.01, -0.02)
     moved = torch.stack(links.targets) - before
