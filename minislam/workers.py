@@ -18,7 +18,6 @@ import signal
 import struct
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
@@ -87,20 +86,13 @@ class Workers:
         tensors, arrays, plain values, and dataclasses, lists or dictionaries of them.
         """
         arguments = [_contiguous(to_tree(list(call))) for call in calls]
-        answers: list[Tree] = [None] * len(calls)
-        left = deque(range(len(calls)))
+        answers: dict[int, Tree] = {}
+        left = iter(range(len(calls)))  # each process takes the next
 
         def compute(answer: Callable[..., Tree]) -> None:
-            while left:
-                try:
-                    number = left.popleft()
-                except IndexError:  # another thread was faster
-                    return
-                try:
+            with suppress(_HelperLost):
+                for number in left:
                     answers[number] = answer(function, arguments[number])
-                except _HelperLost:
-                    left.append(number)  # for this process, where an error of the function is seen
-                    return
 
         helpers = self._helpers[: max(0, len(calls) - 1)]
         threads = [Thread(target=compute, args=(h.answer,), daemon=True) for h in helpers]
@@ -110,7 +102,8 @@ class Workers:
             compute(_answer)
             for thread in threads:
                 thread.join()
-            compute(_answer)
+            for number in set(range(len(calls))) - set(answers):  # of helpers that were lost
+                answers[number] = _answer(function, arguments[number])
         except BaseException:
             self.close()  # else a late answer would be taken for that of the next call
             raise
@@ -118,7 +111,7 @@ class Workers:
         if len(alive) < len(self._helpers):
             self._warn(f"a worker process has ended; the run goes on with {len(alive) + 1}")
         self._helpers = alive
-        return [_result(function, answer) for answer in answers]
+        return [_result(function, answers[number]) for number in range(len(calls))]
 
     def start(self, function: Callable[..., Any], *call: Any) -> Callable[[], Any]:
         """Begin function(*call) in a helper, as for `map`; return what waits for the result.
