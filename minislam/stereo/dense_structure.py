@@ -13,17 +13,9 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.images import resample
 from minislam.records import Frame, Keyframe, Progress
+from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
-from minislam.stereo.votes import (
-    MAX_REFUTED,
-    ConfirmedDepth,
-    SweptView,
-    confirm,
-    count_votes,
-    judges,
-    keep_what_stays,
-)
 from minislam.workers import Workers
 
 WIDTH = 160  # px of the images that are swept for the map
@@ -52,7 +44,7 @@ def with_swept_depth(
     """
     small, result = _small(camera, WIDTH), []
     views = [_view(small, k, *found) for k, found in zip(keyframes, swept, strict=True)]
-    judging = {k: views[k] for k in judges(len(views))}
+    judging = {k: views[k] for k in votes.judges(len(views))}
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
         if bool(keyframe.depth.any()):
             both = (depth > 0) & (keyframe.depth > 0)
@@ -60,8 +52,8 @@ def with_swept_depth(
             guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
             guessed = _view(small, keyframe, guess, confirmation)
             others = [judge for k, judge in judging.items() if k != index]
-            agreeing, refuting = count_votes(small, guessed, others)
-            moves = torch.from_numpy(refuting > MAX_REFUTED * agreeing).to(depth)
+            agreeing, refuting = votes.count_votes(small, guessed, others)
+            moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
             depth = torch.where((depth > 0) | moves, depth, guess)
         confirmation = resample(confirmation, *keyframe.features.shape[:2])
@@ -69,12 +61,14 @@ def with_swept_depth(
     return result
 
 
-def _view(camera: Camera, keyframe: Keyframe, depth: Tensor, confirmation: Tensor) -> SweptView:
+def _view(
+    camera: Camera, keyframe: Keyframe, depth: Tensor, confirmation: Tensor
+) -> votes.SweptView:
     """Return a view that votes with a depth (H, W) of a keyframe, at the size of a camera."""
     size, images = (camera.width, camera.height), (depth, confirmation)
     small = [cv2.resize(i.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST) for i in images]
     known = np.where(small[0] > 0, 1 / np.maximum(small[0], 1e-6), np.nan)
-    return SweptView(known, 1 - small[1], 0.0, keyframe.T_camera_world.cpu().numpy())
+    return votes.SweptView(known, 1 - small[1], 0.0, keyframe.T_camera_world.cpu().numpy())
 
 
 def _small(camera: Camera, width: int) -> Camera:
@@ -96,7 +90,7 @@ def dense_depths(
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     frames = swept_frames(keyframes, list(poses))
-    swept: list[SweptView] = []
+    swept: list[votes.SweptView] = []
     for first in range(0, len(frames), AT_ONCE):
         sweeps = []
         for frame in frames[first : first + AT_ONCE]:
@@ -109,9 +103,9 @@ def dense_depths(
     depths = []
     for at, view in enumerate(swept):
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
-        depths.append(confirm(planner.camera, view, others))
+        depths.append(votes.confirm(planner.camera, view, others))
     wanted = [frames.index(keyframe) for keyframe in keyframes]
-    kept = keep_what_stays(planner.camera, swept, depths, wanted)
+    kept = votes.keep_what_stays(planner.camera, swept, depths, wanted)
     return [full_size(depth, camera) for depth in kept]
 
 
@@ -130,18 +124,18 @@ def swept_view(
     reference: PosedImage,
     others: list[PosedImage],
     planes: np.ndarray,  # (D,) 1/world unit, evenly spaced
-) -> SweptView:
+) -> votes.SweptView:
     """Sweep one image; without others nothing is found. Any process can compute it."""
     step, pose = float(planes[1]), reference.T_camera_world
     if not others:
         nothing = np.full_like(reference.gray, np.nan)
-        return SweptView(nothing, nothing + 1, step, pose)
+        return votes.SweptView(nothing, nothing + 1, step, pose)
     cost = sweep(camera, reference, others, planes)
     best, fraction = refined_minimum(aggregate(cost, reference.gray))
     found = ((best + fraction) * step).clip(0).astype(np.float32)
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
     at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
-    return SweptView(found, at_best, step, pose)
+    return votes.SweptView(found, at_best, step, pose)
 
 
 class SweepPlanner:
@@ -193,7 +187,7 @@ class SweepPlanner:
         return float(np.linalg.norm(self._centres[first] - self._centres[second]))
 
 
-def full_size(depth: ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:
+def full_size(depth: votes.ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) at the size of the images.
 
     Inverse depth is interpolated on a surface; at its edge each pixel takes the nearest value.

@@ -98,12 +98,8 @@ def count_votes(
     camera: Camera, view: SweptView, others: list[SweptView]
 ) -> tuple[np.ndarray, np.ndarray]:  # 2 x (h, w)
     """Return how many views agree with each depth of a view, and how many refute it."""
-    agreeing, refuting = np.zeros_like(view.cost), np.zeros_like(view.cost)
-    for other in others:
-        agrees, refutes = vote(camera, view, other)
-        agreeing += agrees
-        refuting += refutes
-    return agreeing, refuting
+    votes, none = [vote(camera, view, other) for other in others], np.zeros_like(view.cost)
+    return sum((agrees for agrees, _ in votes), none), sum((refutes for _, refutes in votes), none)
 
 
 def vote(camera: Camera, view: SweptView, other: SweptView) -> tuple[np.ndarray, np.ndarray]:
