@@ -15,7 +15,6 @@ import json
 import math
 import os
 import signal
-import struct
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -163,11 +162,8 @@ class _Helper:
 
     def end(self) -> None:
         self.runs = False
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):  # what was not sent is lost with the helper
-                stream.close()  # type: ignore[union-attr]
+        with suppress(OSError), self._process:  # what was not sent is lost with the helper
+            self._process.kill()
 
 
 def serve() -> None:
@@ -219,22 +215,21 @@ def _contiguous(tree: Tree) -> Tree:
 
 
 def _send(stream: Any, tree: Tree) -> None:
-    """Write the length of a JSON text, the text, and the bytes of the tensors it names."""
+    """Write a line of JSON, and the bytes of the tensors that it names."""
     tensors: list[Tensor] = []
 
     def named(tensor: Tensor) -> Tree:  # called in the order of the text
         tensors.append(tensor)
         return {_TENSOR: [str(tensor.dtype).removeprefix("torch."), list(tensor.shape)]}
 
-    text = json.dumps(tree, default=named).encode()
-    stream.write(struct.pack("<Q", len(text)) + text)
+    stream.write(json.dumps(tree, default=named).encode() + b"\n")
     for tensor in tensors:
         stream.write(tensor.numpy().data)
     stream.flush()
 
 
 def _receive(stream: Any) -> Tree:
-    """Read what `_send` has written."""
+    """Read what `_send` has written, or raise EOFError or ValueError."""
 
     def filled(node: dict[str, Any]) -> Tree:  # called in the order of the text
         if _TENSOR not in node:
@@ -245,8 +240,4 @@ def _receive(stream: Any) -> Tree:
             raise EOFError
         return tensor
 
-    size = stream.read(8)
-    text = stream.read(*struct.unpack("<Q", size)) if len(size) == 8 else b""
-    if not text:
-        raise EOFError
-    return json.loads(text, object_hook=filled)
+    return json.loads(stream.readline(), object_hook=filled)
