@@ -142,11 +142,7 @@ class SweepPlanner:
     """Chooses the views and planes of a sweep. It keeps the small grey images that it has read."""
 
     def __init__(
-        self,
-        read: Callable[[int], Frame],
-        camera: Camera,
-        poses: dict[int, Tensor],
-        width: int = WIDTH,
+        self, read: Callable[[int], Frame], camera: Camera, poses: dict[int, Tensor], width: int
     ) -> None:
         self.camera = _small(camera, width)
         self._read = read
@@ -160,7 +156,7 @@ class SweepPlanner:
         """Return the arguments of `swept_view`; `known` are inverse depths of the scene."""
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
-        baseline = max((self._distance(frame, other) for other in others), default=0.0)
+        baseline = max(others.values(), default=0.0)
         # About one plane per pixel of parallax.
         planes = np.linspace(0, nearest, int(np.clip(baseline * nearest * self.camera.fx, *PLANES)))
         views = [self._image(other) for other in others] if baseline > 0 else []
@@ -172,19 +168,19 @@ class SweepPlanner:
         small = cv2.resize(gray, size, None, 0, 0, cv2.INTER_AREA)
         return PosedImage(small, self._poses[frame_index])
 
-    def _views(self, frame: int, inverse_depth: float) -> list[int]:
-        """Choose the frames to sweep against, spread evenly over those of moderate parallax."""
-        near = [k for k in self._poses if 0 < abs(k - frame) <= REACH]
-        limit = MAX_PARALLAX * self.camera.width / (self.camera.fx * inverse_depth)
-        usable = [k for k in near if self._distance(frame, k) <= limit]
-        if len(usable) < 2:
-            return sorted(near, key=lambda k: abs(k - frame))[:2]
-        chosen = np.linspace(0, len(usable) - 1, min(VIEWS, len(usable))).round().astype(int)
-        return [usable[k] for k in chosen]
+    def _views(self, frame: int, inverse_depth: float) -> dict[int, float]:
+        """Choose the frames to sweep against, spread evenly over those of moderate parallax.
 
-    def _distance(self, first: int, second: int) -> float:
-        """Return the distance between two cameras."""
-        return float(np.linalg.norm(self._centres[first] - self._centres[second]))
+        Each comes with its distance [world unit].
+        """
+        here, near = self._centres[frame], [k for k in self._poses if 0 < abs(k - frame) <= REACH]
+        distances = {k: float(np.linalg.norm(here - self._centres[k])) for k in near}
+        limit = MAX_PARALLAX * self.camera.width / (self.camera.fx * inverse_depth)
+        chosen = [k for k in near if distances[k] <= limit]
+        if len(chosen) < 2:
+            chosen = sorted(near, key=lambda k: abs(k - frame))[:2]
+        spread = np.linspace(0, len(chosen) - 1, min(VIEWS, len(chosen))).round().astype(int)
+        return {chosen[k]: distances[chosen[k]] for k in spread}
 
 
 def full_size(depth: votes.ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:
