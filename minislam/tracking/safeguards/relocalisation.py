@@ -70,21 +70,12 @@ class Relocaliser:
         if int(usable.sum()) < MIN_INLIERS:
             return None
         points = grid.camera.rays(positions) / disparities[:, None]
-        pose = self._pose(points[usable].double().numpy(), matched[usable.numpy()])
-        if pose is None:
-            return None
-        T_frame_keyframe, inliers = pose
-        T_keyframe_world = keyframes.T_camera_world[index]
-        return Place(index, T_frame_keyframe.to(T_keyframe_world) @ T_keyframe_world, inliers)
-
-    def _pose(self, points: np.ndarray, pixels: np.ndarray) -> tuple[Tensor, int] | None:
-        """Return T_frame_keyframe and its inliers from points (P, 3) and pixels (P, 2)."""
         cv2.setRNGSeed(0)
         try:
             found, phi, t, inliers = cv2.solvePnPRansac(
-                points,
-                pixels.astype(np.float64),
-                camera_matrix(self._graph.grid.camera),
+                points[usable].double().numpy(),
+                matched[usable.numpy()].astype(np.float64),
+                camera_matrix(grid.camera),
                 None,
                 iterationsCount=PNP_ITERATIONS,
                 reprojectionError=PNP_ERROR * self._graph.pixel_scale,
@@ -94,8 +85,10 @@ class Relocaliser:
             return None
         if not found or inliers is None or len(inliers) < MIN_INLIERS:
             return None
-        rotation = so3_exp(torch.from_numpy(phi[:, 0]))
-        return make_transform(rotation, torch.from_numpy(t[:, 0])), len(inliers)
+        T_keyframe_world = keyframes.T_camera_world[index]
+        rotation, translation = so3_exp(torch.from_numpy(phi[:, 0])), torch.from_numpy(t[:, 0])
+        T_frame_keyframe = make_transform(rotation, translation).to(T_keyframe_world)
+        return Place(index, T_frame_keyframe @ T_keyframe_world, len(inliers))
 
 
 def _summary(features: Tensor) -> Tensor:  # (h', w', C) -> (C,)
