@@ -104,7 +104,7 @@ class Workers:
             for number in set(range(len(calls))) - set(answers):  # of helpers that were lost
                 answers[number] = _answer(function, arguments[number])
         except BaseException:
-            self.close()  # else a late answer would be taken for that of the next call
+            self.close()  # else the helpers would go on with what nobody waits for
             raise
         alive = [helper for helper in self._helpers if helper.runs]
         if len(alive) < len(self._helpers):

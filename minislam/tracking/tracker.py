@@ -25,13 +25,9 @@ from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
+from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.focal_length import seek_readouts
-from minislam.tracking.safeguards.motion_memory import (
-    inherit_motion,
-    judge_motion,
-    remember_motion,
-)
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.settling import SETTLED, Settling
@@ -178,14 +174,14 @@ class Tracker(Stateful):
             if self.graph.is_learned:
                 pose, _ = self.graph.fit_pose(frame, [len(self.keyframes) - 1], pose)
             disparities = self._settling.hand_on(information, pose)
-            remember_motion(self.graph, matches, pose, settled=information > SETTLED)
+            motion_memory.remember(self.graph, matches, pose, settled=information > SETTLED)
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()
         self.last_non_keyframe = None
         self.graph.flow_to_next.append(matches)
         self._add_keyframe(frame, self._features(frame), pose, disparities)
         if self.initialised:
-            inherit_motion(self.graph, matches)
+            motion_memory.inherit(self.graph, matches)
             local_ba(self.graph)
             self.watch.judge(first=len(self.keyframes) - 1)
             self._adjust_all_if_due()
@@ -248,7 +244,7 @@ class Tracker(Stateful):
         self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
-        judge_motion(self.graph)
+        motion_memory.judge_all(self.graph)
 
     def refine_initialisation(self) -> None:
         """Adjust the warm-up keyframes again, now that beta is known (second stage)."""
@@ -262,7 +258,7 @@ class Tracker(Stateful):
     def finish(self, progress: Progress | None = None) -> None:
         """Run the final global BA, with the newest beta."""
         self._update_static_weights()
-        judge_motion(self.graph)  # online, depths were hardly settled
+        motion_memory.judge_all(self.graph)  # online, depths were hardly settled
         seek_readouts(self.graph)
         final_global_ba(self.graph, progress)
         self.watch.conclude()

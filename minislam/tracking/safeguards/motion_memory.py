@@ -33,18 +33,18 @@ MIN_PAIRS = 2  # pairs of keyframes in which the camera moves; fewer tell nothin
 MIN_CELLS = 4
 
 
-def judge_motion(graph: KeyframeGraph) -> None:
+def judge_all(graph: KeyframeGraph) -> None:
     """Set all motion weights by the present geometry; after a lost camera memory begins anew."""
     keyframes = graph.keyframes
     for index, matches in enumerate([None, *graph.flow_to_next]):
         if matches is None:
             keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
         else:
-            remember_motion(graph, matches, keyframes.T_camera_world[index], index - 1)
-            inherit_motion(graph, matches, index)
+            remember(graph, matches, keyframes.T_camera_world[index], index - 1)
+            inherit(graph, matches, index)
 
 
-def remember_motion(
+def remember(
     graph: KeyframeGraph,
     matches: FlowMatches,
     T_camera_world: Tensor,  # (4, 4) where the camera moves on to
@@ -66,7 +66,7 @@ def remember_motion(
     keyframes.set_motion_weight(index, weight)
 
 
-def inherit_motion(graph: KeyframeGraph, matches: FlowMatches, index: int = -1) -> None:
+def inherit(graph: KeyframeGraph, matches: FlowMatches, index: int = -1) -> None:
     """Set the motion weights of a keyframe from those of the keyframe before it."""
     before = graph.keyframes.motion_weights[index - 1]
     weight = inherit_motion_weight(graph.grid, matches, before)

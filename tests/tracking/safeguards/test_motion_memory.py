@@ -11,8 +11,8 @@ from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import reproject
 from minislam.tracking.safeguards.motion_memory import (
     inherit_motion_weight,
-    judge_motion,
-    remember_motion,
+    judge_all,
+    remember,
     update_motion_weight,
 )
 from tests.tracking.scene import CAMERA, STRIDE
@@ -130,7 +130,7 @@ def test_all_keyframes_are_judged_anew_from_the_first_on():
     flow = [matches_of(moves), matches_of(moves)]
     store = store_of(3)
     graph = graph_of(store, flow)
-    judge_motion(graph)
+    judge_all(graph)
     first = update_motion_weight(GRID, flow[0], DISPARITIES, MOTION, torch.ones(CELLS), SCALE)
     assert torch.equal(store.motion_weights[0], first)
     second = inherit_motion_weight(GRID, flow[0], first)
@@ -138,20 +138,20 @@ def test_all_keyframes_are_judged_anew_from_the_first_on():
     torch.testing.assert_close(store.motion_weights[1], judged)
     assert torch.equal(store.motion_weights[2], inherit_motion_weight(GRID, flow[1], judged))
     before = store.motion_weights.clone()
-    judge_motion(graph)  # what was judged before has no effect
+    judge_all(graph)  # what was judged before has no effect
     assert torch.equal(store.motion_weights, before)
 
 
 def test_memory_begins_anew_where_the_camera_was_relocalised():
     off = torch.full((CELLS, 2), 30.0)
     store = store_of(3)
-    judge_motion(graph_of(store, [matches_of(off), None]))
+    judge_all(graph_of(store, [matches_of(off), None]))
     assert store.motion_weights[0].max() < 0.15 and store.motion_weights[2].min() == 1
 
 
 def test_no_scale_is_no_memory():
     store = store_of(2)
-    judge_motion(graph_of(store, [matches_of(torch.full((CELLS, 2), 30.0))], scale=0.0))
+    judge_all(graph_of(store, [matches_of(torch.full((CELLS, 2), 30.0))], scale=0.0))
     assert store.motion_weights[0].min() == 1
 
 
@@ -159,7 +159,7 @@ def test_a_cell_whose_disparity_is_unknown_keeps_its_weight():
     store, settled = store_of(2), torch.arange(CELLS) % 2 == 0
     moves = matches_of(torch.full((CELLS, 2), 30.0))
     graph = graph_of(store, [moves])
-    remember_motion(graph, moves, store.T_camera_world[1], index=0, settled=settled)
+    remember(graph, moves, store.T_camera_world[1], index=0, settled=settled)
     judged = store.motion_weights[0]
     assert judged[settled].max() < 0.15
     assert torch.equal(judged[~settled], torch.full_like(judged[~settled], 0.5))
