@@ -44,15 +44,13 @@ def with_swept_depth(
     """
     small, result = _small(camera, WIDTH), []
     views = [_view(small, k, *found) for k, found in zip(keyframes, swept, strict=True)]
-    judging = {k: views[k] for k in votes.judges(len(views))}
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
         if bool(keyframe.depth.any()):
             both = (depth > 0) & (keyframe.depth > 0)
             enough = int(both.sum()) > LEAST_COMMON
             guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
             guessed = _view(small, keyframe, guess, confirmation)
-            others = [judge for k, judge in judging.items() if k != index]
-            agreeing, refuting = votes.count_votes(small, guessed, others)
+            agreeing, refuting = votes.count_judges(small, guessed, views, index)
             moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
             depth = torch.where((depth > 0) | moves, depth, guess)
