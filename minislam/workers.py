@@ -15,10 +15,8 @@ import json
 import math
 import os
 import signal
-import struct
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
@@ -87,20 +85,13 @@ class Workers:
         tensors, arrays, plain values, and dataclasses, lists or dictionaries of them.
         """
         arguments = [_contiguous(to_tree(list(call))) for call in calls]
-        answers: list[Tree] = [None] * len(calls)
-        left = deque(range(len(calls)))
+        answers: dict[int, Tree] = {}
+        left = iter(range(len(calls)))  # each process takes the next
 
         def compute(answer: Callable[..., Tree]) -> None:
-            while left:
-                try:
-                    number = left.popleft()
-                except IndexError:  # another thread was faster
-                    return
-                try:
+            with suppress(_HelperLost):
+                for number in left:
                     answers[number] = answer(function, arguments[number])
-                except _HelperLost:
-                    left.append(number)  # for this process, where an error of the function is seen
-                    return
 
         helpers = self._helpers[: max(0, len(calls) - 1)]
         threads = [Thread(target=compute, args=(h.answer,), daemon=True) for h in helpers]
@@ -110,15 +101,16 @@ class Workers:
             compute(_answer)
             for thread in threads:
                 thread.join()
-            compute(_answer)
+            for number in set(range(len(calls))) - set(answers):  # of helpers that were lost
+                answers[number] = _answer(function, arguments[number])
         except BaseException:
-            self.close()  # else a late answer would be taken for that of the next call
+            self.close()  # else the helpers would go on with what nobody waits for
             raise
         alive = [helper for helper in self._helpers if helper.runs]
         if len(alive) < len(self._helpers):
             self._warn(f"a worker process has ended; the run goes on with {len(alive) + 1}")
         self._helpers = alive
-        return [_result(function, answer) for answer in answers]
+        return [_result(function, answers[number]) for number in range(len(calls))]
 
     def start(self, function: Callable[..., Any], *call: Any) -> Callable[[], Any]:
         """Begin function(*call) in a helper, as for `map`; return what waits for the result.
@@ -170,11 +162,8 @@ class _Helper:
 
     def end(self) -> None:
         self.runs = False
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):  # what was not sent is lost with the helper
-                stream.close()  # type: ignore[union-attr]
+        with suppress(OSError), self._process:  # what was not sent is lost with the helper
+            self._process.kill()
 
 
 def serve() -> None:
@@ -226,22 +215,21 @@ def _contiguous(tree: Tree) -> Tree:
 
 
 def _send(stream: Any, tree: Tree) -> None:
-    """Write the length of a JSON text, the text, and the bytes of the tensors it names."""
+    """Write a line of JSON, and the bytes of the tensors that it names."""
     tensors: list[Tensor] = []
 
     def named(tensor: Tensor) -> Tree:  # called in the order of the text
         tensors.append(tensor)
         return {_TENSOR: [str(tensor.dtype).removeprefix("torch."), list(tensor.shape)]}
 
-    text = json.dumps(tree, default=named).encode()
-    stream.write(struct.pack("<Q", len(text)) + text)
+    stream.write(json.dumps(tree, default=named).encode() + b"\n")
     for tensor in tensors:
         stream.write(tensor.numpy().data)
     stream.flush()
 
 
 def _receive(stream: Any) -> Tree:
-    """Read what `_send` has written."""
+    """Read what `_send` has written, or raise EOFError or ValueError."""
 
     def filled(node: dict[str, Any]) -> Tree:  # called in the order of the text
         if _TENSOR not in node:
@@ -252,8 +240,4 @@ def _receive(stream: Any) -> Tree:
             raise EOFError
         return tensor
 
-    size = stream.read(8)
-    text = stream.read(*struct.unpack("<Q", size)) if len(size) == 8 else b""
-    if not text:
-        raise EOFError
-    return json.loads(text, object_hook=filled)
+    return json.loads(stream.readline(), object_hook=filled)

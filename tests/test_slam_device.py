@@ -174,9 +174,7 @@ def test_a_lost_camera_is_found_on_the_gpu(both: tuple[Run, Run], monkeypatch: p
 
 
 def place_of_second_keyframe(slam: Slam) -> relocalisation.Place:
-    tracker, keyframes = slam.tracker, slam.tracker.keyframes
-    scale = tracker.graph.pixel_scale
-    finder = relocalisation.Relocaliser(tracker.grid, keyframes, scale)
+    keyframes, finder = slam.tracker.keyframes, relocalisation.Relocaliser(slam.tracker.graph)
     place = finder.find(keyframes.frames[1].image, keyframes.features[1])
     assert place is not None
     return place

@@ -149,7 +149,7 @@ def _ties(slam: Slam) -> dict[str, float | None]:
 def _segment_errors(slam: Slam) -> dict[str, float | None]:
     """Return the ATE of each piece of a broken trajectory, aligned by itself [cm]."""
     truth, watch = slam.sequence.ground_truth, slam.tracker.watch
-    if truth is None or truth.trajectory is None or not watch.is_broken:
+    if truth is None or truth.trajectory is None or not watch.breaks:
         return {}
     trajectory, errors = slam.trajectory(), {}
     times = trajectory.timestamps

@@ -154,7 +154,7 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     adjustments = slam.tracker.graph.adjustments
     if 2 * adjustments.failed > adjustments.count:
         return "finished, most bundle adjustments failed", LOST_EXIT
-    if slam.tracker.watch.is_broken:
+    if slam.tracker.watch.breaks:
         return "finished, broken", LOST_EXIT
     if has_large_holes(slam):
         return "finished, map with large holes", LOST_EXIT

@@ -13,17 +13,9 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.images import resample
 from minislam.records import Frame, Keyframe, Progress
+from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
-from minislam.stereo.votes import (
-    MAX_REFUTED,
-    ConfirmedDepth,
-    SweptView,
-    confirm,
-    count_votes,
-    judges,
-    keep_what_stays,
-)
 from minislam.workers import Workers
 
 WIDTH = 160  # px of the images that are swept for the map
@@ -52,16 +44,14 @@ def with_swept_depth(
     """
     small, result = _small(camera, WIDTH), []
     views = [_view(small, k, *found) for k, found in zip(keyframes, swept, strict=True)]
-    judging = {k: views[k] for k in judges(len(views))}
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
         if bool(keyframe.depth.any()):
             both = (depth > 0) & (keyframe.depth > 0)
             enough = int(both.sum()) > LEAST_COMMON
             guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
             guessed = _view(small, keyframe, guess, confirmation)
-            others = [judge for k, judge in judging.items() if k != index]
-            agreeing, refuting = count_votes(small, guessed, others)
-            moves = torch.from_numpy(refuting > MAX_REFUTED * agreeing).to(depth)
+            agreeing, refuting = votes.count_judges(small, guessed, views, index)
+            moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
             depth = torch.where((depth > 0) | moves, depth, guess)
         confirmation = resample(confirmation, *keyframe.features.shape[:2])
@@ -69,12 +59,14 @@ def with_swept_depth(
     return result
 
 
-def _view(camera: Camera, keyframe: Keyframe, depth: Tensor, confirmation: Tensor) -> SweptView:
+def _view(
+    camera: Camera, keyframe: Keyframe, depth: Tensor, confirmation: Tensor
+) -> votes.SweptView:
     """Return a view that votes with a depth (H, W) of a keyframe, at the size of a camera."""
     size, images = (camera.width, camera.height), (depth, confirmation)
     small = [cv2.resize(i.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST) for i in images]
     known = np.where(small[0] > 0, 1 / np.maximum(small[0], 1e-6), np.nan)
-    return SweptView(known, 1 - small[1], 0.0, keyframe.T_camera_world.cpu().numpy())
+    return votes.SweptView(known, 1 - small[1], 0.0, keyframe.T_camera_world.cpu().numpy())
 
 
 def _small(camera: Camera, width: int) -> Camera:
@@ -96,7 +88,7 @@ def dense_depths(
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     frames = swept_frames(keyframes, list(poses))
-    swept: list[SweptView] = []
+    swept: list[votes.SweptView] = []
     for first in range(0, len(frames), AT_ONCE):
         sweeps = []
         for frame in frames[first : first + AT_ONCE]:
@@ -109,9 +101,9 @@ def dense_depths(
     depths = []
     for at, view in enumerate(swept):
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
-        depths.append(confirm(planner.camera, view, others))
+        depths.append(votes.confirm(planner.camera, view, others))
     wanted = [frames.index(keyframe) for keyframe in keyframes]
-    kept = keep_what_stays(planner.camera, swept, depths, wanted)
+    kept = votes.keep_what_stays(planner.camera, swept, depths, wanted)
     return [full_size(depth, camera) for depth in kept]
 
 
@@ -130,29 +122,25 @@ def swept_view(
     reference: PosedImage,
     others: list[PosedImage],
     planes: np.ndarray,  # (D,) 1/world unit, evenly spaced
-) -> SweptView:
+) -> votes.SweptView:
     """Sweep one image; without others nothing is found. Any process can compute it."""
     step, pose = float(planes[1]), reference.T_camera_world
     if not others:
         nothing = np.full_like(reference.gray, np.nan)
-        return SweptView(nothing, nothing + 1, step, pose)
+        return votes.SweptView(nothing, nothing + 1, step, pose)
     cost = sweep(camera, reference, others, planes)
     best, fraction = refined_minimum(aggregate(cost, reference.gray))
     found = ((best + fraction) * step).clip(0).astype(np.float32)
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
     at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
-    return SweptView(found, at_best, step, pose)
+    return votes.SweptView(found, at_best, step, pose)
 
 
 class SweepPlanner:
     """Chooses the views and planes of a sweep. It keeps the small grey images that it has read."""
 
     def __init__(
-        self,
-        read: Callable[[int], Frame],
-        camera: Camera,
-        poses: dict[int, Tensor],
-        width: int = WIDTH,
+        self, read: Callable[[int], Frame], camera: Camera, poses: dict[int, Tensor], width: int
     ) -> None:
         self.camera = _small(camera, width)
         self._read = read
@@ -166,7 +154,7 @@ class SweepPlanner:
         """Return the arguments of `swept_view`; `known` are inverse depths of the scene."""
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
-        baseline = max((self._distance(frame, other) for other in others), default=0.0)
+        baseline = max(others.values(), default=0.0)
         # About one plane per pixel of parallax.
         planes = np.linspace(0, nearest, int(np.clip(baseline * nearest * self.camera.fx, *PLANES)))
         views = [self._image(other) for other in others] if baseline > 0 else []
@@ -178,22 +166,22 @@ class SweepPlanner:
         small = cv2.resize(gray, size, None, 0, 0, cv2.INTER_AREA)
         return PosedImage(small, self._poses[frame_index])
 
-    def _views(self, frame: int, inverse_depth: float) -> list[int]:
-        """Choose the frames to sweep against, spread evenly over those of moderate parallax."""
-        near = [k for k in self._poses if 0 < abs(k - frame) <= REACH]
+    def _views(self, frame: int, inverse_depth: float) -> dict[int, float]:
+        """Choose the frames to sweep against, spread evenly over those of moderate parallax.
+
+        Each comes with its distance [world unit].
+        """
+        here, near = self._centres[frame], [k for k in self._poses if 0 < abs(k - frame) <= REACH]
+        distances = {k: float(np.linalg.norm(here - self._centres[k])) for k in near}
         limit = MAX_PARALLAX * self.camera.width / (self.camera.fx * inverse_depth)
-        usable = [k for k in near if self._distance(frame, k) <= limit]
-        if len(usable) < 2:
-            return sorted(near, key=lambda k: abs(k - frame))[:2]
-        chosen = np.linspace(0, len(usable) - 1, min(VIEWS, len(usable))).round().astype(int)
-        return [usable[k] for k in chosen]
-
-    def _distance(self, first: int, second: int) -> float:
-        """Return the distance between two cameras."""
-        return float(np.linalg.norm(self._centres[first] - self._centres[second]))
+        chosen = [k for k in near if distances[k] <= limit]
+        if len(chosen) < 2:
+            chosen = sorted(near, key=lambda k: abs(k - frame))[:2]
+        spread = np.linspace(0, len(chosen) - 1, min(VIEWS, len(chosen))).round().astype(int)
+        return {chosen[k]: distances[chosen[k]] for k in spread}
 
 
-def full_size(depth: ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:
+def full_size(depth: votes.ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) at the size of the images.
 
     Inverse depth is interpolated on a surface; at its edge each pixel takes the nearest value.

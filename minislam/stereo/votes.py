@@ -63,12 +63,18 @@ def keep_what_stays(
 
     Around a dropped pixel the confirmation fades too.
     """
-    known_only = {k: _known_only(views[k], depths[k]) for k in judges(len(views))}
+    known_only = [
+        replace(
+            view,
+            inverse_depth=np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
+            cost=1 - depth.confirmation,
+        )
+        for view, depth in zip(views, depths, strict=True)
+    ]
     kept = []
     for index in wanted:
-        view, depth = views[index], depths[index]
-        others = [judge for k, judge in known_only.items() if k != index]
-        agreeing, refuting = count_votes(camera, _known_only(view, depth), others)
+        depth = depths[index]
+        agreeing, refuting = count_judges(camera, known_only[index], known_only, index)
         left = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
         known = (depth.inverse_depth > 0) & ~left
         known &= _window_share(known) >= MIN_SUPPORT
@@ -77,33 +83,25 @@ def keep_what_stays(
     return kept
 
 
-def _known_only(view: SweptView, depth: ConfirmedDepth) -> SweptView:
-    """Return a view that votes with its confirmed depths alone."""
-    known = np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan)
-    return replace(view, inverse_depth=known, cost=1 - depth.confirmation)
-
-
-def judges(count: int) -> list[int]:
-    """Return which of so many views, of all times, judge the others."""
-    chosen: list[int] = np.unique(np.linspace(0, count - 1, JUDGES).round().astype(int)).tolist()
-    return chosen
-
-
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
     """Return the share of the window around each pixel in which the mask is true."""
     return cv2.blur(mask.astype(np.float32), (SUPPORT_WINDOW, SUPPORT_WINDOW))
+
+
+def count_judges(
+    camera: Camera, view: SweptView, views: list[SweptView], index: int
+) -> tuple[np.ndarray, np.ndarray]:  # 2 x (h, w)
+    """Count the votes of some views of all times on a view, the one at `index` among them."""
+    judges = np.unique(np.linspace(0, len(views) - 1, JUDGES).round().astype(int))
+    return count_votes(camera, view, [views[k] for k in judges if k != index])
 
 
 def count_votes(
     camera: Camera, view: SweptView, others: list[SweptView]
 ) -> tuple[np.ndarray, np.ndarray]:  # 2 x (h, w)
     """Return how many views agree with each depth of a view, and how many refute it."""
-    agreeing, refuting = np.zeros_like(view.cost), np.zeros_like(view.cost)
-    for other in others:
-        agrees, refutes = vote(camera, view, other)
-        agreeing += agrees
-        refuting += refutes
-    return agreeing, refuting
+    votes, none = [vote(camera, view, other) for other in others], np.zeros_like(view.cost)
+    return sum((agrees for agrees, _ in votes), none), sum((refutes for _, refutes in votes), none)
 
 
 def vote(camera: Camera, view: SweptView, other: SweptView) -> tuple[np.ndarray, np.ndarray]:

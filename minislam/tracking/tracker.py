@@ -24,9 +24,9 @@ from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
+from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.focal_length import seek_readouts
-from minislam.tracking.safeguards.motion_memory import MotionMemory
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.settling import SETTLED, Settling
@@ -68,16 +68,14 @@ class Tracker(Stateful):
     ) -> None:
         """Start without any frame. Online a keyframe keeps the static weight it came with."""
         self.graph = KeyframeGraph(camera, config, flow, device)
-        self.config = config = self.graph.config  # for this kind of flow
+        self.config = self.graph.config  # for this kind of flow
         self.keyframes = self.graph.keyframes
         self.grid = self.graph.grid
         self.tracked, self.watch, self._settling = [], Watch(self.graph), Settling(self.graph)
         self._features = features
         self._depth_prior = lambda frame: depth_prior(frame, camera)  # as given: one unit of length
         self._predict_static_weight = predict_static_weight
-        memory_scale = config.motion_memory * self.graph.pixel_scale
-        self._motion = MotionMemory(self.grid, self.keyframes, memory_scale)
-        self._relocaliser = Relocaliser(self.grid, self.keyframes, self.graph.pixel_scale)
+        self._relocaliser = Relocaliser(self.graph)
         # From the newest keyframe to the newest frame that could be matched with it.
         self._chain: FlowChain | None = None
 
@@ -158,16 +156,16 @@ class Tracker(Stateful):
             if self.graph.is_learned:
                 pose, _ = self.graph.fit_pose(frame, [len(self.keyframes) - 1], pose)
             disparities = self._settling.hand_on(information, pose)
-            self._motion.remember(matches, pose, settled=information > SETTLED)
+            motion_memory.remember(self.graph, matches, pose, settled=information > SETTLED)
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()
         self.last_non_keyframe = None
         self.graph.flow_to_next.append(matches)
         self._add_keyframe(frame, self._features(frame), pose, disparities)
         if self.initialised:
-            self._motion.inherit(matches)
+            motion_memory.inherit(self.graph, matches)
             local_ba(self.graph)
-            self.watch.judge_newest()
+            self.watch.judge(first=len(self.keyframes) - 1)
             self._adjust_all_if_due()
 
     def _add_keyframe(
@@ -207,7 +205,7 @@ class Tracker(Stateful):
         if not attach_newest(self.graph, place.keyframe_index):
             self.graph.remove_newest()
             return False
-        self.watch.judge_newest()
+        self.watch.judge(first=len(self.keyframes) - 1)
         self._chain = self.graph.flow.start_chain(frame.image)
         self.last_non_keyframe = None
         self._log_followed(frame, 1.0)
@@ -227,7 +225,7 @@ class Tracker(Stateful):
         self.initialised = True
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
-        self._motion.judge_all(self.graph.flow_to_next)
+        motion_memory.judge_all(self.graph)
 
     def refine_initialisation(self) -> None:
         """Adjust the warm-up keyframes again, now that beta is known (second stage)."""
@@ -236,12 +234,12 @@ class Tracker(Stateful):
         mask_priors(self.keyframes, self.grid, edges, self.config)
         seek_readouts(self.graph)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds_with_beta)
-        self.watch.judge_all()
+        self.watch.judge()
 
     def finish(self, progress: Progress | None = None) -> None:
         """Run the final global BA, with the newest beta."""
         self._update_static_weights()
-        self._motion.judge_all(self.graph.flow_to_next)  # online, depths were hardly settled
+        motion_memory.judge_all(self.graph)  # online, depths were hardly settled
         seek_readouts(self.graph)
         final_global_ba(self.graph, progress)
         self.watch.conclude()

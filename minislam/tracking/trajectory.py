@@ -7,7 +7,7 @@ from torch import Tensor
 from minislam.geometry import se3_interpolate
 from minislam.records import Progress, Sequence, TrackedFrame, TrackingStatus
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.safeguards.pose_support import PoseFit, ShownImages, retry_doubtful
+from minislam.tracking.safeguards.pose_support import PoseFit, repeats_last, retry_doubtful
 from minislam.tracking.tracker import Tracker
 
 
@@ -25,11 +25,11 @@ def pose_all_frames(
     fits = {f.frame_index: PoseFit(T, 1.0) for f, T in zip(frames, poses, strict=True)}
     followed = [t for t in tracker.tracked if t.status.is_followed]
     others = {t.frame_index: t for t in followed if t.frame_index not in fits}
-    shown = ShownImages(frames)
+    shown = {frame.frame_index: frame for frame in frames}
 
     def fit_from(index: int, start: Tensor) -> PoseFit:
         frame = sequence.frame(index).to(poses.device)
-        if shown.repeats(frame) and index - 1 in fits:
+        if repeats_last(frame, shown) and index - 1 in fits:
             return fits[index - 1]
         return PoseFit(*graph.fit_pose(frame, _around(graph, others[index]), start))
 

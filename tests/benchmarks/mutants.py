@@ -166,7 +166,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("runs/run.py", "runs/test_run_ending.py"): [
         ("if slam.lost_frames() or slam.sequence.lost:", "if False:"),
         ("2 * adjustments.failed > adjustments.count", "adjustments.failed > adjustments.count"),
-        ("if slam.tracker.watch.is_broken:", "if False:"),
+        ("if slam.tracker.watch.breaks:", "if False:"),
     ],
     ("runs/facts.py", "runs/test_facts.py"): [
         ("2 * without >= len", "2 * without < len"),

@@ -54,12 +54,12 @@ def test_views_of_much_parallax_are_not_used():
     for index in range(20):
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.1 * index
-    planner = SweepPlanner(sequence().frame, camera(), poses)
+    planner = SweepPlanner(sequence().frame, camera(), poses, 160)
     near = planner._views(0, 0.3)
     largest = max(near) * 0.1 * 0.3 * planner.camera.fx
     assert len(near) >= 2 and largest <= 0.125 * planner.camera.width
-    assert planner._views(0, 1e-3) == [1, 4, 6, 9, 11, 14, 16, 19]  # spread evenly
-    assert planner._views(0, 1e3) == [1, 2]  # the two nearest, if all are too far
+    assert list(planner._views(0, 1e-3)) == [1, 4, 6, 9, 11, 14, 16, 19]  # spread evenly
+    assert list(planner._views(0, 1e3)) == [1, 2]  # the two nearest, if all are too far
 
 
 # Degenerate input
@@ -114,7 +114,7 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
 
 
 def test_the_swept_camera_sees_what_the_camera_sees():
-    small = SweepPlanner(sequence().frame, camera(), {}).camera
+    small = SweepPlanner(sequence().frame, camera(), {}, 160).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx
 
 

@@ -60,24 +60,15 @@ class Watch(Stateful):
         self._graph = graph
         self.diagnostics, self.breaks = [], []
 
-    def judge_newest(self) -> None:
-        """Add the diagnostics of the newest keyframe."""
-        self.diagnostics.append(diagnose(self._graph, len(self._graph.keyframes) - 1))
-
-    def judge_all(self) -> None:
-        """Replace the diagnostics of all keyframes by their present ones."""
-        count = len(self._graph.keyframes)
-        self.diagnostics = [diagnose(self._graph, keyframe) for keyframe in range(count)]
+    def judge(self, first: int = 0) -> None:
+        """Replace the diagnostics of the keyframes from `first` on by their present ones."""
+        keyframes = range(first, len(self._graph.keyframes))
+        self.diagnostics[first:] = [diagnose(self._graph, keyframe) for keyframe in keyframes]
 
     def conclude(self) -> None:
         """Judge all keyframes after the final adjustment, and find the breaks."""
-        self.judge_all()
+        self.judge()
         self.breaks = find_breaks(self.diagnostics)
-
-    @property
-    def is_broken(self) -> bool:
-        """Tell whether the whole trajectory does not hang together; known at the end."""
-        return bool(self.breaks)
 
     @property
     def segments(self) -> list[tuple[int, int]]:

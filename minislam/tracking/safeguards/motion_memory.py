@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 from minislam.geometry import se3_inverse
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.grid import Grid
-from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import filled_from_nearest
 from minislam.tracking.reprojection import lengths, reproject
 
@@ -33,49 +33,44 @@ MIN_PAIRS = 2  # pairs of keyframes in which the camera moves; fewer tell nothin
 MIN_CELLS = 4
 
 
-class MotionMemory:
-    """Updates the motion weights of the keyframes, once poses and disparities are known."""
+def judge_all(graph: KeyframeGraph) -> None:
+    """Set all motion weights by the present geometry; after a lost camera memory begins anew."""
+    keyframes = graph.keyframes
+    for index, matches in enumerate([None, *graph.flow_to_next]):
+        if matches is None:
+            keyframes.motion_weights[index] = torch.ones_like(keyframes.disparities[index])
+        else:
+            remember(graph, matches, keyframes.T_camera_world[index], index - 1)
+            inherit(graph, matches, index)
 
-    def __init__(self, grid: Grid, keyframes: KeyframeStore, scale: float) -> None:
-        self._grid, self._keyframes = grid, keyframes
-        self.scale = scale or None  # px, of the residuals that still count; None: no memory
 
-    def judge_all(self, flow_to_next: list[FlowMatches | None]) -> None:
-        """Set all weights by the present geometry; after a lost camera memory begins anew."""
-        keyframes = self._keyframes
-        for index, matches in enumerate([None, *flow_to_next]):
-            if matches is None:
-                keyframes.motion_weights[index] = torch.ones_like(keyframes.disparities[index])
-            else:
-                self.remember(matches, keyframes.T_camera_world[index], index - 1)
-                self.inherit(matches, index)
+def remember(
+    graph: KeyframeGraph,
+    matches: FlowMatches,
+    T_camera_world: Tensor,  # (4, 4) where the camera moves on to
+    index: int = -1,
+    settled: Tensor | None = None,  # (N,) bool, whose disparity is known; None: of all
+) -> None:
+    """Lower the motion weight of a keyframe's cells whose flow does not fit the camera motion.
 
-    def remember(
-        self,
-        matches: FlowMatches,
-        T_camera_world: Tensor,  # (4, 4) where the camera moves on to
-        index: int = -1,
-        settled: Tensor | None = None,  # (N,) bool, whose disparity is known; None: of all
-    ) -> None:
-        """Lower the weight of a keyframe's cells whose flow does not fit the motion.
+    A wrong disparity does not fit either, so a cell that is not settled keeps its weight.
+    """
+    keyframes, scale = graph.keyframes, graph.config.motion_memory * graph.pixel_scale
+    if not scale:
+        return
+    before = keyframes.motion_weights[index]
+    motion = T_camera_world @ se3_inverse(keyframes.T_camera_world[index])
+    known = keyframes.disparities[index], motion, before, scale
+    after = update_motion_weight(graph.grid, matches, *known)
+    weight = after if settled is None else torch.where(settled, after, before)
+    keyframes.motion_weights[index] = weight
 
-        A wrong disparity does not fit either, so a cell that is not settled keeps its weight.
-        """
-        keyframes = self._keyframes
-        if self.scale is None:
-            return
-        before = keyframes.motion_weights[index]
-        motion = T_camera_world @ se3_inverse(keyframes.T_camera_world[index])
-        known = keyframes.disparities[index], motion, before, self.scale
-        after = update_motion_weight(self._grid, matches, *known)
-        weight = after if settled is None else torch.where(settled, after, before)
-        keyframes.motion_weights[index] = weight
 
-    def inherit(self, matches: FlowMatches, index: int = -1) -> None:
-        """Set the motion weights of a keyframe from those of the keyframe before it."""
-        before = self._keyframes.motion_weights[index - 1]
-        weight = inherit_motion_weight(self._grid, matches, before)
-        self._keyframes.motion_weights[index] = weight
+def inherit(graph: KeyframeGraph, matches: FlowMatches, index: int = -1) -> None:
+    """Set the motion weights of a keyframe from those of the keyframe before it."""
+    before = graph.keyframes.motion_weights[index - 1]
+    weight = inherit_motion_weight(graph.grid, matches, before)
+    graph.keyframes.motion_weights[index] = weight
 
 
 def update_motion_weight(

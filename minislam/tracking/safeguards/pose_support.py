@@ -54,18 +54,15 @@ def retry_doubtful(
     return lost
 
 
-class ShownImages:
-    """Finds images that repeat the one before, as of a recorder that froze."""
+def repeats_last(frame: Frame, shown: dict[int, Frame]) -> bool:
+    """Tell whether an image repeats the one before it, as of a recorder that froze.
 
-    def __init__(self, frames: list[Frame]) -> None:
-        self._frames = {frame.frame_index: frame for frame in frames}
-
-    def repeats(self, frame: Frame) -> bool:
-        """Tell whether an image repeats the one before it. Sensor noise differs by more."""
-        self._frames[frame.frame_index] = frame
-        self._frames.pop(frame.frame_index - 2, None)
-        before = self._frames.get(frame.frame_index - 1)
-        return before is not None and float((frame.image - before.image).abs().mean()) < REPEATED
+    Sensor noise differs by more. The frame joins those that were `shown`, by frame index.
+    """
+    shown[frame.frame_index] = frame
+    shown.pop(frame.frame_index - 2, None)
+    before = shown.get(frame.frame_index - 1)
+    return before is not None and float((frame.image - before.image).abs().mean()) < REPEATED
 
 
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:

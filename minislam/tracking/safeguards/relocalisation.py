@@ -16,9 +16,7 @@ from minislam.geometry.distortion import camera_matrix
 from minislam.geometry.se3 import make_transform, so3_exp
 from minislam.priors.dense_flow import grayscale
 from minislam.tracking.frame_graph import both_directions
-from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
-from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.optimisation import FIRST_WIDENING, adjust
 
 CANDIDATES = 3  # keyframes that are tried for one frame
@@ -43,15 +41,14 @@ class Place:
 class Relocaliser:
     """Finds frames among the keyframes; keeps the keypoints of the keyframes it has tried."""
 
-    def __init__(self, grid: Grid, keyframes: KeyframeStore, pixel_scale: float) -> None:
-        self._grid, self._keyframes = grid, keyframes
-        self._error = PNP_ERROR * pixel_scale
+    def __init__(self, graph: KeyframeGraph) -> None:
+        self._graph = graph
         self._keypoints: dict[int, Keypoints] = {}
 
     def find(self, image: Tensor, features: Tensor) -> Place | None:
         """Return the place with most inliers: image (H, W, 3), features (h', w', C); or None."""
         seen = _keypoints(image)
-        known = torch.stack([_summary(f) for f in self._keyframes.features])
+        known = torch.stack([_summary(f) for f in self._graph.keyframes.features])
         similarity = known @ _summary(features)
         most_similar = similarity.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
         places = [self._place(seen, index) for index in most_similar]
@@ -60,12 +57,10 @@ class Relocaliser:
 
     def _place(self, seen: Keypoints, index: int) -> Place | None:
         """Return the pose from keypoint matches with one keyframe, if there are enough."""
+        keyframes, grid = self._graph.keyframes, self._graph.grid
         if index not in self._keypoints:
-            self._keypoints[index] = _keypoints(self._keyframes.frames[index].image)
+            self._keypoints[index] = _keypoints(keyframes.frames[index].image)
         pixels, matched = _keypoint_matches(self._keypoints[index], seen)
-        if len(pixels) < MIN_INLIERS:
-            return None
-        keyframes, grid = self._keyframes, self._grid
         structure = torch.stack([keyframes.disparities[index], keyframes.cell_weights[index]], -1)
         positions = torch.from_numpy(pixels)
         # From here on on the CPU, where OpenCV finds the pose.
@@ -75,32 +70,25 @@ class Relocaliser:
         if int(usable.sum()) < MIN_INLIERS:
             return None
         points = grid.camera.rays(positions) / disparities[:, None]
-        pose = self._pose(points[usable].double().numpy(), matched[usable.numpy()])
-        if pose is None:
-            return None
-        T_frame_keyframe, inliers = pose
-        T_keyframe_world = keyframes.T_camera_world[index]
-        return Place(index, T_frame_keyframe.to(T_keyframe_world) @ T_keyframe_world, inliers)
-
-    def _pose(self, points: np.ndarray, pixels: np.ndarray) -> tuple[Tensor, int] | None:
-        """Return T_frame_keyframe and its inliers from points (P, 3) and pixels (P, 2)."""
         cv2.setRNGSeed(0)
         try:
             found, phi, t, inliers = cv2.solvePnPRansac(
-                points,
-                pixels.astype(np.float64),
-                camera_matrix(self._grid.camera),
+                points[usable].double().numpy(),
+                matched[usable.numpy()].astype(np.float64),
+                camera_matrix(grid.camera),
                 None,
                 iterationsCount=PNP_ITERATIONS,
-                reprojectionError=self._error,
+                reprojectionError=PNP_ERROR * self._graph.pixel_scale,
                 flags=cv2.SOLVEPNP_SQPNP,
             )
         except cv2.error:  # SQPnP raises where all points coincide
             return None
         if not found or inliers is None or len(inliers) < MIN_INLIERS:
             return None
-        rotation = so3_exp(torch.from_numpy(phi[:, 0]))
-        return make_transform(rotation, torch.from_numpy(t[:, 0])), len(inliers)
+        T_keyframe_world = keyframes.T_camera_world[index]
+        rotation, translation = so3_exp(torch.from_numpy(phi[:, 0])), torch.from_numpy(t[:, 0])
+        T_frame_keyframe = make_transform(rotation, translation).to(T_keyframe_world)
+        return Place(index, T_frame_keyframe @ T_keyframe_world, len(inliers))
 
 
 def _summary(features: Tensor) -> Tensor:  # (h', w', C) -> (C,)

@@ -69,8 +69,6 @@ class ImageMotion(Stateful):
 
     def displacement(self, frame_index: int, readout: Readout) -> np.ndarray | None:  # (H, W, 2)
         """Return how far each pixel is from where a global shutter shows it; None: negligible."""
-        if not any(readout):
-            return None
         grid, camera = self._grid, self._grid.camera
         late = grid.pixels.T / grid.pixels.new_tensor([[camera.width], [camera.height]]) - 0.5
         moved = self.velocity(frame_index) * (grid.pixels.new_tensor(readout) @ late)

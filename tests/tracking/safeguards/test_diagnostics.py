@@ -1,6 +1,7 @@
 """What the links of a keyframe say about it, and where a trajectory is broken."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from minislam.tracking.safeguards.diagnostics import (
     weight_so_far,
     weighted_median,
 )
-from minislam.tracking.safeguards.motion_memory import MotionMemory
+from minislam.tracking.safeguards.motion_memory import judge_all
 from tests.tracking.wall import CAMERA, GRID, true_graph
 
 HEALTHY, WEAK, UNEXPLAINED, DEEP = (
@@ -61,7 +62,8 @@ def test_what_contradicts_a_pose_counts_although_the_memory_takes_it_for_motion(
     last = [p for p, edge in enumerate(graph.links.edges) if edge[1] == 2]
     for targets in [*(graph.links.targets[p] for p in last), graph.flow_to_next[1].targets[0]]:
         targets[:, contradicts] += 8  # px
-    MotionMemory(graph.grid, graph.keyframes, scale=0.5).judge_all(graph.flow_to_next)
+    graph.config = replace(graph.config, motion_memory=0.5 / graph.pixel_scale)
+    judge_all(graph)
     assert graph.keyframes.cell_weights[1, contradicts].mean() < 0.3  # excluded from now on
     assert diagnose(graph, 2).explained == pytest.approx(0.3, abs=0.1)
     assert diagnose(graph, 1).explained == 1

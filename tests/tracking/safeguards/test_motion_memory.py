@@ -1,5 +1,7 @@
 """Trust in cells: lost where they do not follow the camera, warped along, regained slowly."""
 
+from types import SimpleNamespace
+
 import torch
 
 from minislam.geometry import se3_exp
@@ -8,8 +10,9 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import reproject
 from minislam.tracking.safeguards.motion_memory import (
-    MotionMemory,
     inherit_motion_weight,
+    judge_all,
+    remember,
     update_motion_weight,
 )
 from tests.tracking.scene import CAMERA, STRIDE
@@ -114,13 +117,20 @@ def store_of(count: int) -> KeyframeStore:
     return store
 
 
+def graph_of(store: KeyframeStore, flow: list, scale: float = SCALE) -> SimpleNamespace:
+    """Return the part of a keyframe graph that the motion memory sees."""
+    config = SimpleNamespace(motion_memory=scale)
+    known = {"grid": GRID, "keyframes": store, "flow_to_next": flow}
+    return SimpleNamespace(config=config, pixel_scale=1.0, **known)
+
+
 def test_all_keyframes_are_judged_anew_from_the_first_on():
     moves = torch.zeros(CELLS, 2)
     moves[: CELLS // 2] = torch.tensor([30.0, 0.0])
     flow = [matches_of(moves), matches_of(moves)]
     store = store_of(3)
-    memory = MotionMemory(GRID, store, SCALE)
-    memory.judge_all(flow)
+    graph = graph_of(store, flow)
+    judge_all(graph)
     first = update_motion_weight(GRID, flow[0], DISPARITIES, MOTION, torch.ones(CELLS), SCALE)
     assert torch.equal(store.motion_weights[0], first)
     second = inherit_motion_weight(GRID, flow[0], first)
@@ -128,29 +138,28 @@ def test_all_keyframes_are_judged_anew_from_the_first_on():
     torch.testing.assert_close(store.motion_weights[1], judged)
     assert torch.equal(store.motion_weights[2], inherit_motion_weight(GRID, flow[1], judged))
     before = store.motion_weights.clone()
-    memory.judge_all(flow)  # what was judged before has no effect
+    judge_all(graph)  # what was judged before has no effect
     assert torch.equal(store.motion_weights, before)
 
 
 def test_memory_begins_anew_where_the_camera_was_relocalised():
     off = torch.full((CELLS, 2), 30.0)
     store = store_of(3)
-    MotionMemory(GRID, store, SCALE).judge_all([matches_of(off), None])
+    judge_all(graph_of(store, [matches_of(off), None]))
     assert store.motion_weights[0].max() < 0.15 and store.motion_weights[2].min() == 1
 
 
 def test_no_scale_is_no_memory():
     store = store_of(2)
-    memory = MotionMemory(GRID, store, 0.0)
-    memory.judge_all([matches_of(torch.full((CELLS, 2), 30.0))])
-    assert memory.scale is None and store.motion_weights[0].min() == 1
+    judge_all(graph_of(store, [matches_of(torch.full((CELLS, 2), 30.0))], scale=0.0))
+    assert store.motion_weights[0].min() == 1
 
 
 def test_a_cell_whose_disparity_is_unknown_keeps_its_weight():
     store, settled = store_of(2), torch.arange(CELLS) % 2 == 0
-    memory = MotionMemory(GRID, store, SCALE)
     moves = matches_of(torch.full((CELLS, 2), 30.0))
-    memory.remember(moves, store.T_camera_world[1], index=0, settled=settled)
+    graph = graph_of(store, [moves])
+    remember(graph, moves, store.T_camera_world[1], index=0, settled=settled)
     judged = store.motion_weights[0]
     assert judged[settled].max() < 0.15
     assert torch.equal(judged[~settled], torch.full_like(judged[~settled], 0.5))

@@ -18,8 +18,7 @@ def finder() -> tuple[Relocaliser, Tracker]:
     """Return a relocaliser that knows the keyframes of the first twelve frames."""
     tracker = new_tracker(with_depth=True)
     run(tracker, frames()[:12])
-    graph = tracker.graph
-    return Relocaliser(graph.grid, graph.keyframes, graph.pixel_scale), tracker
+    return Relocaliser(tracker.graph), tracker
 
 
 def test_a_known_place_is_found():
