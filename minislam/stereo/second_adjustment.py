@@ -100,7 +100,9 @@ def adjust_confirmed(
         torch.stack([image[::stride, ::stride].reshape(-1) for image in column])
         for column in zip(*swept, strict=True)
     )
-    keyframes.static_weights *= confirmation.clamp_min(UNCONFIRMED_WEIGHT)
+    weights = keyframes.static_weights * confirmation.clamp_min(UNCONFIRMED_WEIGHT)
+    for index, weight in enumerate(weights):
+        keyframes.set_static_weight(index, weight)
     disparities = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), keyframes.disparities)
     keyframes.set_geometry(keyframes.T_camera_world, disparities)
     final_global_ba(graph, progress)

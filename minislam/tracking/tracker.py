@@ -1,6 +1,7 @@
 """The tracker: estimates the camera's pose frame by frame and keeps keyframes (paper Sec. 3.3)."""
 
 from collections.abc import Callable
+from enum import Enum
 
 import torch
 from torch import Tensor
@@ -37,13 +38,22 @@ LONGEST_TAIL = 2  # frames after the last keyframe
 LEAST_GROWTH = 5  # online all keyframes are adjusted again once a fifth of them is new
 
 
+class Mode(Enum):
+    """What the tracker is doing; the diagram is at Tracker."""
+
+    WAITING = "waiting"
+    WARMING_UP = "warming up"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
 class Tracker(Stateful):
     """Turns frames into keyframes with poses and disparities.
 
-        first frame --> warm-up --initialise()--> tracking --no match--> lost
-                                                      ^                   |
-                                                      +--- old view or ---+
-                                                           known place
+        WAITING --first frame--> WARMING_UP --initialise()--> TRACKING --no match--> LOST
+                                                                  ^                    |
+                                                                  +---- old view or ---+
+                                                                       known place
 
     A frame of the warm-up that cannot be matched is lost, too; with many, `FirstFrame` begins anew.
     """
@@ -52,7 +62,7 @@ class Tracker(Stateful):
     tracked: list[TrackedFrame]
     watch: Watch
     _settling: Settling
-    initialised: bool = False  # the warm-up is over: there are poses to start from
+    mode: Mode = Mode.WAITING
     last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
     _last_global: int = 0  # keyframes at the last online global BA
 
@@ -91,14 +101,19 @@ class Tracker(Stateful):
         chain = state["chain"]
         self._chain = None if chain is None else self.graph.flow.restore_chain(chain, frame_of)
 
+    @property
+    def initialised(self) -> bool:
+        """Tell whether the warm-up is over: there are poses to start from."""
+        return self.mode in (Mode.TRACKING, Mode.LOST)
+
     def track(self, frame: Frame) -> bool:
         """Follow the camera into the next frame; tell whether there are new keyframes."""
         count = len(self.keyframes)
         self.graph.shutter.see(frame)
-        if self.keyframes.frames:
-            self._follow(frame)
-        else:
+        if self.mode is Mode.WAITING:
             self._begin(frame)
+        else:
+            self._follow(frame)
         return len(self.keyframes) > count
 
     def end(self) -> None:
@@ -110,6 +125,7 @@ class Tracker(Stateful):
 
     def _begin(self, frame: Frame) -> None:
         """Make the first frame the first keyframe; its camera frame is the world frame."""
+        self.mode = Mode.WARMING_UP
         self._chain = self.graph.flow.start_chain(frame.image)
         ones = torch.ones_like(self.grid.rays[:, 0])
         world = torch.eye(4, device=ones.device)
@@ -141,6 +157,8 @@ class Tracker(Stateful):
         return chain, judged_by_pose(self.graph, matches) if self.graph.is_learned else matches
 
     def _log_followed(self, frame: Frame, ratio: float) -> None:
+        if self.initialised:
+            self.mode = Mode.TRACKING
         status = TrackingStatus.OK if self.initialised else TrackingStatus.INITIALISING
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
 
@@ -190,6 +208,7 @@ class Tracker(Stateful):
     def _handle_loss(self, frame: Frame, ratio: float) -> None:
         """Look for the camera among all keyframes; keep the chain, should the old view return."""
         if self.initialised:
+            self.mode = Mode.LOST
             features = self._features(frame)
             place = self._relocaliser.find(frame.image, features)
             if place is not None and self._resume(frame, place, features):
@@ -222,7 +241,7 @@ class Tracker(Stateful):
             )
         first_geometry(self.graph, workers)
         self._settling.fall_back_on_prior()
-        self.initialised = True
+        self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
         motion_memory.judge_all(self.graph)
@@ -248,4 +267,4 @@ class Tracker(Stateful):
         """Predict the static weights of the keyframes from `first` on, by the present beta."""
         for index in range(first, len(self.keyframes)):
             weight = self._predict_static_weight(index)
-            self.keyframes.static_weights[index] = weight.reshape(-1)
+            self.keyframes.set_static_weight(index, weight.reshape(-1))

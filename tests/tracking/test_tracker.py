@@ -11,7 +11,7 @@ import torch
 from minislam.errors import TrackingLost
 from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error, centres
 from minislam.records import Frame, TrackingStatus, Trajectory
-from minislam.tracking.tracker import LONGEST_TAIL, Tracker
+from minislam.tracking.tracker import LONGEST_TAIL, Mode, Tracker
 from tests.tracking.recording import (
     CONFIG,
     SIZE,
@@ -77,16 +77,17 @@ def test_no_adjustment_failed():
     assert adjustments.count > 0 == adjustments.failed and not adjustments.last_reason
 
 
-def test_a_tracker_warms_up_tracks_loses_the_camera_and_finds_it_again():
+def test_the_modes_follow_each_other():
     tracker, images = new_tracker(with_depth=True), frames()
-    assert tracker.track(images[0]) and not tracker.track(images[1])
-    assert not tracker.initialised and len(tracker.keyframes) == 1
+    assert tracker.mode is Mode.WAITING and not tracker.initialised
+    assert tracker.track(images[0]) and tracker.mode is Mode.WARMING_UP
+    assert not tracker.track(images[1]) and len(tracker.keyframes) == 1
     tracker.initialise()
-    assert tracker.initialised and len(tracker.keyframes) == 2
+    assert tracker.mode is Mode.TRACKING and len(tracker.keyframes) == 2
     tracker.track(Frame(2, 2 / 30, torch.zeros_like(images[0].image)))
+    assert tracker.mode is Mode.LOST and tracker.initialised
     tracker.track(images[3])
-    names = [frame.status.value for frame in tracker.tracked]
-    assert tracker.initialised and names == ["initialising", "initialising", "lost", "ok"]
+    assert tracker.mode is Mode.TRACKING
 
 
 def test_the_last_frame_becomes_a_keyframe():

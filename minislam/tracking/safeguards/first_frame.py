@@ -10,7 +10,7 @@ from dataclasses import replace
 from minislam.records import TrackingStatus
 from minislam.state.stateful import Stateful
 from minislam.tracking.keyframe_selection import mean_flow
-from minislam.tracking.tracker import Tracker
+from minislam.tracking.tracker import Mode, Tracker
 
 Worth = tuple[bool, int]  # whether a start can tell depth; the frames that it followed
 
@@ -60,6 +60,6 @@ def begin_anew(tracker: Tracker, first: int) -> None:
         tracker.graph.remove_newest()
     tracker.keyframes.remove_newest()
     tracker.graph.flow.remove_frame(0)
-    tracker.last_non_keyframe = None
+    tracker.mode, tracker.last_non_keyframe = Mode.WAITING, None
     del tracked[first:]
     tracked[start:] = [replace(frame, status=TrackingStatus.LOST) for frame in tracked[start:]]

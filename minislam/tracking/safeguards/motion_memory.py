@@ -38,7 +38,7 @@ def judge_all(graph: KeyframeGraph) -> None:
     keyframes = graph.keyframes
     for index, matches in enumerate([None, *graph.flow_to_next]):
         if matches is None:
-            keyframes.motion_weights[index] = torch.ones_like(keyframes.disparities[index])
+            keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
         else:
             remember(graph, matches, keyframes.T_camera_world[index], index - 1)
             inherit(graph, matches, index)
@@ -63,14 +63,14 @@ def remember(
     known = keyframes.disparities[index], motion, before, scale
     after = update_motion_weight(graph.grid, matches, *known)
     weight = after if settled is None else torch.where(settled, after, before)
-    keyframes.motion_weights[index] = weight
+    keyframes.set_motion_weight(index, weight)
 
 
 def inherit(graph: KeyframeGraph, matches: FlowMatches, index: int = -1) -> None:
     """Set the motion weights of a keyframe from those of the keyframe before it."""
     before = graph.keyframes.motion_weights[index - 1]
     weight = inherit_motion_weight(graph.grid, matches, before)
-    graph.keyframes.motion_weights[index] = weight
+    graph.keyframes.set_motion_weight(index, weight)
 
 
 def update_motion_weight(
