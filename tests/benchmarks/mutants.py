@@ -48,6 +48,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("1 + (1 - position)", "1 - (1 - position)"),
         (".clamp_max(TRACKING_CAP)", ""),
         ("torch.where(weight < least", "torch.where(weight > least"),
+        ("weight.quantile(1 - STATIC_FRACTION)", "weight.quantile(STATIC_FRACTION)"),
+        ("(weight / weight.quantile(1 - STATIC_FRACTION))", "weight"),
     ],
     ("uncertainty/losses.py", "uncertainty/test_losses.py"): [
         ("contrast.clamp_max(STRUCTURE_CAP)", "contrast"),
