@@ -7,7 +7,7 @@ scripts, the first picture is seen.
 
 import json
 from collections.abc import Sequence as Series
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from itertools import product
 from string import Template
@@ -28,7 +28,7 @@ _SCALES = (1.0, 0.75, 0.5, 0.35)  # of the size, tried when no quality fits
 class FlipBook:
     """The HTML of a flip book; a notebook shows it."""
 
-    html: str
+    html: str = field(repr=False)
 
     def _repr_html_(self) -> str:
         return self.html
