@@ -120,12 +120,7 @@ def _run(
                 raise
             interrupted = True
         facts = facts_of(*_ending(slam, interrupted))
-        _write_trajectories(folder, slam)
-        arrays = slam.mapper.gaussians.to_arrays()
-        arrays.pop("anchor_keyframe")
-        atomic_write(folder.path / names.MAP, encode_ply(GaussianArrays(**arrays)))
-        folder.write_mlp(slam.mapper.mlp.state_dict())
-        write_json(folder.path / names.CAMERA, scene_of(slam))
+        _write_estimates(folder, slam)
         clip_is_written = slam.workers.start(write_clip, str(folder.path))
         metrics = measure(slam, facts["seconds"]["total"], lpips)
         write_json(folder.path / names.METRICS, metrics)
@@ -170,3 +165,12 @@ def _write_trajectories(folder: RunFolder, slam: Slam) -> None:
         write_trajectory(folder.path / names.KEYFRAME_TRAJECTORY, slam.keyframe_trajectory())
         undecoded = [(-1, stamp, reason) for stamp, reason in slam.sequence.lost]
         folder.write_lost_frames(sorted([*slam.lost_frames(), *undecoded], key=itemgetter(1)))
+
+
+def _write_estimates(folder: RunFolder, slam: Slam) -> None:
+    _write_trajectories(folder, slam)
+    arrays = slam.mapper.gaussians.to_arrays()
+    arrays.pop("anchor_keyframe")
+    atomic_write(folder.path / names.MAP, encode_ply(GaussianArrays(**arrays)))
+    folder.write_mlp(slam.mapper.mlp.state_dict())
+    write_json(folder.path / names.CAMERA, scene_of(slam))
