@@ -4,6 +4,9 @@ The links of a new keyframe lead to its predecessors (neighbourhood) and, if the
 both directions, to older keyframes that see the same place (covisibility, by the flow distance).
 """
 
+from collections.abc import Iterator
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -45,6 +48,7 @@ GLOBAL_EDGES = 6  # further links per keyframe in a global BA
 GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
 ROBUST_NARROWING = 0.5  # between keyframes, because the structure is known by then [-]
 LEAST_WEIGHT = 0.01  # mean weight of cells, below which little is known of a pose between them [-]
+AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
 ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [-]
 
 
@@ -181,7 +185,8 @@ class KeyframeGraph(Stateful):
 
     def match(self, edges: list[Edge]) -> None:
         """Measure the flow of these edges, started from the present geometry, and store it."""
-        self.links.record(edges, self._flow_from_geometry(edges))
+        for part in _in_parts(edges):
+            self.links.record(part, self._flow_from_geometry(part))
 
     def match_composed(self, target: int) -> None:
         """Measure the flow between a keyframe and its predecessors, since the last loss.
@@ -207,10 +212,10 @@ class KeyframeGraph(Stateful):
         The flow of a far link starts from poses that may have drifted, and one wrong link can
         outweigh all right ones.
         """
-        if not edges:
-            return []
-        matches = self._flow_from_geometry(edges)
-        ratio = dict(zip(edges, matches.matched_ratios.tolist(), strict=True))
+        ratio: dict[Edge, float] = {}
+        for part in _in_parts(edges):
+            matches = self._flow_from_geometry(part)
+            ratio |= zip(part, matches.matched_ratios.tolist(), strict=True)
         least = self.config.min_link_ratio
         return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= least]
 
@@ -267,7 +272,8 @@ class KeyframeGraph(Stateful):
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""
-        return mean_parallax(*self.geometry(sources, targets))
+        parts = zip(_in_parts(sources), _in_parts(targets), strict=True)
+        return torch.cat([mean_parallax(*self.geometry(*part)) for part in parts])
 
     def geometry(
         self, sources: Tensor | list[int], targets: Tensor | list[int]
@@ -276,3 +282,8 @@ class KeyframeGraph(Stateful):
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         disparities = self.keyframes.disparities[sources]
         return transforms, disparities, self.grid.rays, self.grid.camera
+
+
+def _in_parts(edges: Any) -> Iterator[Any]:
+    """Cut a list of edges, or a tensor with a row per edge: all at once would take gigabytes."""
+    return (edges[first : first + AT_ONCE] for first in range(0, len(edges), AT_ONCE))

@@ -30,6 +30,7 @@ from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.focal_length import seek_readouts
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
+from minislam.tracking.safeguards.scale_drift import undo_scale_drift
 from minislam.tracking.safeguards.settling import SETTLED, Settling
 from minislam.workers import Workers
 
@@ -260,6 +261,8 @@ class Tracker(Stateful):
         self._update_static_weights()
         motion_memory.judge_all(self.graph)  # online, depths were hardly settled
         seek_readouts(self.graph)
+        if not self.config.lambda_disparity_prior:
+            undo_scale_drift(self.keyframes)
         final_global_ba(self.graph, progress)
         self.watch.conclude()
 

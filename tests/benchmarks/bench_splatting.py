@@ -1,6 +1,7 @@
 """Time the renderer, forward and backward, and compare it with plain autograd renderers.
 
     python -m tests.benchmarks.bench_splatting [--threads 1] [--repeats 15] [--plot timings.png]
+    python -m tests.benchmarks.bench_splatting --device cuda  # our own renderer alone
 
 All contestants take turns in one process, so that a busy machine slows them all alike: the
 ratios mean more than the milliseconds. The dense reference runs only on a small scene.
@@ -34,25 +35,30 @@ TOLERANCE = 5e-2
 class Case:
     """A scene with everything requiring a gradient, and fixed image gradients."""
 
-    def __init__(self, width: int, height: int, count: int) -> None:
+    def __init__(self, width: int, height: int, count: int, device: str = "cpu") -> None:
         self.name = f"{width}x{height} / {count}"
         self.camera: Camera = room_camera(width, height)
-        gaussians, self.pose = room_scene(self.camera, count, seed=0)
-        leaves = [value.requires_grad_() for value in gaussians.parameters.values()]
-        self.gaussians = GaussianMap(*leaves, gaussians.anchor_keyframe)
-        self.twist = torch.zeros(6, requires_grad=True)
+        gaussians, pose = room_scene(self.camera, count, seed=0)
+        leaves = [p.to(device).requires_grad_() for p in gaussians.parameters.values()]
+        self.gaussians = GaussianMap(*leaves, gaussians.anchor_keyframe.to(device))
+        self.pose, self.twist = pose.to(device), torch.zeros(6, device=device, requires_grad=True)
         self.leaves = [*leaves, self.twist]
         source = torch.Generator().manual_seed(1)
         shapes = [(height, width, 3), (height, width), (height, width)]
-        self.cotangents = [torch.randn(shape, generator=source) for shape in shapes]
+        self.cotangents = [torch.randn(shape, generator=source).to(device) for shape in shapes]
 
     def time(self, renderer: Callable) -> tuple[float, float, list[Tensor]]:
         """Return seconds of forward and backward, and the gradients."""
-        start = time.perf_counter()
+        start = self._now()
         images = renderer(self.gaussians, self.camera, self.pose, twist=self.twist)[:3]
-        middle = time.perf_counter()
+        middle = self._now()
         gradients = torch.autograd.grad(images, self.leaves, self.cotangents)
-        return middle - start, time.perf_counter() - middle, list(gradients)
+        return middle - start, self._now() - middle, list(gradients)
+
+    def _now(self) -> float:
+        if self.twist.is_cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter()
 
 
 def median_ms(seconds: list[float]) -> float:
@@ -60,9 +66,9 @@ def median_ms(seconds: list[float]) -> float:
     return 1e3 * statistics.median(seconds)
 
 
-def time_sizes(repeats: int) -> list[tuple[str, float, float]]:
+def time_sizes(repeats: int, device: str = "cpu") -> list[tuple[str, float, float]]:
     """Return (name, forward ms, backward ms) at each size, the sizes taking turns."""
-    cases = [Case(*size) for size in SIZES]
+    cases = [Case(*size, device) for size in SIZES]
     times = {case.name: ([], []) for case in cases}
     for repeat in range(repeats + 2):
         for case in cases:
@@ -132,6 +138,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--plot", help="path of the bar chart to save")
     parser.add_argument("--memory-only", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -140,11 +147,13 @@ def main() -> None:
         print(measure_memory())
         return
 
-    rows = time_sizes(arguments.repeats)
-    print(f"{arguments.threads} thread(s), medians of {arguments.repeats}")
+    rows = time_sizes(arguments.repeats, arguments.device)
+    print(f"{arguments.device}, {arguments.threads} thread(s), medians of {arguments.repeats}")
     print(f"{'scene':<18} {'forward':>9} {'backward':>9} {'total':>9}  ms")
     for name, forward, backward in rows:
         print(f"{name:<18} {forward:9.1f} {backward:9.1f} {forward + backward:9.1f}")
+    if arguments.device != "cpu":
+        return
     for label, size, other in (
         ("per-tile autograd, 16 px", COMPARED, render_tiles_with_autograd),
         ("dense reference", DENSE, render_reference),

@@ -11,5 +11,6 @@ first_depth      depth of the first keyframe from matches alone
 diagnostics      how well each keyframe is tied to the others
 focal_length     estimates an unknown focal length, tells whether a given one was wrong; the readout
 focal_column     the focal length as one more unknown of the bundle adjustment
+scale_drift      undoes a drift of the scale that a depth prior tells
 rolling_shutter  the time to read an image as two more, and images as a global shutter sees them
 """
