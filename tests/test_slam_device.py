@@ -255,9 +255,9 @@ def test_a_real_gpu_gives_nearly_what_the_cpu_gives(kind: str, root: Path):
     resumed = new_slam(kind, "cuda")
     resumed.restore_state(read_checkpoint(root / kind, "cuda"), resumed.frame)
     resumed.run()
-    for run in (slam, resumed):  # last digits differ, and with them what is pruned [world units]
-        np.testing.assert_allclose(Run(run).results[0], on_cpu(kind).results[0], atol=5e-3)
-        assert {t.device.type for t in run.mapper.gaussians.parameters.values()} == {"cuda"}
+    for each in (slam, resumed):  # last digits differ, and with them what is pruned [world units]
+        np.testing.assert_allclose(Run(each).results[0], on_cpu(kind).results[0], atol=5e-3)
+        assert {t.device.type for t in each.mapper.gaussians.parameters.values()} == {"cuda"}
 
 
 # What no short run reaches: every line that makes a tensor names the device
