@@ -148,7 +148,8 @@ class Slam(Stateful):
                     self.mapper.integrate(keyframe)
             else:
                 self.mapper.camera = self.tracker.grid.camera
-                self.mapper.initialise(new_keyframes, self.steps.on_progress("first map"))
+                progress = self.steps.on_progress("first map")
+                self.mapper.initialise(new_keyframes, progress, online=True)
 
     def _move_map(self) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""

@@ -1,8 +1,8 @@
 """The whole system runs on the device it is given, and nowhere else without saying so.
 
 No test needs a GPU. `tests/pretended_gpu.py` stands for one: it refuses to mix devices as CUDA
-does, and its numbers are those of the CPU, so a run there gives the same bytes. Where there is a
-real one, it runs the same system.
+does, and its numbers are those of the CPU, so a run there gives the same bytes.
+`test_slam_gpu.py` runs the same system on a real one, where there is one.
 """
 
 import ast
@@ -238,26 +238,6 @@ def cpu_tensors(tree: Tree, name: str = "slam") -> Iterator[str]:
     )
     for key, item in items:
         yield from cpu_tensors(item, f"{name}/{key}")
-
-
-# A real GPU, where there is one
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("kind", ["depth", "no depth", "networks"])
-def test_a_real_gpu_gives_nearly_what_the_cpu_gives(kind: str, root: Path):
-    def save(force: bool) -> None:
-        if slam.steps.done("tracking and mapping") == 3:
-            write_checkpoint(root / kind, slam.saved_state())
-
-    slam = new_slam(kind, "cuda", save)
-    slam.run()
-    resumed = new_slam(kind, "cuda")
-    resumed.restore_state(read_checkpoint(root / kind, "cuda"), resumed.frame)
-    resumed.run()
-    for each in (slam, resumed):  # last digits differ, and with them what is pruned [world units]
-        np.testing.assert_allclose(Run(each).results[0], on_cpu(kind).results[0], atol=5e-3)
-        assert {t.device.type for t in each.mapper.gaussians.parameters.values()} == {"cuda"}
 
 
 # What no short run reaches: every line that makes a tensor names the device

@@ -64,8 +64,10 @@ class MappingConfig:
         " rendered keyframe; paper 1",
         1,
     )
-    init_iterations: int = parameter(150, "on the first keyframes, at least 4 each; official 1050")
-    keyframe_iterations: int = parameter(25, "iterations per keyframe; official 450")
+    init_iterations: int = parameter(
+        150, "on the first keyframes, at least 4 each, online no more than others; official 1050"
+    )
+    keyframe_iterations: int = parameter(12, "iterations per keyframe, online; official 450")
     keyframe_stride: int = parameter(
         1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode", 1
     )

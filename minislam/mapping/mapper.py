@@ -32,6 +32,7 @@ class Mapper(JointOptimisation):
         keyframes: list[Keyframe],
         progress: Progress | None = None,
         exposures: Tensor | None = None,  # (K, 3) how bright the keyframes are, if they differ
+        online: bool = False,  # more keyframes will come
     ) -> None:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
         assert keyframes, "a map starts from at least one keyframe"
@@ -49,7 +50,8 @@ class Mapper(JointOptimisation):
         for keyframe in self.keyframes:
             self._insert(keyframe)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
-        iterations = max(self.config.init_iterations, self._weighted_from)
+        most = count * self.config.keyframe_iterations if online else self.config.init_iterations
+        iterations = max(min(self.config.init_iterations, most), self._weighted_from)
         self._optimise([self._online_camera] * iterations, progress=progress)
         self._replace_dynamic_gaussians()
 

@@ -110,6 +110,14 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("information > SETTLED", "information < SETTLED"),
         (".clamp_min(LEAST)", ""),
     ],
+    ("tracking/safeguards/scale_drift.py", "tracking/safeguards/test_scale_drift.py"): [
+        ("(-drift).exp()", "drift.exp()"),
+        ("(drift[1:] + drift[:-1]) / 2", "drift[1:]"),
+        ("drift - drift.mean()", "drift"),
+        ("SLOW_ERROR**2 + noise", "0 * noise"),
+        ("log_ratio[told].diff()", "0 * log_ratio[told]"),
+        ("-0.5 * ((position", "-5.0 * ((position"),
+    ],
     ("tracking/safeguards/motion_memory.py",
      "tracking/safeguards/test_motion_memory_overlay.py"): [
         ("counts & (flow < STANDS)", "flow < STANDS"),
