@@ -63,7 +63,8 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
     scale = sequence.camera.width * sequence.camera.height / REFERENCE_PIXELS
     per_frame, iteration = frames * scale, 0.24 * mapping.image_scale * scale
     first_map = {"first map": iteration * mapping.init_iterations}
-    first_online = mapping.keyframe_iterations * config.tracking.warmup_keyframes * iteration
+    online_iterations = mapping.keyframe_iterations * config.tracking.warmup_keyframes
+    first_online = iteration * min(mapping.init_iterations, online_iterations)
     late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
     online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
     coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}

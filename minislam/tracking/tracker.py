@@ -261,7 +261,7 @@ class Tracker(Stateful):
         self._update_static_weights()
         motion_memory.judge_all(self.graph)  # online, depths were hardly settled
         seek_readouts(self.graph)
-        if not self.config.lambda_disparity_prior:
+        if not self.config.lambda_disparity_prior:  # else the prior holds the scale itself
             undo_scale_drift(self.keyframes)
         final_global_ba(self.graph, progress)
         self.watch.conclude()

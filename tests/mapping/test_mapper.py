@@ -94,6 +94,13 @@ def test_the_first_map_sees_every_keyframe_some_times_however_many_there_are():
     assert len(mapper.history.render) == 20
 
 
+@pytest.mark.parametrize(("init", "expected"), [(60, 15), (14, 14), (1, 12)])
+def test_online_the_first_keyframes_get_no_more_iterations_than_others(init: int, expected: int):
+    mapper = make_mapper(replace(CONFIG, init_iterations=init, keyframe_iterations=5))
+    mapper.initialise([wall_keyframe(k) for k in range(3)], online=True)
+    assert len(mapper.history.render) == expected
+
+
 def test_gaussians_on_a_mover_are_removed_and_not_inserted_again_once_the_mlp_knows_it():
     mapper = make_mapper(replace(CONFIG, init_iterations=1))
     mapper.initialise([wall_keyframe(0, mover_column=12)])

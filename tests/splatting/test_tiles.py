@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from minislam.splatting import tiles
 from minislam.splatting.reference import gaussian_alphas
 from minislam.splatting.tiles import TILE, TileGroup, build_tile_lists, tile_grid
 from minislam.splatting.visible import project_gaussians
@@ -41,9 +42,13 @@ def slots_in_use(lists: list[TileGroup], count: int) -> int:
     return sum(int((group.gaussians < count).sum()) for group in lists)
 
 
+@pytest.mark.parametrize("group", [1, 7, tiles.GROUP, tiles.GROUP_ON_GPU])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(6))
-def test_every_pair_that_shows_is_listed_once(kind: str, seed: int):
+def test_every_pair_that_shows_is_listed_once(
+    kind: str, seed: int, group: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(tiles, "GROUP", group)
     lists, overlaps, count = lists_and_truth(kind, seed)
     pairs = listed_pairs(lists, overlaps.shape, count)
     assert not (overlaps & ~pairs).any()

@@ -1,5 +1,8 @@
 """Links of the keyframe graph on exact flow: what is confirmed, and how far keyframes are apart."""
 
+import pytest
+
+from minislam.tracking import keyframe_graph
 from minislam.tracking.config import TrackingConfig
 from tests.tracking.wall import TrueFlow, true_graph
 
@@ -18,3 +21,18 @@ def test_flow_between_the_newest_keyframe_and_its_predecessors_is_measured_both_
     graph = true_graph([0, 1, 2])
     graph.match_composed(2)
     assert graph.links.edges == [(1, 2), (2, 1), (0, 2), (2, 0)]
+
+
+def test_many_links_are_measured_in_parts_as_all_at_once(monkeypatch: pytest.MonkeyPatch):
+    edges = [(i, j) for i in range(4) for j in range(4) if i != j]
+    whole, parted = true_graph([0, 1, 2, 3]), true_graph([0, 1, 2, 3])
+    sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
+    whole.match(edges)
+    parallaxes, confirmed = whole.parallaxes(sources, targets), whole.filter_confirmed(edges)
+    monkeypatch.setattr(keyframe_graph, "AT_ONCE", 2)
+    parted.match(edges)
+    assert parted.links.edges == whole.links.edges == edges
+    pairs = zip(parted.links.targets, whole.links.targets, strict=True)
+    assert all(a.equal(b) for a, b in pairs)
+    assert parted.parallaxes(sources, targets).equal(parallaxes)
+    assert parted.filter_confirmed(edges) == confirmed == edges
