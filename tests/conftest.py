@@ -13,12 +13,14 @@ import pytest
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
+# Here, because the conftest.py of a folder may import torch, which reads the first of them then.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MINISLAM_WORKERS", "1")  # a helper imports torch, most tests are shorter
+os.environ.setdefault("MPLCONFIGDIR", tempfile.gettempdir())
+
 
 def pytest_configure(config) -> None:
     """Set what the test process and the notebook kernels inherit."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("MINISLAM_WORKERS", "1")  # a helper imports torch, most tests are shorter
-    os.environ.setdefault("MPLCONFIGDIR", tempfile.gettempdir())
     # Notebook kernels start in notebooks/, so a bare clone needs an absolute path to the package.
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     sys.path.insert(0, str(ROOT))

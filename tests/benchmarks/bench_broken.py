@@ -6,9 +6,9 @@
 
 Tracking alone, at 160x120; `pieces` takes a real sequence in pieces of LENGTH frames at its usual
 size. With the simulated depth prior, or with `none`. A row tells the ATE of all posed frames and
-the spread of the true camera centres [cm], the least explained flow and the largest depth error of
-a keyframe, and what the run says: lost frames, breaks, a doubtful focal length. A run is survived
-if its ATE is below SURVIVED of that spread.
+the spread of the true camera centres [cm], of all keyframes the least explained flow, the largest
+depth error, the least continuity and the least agreement, and what the run says: lost frames,
+breaks, a doubtful focal length. A run is survived if its ATE is below SURVIVED of that spread.
 """
 
 import sys
@@ -113,12 +113,15 @@ def row(name: str, sequence: Sequence, with_prior: bool, holds: bool = True) -> 
     verdict = "declared" if said else "MISSED"
     if survived:
         verdict = "ALARM" if is_alarmed else "fine"
-    explained = [d.explained for d in tracker.watch.diagnostics if d.explained is not None]
-    errors = [d.depth_error for d in tracker.watch.diagnostics if d.depth_error is not None]
+    found = tracker.watch.diagnostics
+    explained = min(d.explained for d in found if d.explained is not None)
+    error = max(d.depth_error for d in found if d.depth_error is not None)
+    continuity = min((d.continuity for d in found if d.continuity is not None), default=np.nan)
+    agreement = min((d.agreement for d in found if d.agreement is not None), default=np.nan)
     return (
-        f"{name:24s} {verdict:9s} {100 * ate:7.2f} {100 * spread:6.1f}  {min(explained):.2f} "
-        f"{max(errors):.3f}  {len(tracker.keyframes):3d} kf {time.perf_counter() - begun:4.0f} s  "
-        f"{'; '.join(said)}"
+        f"{name:24s} {verdict:9s} {100 * ate:7.2f} {100 * spread:6.1f}  {explained:.2f} "
+        f"{error:.3f} {continuity:.3f} {agreement:.2f}  {len(tracker.keyframes):3d} kf "
+        f"{time.perf_counter() - begun:4.0f} s  {'; '.join(said)}"
     )
 
 

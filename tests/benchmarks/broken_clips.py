@@ -88,21 +88,26 @@ def _zoomed(factor: float, wide: float | None = None) -> Callable[[np.ndarray], 
 
 
 def _covering(frames: Frames, share: float) -> Frames:
-    """Cover a share of the view with a textured thing that moves on its own, from BREAK on."""
+    """Cover a share of the view with a textured thing that moves on its own, from BREAK on.
+
+    It is nearer than anything else, and a depth network would see it.
+    """
     rng = np.random.default_rng(5)
     height, width = frames[0].rgb.shape[:2]
     coarse = rng.integers(0, 255, (height // 3, width // 2, 3), dtype=np.uint8)
     cloth = cv2.resize(coarse, (3 * width, 2 * height), interpolation=cv2.INTER_CUBIC)
 
-    def change(index: int, image: np.ndarray) -> np.ndarray:
+    near = 0.5 * min(float(frame.depth.min()) for frame in frames)
+
+    def covered(index: int) -> SyntheticFrame:
         step = index - BREAK
         x, y = 5 * step, int(20 + 15 * np.sin(0.4 * step))
         cut = int(min(1.0, 0.2 + 0.2 * step) * share * width)
-        covered = image.copy()
-        covered[:, :cut] = cloth[y : y + height, x : x + cut]
-        return covered
+        rgb, depth = frames[index].rgb.copy(), frames[index].depth.copy()
+        rgb[:, :cut], depth[:, :cut] = cloth[y : y + height, x : x + cut], near
+        return replace(frames[index], rgb=rgb, depth=depth)
 
-    return _images(frames, change, TAIL)
+    return [*frames[:BREAK], *(covered(index) for index in TAIL)]
 
 
 def _turning(name: str, seed: int, frames: Frames, size: tuple[int, int]) -> Frames:

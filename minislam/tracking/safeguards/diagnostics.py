@@ -1,9 +1,10 @@
 """How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
 
 With a low matched ratio or little parallax the scale can drift while all residuals stay small.
-Where everything is matched, two measurements tell broken keyframes from healthy ones
+Where everything is matched, three measurements tell broken keyframes from healthy ones
 (tests/benchmarks/bench_broken.py has the table): a wrong pose does not explain the flow of the
-keyframes before it, and after a wrong scale two keyframes see a thing at different depths.
+keyframes before it, after a wrong scale two keyframes see a thing at different depths, and where a
+large dynamic object takes the place of the scene, nothing ties a keyframe to those before it.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
-from minislam.tracking.safeguards.motion_memory import inherit_motion_weight
+from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -28,6 +29,9 @@ MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
 LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .1, broken .5
+MIN_CONTINUITY = 0.007  # of the view; healthy .009 to .5, broken 0 to .006
+MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
+MIN_EVIDENCE = 0.005  # of the view, for an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
 
 
@@ -40,6 +44,8 @@ class KeyframeDiagnostics:
     parallax: float  # px, the largest mean flow by translation alone among its links
     explained: float | None  # of the matched flow from its predecessors; None: no link
     depth_error: float | None  # median relative difference from them; None: they see other things
+    continuity: float | None  # of the view: known before, and holds it still; None: no such links
+    agreement: float | None  # of what was known before, in the link that agrees least
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,8 @@ def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
     sources, targets = ([edges[p][end] for p in positions] for end in (0, 1))
     ratio = max((graph.links.matched_ratios[p] for p in positions), default=0.0)
     parallax = float(graph.parallaxes(sources, targets).max()) if positions else 0.0
-    return KeyframeDiagnostics(frame_index, ratio, parallax, explained, depth_error)
+    ties = explained, depth_error, *continuity(graph, keyframe)
+    return KeyframeDiagnostics(frame_index, ratio, parallax, *ties)
 
 
 def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
@@ -107,17 +114,51 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
         return None, None
     problem = bundle_problem(graph, positions, 0, 0.0)
     residual, robust_weights = residuals(problem, graph.state)
-    fits = lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
     sources, targets = problem.edges_source, problem.edges_target
     confidences = torch.stack([graph.links.confidences[p][0] for p in positions])
     weights = confidences * torch.stack([weight_so_far(graph, edges[p][0]) for p in positions])
     weights *= (targets == keyframe)[:, None]
-    explained = float((weights * fits).sum() / weights.sum().clamp_min(1e-6))
+    explained = float((weights * fitting(graph, residual)).sum() / weights.sum().clamp_min(1e-6))
 
     positions_seen = (problem.targets - residual).mT
     seen, expected = seen_and_expected(graph, sources, targets, positions_seen)
     counted = robust_weights[:, 0] * graph.grid.camera.contains(positions_seen)
     return explained, weighted_median((seen / expected).log().abs(), counted)
+
+
+def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
+    """Return what holds a keyframe and has held the one before it, too.
+
+    A cell of a keyframe before this one is known if its flow to the next keyframe fits. Of the
+    keyframe just before, the cells are known to which known ones flow: what comes into view is not.
+
+    First the part of the view [-] that is known, matched and fits this keyframe, in the best link
+    into it. Then how much of what is known and matched fits [-], in the worst link. None: no link.
+    """
+    before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
+    sources = range(max(0, keyframe - LOOK_BACK), keyframe)
+    wanted = {(i, end) for i in sources for end in (i + 1, keyframe)}
+    links = {edge: p for p, edge in enumerate(graph.links.edges) if edge in wanted}
+    if before is None or now is None or len(links) < len(wanted):
+        return None, None
+    residual, _ = residuals(bundle_problem(graph, list(links.values()), 0, 0.0), graph.state)
+    fits = dict(zip(links, fitting(graph, residual).float(), strict=True))
+    known = {i: fits[i, i + 1] for i in sources[:-1]}
+    known[keyframe - 1] = arrived(graph.grid, before, known[keyframe - 2])
+    holding, agreeing = [], []
+    for i in sources:
+        matched = known[i] * graph.links.confidences[links[i, keyframe]][0]
+        matched = matched * graph.keyframes.static_weights[i]
+        fitted = matched * fits[i, keyframe]
+        holding.append(float((fitted * graph.keyframes.motion_weights[i]).mean()))
+        if matched.mean() > MIN_EVIDENCE:
+            agreeing.append(float(fitted.sum() / matched.sum()))
+    return max(holding), min(agreeing, default=None)
+
+
+def fitting(graph: KeyframeGraph, residual: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) bool
+    """Tell which matches the geometry explains."""
+    return lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
 
 
 def seen_and_expected(
@@ -163,8 +204,8 @@ def is_unexplained(newest: KeyframeDiagnostics) -> bool:
 def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
-    One keyframe is a break if it explains very little or sees other depths; LONG in a row are one
-    if they explain a little too little.
+    One keyframe is a break if it explains very little, sees other depths or is held by
+    something new; LONG in a row are one if they explain a little too little.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little
@@ -172,10 +213,22 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
         explained = 1.0 if keyframe.explained is None else keyframe.explained
         weak = weak + 1 if explained < MIN_EXPLAINED_LONG else 0
         error = keyframe.depth_error or 0.0
-        if explained < MIN_EXPLAINED or weak >= LONG or error > MAX_DEPTH_ERROR:
+        if (
+            explained < MIN_EXPLAINED
+            or weak >= LONG
+            or error > MAX_DEPTH_ERROR
+            or _is_new(keyframe)
+        ):
             first = diagnostics[index - LONG + 1 if weak >= LONG else index].frame_index
             if found and index - last <= HEALED_AFTER:
                 first = found.pop().first_frame
             found.append(Break(first, keyframe.frame_index))
             last = index
     return found
+
+
+def _is_new(keyframe: KeyframeDiagnostics) -> bool:
+    """Tell whether what holds a keyframe is something else than what held those before it."""
+    nothing = keyframe.continuity is not None and keyframe.continuity < MIN_CONTINUITY
+    another = keyframe.agreement is not None and keyframe.agreement < MIN_AGREEMENT
+    return nothing or another

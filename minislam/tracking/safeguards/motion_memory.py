@@ -98,16 +98,29 @@ def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> T
 
     Of several source cells the lowest weight counts; without any, that of the nearest cell.
     """
+    inherited = _inherited(grid, matches, weight)
+    if bool(inherited.isinf().all()):
+        return torch.ones_like(weight)
+    return filled_from_nearest(inherited, inherited.isinf())
+
+
+def arrived(grid: Grid, matches: FlowMatches, marks: Tensor) -> Tensor:  # (N,) 0 or 1
+    """Return the marks of the target cells, 0 where no source cell flows to the 3 x 3 around."""
+    marked = _inherited(grid, matches, marks)
+    marked[marked.isinf()] = -1
+    beside = max_pool2d(marked[None, None], 3, 1, 1)[0, 0]
+    return torch.where(marked < 0, beside.clamp_min(0), marked).reshape(-1)
+
+
+def _inherited(grid: Grid, matches: FlowMatches, values: Tensor) -> Tensor:  # (H, W), inf: none
+    """Return the lowest value of the source cells that flow to each target cell."""
     cells = (matches.targets[0].mT / grid.stride).round().long()
     height, width = grid.shape
     inside = (cells >= 0).all(1) & (cells[:, 0] < width) & (cells[:, 1] < height)
     arrives = inside & _is_matched(matches)
-    if not bool(arrives.any()):
-        return torch.ones_like(weight)
     index = cells[arrives, 1] * width + cells[arrives, 0]
-    unknown = torch.full_like(weight, torch.inf)
-    inherited = unknown.scatter_reduce(0, index, weight[arrives], "amin").reshape(grid.shape)
-    return filled_from_nearest(inherited, inherited.isinf())
+    unknown = torch.full_like(values, torch.inf)
+    return unknown.scatter_reduce(0, index, values[arrives], "amin").reshape(grid.shape)
 
 
 def _is_matched(matches: FlowMatches) -> Tensor:  # (N,) bool

@@ -14,6 +14,7 @@ from minislam.tracking.safeguards.diagnostics import (
     Break,
     KeyframeDiagnostics,
     Watch,
+    continuity,
     diagnose,
     find_breaks,
     is_unexplained,
@@ -23,15 +24,17 @@ from minislam.tracking.safeguards.diagnostics import (
 from minislam.tracking.safeguards.motion_memory import judge_all
 from tests.tracking.wall import CAMERA, GRID, true_graph
 
-HEALTHY, WEAK, UNEXPLAINED, DEEP = (
-    (0.97, 0.02),
-    (0.8, 0.02),
-    (0.4, 0.02),
-    (0.97, 0.5),
-)  # explained flow, depth error
+HEALTHY, WEAK, UNEXPLAINED, DEEP, UNTIED, NEW = (
+    (0.97, 0.02, 0.2, 0.9),
+    (0.8, 0.02, 0.2, 0.9),
+    (0.4, 0.02, 0.2, 0.9),
+    (0.97, 0.5, 0.2, 0.9),
+    (0.97, 0.02, 0.003, None),
+    (0.97, 0.02, 0.2, 0.4),
+)  # explained flow, depth error, continuity, agreement
 
 
-def keyframes(*kinds: tuple[float | None, float | None]) -> list[KeyframeDiagnostics]:
+def keyframes(*kinds: tuple[float | None, ...]) -> list[KeyframeDiagnostics]:
     """Return diagnostics of keyframes at frames 0, 10, 20, ..."""
     return [KeyframeDiagnostics(10 * k, 0.9, 30.0, *kind) for k, kind in enumerate(kinds)]
 
@@ -86,6 +89,38 @@ def test_what_was_known_to_move_need_not_be_explained():
     assert weight_so_far(graph, 2).max() == 0
 
 
+def test_what_holds_a_keyframe_is_known_from_those_before():
+    graph = true_graph([0, 1, 2, 3])
+    graph.match(neighbourhood_edges(0, 4, 3))
+    assert continuity(graph, 0) == continuity(graph, 1) == (None, None)  # nothing before it
+    held, agreement = continuity(graph, 3)
+    newest = graph.links.confidences[graph.links.edges.index((2, 3))][0]
+    assert agreement == 1 and held == pytest.approx(float(newest.mean()), abs=0.05)
+    graph.keyframes.motion_weights[:] = 0.5
+    graph.keyframes.static_weights[:, ::2] = 0
+    assert continuity(graph, 3)[0] == pytest.approx(held / 4, rel=0.1)
+    graph.flow_to_next[1] = None  # the camera was lost
+    assert continuity(graph, 2) == continuity(graph, 3) == (None, None)
+
+
+def test_a_dynamic_object_in_place_of_the_scene_is_new():
+    graph = true_graph([0, 1, 2, 3])
+    graph.match(neighbourhood_edges(0, 4, 3))
+    before, _ = continuity(graph, 3)
+    rest = GRID.pixels[:, 0] > 0.75 * CAMERA.width
+    confidences = dict(zip(graph.links.edges, graph.links.confidences, strict=True))
+    targets = dict(zip(graph.links.edges, graph.links.targets, strict=True))
+    for source in (0, 1):
+        confidences[source, 3][:, ~rest] = 0  # behind it
+        targets[source, 3][0, rest] += 9  # px: the pose follows it, not what is left of the scene
+    seen = graph.flow_to_next[1]
+    seen.confidences[0, :, ~rest] = 0
+    targets[2, 3][0, rest] += 9
+    held, agreement = continuity(graph, 3)
+    assert held < 0.2 * before and agreement == 0
+    assert continuity(graph, 2)[1] == 1
+
+
 def test_a_keyframe_of_another_scale_sees_other_depths():
     graph = true_graph([0, 0])  # from one place the flow says nothing about depth
     graph.match(neighbourhood_edges(0, 2, 1))
@@ -126,7 +161,8 @@ def test_the_weighted_median_splits_the_weight():
         ([HEALTHY, HEALTHY, UNEXPLAINED, HEALTHY], [Break(20, 20)]),
         ([HEALTHY, DEEP, HEALTHY, UNEXPLAINED, HEALTHY], [Break(10, 30)]),
         ([UNEXPLAINED, *[HEALTHY] * 4, DEEP], [Break(0, 0), Break(50, 50)]),
-        ([HEALTHY, (None, None), HEALTHY], []),
+        ([HEALTHY, (None, None, None, None), HEALTHY], []),
+        ([HEALTHY, UNTIED, HEALTHY, NEW, HEALTHY], [Break(10, 30)]),
         ([HEALTHY, WEAK, WEAK, HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),
     ],
