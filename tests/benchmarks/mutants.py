@@ -124,7 +124,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("> MOVES", "> 0"),
         (">= ALWAYS", "> 0"),
         ("len(still) < MIN_PAIRS", "not still"),
-        ("3, 1, 1)", "1, 1, 0)"),
+        ("*grid.shape), 3, 1, 1)", "*grid.shape), 1, 1, 0)"),
     ],
     ("tracking/safeguards/pose_support.py", "tracking/safeguards/test_pose_support.py"): [
         ("fits[index].support < LOST_SUPPORT", "fits[index].support < 0 *"),
@@ -134,7 +134,15 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("lost >= len(followed)", "lost > len(followed)"),
     ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
-        ("weak >= LONG or error", "error"),
+        ("weak >= LONG or _is", "_is"),
+        ("or held < MIN_CONTINUITY", ""),
+        ("or agreement < MIN_AGREEMENT", ""),
+        ("matched * fits[i, keyframe]", "matched"),
+        ("known[i] * graph.links.conf", "graph.links.conf"),
+        ("fitted * graph.keyframes.motion_weights[i]", "fitted"),
+        ("matched * graph.keyframes.static_weights[i]", "matched"),
+        ("max(holding)", "min(holding)"),
+        ("min(agreeing,", "max(agreeing,"),
         ("index - last <= HEALED_AFTER", "False"),
     ],
     ("tracking/disparity_prior.py", "tracking/test_disparity_prior.py"): [

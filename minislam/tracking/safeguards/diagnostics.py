@@ -210,15 +210,9 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little
     for index, keyframe in enumerate(diagnostics):
-        explained = 1.0 if keyframe.explained is None else keyframe.explained
-        weak = weak + 1 if explained < MIN_EXPLAINED_LONG else 0
-        error = keyframe.depth_error or 0.0
-        if (
-            explained < MIN_EXPLAINED
-            or weak >= LONG
-            or error > MAX_DEPTH_ERROR
-            or _is_new(keyframe)
-        ):
+        is_weak = keyframe.explained is not None and keyframe.explained < MIN_EXPLAINED_LONG
+        weak = weak + 1 if is_weak else 0
+        if weak >= LONG or _is_broken(keyframe):
             first = diagnostics[index - LONG + 1 if weak >= LONG else index].frame_index
             if found and index - last <= HEALED_AFTER:
                 first = found.pop().first_frame
@@ -227,8 +221,8 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     return found
 
 
-def _is_new(keyframe: KeyframeDiagnostics) -> bool:
-    """Tell whether what holds a keyframe is something else than what held those before it."""
-    nothing = keyframe.continuity is not None and keyframe.continuity < MIN_CONTINUITY
-    another = keyframe.agreement is not None and keyframe.agreement < MIN_AGREEMENT
-    return nothing or another
+def _is_broken(keyframe: KeyframeDiagnostics) -> bool:
+    ties = keyframe.explained, keyframe.continuity, keyframe.agreement
+    explained, held, agreement = (1.0 if tie is None else tie for tie in ties)
+    is_tied = explained >= MIN_EXPLAINED and (keyframe.depth_error or 0.0) <= MAX_DEPTH_ERROR
+    return not is_tied or held < MIN_CONTINUITY or agreement < MIN_AGREEMENT

@@ -96,6 +96,8 @@ def test_what_holds_a_keyframe_is_known_from_those_before():
     held, agreement = continuity(graph, 3)
     newest = graph.links.confidences[graph.links.edges.index((2, 3))][0]
     assert agreement == 1 and held == pytest.approx(float(newest.mean()), abs=0.05)
+    graph.links.confidences[graph.links.edges.index((0, 3))][:] = 0  # the best link counts
+    assert continuity(graph, 3) == (held, 1)
     graph.keyframes.motion_weights[:] = 0.5
     graph.keyframes.static_weights[:, ::2] = 0
     assert continuity(graph, 3)[0] == pytest.approx(held / 4, rel=0.1)

@@ -10,6 +10,7 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import reproject
 from minislam.tracking.safeguards.motion_memory import (
+    arrived,
     inherit_motion_weight,
     judge_all,
     remember,
@@ -163,3 +164,14 @@ def test_a_cell_whose_disparity_is_unknown_keeps_its_weight():
     judged = store.motion_weights[0]
     assert judged[settled].max() < 0.15
     assert torch.equal(judged[~settled], torch.full_like(judged[~settled], 0.5))
+
+
+def test_marks_arrive_where_they_flow_to_and_just_beside():
+    marks = torch.zeros(GRID.shape)
+    marks[4, 4] = 1
+    still = FlowMatches(GRID.pixels.T[None], torch.ones(1, 2, CELLS), torch.ones(1))
+    assert torch.equal(arrived(GRID, still, marks.flatten()).reshape(GRID.shape), marks)
+    still.confidences[0, :, marks.flatten() == 0] = 0  # one cell flows: it fills the 3 x 3 around
+    found = arrived(GRID, still, marks.flatten()).reshape(GRID.shape)
+    assert found[3:6, 3:6].min() == 1 and found.sum() == 9
+    assert arrived(GRID, still, 0 * marks.flatten()).max() == 0
