@@ -197,7 +197,8 @@ def _warnings(slam: Slam) -> Iterator[str]:
         where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
         pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
         yield (
-            f"the trajectory is broken at frames {where}: motion or depth contradicts the images. "
+            f"the trajectory is broken at frames {where}: motion or depth contradicts the images, "
+            "or the camera follows something that came into view. "
             f"Before and after, scale and direction do not belong together; each piece (frames "
             f"{pieces or 'none'}) stands for itself"
         )
