@@ -65,6 +65,7 @@ def write_pictures(
     health = viz.keyframe_health(
         [keyframe.frame_index for keyframe in diagnostics],
         [keyframe.explained for keyframe in diagnostics],
+        [keyframe.agreement for keyframe in diagnostics],
         MIN_EXPLAINED_LONG,
         [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
         [index for index, _, _ in slam.lost_frames()],

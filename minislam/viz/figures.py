@@ -91,13 +91,18 @@ def map_growth(gaussians: Series[int]) -> Figure:
 def keyframe_health(
     frames: Series[int],  # (K,) frame_index of the keyframes
     explained: Series[float | None],  # (K,) part of the flow that poses and disparities explain [-]
+    agreement: Series[float | None],  # (K,) part of what held the keyframes before that fits [-]
     least: float,  # of a healthy keyframe
     broken: Series[tuple[int, int]],  # first and last frame
     lost: Series[int],  # frame_index
 ) -> Figure:
     """Draw how well poses and depths explain the flow, and where the run is broken or lost."""
     figure, axes = _one_panel("frame", "explained flow", height=2.2)
-    axes.plot(frames, [np.nan if e is None else e for e in explained], marker=".", **ESTIMATE_STYLE)
+    shown = [
+        [np.nan if part is None else part for part in parts] for parts in (explained, agreement)
+    ]
+    axes.plot(frames, shown[0], marker=".", label="of all flow", **ESTIMATE_STYLE)
+    axes.plot(frames, shown[1], "--", color="tab:purple", label="of what held the camera before")
     axes.axhline(least, color="gray", linestyle=":", label="least of a healthy keyframe")
     for position, (first, last) in enumerate(broken):
         label = "broken" if position == 0 else None

@@ -38,7 +38,9 @@ FIGURES = {
     "losses": lambda: loss_curves({"render": [3, 2, 1], "uncertainty": [0.0, -1]}),
     "losses with pauses": lambda: loss_curves({"uncertainty": [1.0, np.nan, -1.0, np.nan]}),
     "growth": lambda: map_growth([10, 30, 20]),
-    "health": lambda: keyframe_health([0, 4, 9], [None, 0.9, 0.3], 0.8, [(9, 12)], [13, 14]),
+    "health": lambda: keyframe_health(
+        [0, 4, 9], [None, 0.9, 0.3], [None, 1, 0.2], 0.8, [(9, 12)], [13, 14]
+    ),
     "empty map": lambda: map_growth([]),
     "no losses": lambda: loss_curves({}),
     "overview": lambda: overview(IMAGE, BETA, IMAGE, path(9), path(9)),
