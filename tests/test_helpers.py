@@ -1,9 +1,14 @@
 """The checkers are checked: a derivative with a flipped sign or one percent off must not pass."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 
 from minislam.geometry import Camera, se3_inverse
+from tests.conftest import ROOT
 from tests.helpers import (
     assert_gradients_close,
     generator,
@@ -103,3 +108,11 @@ def test_random_transforms_are_rigid_repeatable_and_of_their_regime(regime: str)
     angle = torch.acos(((trace - 1) / 2).clamp(-1, 1))
     low, high = {"normal": (0, 3.0), "tiny": (0, 1e-6), "half_turn": (3.14, 3.15)}[regime]
     assert angle.min() >= low and angle.max() <= high
+
+
+def test_the_settings_of_the_tests_hold_before_a_folder_imports_torch():
+    # With tests/runs on the command line its conftest.py, and so torch, comes before any hook.
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    code = "import tests.conftest, torch; print(torch.get_num_threads())"
+    command = [sys.executable, "-c", code]
+    assert subprocess.check_output(command, env=environment, cwd=ROOT).strip() == b"1"

@@ -1,10 +1,11 @@
 """How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
 
 With a low matched ratio or little parallax the scale can drift while all residuals stay small.
-Where everything is matched, three measurements tell broken keyframes from healthy ones
+Where everything is matched, four measurements tell broken keyframes from healthy ones
 (tests/benchmarks/bench_broken.py has the table): a wrong pose does not explain the flow of the
-keyframes before it, after a wrong scale two keyframes see a thing at different depths, and where a
-large dynamic object takes the place of the scene, nothing ties a keyframe to those before it.
+keyframes before it; after a wrong scale two keyframes see a thing at different depths; and where a
+large dynamic object takes the place of the scene, hardly anything that held the keyframes before
+holds this one, or what is left of it does not fit.
 """
 
 from collections.abc import Sequence
@@ -133,7 +134,8 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
     keyframe just before, the cells are known to which known ones flow: what comes into view is not.
 
     First the part of the view [-] that is known, matched and fits this keyframe, in the best link
-    into it. Then how much of what is known and matched fits [-], in the worst link. None: no link.
+    into it, weighed by motion, too: all that holds the pose. Then how much of what is known and
+    matched fits [-], in the worst link, moving or not. None: a link is missing, or the camera was.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
