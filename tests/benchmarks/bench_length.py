@@ -7,14 +7,13 @@ and the memory of the process (Linux); then all stages, and the error.
 """
 
 import argparse
-import ctypes
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import torch
 
-from minislam.cli.main import MALLOC
+from minislam.cli.main import set_malloc
 from minislam.config import SlamConfig
 from minislam.data import InputOptions, open_sequence
 from minislam.evaluation.metrics import ate_cm
@@ -61,8 +60,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     steps.time = SimpleNamespace(perf_counter=time.process_time)
-    for parameter, value in MALLOC.items():  # as the command does
-        ctypes.CDLL(None).mallopt(parameter, value)
+    set_malloc()  # as the command does
     sequence = open_sequence(given.name, InputOptions(max_frames=given.frames))
     config, quarters = SlamConfig(), Quarters()
     priors = choose_priors(PriorChoice(depth="simulated"), sequence, config)

@@ -1,6 +1,7 @@
 """The command line: help without torch, exit codes, and one sentence for whatever is wrong."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import minislam
-from minislam.cli.main import main
+from minislam.cli.main import MALLOC, main
 from tests.recordings import picture, save, tum_folder, video
 
 pytestmark = pytest.mark.slow
@@ -235,5 +236,32 @@ def test_an_unknown_setting_in_a_file_names_the_nearest(tree: dict, tmp_path: Pa
 
 def test_another_c_library_has_no_such_settings_of_malloc(monkeypatch: pytest.MonkeyPatch):
     for library in (lambda name: object(), lambda name: len(name)):  # macOS; Windows takes no None
+        for name in MALLOC:
+            monkeypatch.delenv(name, raising=False)
         monkeypatch.setattr("ctypes.CDLL", library)
         assert main(["weights", "list"]) == 0
+        assert os.environ["MALLOC_ARENA_MAX"] == "1"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="settings of glibc")
+def test_freed_memory_stays_in_the_process_and_in_those_that_it_starts():
+    text = (
+        "import resource, subprocess, sys, numpy; from minislam.cli.main import set_malloc\n"
+        "if sys.argv[1] == 'set': set_malloc()\n"
+        "def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "before = faults()\n"
+        "for _ in range(100): numpy.ones(3 << 17)\n"  # 3 MB: 768 pages
+        "print(faults() - before, flush=True)\n"
+        "if sys.argv[1] == 'set': subprocess.run([sys.executable, '-c', sys.argv[2], 'inherit'])\n"
+    )
+    plain = {name: value for name, value in os.environ.items() if name not in MALLOC}
+
+    def counted(environment: dict[str, str]) -> list[int]:
+        command = [sys.executable, "-c", text, "set", text]
+        return [
+            int(n) for n in subprocess.check_output(command, env=environment, text=True).split()
+        ]
+
+    assert max(counted(plain)) < 10_000
+    given = {"MALLOC_TRIM_THRESHOLD_": "131072", "MALLOC_MMAP_THRESHOLD_": "131072"}
+    assert min(counted(plain | given)) > 50_000  # what the user has set stays
