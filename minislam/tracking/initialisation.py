@@ -26,7 +26,7 @@ from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, ov
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 
-HYPOTHESIS_ITERATIONS = 12  # Gauss-Newton steps per width before hypotheses are compared
+HYPOTHESIS_ITERATIONS = 8  # Gauss-Newton steps per width before hypotheses are compared
 ROBUST_NARROWING = (0.5, 0.25)  # [-], times the final width
 # Starts of an unknown focal length beside its guess: the search reaches 0.7 to 1.4 times the truth.
 OTHER_FOCALS = (math.log(0.5), math.log(2.0))
