@@ -18,14 +18,10 @@ from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, USAGE_EXIT, MinislamE
 
 # The modules of minislam.cli that add the commands, in the order of the help.
 COMMANDS = "run render export evaluate settings weights priors bench notebooks grade doctor".split()
-# Settings of glibc's malloc, by environment variable: number for mallopt, value. One arena for all
-# threads, and blocks of 4 MB and more mapped one by one, because freed images leave holes that
-# later ones do not fit. 64 MB that are free stay in the process: a tenth of the time of a run.
-MALLOC = {
-    "MALLOC_ARENA_MAX": (-8, 1),
-    "MALLOC_MMAP_THRESHOLD_": (-3, 4 << 20),
-    "MALLOC_TRIM_THRESHOLD_": (-1, 64 << 20),
-}
+# Settings MALLOC_* of glibc: their numbers for mallopt, and values. One arena for all threads, and
+# blocks of 4 MB and more mapped one by one, because freed images leave holes that later ones do
+# not fit. 64 MB that are free stay in the process: to return them took a tenth of a run's time.
+MALLOC = {"ARENA_MAX": (-8, 1), "MMAP_THRESHOLD_": (-3, 4 << 20), "TRIM_THRESHOLD_": (-1, 64 << 20)}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,8 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def set_malloc() -> None:
     """Apply MALLOC here and in the processes that this one starts; a variable that is set stays."""
     for name, (parameter, value) in MALLOC.items():
-        if name not in os.environ:
-            os.environ[name] = str(value)
+        if f"MALLOC_{name}" not in os.environ:
+            os.environ[f"MALLOC_{name}"] = str(value)
             with suppress(OSError, TypeError, AttributeError):  # another C library has none of them
                 ctypes.CDLL(None).mallopt(parameter, value)
 
