@@ -262,6 +262,9 @@ def test_freed_memory_stays_in_the_process_and_in_those_that_it_starts():
             int(n) for n in subprocess.check_output(command, env=environment, text=True).split()
         ]
 
-    assert max(counted(plain)) < 10_000
     given = {"MALLOC_TRIM_THRESHOLD_": "131072", "MALLOC_MMAP_THRESHOLD_": "131072"}
-    assert min(counted(plain | given)) > 50_000  # what the user has set stays
+    returned = counted(plain | given)  # what the user has set stays
+    if not any(returned):
+        pytest.skip("this system counts no page faults")
+    assert max(counted(plain)) < 10_000
+    assert min(returned) > 20_000
