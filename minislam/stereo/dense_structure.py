@@ -1,6 +1,6 @@
 """Dense depth from all posed frames: which views to sweep, and from which others."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -35,38 +35,43 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 def with_swept_depth(
     camera: Camera,  # of the images
     keyframes: list[Keyframe],
-    swept: list[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
+    swept: Iterable[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth, where nothing was swept with their own, and confirmed.
 
     The depth of each keyframe is scaled to what was swept there, because a network errs image by
     image. Where other keyframes look through it, it is of something that moves, and left out.
     """
-    small, result = _small(camera, WIDTH), []
-    views = [_view(small, k, *found) for k, found in zip(keyframes, swept, strict=True)]
-    for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
+    small, views, result = _small(camera, WIDTH), [], []
+    for keyframe, (depth, confirmation) in zip(keyframes, swept, strict=True):
+        cost, pose = 1 - _nearest(confirmation, small), keyframe.T_camera_world.cpu().numpy()
+        views.append(votes.SweptView(_inverse(_nearest(depth, small)), cost, 0.0, pose))
+        confirmation = resample(confirmation, *keyframe.features.shape[:2])
+        result.append(replace(keyframe, depth=depth, confirmation=confirmation))
+    for index, (keyframe, found) in enumerate(zip(keyframes, result, strict=True)):
         if bool(keyframe.depth.any()):
+            depth = found.depth
             both = (depth > 0) & (keyframe.depth > 0)
             enough = int(both.sum()) > LEAST_COMMON
             guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
-            guessed = _view(small, keyframe, guess, confirmation)
+            guessed = replace(views[index], inverse_depth=_inverse(_nearest(guess, small)))
             agreeing, refuting = votes.count_judges(small, guessed, views, index)
             moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
             depth = torch.where((depth > 0) | moves, depth, guess)
-        confirmation = resample(confirmation, *keyframe.features.shape[:2])
-        result.append(replace(keyframe, depth=depth, confirmation=confirmation))
+            result[index] = replace(found, depth=depth)
     return result
 
 
-def _view(
-    camera: Camera, keyframe: Keyframe, depth: Tensor, confirmation: Tensor
-) -> votes.SweptView:
-    """Return a view that votes with a depth (H, W) of a keyframe, at the size of a camera."""
-    size, images = (camera.width, camera.height), (depth, confirmation)
-    small = [cv2.resize(i.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST) for i in images]
-    known = np.where(small[0] > 0, 1 / np.maximum(small[0], 1e-6), np.nan)
-    return votes.SweptView(known, 1 - small[1], 0.0, keyframe.T_camera_world.cpu().numpy())
+def _nearest(image: Tensor, camera: Camera) -> np.ndarray:
+    """Return an image (H, W) at the size of a camera."""
+    size = camera.width, camera.height
+    return cv2.resize(image.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST)
+
+
+def _inverse(depth: np.ndarray) -> np.ndarray:
+    """Return the inverse of a depth, nan where unknown."""
+    return np.where(depth > 0, 1 / np.maximum(depth, 1e-6), np.nan)
 
 
 def _small(camera: Camera, width: int) -> Camera:
@@ -84,8 +89,8 @@ def dense_depths(
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
-) -> list[tuple[Tensor, Tensor]]:
-    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe."""
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe in turn."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     frames = swept_frames(keyframes, list(poses))
     swept: list[votes.SweptView] = []
@@ -104,7 +109,7 @@ def dense_depths(
         depths.append(votes.confirm(planner.camera, view, others))
     wanted = [frames.index(keyframe) for keyframe in keyframes]
     kept = votes.keep_what_stays(planner.camera, swept, depths, wanted)
-    return [full_size(depth, camera) for depth in kept]
+    return (full_size(depth, camera) for depth in kept)
 
 
 def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:

@@ -5,7 +5,7 @@ and bends the poses. But it is swept to depths on which no two views agree. So c
 multiplies the static weight of each cell, and swept depth is the start, of one more final BA.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from torch import Tensor
@@ -57,14 +57,14 @@ def sweep_keyframes(
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
-) -> list[tuple[Tensor, Tensor]]:
-    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of the tracker's keyframes."""
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each keyframe in turn."""
     frames = [frame.frame_index for frame in graph.keyframes.frames]
     known = [agreed_disparities(graph, index).cpu().numpy() for index in range(len(frames))]
     inputs = graph.grid.camera, poses, frames, known, progress, workers, width
     swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
-    return [(depth.to(device), confirmation.to(device)) for depth, confirmation in swept]
+    return ((depth.to(device), confirmation.to(device)) for depth, confirmation in swept)
 
 
 def agreed_disparities(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (n,)
@@ -91,15 +91,13 @@ def agreeing_views(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) int
 
 def adjust_confirmed(
     graph: KeyframeGraph,
-    swept: list[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
+    swept: Iterable[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
     progress: Progress | None = None,
 ) -> None:
     """Adjust all keyframes on fresh flow. Each cell counts as far as it is confirmed."""
     keyframes, stride = graph.keyframes, graph.grid.stride
-    depth, confirmation = (
-        torch.stack([image[::stride, ::stride].reshape(-1) for image in column])
-        for column in zip(*swept, strict=True)
-    )
+    cells = [torch.stack(images)[:, ::stride, ::stride].flatten(1) for images in swept]
+    depth, confirmation = torch.stack(cells, 1)
     weights = keyframes.static_weights * confirmation.clamp_min(UNCONFIRMED_WEIGHT)
     for index, weight in enumerate(weights):
         keyframes.set_static_weight(index, weight)

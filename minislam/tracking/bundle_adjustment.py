@@ -209,26 +209,25 @@ def _assemble_poses(
     With J_source = -J_target Ad: H_st = -Ad^T A, H_ss = Ad^T A Ad, g_s = -Ad^T b. The columns
     after the poses (G) are common to all edges: rows of A beyond the sixth are just summed.
     """
-    slots = _pose_slots(problem)
-    count = int(problem.free_poses.sum())
-    width = count + 1  # one extra slot collects the fixed poses and is cut off afterwards
-    source = slots[problem.edges_source] % width
-    target = slots[problem.edges_target] % width
+    width = int(problem.free_poses.sum()) + 1  # the first slot is that of all fixed poses
+    slots = _pose_slots(problem) + 1
+    source, target = slots[problem.edges_source], slots[problem.edges_target]
     common, border, A = A[:, 6:, 6:].sum(0), A[:, :6, 6:], A[:, :6, :6]
     A_source = -adjoint.mT @ A  # rows of the source, columns of the target
-    H = A.new_zeros(width**2, 6, 6)
-    H.index_add_(0, target * width + target, A)
-    H.index_add_(0, source * width + target, A_source)
-    H.index_add_(0, target * width + source, A_source.mT)
-    H.index_add_(0, source * width + source, -A_source @ adjoint)
+    poses = 6 * width
+    H = A.new_zeros(poses + len(common), poses + len(common))
+    blocks = H[:poses, :poses].unflatten(1, (-1, 6)).unflatten(0, (-1, 6)).transpose(1, 2)
+    blocks.index_put_((target, target), A, accumulate=True)
+    blocks.index_put_((source, target), A_source, accumulate=True)
+    blocks.index_put_((target, source), A_source.mT, accumulate=True)
+    blocks.index_put_((source, source), -A_source @ adjoint, accumulate=True)
     right = torch.cat([border, b[:, :6, None]], 2)  # the border and g are summed alike
     B = right.new_zeros(width, 6, right.shape[2])
     B.index_add_(0, target, right)
     B.index_add_(0, source, -adjoint.mT @ right)
-    H = H.reshape(width, width, 6, 6)[:count, :count].permute(0, 2, 1, 3).flatten(2).flatten(0, 1)
-    B, g = B[:count].flatten(0, 1).tensor_split([-1], 1)
-    H = torch.cat([torch.cat([H, B], 1), torch.cat([B.T, common], 1)])
-    return H, torch.cat([g[:, 0], b[:, 6:].sum(0)])
+    border, g = B.flatten(0, 1).tensor_split([-1], 1)
+    H[:poses, poses:], H[poses:, :poses], H[poses:, poses:] = border, border.T, common
+    return H[6:, 6:], torch.cat([g[6:, 0], b[:, 6:].sum(0)])  # without the first slot
 
 
 def _source_blocks(
@@ -272,14 +271,17 @@ def _damped_step(
         typical = problem.disparity_damping * (problem.prior_weights == 0)
     C = C * (1 + damping) + typical
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
-    S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
+    # Column by column, so that LAPACK factorises S in place: with many keyframes copies are large.
+    S = equations.pose_pose.mT.clone(memory_format=torch.contiguous_format).mT
+    b = equations.pose_gradient.clone()
     for source, rows, E in equations.source_blocks:
         scaled = E * inverse_C[source]
         S.index_put_((rows[:, None], rows[None, :]), -(scaled @ E.mT).double(), accumulate=True)
         b.index_add_(0, rows, -(scaled @ equations.disparity_gradient[source]).double())
     S.diagonal().mul_(1 + damping).add_(absolute_damping)
-    factor, failure = torch.linalg.cholesky_ex(S)
-    xi = torch.cholesky_solve(b[:, None], factor).squeeze(1)
+    factor, failure = torch.linalg.cholesky_ex(S, out=(S, b.new_empty((), dtype=torch.int32)))
+    xi = torch.linalg.solve_triangular(factor, b[:, None], upper=False)
+    xi = torch.linalg.solve_triangular(factor.mT, xi, upper=True).squeeze(1)
     if failure | ~torch.isfinite(xi).all():
         return None
 
@@ -290,9 +292,8 @@ def _damped_step(
     step = equations.disparity_gradient.clone()
     for source, rows, E in equations.source_blocks:
         step[source] -= xi[rows].to(E.dtype) @ E
-    disparities = state.disparities + inverse_C * step
-    clamped = disparities.clamp_min(MIN_DISPARITY)
-    disparities = torch.where(problem.free_disparities[:, None], clamped, state.disparities)
+    disparities = (state.disparities + inverse_C * step).clamp_min(MIN_DISPARITY)
+    disparities = torch.where(problem.free_disparities[:, None], disparities, state.disparities)
     zoom = common.pop(0) if problem.free_focal else 0.0
     later = common if common else (0.0, 0.0)
     readout = state.readout[0] + later[0], state.readout[1] + later[1]

@@ -14,7 +14,7 @@ from minislam.tracking.bundle_adjustment import (
     bundle_adjust,
 )
 from minislam.tracking.disparity_prior import mask_priors
-from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
+from minislam.tracking.keyframe_graph import AT_ONCE, Edge, KeyframeGraph
 from minislam.tracking.safeguards.parts import of_rows
 
 # Of the robust weight: else it takes the cells of a new keyframe with a large error for outliers.
@@ -140,13 +140,8 @@ def bundle_problem(
     ends = [links.edges[p] for p in positions]
     sources, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
     targets = torch.stack([links.targets[p] for p in positions])
-    confidences = torch.stack([links.confidences[p] for p in positions])
-    # Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a
-    # dynamic object covers; a classical one does not, so the weight of the target counts as well.
-    cell_weights = keyframes.cell_weights
-    weights = cell_weights[sources]
-    if not graph.is_learned:
-        weights = weights * grid.sample(cell_weights[edges_target][..., None], targets.mT)[..., 0]
+    weights = torch.stack([links.confidences[p] for p in positions])
+    _weigh_by_cells(graph, weights, sources, edges_target, targets)
     prior = keyframes.prior_disparities
     if lambda_prior is None:
         lambda_prior = graph.config.lambda_disparity_prior
@@ -157,12 +152,32 @@ def bundle_problem(
     return BundleProblem(
         camera=grid.camera,
         rays=grid.rays,
-        edges_source=sources, edges_target=edges_target, targets=targets,
-        weights=confidences * weights[:, None],
+        edges_source=sources, edges_target=edges_target,
+        targets=targets, weights=weights,
         prior_disparities=prior, prior_weights=strength * (prior > 0) * keyframes.prior_masks,
         free_poses=free_poses, free_disparities=free, robust=graph.robust,
         disparity_damping=graph.flow.disparity_damping(len(keyframes)),
     )  # fmt: skip
+
+
+def _weigh_by_cells(
+    graph: KeyframeGraph,
+    weights: Tensor,  # (E, 2, N), multiplied in place
+    sources: Tensor,  # (E,) keyframe index
+    edges_target: Tensor,  # (E,)
+    targets: Tensor,  # (E, 2, N) px
+) -> None:
+    """Multiply the weights of edges by those of the cells at both ends, some edges at a time.
+
+    Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a dynamic
+    object covers; a classical one does not, so the weight of the target counts as well.
+    """
+    of_cells, columns = graph.keyframes.cell_weights, (weights, sources, edges_target, targets)
+    for weight, source, target, position in zip(*(c.split(AT_ONCE) for c in columns), strict=True):
+        static = of_cells[source]
+        if not graph.is_learned:
+            static = static * graph.grid.sample(of_cells[target][..., None], position.mT)[..., 0]
+        weight *= static[:, None]
 
 
 def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool

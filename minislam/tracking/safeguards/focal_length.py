@@ -26,7 +26,7 @@ STEP = math.log(1.05)  # to either side, where the cost must have risen
 ITERATIONS = 10  # Gauss-Newton steps of each adjustment
 WIDENINGS = [4.0, 1.0]  # of the robust weight: a focal length far off has large residuals [-]
 MOST_KEYFRAMES = 100  # from the first on, that a check adjusts, dozens of times
-EVERY = 2  # cells of a check along each side: it adjusts so often, and one unknown asks for few
+EVERY = 2  # cells of a check along each side: it adjusts so often, and few unknowns ask for few
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
 # Smallest mean rise of the cost. In six pieces of real video, two seconds each, the cost rose by
@@ -87,11 +87,17 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
         return FocalLengthFit(graph.grid.camera.fx, None, 0.0)
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     rows = torch.tensor(keyframes, device=problem.rays.device)
-    problem, state = of_rows(problem, graph.state, rows)
-    cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
-    problem, state = of_cells(problem, state, cells[::EVERY, ::EVERY].flatten())
+    problem, state = _of_few_cells(graph, *of_rows(problem, graph.state, rows))
     problem.free_poses[0] = False  # the first of them is their world
     return fit_focal_length(problem, state, workers)[0]
+
+
+def _of_few_cells(
+    graph: KeyframeGraph, problem: BundleProblem, state: BundleState
+) -> tuple[BundleProblem, BundleState]:
+    """Return problem and state of every EVERY-th cell along each side alone."""
+    cells = torch.arange(len(problem.rays), device=problem.rays.device).view(graph.grid.shape)
+    return of_cells(problem, state, cells[::EVERY, ::EVERY].flatten())
 
 
 def seek_focal_length(graph: KeyframeGraph) -> None:
@@ -151,11 +157,11 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     if columns is None or shutter.axis is not None:
         return
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
-    problem = replace(problem, free_focal=graph.focal_is_free)
+    problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
     rows = torch.arange(min(MOST_KEYFRAMES, len(graph.keyframes)), device=columns.device)
-    problem, start = of_rows(problem, graph.state, rows)
-    _, held = bundle_adjust(problem, start, ITERATIONS)
-    state, free = bundle_adjust(replace(problem, shutter=columns), start, ITERATIONS)
+    problem, start = _of_few_cells(graph, *of_rows(problem, graph.state, rows))
+    _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
+    state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
     if held.cost_after - free.cost_after > READOUT_WORTH_SAVING * max(held.cost_after, floor):
         (across, down), moved = state.readout, columns.abs().mean((0, 2, 3))

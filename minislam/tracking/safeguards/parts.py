@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 CELLS_AT_ONCE = 300_000  # of all edges of a part: 200 bytes a cell
 _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
-_OF_CELLS = "targets weights prior_disparities prior_weights disparity_damping"
+_OF_CELLS = "targets weights shutter prior_disparities prior_weights disparity_damping"
 
 
 def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"]]:
