@@ -24,10 +24,7 @@ from minislam.records import Trajectory
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Slam
 from minislam.splatting import Rendering
-from minislam.tracking.bundle_adjustment import residuals
-from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.reprojection import lengths
-from minislam.tracking.safeguards.diagnostics import weighted_median
+from minislam.tracking.optimisation import bundle_problem, typical_residual
 
 # Of the static pixels, in the mean of the keyframes [-]: 78 good runs show .94 to 1, a trajectory
 # that hangs together badly .65, a camera on a tripod .03 to .17.
@@ -136,9 +133,7 @@ def _ties(slam: Slam) -> dict[str, float | None]:
     parallaxes = [keyframe.parallax for keyframe in slam.tracker.watch.diagnostics]
     links, error = range(len(graph.links)), None
     if links:
-        problem = bundle_problem(graph, links, 0, 0.0)
-        distances = lengths(residuals(problem, graph.state)[0])
-        error = weighted_median(distances, problem.weights[:, 0])
+        error = typical_residual(bundle_problem(graph, links, 0, 0.0), graph.state)
     return {
         "path_length": float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
         "reprojection_px": error,

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from minislam.records import Frame
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.safeguards.diagnostics import weighted_median
+from minislam.tracking.safeguards.robust import weighted_median
 
 BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the dark
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated

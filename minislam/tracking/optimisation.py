@@ -12,13 +12,17 @@ from minislam.tracking.bundle_adjustment import (
     BundleReport,
     BundleState,
     bundle_adjust,
+    residuals,
 )
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import AT_ONCE, Edge, KeyframeGraph
-from minislam.tracking.safeguards.parts import of_rows
+from minislam.tracking.reprojection import lengths
+from minislam.tracking.safeguards.parts import of_cells, of_rows
+from minislam.tracking.safeguards.robust import weighted_median
 
 # Of the robust weight: else it takes the cells of a new keyframe with a large error for outliers.
 FIRST_WIDENING = 8.0
+EVERY = 4  # one cell in so many tells the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
 
 
@@ -56,7 +60,7 @@ def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> N
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
     for done in range(config.final_rounds):
         graph.match(edges)
-        adjust(graph, 0, config.global_iterations, lambda_prior, free_camera=True)
+        adjust(graph, 0, config.global_iterations, lambda_prior, free_camera=True, settled=True)
         if progress:
             progress(done + 1, config.final_rounds)
 
@@ -75,11 +79,16 @@ def adjust(
     lambda_prior: float | None = None,  # None: as configured
     widening: float = 1.0,  # of the robust weight
     free_camera: bool = False,  # refine an unknown focal length, and the readouts
+    settled: bool = False,  # poses and depths are, so the robust weight follows the residuals
 ) -> None:
     """Run a bundle adjustment over the links that touch the free keyframes."""
     positions = graph.links.select(first_free)
     problem = bundle_problem(graph, positions, first_free, lambda_prior)
-    problem = replace(problem, robust=problem.robust and problem.robust.widened(widening))
+    if problem.robust is not None:
+        kernel = problem.robust.widened(widening)
+        if settled:
+            kernel = kernel.narrowed(typical_residual(problem, graph.state))
+        problem = replace(problem, robust=kernel)
     if free_camera:
         columns = graph.shutter.link_columns(positions) if graph.shutter.axis is not None else None
         problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
@@ -93,6 +102,13 @@ def adjust(
     graph.grid.zoom(state.log_focal)
     graph.shutter.lengthen(state.readout)
     graph.count_adjustment(report)
+
+
+def typical_residual(problem: BundleProblem, state: BundleState) -> float | None:
+    """Return the median length of the residuals [px] by weight; None if nothing is weighed."""
+    cells = torch.arange(0, len(problem.rays), EVERY, device=problem.rays.device)
+    residual, weights = residuals(*of_cells(replace(problem, robust=None), state, cells))
+    return weighted_median(lengths(residual), weights[:, 0])
 
 
 def adjust_touched(

@@ -5,11 +5,19 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
+from minislam.tracking import optimisation
 from minislam.tracking.bundle_adjustment import BundleState, residuals
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.optimisation import adjust, bundle_problem, final_global_ba, local_ba
+from minislam.tracking.optimisation import (
+    adjust,
+    bundle_problem,
+    final_global_ba,
+    local_ba,
+    typical_residual,
+)
+from minislam.tracking.safeguards.robust import RobustKernel
 from tests.tracking.scene import CAMERA, assert_same_bits
 from tests.tracking.wall import true_graph, true_poses
 
@@ -52,6 +60,28 @@ def test_weights_are_confidence_times_the_cell_weights_of_both_ends():
     problem = bundle_problem(graph, [0, 1], first_free=0)
     confidences = torch.stack(graph.links.confidences)
     torch.testing.assert_close(problem.weights, 0.125 * confidences)
+
+
+def test_weights_are_the_same_however_many_links_are_weighed_at_once(monkeypatch):
+    graph = matched()
+    graph.keyframes.static_weights[2] = torch.linspace(0, 1, len(graph.grid.rays))
+    whole = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    monkeypatch.setattr(optimisation, "AT_ONCE", 3)
+    parts = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    assert torch.equal(parts.weights, whole.weights)
+
+
+def test_the_typical_residual_is_that_of_the_cells_that_weigh():
+    graph = matched(3)
+    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    problem.targets[:, 0] += 0.3
+    problem.targets[:, 1] += 0.4
+    covered = graph.grid.pixels[:, 0] < CAMERA.width / 2 + 8
+    problem.targets[..., covered] += 9.0
+    problem.weights[..., covered] = 0
+    assert typical_residual(problem, graph.state) == pytest.approx(0.5, abs=1e-3)
+    problem.weights.zero_()
+    assert typical_residual(problem, graph.state) is None
 
 
 def test_the_first_pose_never_moves_and_older_keyframes_stay():
@@ -129,6 +159,20 @@ def test_the_last_adjustment_keeps_the_truth():
     rounds = graph.config.final_rounds
     assert calls == [(done, rounds) for done in range(1, rounds + 1)]
     assert max(pose_error(graph, keyframe) for keyframe in range(4)) < 1e-3
+
+
+def test_the_last_adjustment_leaves_out_what_errs_more_than_flow_does(monkeypatch):
+    def error(settles: bool) -> float:
+        graph = matched()
+        covered = graph.grid.pixels[:, 0] < CAMERA.width / 4
+        graph.links.targets = [t + 0.6 * covered for t in graph.links.targets]  # a slow mover
+        monkeypatch.setattr(graph, "match", lambda edges: None)
+        if not settles:
+            monkeypatch.setattr(RobustKernel, "narrowed", lambda kernel, residual: kernel)
+        final_global_ba(graph)
+        return max(pose_error(graph, keyframe) for keyframe in range(4))
+
+    assert 3 * error(settles=True) < error(settles=False)
 
 
 def test_the_unit_of_length_is_chosen_without_changing_any_image():

@@ -21,6 +21,7 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
+from minislam.tracking.safeguards.robust import weighted_median
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -187,15 +188,6 @@ def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
         before = keyframes.motion_weights[keyframe - 1]
         weight = weight * inherit_motion_weight(graph.grid, matches, before)
     return weight if keyframes.overlay is None else weight * keyframes.overlay
-
-
-def weighted_median(values: Tensor, weights: Tensor) -> float | None:
-    """Return the value below which half of the weight lies; None without weight."""
-    order = values.flatten().argsort()
-    below = weights.flatten()[order].cumsum(0)
-    if below[-1] <= 0:
-        return None
-    return float(values.flatten()[order][torch.searchsorted(below, below[-1] / 2)])
 
 
 def is_unexplained(newest: KeyframeDiagnostics) -> bool:

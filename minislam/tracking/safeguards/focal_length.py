@@ -20,6 +20,7 @@ from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bund
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.safeguards.parts import of_cells, of_rows
+from minislam.tracking.safeguards.robust import MIN_RESIDUAL
 from minislam.workers import Workers
 
 STEP = math.log(1.05)  # to either side, where the cost must have risen
@@ -32,7 +33,6 @@ LARGEST = math.log(2.0)  # either way; what is further off is no focal length bu
 # Smallest mean rise of the cost. In six pieces of real video, two seconds each, the cost rose by
 # 1.3 % to 3.7 % and the estimate was right to 2.2 %; synthetic clips rise by 12 % and more. [-]
 MIN_RISE = 0.012
-MIN_RESIDUAL = 0.05  # px; no flow is more exact, so smaller residuals count as this
 # A warning needs a larger difference, and a larger saving of cost, than was ever measured with
 # the right focal length (5.4 %, saving 1.3 %, in two seconds of real video). [-]
 WORTH_SAYING, WORTH_SAVING = 0.05, 0.02

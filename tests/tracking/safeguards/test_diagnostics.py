@@ -19,7 +19,6 @@ from minislam.tracking.safeguards.diagnostics import (
     find_breaks,
     is_unexplained,
     weight_so_far,
-    weighted_median,
 )
 from minislam.tracking.safeguards.motion_memory import judge_all
 from tests.tracking.wall import CAMERA, GRID, true_graph
@@ -148,12 +147,6 @@ def test_a_keyframe_without_links_is_reported_as_such():
     assert found.matched_ratio == 0 and found.parallax == 0
     assert found.explained is None and found.depth_error is None
     assert find_breaks([found]) == [] and not is_unexplained(found)
-
-
-def test_the_weighted_median_splits_the_weight():
-    values, weights = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([0.1, 1.0, 0.5])
-    assert weighted_median(values, weights) == 1  # of 1.6 in all, 0.8 lies below: within the first
-    assert weighted_median(values, 0 * weights) is None
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from minislam.tracking.safeguards.robust import RobustKernel
+from minislam.tracking.safeguards.robust import MIN_RESIDUAL, RobustKernel, weighted_median
 from tests.helpers import numerical_jacobian
 
 SQUARED = torch.tensor([0.0, 0.01, 0.3, 1.0, 4.0, 100.0], dtype=torch.float64)
@@ -35,3 +35,17 @@ def test_small_residuals_cost_their_square_and_a_mover_no_more_than_the_scale_al
 
 def test_widening():
     assert RobustKernel(2.0).widened(4) == RobustKernel(8.0)
+
+
+def test_settled_poses_ask_for_a_narrower_kernel_never_for_a_wider_one():
+    kernel = RobustKernel(1.0, 1.5)
+    assert kernel.narrowed(0.1).scale == pytest.approx(0.35)
+    assert kernel.narrowed(0.1).power == 1.5
+    assert kernel.narrowed(0.0) == kernel.narrowed(MIN_RESIDUAL) != kernel  # no flow is exact
+    assert kernel.narrowed(2.0) == kernel == kernel.narrowed(None)
+
+
+def test_the_weighted_median_splits_the_weight():
+    values, weights = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([0.1, 1.0, 0.5])
+    assert weighted_median(values, weights) == 1  # of 1.6 in all, 0.8 lies below: within the first
+    assert weighted_median(values, 0 * weights) is None
