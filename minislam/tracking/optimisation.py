@@ -60,7 +60,8 @@ def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> N
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
     for done in range(config.final_rounds):
         graph.match(edges)
-        adjust(graph, 0, config.global_iterations, lambda_prior, free_camera=True, settled=True)
+        is_last = done + 1 == config.final_rounds
+        adjust(graph, 0, config.global_iterations, lambda_prior, free_camera=True, settled=is_last)
         if progress:
             progress(done + 1, config.final_rounds)
 
