@@ -105,6 +105,14 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("tracking/safeguards/robust.py", "tracking/safeguards/test_robust.py"): [
         ("-self.power", "-1"),
         ("self.scale**2 * torch.log1p", "torch.log1p"),
+        ("max(residual, MIN_RESIDUAL)", "residual"),
+        ("min(width, self.scale)", "width"),
+    ],
+    ("tracking/optimisation.py", "tracking/test_optimisation.py"): [
+        ("settled=is_last", "settled=True"),
+        ("0, len(problem.rays), EVERY", "0, len(problem.rays) // 2, EVERY"),
+        ("lengths(residual), weights[:, 0]", "lengths(residual), 1 + 0 * weights[:, 0]"),
+        ("static[:, None]", "of_cells[source][:, None]"),
     ],
     ("tracking/safeguards/motion_memory.py", "tracking/safeguards/test_motion_memory.py"): [
         ("LOSS_RATE, RECOVERY_RATE)", "RECOVERY_RATE, LOSS_RATE)"),
