@@ -6,6 +6,7 @@ import torch
 
 from minislam.geometry import Camera
 from minislam.records import Keyframe
+from minislam.stereo import dense_structure
 from minislam.stereo.dense_structure import (
     SweepPlanner,
     dense_depths,
@@ -76,6 +77,16 @@ def test_a_single_frame_gives_no_depth():
         sequence().frame, camera(), {0: torch.from_numpy(pose(0))}, [0], [np.ones(3)]
     )
     assert depth.shape == SIZE[::-1] and float(depth.max()) == 0 == float(confirmation.max())
+
+
+def test_depths_are_enlarged_one_by_one(monkeypatch):
+    enlarged = []
+    monkeypatch.setattr(dense_structure, "full_size", lambda *view: enlarged.append(view))
+    poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
+    depths = dense_depths(sequence().frame, camera(), poses, [0, 2], [np.ones(3)] * 2)
+    assert not enlarged  # hundreds of them would fill the memory
+    next(depths)
+    assert len(enlarged) == 1
 
 
 def test_progress_counts_the_swept_frames():
