@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from minislam.errors import InputError
-from minislam.mapping.views import MappedKeyframe, median_depth
+from minislam.mapping.views import MOST_DEPTHS, MappedKeyframe, median_depth
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
 
 HALF = CAMERA.resized(16, 12)
@@ -62,3 +62,11 @@ def test_keyframes_without_any_depth_are_refused_in_one_sentence():
     record.depth.zero_()
     with pytest.raises(InputError, match="some known depth"):
         median_depth([record])
+
+
+def test_of_many_keyframes_some_tell_the_median_depth():
+    record = wall_keyframe(0)
+    depths = [torch.full_like(record.depth, 1.0 + number) for number in range(2 * MOST_DEPTHS)]
+    keyframes = [replace(record, depth=depth) for depth in depths]
+    assert median_depth(keyframes[:5]) == 3
+    assert median_depth(keyframes) == pytest.approx(MOST_DEPTHS, abs=1)  # every second one
