@@ -271,15 +271,14 @@ def _damped_step(
         typical = problem.disparity_damping * (problem.prior_weights == 0)
     C = C * (1 + damping) + typical
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
-    # Column by column, so that LAPACK factorises S in place: with many keyframes copies are large.
-    S = equations.pose_pose.mT.clone(memory_format=torch.contiguous_format).mT
-    b = equations.pose_gradient.clone()
+    S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
     for source, rows, E in equations.source_blocks:
         scaled = E * inverse_C[source]
         S.index_put_((rows[:, None], rows[None, :]), -(scaled @ E.mT).double(), accumulate=True)
         b.index_add_(0, rows, -(scaled @ equations.disparity_gradient[source]).double())
     S.diagonal().mul_(1 + damping).add_(absolute_damping)
-    factor, failure = torch.linalg.cholesky_ex(S, out=(S, b.new_empty((), dtype=torch.int32)))
+    factor, failure = torch.linalg.cholesky_ex(S)
+    # Not `cholesky_solve`, which copies the factor: with hundreds of keyframes it has 100 MB.
     xi = torch.linalg.solve_triangular(factor, b[:, None], upper=False)
     xi = torch.linalg.solve_triangular(factor.mT, xi, upper=True).squeeze(1)
     if failure | ~torch.isfinite(xi).all():

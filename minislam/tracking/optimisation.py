@@ -189,11 +189,11 @@ def _weigh_by_cells(
     Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a dynamic
     object covers; a classical one does not, so the weight of the target counts as well.
     """
-    of_cells, columns = graph.keyframes.cell_weights, (weights, sources, edges_target, targets)
+    of_cell, columns = graph.keyframes.cell_weights, (weights, sources, edges_target, targets)
     for weight, source, target, position in zip(*(c.split(AT_ONCE) for c in columns), strict=True):
-        static = of_cells[source]
+        static = of_cell[source]
         if not graph.is_learned:
-            static = static * graph.grid.sample(of_cells[target][..., None], position.mT)[..., 0]
+            static = static * graph.grid.sample(of_cell[target][..., None], position.mT)[..., 0]
         weight *= static[:, None]
 
 

@@ -112,7 +112,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("settled=is_last", "settled=True"),
         ("0, len(problem.rays), EVERY", "0, len(problem.rays) // 2, EVERY"),
         ("lengths(residual), weights[:, 0]", "lengths(residual), 1 + 0 * weights[:, 0]"),
-        ("static[:, None]", "of_cells[source][:, None]"),
+        ("static[:, None]", "of_cell[source][:, None]"),
     ],
     ("tracking/safeguards/motion_memory.py", "tracking/safeguards/test_motion_memory.py"): [
         ("LOSS_RATE, RECOVERY_RATE)", "RECOVERY_RATE, LOSS_RATE)"),

@@ -200,7 +200,7 @@ def test_adjustments_that_all_fail_are_counted_and_keep_the_state(monkeypatch: p
     move(graph, 3)
     before = BundleState(graph.state.T_camera_world.clone(), graph.state.disparities.clone())
 
-    def singular(S: Tensor, out: tuple[Tensor, Tensor]) -> tuple[Tensor, bool]:
+    def singular(S: Tensor) -> tuple[Tensor, bool]:
         return S, True
 
     monkeypatch.setattr(torch.linalg, "cholesky_ex", singular)
