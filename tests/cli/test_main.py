@@ -139,10 +139,10 @@ def test_a_wrong_input_is_one_sentence_and_exit_code_1(make, words: str, tmp_pat
     assert not list(tmp_path.rglob("*.tmp"))
 
 
-def test_two_smooth_pictures_are_said_to_be_broken(tmp_path: Path, capsys):
+def test_two_smooth_pictures_do_not_pass_for_a_map(tmp_path: Path, capsys):
     source = images(tmp_path / "input", [picture(k) for k in range(2)])
     assert run(source, "-o", tmp_path / "out") == 3
-    assert "the trajectory is broken" in capsys.readouterr().err
+    assert "the map shows only" in capsys.readouterr().err
 
 
 def test_a_video_that_is_none_is_one_line_on_the_real_stderr(tmp_path: Path):
