@@ -33,10 +33,10 @@ COMMAND = ["run", *INPUT, "--preset", "test"]
 METRICS = [
     "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
     "psnr_novel_oriented_db",
-    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
+    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db",
     "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
-    "psnr_static_db", "shown_static", "path_length", "reprojection_px", "parallax_px",
+    "shown_static", "path_length", "reprojection_px", "parallax_px",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0

@@ -1,7 +1,7 @@
 """All measures of one run against the ground truth, as in the paper (Sec. 4)."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,19 +27,20 @@ CENTIMETRES = 100.0  # per world unit of the truth, which is metric
 
 @dataclass(frozen=True)
 class MappedView:
-    """A keyframe at the end of a run."""
+    """The map at the end of a run, seen from a keyframe."""
 
     frame_index: int
-    T_world_camera: np.ndarray  # (4, 4) estimated
-    beta: np.ndarray | None  # (H, W), None if no beta was learnt
+    color: np.ndarray  # (H, W, 3) rendered, in [0, 1]
     depth: np.ndarray | None = None  # (H, W) rendered z in units of the map, 0 where transparent
+    beta: np.ndarray | None = None  # (H, W), None if no beta was learnt
+    static_psnr: float | None = None  # [dB] against the image itself where beta finds it static
 
 
 def measure_run(
     truth: GroundTruth | None,
     trajectory: Trajectory,
     keyframe_trajectory: Trajectory,
-    views: list[MappedView],
+    views: Iterable[MappedView],  # one by one: each is let go before the next
     render: Render,
     lpips: ImageDistance | None = None,  # needs weights; without it two metrics are left out
 ) -> dict[str, float | None]:
@@ -47,14 +48,13 @@ def measure_run(
     names = [
         "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
         "psnr_novel_oriented_db", "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
+        "psnr_static_db",
     ]  # fmt: skip
     names += ["lpips_novel", "lpips_input"] if lpips is not None else []
     metrics: dict[str, float | None] = dict.fromkeys(names)
-    if truth is None:
-        return metrics
-    path, scale = truth.trajectory, None
     values: dict[str, list[float]] = defaultdict(list)  # to be averaged
-    if path is not None:
+    path, scale = truth.trajectory if truth else None, None
+    if truth is not None and path is not None:
         metrics["ate_all_cm"] = ate_cm(trajectory, path)
         metrics["ate_keyframes_cm"] = ate_cm(keyframe_trajectory, path)
         metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
@@ -64,11 +64,19 @@ def measure_run(
             pair = paired(trajectory, path, MAX_DIFFERENCE)
             for name, value in _novel_errors(truth.novel_views(), *pair, render, lpips):
                 values[name].append(value)
+    betas: list[tuple[np.ndarray, np.ndarray]] = []  # with the true masks
     for view in views:
-        for name, value in _keyframe_errors(view, truth, scale, render, lpips):
+        if view.static_psnr is not None:
+            values["psnr_static_db"].append(view.static_psnr)
+        if truth is None:
+            continue
+        moving = truth.moving_mask(view.frame_index)
+        for name, value in _keyframe_errors(view, truth, moving, scale, lpips):
             values[name].append(value)
+        if view.beta is not None and moving is not None:
+            betas.append((view.beta, moving))
     metrics |= {name: float(np.mean(found)) for name, found in values.items()}
-    metrics["beta_auroc"] = _beta_auroc(truth, views)
+    metrics["beta_auroc"] = _beta_auroc(betas)
     return metrics
 
 
@@ -111,22 +119,21 @@ def _novel_errors(
 def _keyframe_errors(
     view: MappedView,
     truth: GroundTruth,
+    moving: np.ndarray | None,  # (H, W) true mask of the view
     scale: float | None,  # of the truth per unit of the map, None: unknown
-    render: Render,
     lpips: ImageDistance | None,
 ) -> Iterator[tuple[str, float]]:
     """Compare the map, seen from a keyframe, with image and depth of the static scene.
 
     `psnr_masked_db` counts only pixels that a dynamic object covered: its ghost would be there.
     """
-    moving, static = truth.moving_mask(view.frame_index), truth.static_image(view.frame_index)
+    static = truth.static_image(view.frame_index)
     if static is not None:
-        rendered = render(view.T_world_camera)
-        yield "psnr_input_db", psnr(rendered, static)
+        yield "psnr_input_db", psnr(view.color, static)
         if lpips is not None:
-            yield "lpips_input", lpips(rendered, static)
+            yield "lpips_input", lpips(view.color, static)
         if moving is not None and moving.sum() >= MIN_MASK:
-            yield "psnr_masked_db", psnr(rendered, static, moving)
+            yield "psnr_masked_db", psnr(view.color, static, moving)
     if scale is None or view.depth is None:
         return
     depth = truth.depth(view.frame_index)
@@ -135,11 +142,9 @@ def _keyframe_errors(
         yield "depth_l1_cm", CENTIMETRES * error
 
 
-def _beta_auroc(truth: GroundTruth, views: list[MappedView]) -> float | None:
+def _beta_auroc(betas: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
     """Return how well beta separates moving from static pixels, over all keyframes together."""
-    pairs = [(view.beta, truth.moving_mask(view.frame_index)) for view in views]
-    known = [(beta, mask) for beta, mask in pairs if beta is not None and mask is not None]
-    if not any(mask.any() for _, mask in known):
+    if not any(moving.any() for _, moving in betas):
         return None
-    betas, moving = zip(*known, strict=True)
-    return auroc(np.stack(betas), np.stack(moving))
+    beta, moving = zip(*betas, strict=True)
+    return auroc(np.stack(beta), np.stack(moving))

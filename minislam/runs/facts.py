@@ -17,7 +17,6 @@ import minislam
 from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MappedView, ate_cm, measure_run
-from minislam.geometry import se3_inverse
 from minislam.mapping.mapper import OPAQUE
 from minislam.priors.choice import PriorChoice
 from minislam.records import Trajectory
@@ -91,29 +90,35 @@ def focal_length_note(slam: Slam) -> str:
 
 def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     """Return the content of metrics.json."""
-    views, likeness = [], []
-    for index, keyframe in enumerate(slam.mapper.keyframes):
-        rendering = slam.mapper.render(keyframe.T_camera_world)
-        beta = slam.beta_image(index) if slam.config.uncertainty.is_learnt else None
-        pose = se3_inverse(keyframe.T_camera_world).cpu().numpy()
-        depth = surface_depth(rendering).cpu().numpy()
-        views.append(MappedView(keyframe.frame_index, pose, beta, depth))
-        static = slam.mapper.static_weight(slam.mapper.beta_of(keyframe), slam.mapper.camera) > 0
-        if static.any():
-            pictures = keyframe.exposed(rendering.color), keyframe.image, static
-            likeness.append(psnr(*(picture.cpu() for picture in pictures)))
     truth, paths = slam.sequence.ground_truth, (slam.trajectory(), slam.keyframe_trajectory())
     return {
-        **measure_run(truth, *paths, views, slam.render, lpips),
+        **measure_run(truth, *paths, mapped_views(slam), slam.render, lpips),
         **_segment_errors(slam),
         "focal_length_px": slam.tracker.grid.camera.fx,
         "seconds_total": seconds,
         "frames_per_second": len(slam.tracker.tracked) / seconds,
         "peak_memory_mb": peak_memory_mb(),
-        "psnr_static_db": float(np.mean(likeness)) if likeness else None,
         "shown_static": shown_static(slam),
         **_ties(slam),
     }
+
+
+def mapped_views(slam: Slam) -> Iterator[MappedView]:
+    """Yield what the map shows of every keyframe, and how well it fits what stands still there."""
+    mapper = slam.mapper
+    for index, keyframe in enumerate(mapper.keyframes):
+        rendering = mapper.render(keyframe.T_camera_world)
+        color, depth = rendering.color.clamp(0, 1), surface_depth(rendering)
+        beta = slam.beta_image(index) if slam.config.uncertainty.is_learnt else None
+        static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
+        pictures = keyframe.exposed(rendering.color), keyframe.image, static
+        yield MappedView(
+            keyframe.frame_index,
+            color=color.cpu().numpy(),
+            depth=depth.cpu().numpy(),
+            beta=beta,
+            static_psnr=psnr(*(p.cpu() for p in pictures)) if static.any() else None,
+        )
 
 
 def shown_static(slam: Slam) -> float | None:

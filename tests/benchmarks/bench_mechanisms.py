@@ -22,9 +22,9 @@ from minislam.config import PRESETS, SlamConfig, preset, with_settings
 from minislam.data import InputOptions, open_sequence
 from minislam.evaluation.metrics import MappedView, measure_run
 from minislam.geometry import se3_inverse
-from minislam.images import resample
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence, Trajectory
+from minislam.runs.facts import mapped_views
 from minislam.runs.run import choose_priors
 from minislam.slam import Slam
 from minislam.tracking.config import TrackingConfig
@@ -140,23 +140,9 @@ def measured(
     slam: Slam, trajectory: Trajectory, views: list[MappedView] | None = None
 ) -> dict[str, float | None]:
     """Return the metrics of a run by name, with the keyframes as views if none are given."""
-    mapper, camera = slam.mapper, slam.sequence.camera
-    if views is None:
-        views = [
-            MappedView(
-                keyframe.frame_index,
-                se3_inverse(keyframe.T_camera_world).numpy(),
-                resample(mapper.beta_of(keyframe), camera.height, camera.width).numpy(),
-            )
-            for keyframe in mapper.keyframes
-        ]
-
-    def render(T_world_camera: np.ndarray) -> np.ndarray:
-        pose = se3_inverse(torch.from_numpy(T_world_camera))
-        return mapper.render(pose).color.clamp(0, 1).numpy()
-
-    truth = slam.sequence.ground_truth
-    return measure_run(truth, trajectory, slam.keyframe_trajectory(), views, render)
+    truth, keyframes = slam.sequence.ground_truth, slam.keyframe_trajectory()
+    seen = mapped_views(slam) if views is None else views
+    return measure_run(truth, trajectory, keyframes, seen, slam.render)
 
 
 def chosen(metrics: dict[str, float | None], *names: str) -> dict[str, float]:

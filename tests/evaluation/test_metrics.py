@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 24, 32
 NAMES = [
     "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
     "psnr_novel_oriented_db",
-    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
+    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db",
 ]  # fmt: skip
 TURN = random_transforms(1, "normal", 1)[0].numpy()
 TO_ESTIMATE = Similarity(0.4, TURN[:3, :3], TURN[:3, 3])  # the world of the map is another one
@@ -62,8 +62,8 @@ class Truth:
         return self.novel
 
 
-def view(frame_index: int, beta: np.ndarray | None = None) -> MappedView:
-    return MappedView(frame_index, np.eye(4), beta)
+def view(frame_index: int, beta: np.ndarray | None = None, color: float = 0.6) -> MappedView:
+    return MappedView(frame_index, grey(color), beta=beta)
 
 
 def measured(truth: Truth | None, views: list[MappedView] | None = None, render=None) -> dict:
@@ -107,6 +107,13 @@ def test_poses_at_other_times_have_nothing_in_common():
     later = Truth(trajectory=Trajectory(truth.timestamps + 50, truth.T_world_camera))
     metrics = measure_run(later, estimated(truth), estimated(truth), [], lambda pose: grey(0))
     assert metrics["ate_all_cm"] is None and metrics["ate_keyframes_cm"] is None
+
+
+def test_how_well_the_map_fits_what_stands_still_needs_no_truth():
+    views = [MappedView(k, grey(0.5), static_psnr=found) for k, found in enumerate((20, None, 24))]
+    for truth in (None, Truth()):
+        metrics = measured(truth, views)
+        assert known(metrics) == {"psnr_static_db"} and metrics["psnr_static_db"] == 22
 
 
 # Known answers
@@ -170,7 +177,7 @@ def test_a_ghost_is_measured_where_the_mover_stood():
     rendered = grey(0.5)
     rendered[:, :4] += 0.1  # the ghost: 20 dB there
     truth = Truth(static={0: grey(0.5), 1: grey(0.5)}, masks={0: left_part(4), 1: left_part(8)})
-    metrics = measured(truth, [view(0), view(1)], lambda pose: rendered)
+    metrics = measured(truth, [MappedView(0, rendered), MappedView(1, rendered)])
     half = 20 + 10 * np.log10(2)  # half the pixels of the second mask are right
     assert metrics["psnr_masked_db"] == pytest.approx((20 + half) / 2, abs=1e-4)
     assert metrics["psnr_input_db"] == pytest.approx(20 + 10 * np.log10(WIDTH / 4), abs=1e-4)
@@ -206,13 +213,13 @@ def test_depth_is_compared_in_the_units_of_the_truth_and_not_on_movers():
     of_map[-1] = 0  # transparent
     of_map[-2] += 0.10 * TO_ESTIMATE.scale
     truth = Truth(trajectory=walk(), masks={0: left_part(4)}, depths={0: true_depth})
-    views = [MappedView(0, np.eye(4), None, of_map), MappedView(1, np.eye(4), None, of_map)]
+    views = [MappedView(0, grey(0.5), of_map), MappedView(1, grey(0.5), of_map)]
     expected = 2.0 + 10.0 / (HEIGHT - 2)  # cm
     assert measured(truth, views)["depth_l1_cm"] == pytest.approx(expected, abs=1e-6)
 
 
 def test_without_true_depth_or_alignment_there_is_no_depth_error():
-    view_with_depth = MappedView(0, np.eye(4), None, np.ones((HEIGHT, WIDTH)))
+    view_with_depth = MappedView(0, grey(0.5), np.ones((HEIGHT, WIDTH)))
     assert measured(Truth(trajectory=walk()), [view_with_depth])["depth_l1_cm"] is None
     no_path = Truth(depths={0: np.ones((HEIGHT, WIDTH))})
     assert measured(no_path, [view_with_depth])["depth_l1_cm"] is None
