@@ -147,9 +147,12 @@ def test_readme_says_the_minutes_that_the_notebooks_say():
     stated = {row[0].split("](")[1].strip(")"): row[3] for row in rows_below("| notebook |")}
     found = {}
     for path in NOTEBOOKS:
-        minutes = re.search(r"\*\*Time\*\* (\d+) minutes", source(load(path)["cells"][0]))
-        assert minutes, f"{path.name} does not say its time"
-        found[f"notebooks/{path.name}"] = minutes[1]
+        first, *others = map(source, load(path)["cells"])
+        time = re.search(r"\*\*Time\*\* (\d+) minutes to read, (\d+) for the exercises", first)
+        assert time, f"{path.name} does not say its time"
+        found[f"notebooks/{path.name}"] = f"{time[1]} + {time[2]}"
+        exercises = re.findall(r"^### Exercise .*, (\d+) minutes", "\n".join(others), re.M)
+        assert int(time[2]) == sum(map(int, exercises))
     assert stated == found
 
 

@@ -1,16 +1,14 @@
-"""What the notebooks store is what the package is today: printed sources, README's minutes."""
+"""What the notebooks store is what the package is today: printed sources."""
 
 import ast
 import contextlib
 import io
-import re
 from pathlib import Path
 
 import pytest
 
-from tests.notebook_files import NOTEBOOKS, ROOT, load, source
+from tests.notebook_files import NOTEBOOKS, load, source
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
@@ -56,12 +54,3 @@ def test_a_listing_is_found_with_what_it_needs():
     assert len(listing({"source": [text]})) == 2
     if NOTEBOOKS:
         assert sum(bool(listing(cell)) for path in NOTEBOOKS for cell in code_cells(path)) >= 8
-
-
-@each_notebook
-def test_readme_has_its_minutes(path: Path):
-    minutes = re.search(r"\*\*Time\*\*\s+(\d+)\s+minutes", source(load(path)["cells"][0]))
-    assert minutes, 'expected "**Time** N minutes" in the first cell'
-    row = re.search(rf"^\| \[{path.stem}\]\([^\n]*\| (\d+) \|$", README, re.M)
-    assert row, f"README's table has no row of {path.stem}"
-    assert row.group(1) == minutes.group(1)
