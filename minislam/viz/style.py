@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -38,9 +37,7 @@ def set_notebook_style() -> None:
 
 def new_figure(size: tuple[float, float]) -> Figure:
     """Return an empty figure (inches) that belongs to no window and no global state."""
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=size, dpi=_DPI, layout="constrained")
 
 
 def figure_png(figure: Figure, dpi: float = _DPI) -> bytes:
