@@ -178,10 +178,9 @@ class Run:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of the run: summary, warnings, one picture."""
-        lines = {line.what: (line.value, line.verdict) for line in self.summary()}
         warnings = self.folder.read_run()["warnings"]
         png = read_bytes(self.folder.path / PLOTS / "overview.png")
-        return summary_html(self.name, lines, warnings, png)
+        return summary_html(self.name, self.summary(), warnings, png)
 
     @cached_property
     def sequence(self) -> RecordedSequence:

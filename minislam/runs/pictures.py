@@ -119,10 +119,7 @@ def _write_report(
         state=facts["state"],
         description=slam.sequence.description,
         warnings=facts["warnings"],
-        summary=[
-            (line.what, line.value, line.verdict, line.detail or line.meaning)
-            for line in summarise(metrics, facts)
-        ],
+        summary=summarise(metrics, facts),
         command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
         settings=named_settings(slam.config),
         **pictures,

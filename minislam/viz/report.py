@@ -26,7 +26,7 @@ class Report:
     description: str = ""  # of the sequence, one line
     warnings: Series[str] = ()
     overview: bytes = b""  # PNG or JPEG
-    summary: Series[tuple[str, str, str, str]] = ()  # what, value with unit, verdict, meaning
+    summary: Series[tuple[str, ...]] = ()  # what, value with unit, verdict, meaning, detail
     keyframes: Mapping[int, Series[bytes]] = field(default_factory=dict)
     # frame_index: JPEG of input, depth, beta, render
     depth_limits: tuple[float, float] = (0.0, 1.0)  # of the colours [unit]
@@ -57,7 +57,7 @@ def build_report(report: Report) -> str:
 
 def summary_html(
     title: str,
-    lines: Mapping[str, tuple[str, str]],  # what -> its value, and whether that is good
+    lines: Series[tuple[str, ...]],  # as of a report
     warnings: Series[str],
     png: bytes,
 ) -> str:
@@ -66,18 +66,18 @@ def summary_html(
     rows = "".join(
         f"<tr><th {left}>{escape(what)}</th><td {left}>{escape(value)}</td>"
         f"<td {left}>{escape(verdict)}</td></tr>"
-        for what, (value, verdict) in lines.items()
+        for what, value, verdict, *_ in lines
     )
     notes = "".join(f"<p><b>Warning:</b> {escape(warning)}</p>" for warning in warnings)
     picture = f'<img src="{picture_url(png)}" alt="input, uncertainty, map, path">'
     return f"<h4>{escape(title)}</h4><table>{rows}</table>{notes}{picture}"
 
 
-def _row(what: str, value: str, verdict: str, meaning: str) -> str:
+def _row(what: str, value: str, verdict: str, meaning: str, detail: str) -> str:
     return (
         f'<tr><th>{escape(what)}</th><td class="value">{escape(value)}</td>'
         f'<td class="verdict"><span class="{verdict}">{verdict}</span></td>'
-        f'<td class="meaning dim">{escape(meaning)}</td></tr>'
+        f'<td class="meaning dim">{escape(detail or meaning)}</td></tr>'
     )
 
 

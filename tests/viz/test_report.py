@@ -24,7 +24,7 @@ def report(**parts: object) -> str:
 
 def test_a_report_shows_its_pictures_without_the_rest_of_the_folder():
     html = report(
-        summary=[("ATE", "1 & 2 cm", "good", "a < b")],
+        summary=[("ATE", "1 & 2 cm", "good", "a < b", "")],
         warnings=["focal length <guessed>"],
         figures=[("a < b", PNG)],
         keyframes=JPEGS,
@@ -38,7 +38,7 @@ def test_a_report_shows_its_pictures_without_the_rest_of_the_folder():
     assert re.findall(r'src="(?!data:)([^"]*)"', html) == []
     assert html.count('class="waiting ended"') == 2 and 'viewer.src = "viewer.html"' in html
     assert html == report(
-        summary=[("ATE", "1 & 2 cm", "good", "a < b")],
+        summary=[("ATE", "1 & 2 cm", "good", "a < b", "")],
         warnings=["focal length <guessed>"],
         figures=[("a < b", PNG)],
         keyframes=JPEGS,
@@ -89,6 +89,6 @@ def test_the_end_of_the_run_decides_what_is_shown():
 
 
 def test_a_summary_escapes_whatever_it_is_given():
-    shown = summary_html("a<b", {"frames": ("3 & 4", "good")}, ["x > y"], b"\x89PNG\r\n")
+    shown = summary_html("a<b", [("frames", "3 & 4", "good", "", "")], ["x > y"], b"\x89PNG\r\n")
     assert "a&lt;b" in shown and "3 &amp; 4" in shown and "x &gt; y" in shown and "good" in shown
     assert "iVBOR" in shown
