@@ -53,16 +53,15 @@ def measure_run(
     names += ["lpips_novel", "lpips_input"] if lpips is not None else []
     metrics: dict[str, float | None] = dict.fromkeys(names)
     values: dict[str, list[float]] = defaultdict(list)  # to be averaged
-    path, scale = truth.trajectory if truth else None, None
-    if truth is not None and path is not None:
+    scale = None
+    if truth is not None and (path := truth.trajectory) is not None:
         metrics["ate_all_cm"] = ate_cm(trajectory, path)
         metrics["ate_keyframes_cm"] = ate_cm(keyframe_trajectory, path)
         metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
         if metrics["ate_all_cm"] is not None:
-            aligned = absolute_trajectory_error(trajectory, path, max_difference=MAX_DIFFERENCE)
-            scale = aligned.similarity.scale
-            pair = paired(trajectory, path, MAX_DIFFERENCE)
-            for name, value in _novel_errors(truth.novel_views(), *pair, render, lpips):
+            estimate, path = paired(trajectory, path, MAX_DIFFERENCE)
+            scale = umeyama(centres(estimate), centres(path)).scale
+            for name, value in _novel_errors(truth.novel_views(), estimate, path, render, lpips):
                 values[name].append(value)
     betas: list[tuple[np.ndarray, np.ndarray]] = []  # with the true masks
     for view in views:
