@@ -5,17 +5,17 @@
 
 import re
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
 from minislam import checks
-from minislam.checks.points import EXERCISES
+from minislam.checks.points import EXERCISES, Exercise
 from tests.notebook_files import NOTEBOOKS, ROOT, is_exercise, load, source
 
 SYLLABUS = ROOT / "notebooks/SYLLABUS.md"
 GENERATED = re.compile(r"(<!-- points: [^\n]+ -->\n).*?(<!-- end of points -->)", re.S)
 WARM_UP = 2  # points
-WITHOUT_HEADINGS = ("05_bundle_adjustment", "06_tracking")  # until they are unfolded
 HEADING = re.compile(
     r"(?:## [^\n]+\n\n)?"  # a section may begin here
     r"### Exercise (\d): [^\n]+ \((★{1,3})(☆{0,2}), (\d+) minutes, (\d) points\)\n"
@@ -31,14 +31,10 @@ def test_each_exercise_has_its_own_key_and_a_check():
         assert callable(getattr(checks, exercise.check))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_headings_say_what_the_table_says(path):
-    cells = load(path)["cells"]
-    is_told = any("### Exercise " in source(cell) for cell in cells)
-    if path.stem in WITHOUT_HEADINGS and not is_told:
-        pytest.skip("this notebook has no such headings yet")
+def exercises_in(path: Path) -> list[tuple[Exercise, int]]:
+    """Return the exercises of a notebook and their minutes, as their headings say."""
     found = []
-    for above, cell in pairwise(cells):
+    for above, cell in pairwise(load(path)["cells"]):
         if is_exercise(cell):
             heading = HEADING.match(source(above))
             assert heading and above["cell_type"] == "markdown", source(above)[:100]
@@ -47,19 +43,23 @@ def test_headings_say_what_the_table_says(path):
             assert source(above).rstrip().endswith("</details>"), "a folded hint is missing"
             check = re.findall(r"^checks\.(\w+)\(", source(cell), re.M)[-1]
             key = f"ex{path.stem.split('_')[0]}_{count}"
-            found.append((key, path.stem, check, int(points), len(stars), int(minutes)))
+            found.append((Exercise(key, path.stem, check, int(points)), int(minutes)))
+    return found
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_headings_say_what_the_table_says(path):
     rows = [e for e in EXERCISES if e.notebook == path.stem]
-    expected = [(e.key, e.notebook, e.check, e.points, e.stars, e.minutes) for e in rows]
-    assert found == expected
+    assert [exercise for exercise, _ in exercises_in(path)] == rows
 
 
 def table_of_points() -> str:
     rows = ["| notebook | warm-ups | building | points | minutes |", "|---|---|---|---|---|"]
-    for notebook in sorted({e.notebook for e in EXERCISES}):
-        own = [e for e in EXERCISES if e.notebook == notebook]
-        warm = sum(e.points == WARM_UP for e in own)
-        points, minutes = sum(e.points for e in own), sum(e.minutes for e in own)
-        rows.append(f"| {notebook} | {warm} | {len(own) - warm} | {points} | {minutes} |")
+    for path in NOTEBOOKS:
+        own = exercises_in(path)
+        warm = sum(e.points == WARM_UP for e, _ in own)
+        points, minutes = sum(e.points for e, _ in own), sum(spent for _, spent in own)
+        rows.append(f"| {path.stem} | {warm} | {len(own) - warm} | {points} | {minutes} |")
     first = sum(e.points for e in EXERCISES if e.notebook < "05")
     whole = sum(e.points for e in EXERCISES)
     last = f"Hand-in 1 (00 to 04): {first} points. Hand-in 2 (05 to 10): {whole - first} points."
