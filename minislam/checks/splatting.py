@@ -237,6 +237,6 @@ def check_picture_gradient(student: Function) -> Verdict:
         (scaled(1 / target.numel()), "L is a sum over the pixels, not a mean."),
         (scaled(-1, slice(2)), "The sign of v_mu' is flipped: d = x' - mu' falls as mu' grows."),
         (scaled(0.5, slice(3, 4)), "b stands twice in the quadratic form: v_b = -sum g du dv."),
-        (partial(reference, fixed_light=True), "A Gaussian also hides what is behind it: R_{k+1}."),
+        (partial(reference, fixed_light=True), "A Gaussian also hides what is behind it: A_{k+1}."),
     ]
     return check_function(student, reference, cases, 1e-7, mistakes, returns=returns)

@@ -29,7 +29,7 @@ def any_twist(seed: int, turn: float) -> list[float]:
 
 
 def check_flow_distance(student: Function) -> Verdict:
-    """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, beta) -> distance [px]."""
+    """Check (poses (2, 4, 4), disparities (2, N), rays, pixels, camera, eta) -> distance [px]."""
     pixels = CAMERA.pixel_grid(10, torch.float64).flatten(0, 1)
     disparities = 0.2 + 0.3 * normals(0, 2, len(pixels)).sigmoid()
 
@@ -40,31 +40,31 @@ def check_flow_distance(student: Function) -> Verdict:
         """Return the distance with another mean of the flows (2, 2, N), both directions."""
 
         def distance(*a: Any) -> Tensor:
-            poses, disparities, rays, pixels, camera, beta = a
+            poses, disparities, rays, pixels, camera, eta = a
             whole = relative_transforms(poses, [0, 1], [1, 0])
             part = torch.eye(4, dtype=poses.dtype).repeat(2, 1, 1)
             kept = (slice(None), slice(3), slice(3) if turned else 3)
             part[kept] = whole[kept]
             flows = [reproject(T, disparities, rays, camera)[0] - pixels.T for T in (whole, part)]
-            return beta * length(flows[0]) + (1 - beta) * length(flows[1])
+            return eta * length(flows[0]) + (1 - eta) * length(flows[1])
 
         return distance
 
-    def case(twist: list[float], beta: float, description: str) -> Case:
+    def case(twist: list[float], eta: float, description: str) -> Case:
         poses, rays = se3_exp(doubles([0.0] * 6, twist)), CAMERA.rays(pixels)
-        return Case((poses, disparities, rays, pixels, CAMERA, beta), description)
+        return Case((poses, disparities, rays, pixels, CAMERA, eta), description)
 
     cases = [
         case([0.3, -0.1, 0.0, 0.0, 0.0, 0.0], 0.75, "a camera that slides"),
         case([0.0, 0.0, 0.0, 0.02, 0.1, 0.0], 0.75, "a camera that turns"),
         case([0.3, 0.1, 0.2, 0.02, -0.05, 0.03], 0.75, "a camera that does both"),
-        *drawn(lambda seed: case(any_twist(seed, 0.03), 0.3, "another motion, beta = 0.3")),
+        *drawn(lambda seed: case(any_twist(seed, 0.03), 0.3, "another motion, eta = 0.3")),
     ]
     mistakes = [
-        (lambda *a: reference(*a[:-1], 1.0), "The flow without rotation has the weight 1 - beta."),
+        (lambda *a: reference(*a[:-1], 1.0), "The flow without rotation has the weight 1 - eta."),
         (lambda *a: reference(*a[:-1], 0.0), "This is the flow without rotation alone."),
-        (lambda *a: reference(*a[:-1], 1 - a[-1]), "beta and 1 - beta are exchanged."),
-        (lambda *a: reference(*a[:-1], 0.75), "0.75 is one beta of many: use the argument."),
+        (lambda *a: reference(*a[:-1], 1 - a[-1]), "eta and 1 - eta are exchanged."),
+        (lambda *a: reference(*a[:-1], 0.75), "0.75 is one eta of many: use the argument."),
         (changed(lambda f: f[0].norm(dim=0).mean()), "One direction only: from 1 to 0 as well."),
         (changed(lambda f: f[1].norm(dim=0).mean()), "One direction only: from 0 to 1 as well."),
         (changed(lambda f: f.norm(dim=1).sum()), "Take the mean over the pixels, not the sum."),

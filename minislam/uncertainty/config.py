@@ -41,7 +41,7 @@ class UncertaintyConfig:
         668.42, "factor of (1-l)(1-s)(1-c) [1]: 100 + 900 b(0.3; 0.8), NeRF On-the-go"
     )
     loss_cap: float = parameter(
-        5.0, "cap of the SSIM and of the depth term [1], official: bounds beta by 2 sqrt(5)"
+        5.0, "cap of the SSIM and of the depth term [1], official: bounds beta by 2 sqrt(6)"
     )
     median_size: int = parameter(
         3, "window of the median filter [cells], odd; official 5 on a grid twice as fine"

@@ -38,7 +38,7 @@ def test_a_solution_passes_and_wrong_answers_do_not():
 
 def test_known_mistakes_of_tracking_are_named():
     assert (
-        "has the weight 1 - beta" in check_flow_distance(lambda *a: distance(*a[:-1], 1.0)).sentence
+        "has the weight 1 - eta" in check_flow_distance(lambda *a: distance(*a[:-1], 1.0)).sentence
     )
     verdict = check_flow_distance(lambda *a: distance(*a[:-1], 0.0))
     assert "for a camera that turns" in verdict.sentence and "alone" in verdict.sentence
