@@ -8,16 +8,13 @@ whole millimetres, and stabilisation crops the image, so that all this is a firs
 import math
 import struct
 from collections.abc import Iterator
-from io import BytesIO
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO
 
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm; equivalents keep the field of view of the diagonal
 VIDEO_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 POSSIBLE = (0.2, 20.0)  # image diagonals, of a focal length that is believed
 
-_HEADER = 1 << 17  # bytes of a photo in which its EXIF segment is looked for
-_LARGEST_INDEX = 1 << 27  # bytes; the index of a video is smaller unless it is damaged
 # Tags of EXIF
 _POINTER, _FILM_EQUIVALENT, _FOCAL_LENGTH, _RESOLUTION, _UNIT, _WIDTH, _HEIGHT = (
     0x8769, 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002, 0xA003,
@@ -31,10 +28,9 @@ def noted_focal_length(path: Path) -> tuple[float, str] | None:
     """Return the focal length over the image diagonal and its origin; None if none is noted."""
     try:
         with path.open("rb") as file:
-            start = file.read(_HEADER)
-            file.seek(0)
-            is_photo = start.startswith(b"\xff\xd8")
-            found = _of_exif(_exif_segment(start)) if is_photo else _of_video(file)
+            content = memoryview(mmap(file.fileno(), 0, access=ACCESS_READ))
+        is_photo = content[:2] == b"\xff\xd8"
+        found = _of_exif(_exif_segment(content)) if is_photo else _of_video(content)
     except (OSError, struct.error, LookupError, ValueError, ArithmeticError):
         return None  # Damaged notes are no reason to refuse whole images.
     if found is None or not POSSIBLE[0] < found < POSSIBLE[1]:
@@ -42,7 +38,7 @@ def noted_focal_length(path: Path) -> tuple[float, str] | None:
     return found, f"{'EXIF' if is_photo else 'QuickTime tag'} of {path.name}"
 
 
-def _exif_segment(photo: bytes) -> bytes:
+def _exif_segment(photo: memoryview) -> memoryview:
     """Return the TIFF structure in the APP1 segment of a JPEG file."""
     at = 2
     while photo[at] == 0xFF:
@@ -53,9 +49,9 @@ def _exif_segment(photo: bytes) -> bytes:
     raise ValueError("no EXIF")
 
 
-def _of_exif(tiff: bytes) -> float | None:
+def _of_exif(tiff: memoryview) -> float | None:
     """Return the focal length over the image diagonal."""
-    order = {b"II": "<", b"MM": ">"}[tiff[:2]]
+    order = {b"II": "<", b"MM": ">"}[bytes(tiff[:2])]
 
     def tags(at: int) -> dict[int, float]:
         values = {}
@@ -74,41 +70,31 @@ def _of_exif(tiff: bytes) -> float | None:
     return found[_FOCAL_LENGTH] * per_millimetre / math.hypot(found[_WIDTH], found[_HEIGHT])
 
 
-def _boxes(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
-    """Yield kind and length of the boxes in a video; the file stands at the content of each."""
-    at = 0
-    while len(header := file.read(16)) >= 8:
-        size, kind = struct.unpack_from(">I4s", header)
+def _boxes(content: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield kind and content of the boxes in a video, or in one of its boxes."""
+    while len(content) >= 8:
+        size, kind = struct.unpack_from(">I4s", content)
         start = 16 if size == 1 else 8
-        size = struct.unpack_from(">Q", header, 8)[0] if size == 1 else size
+        size = struct.unpack_from(">Q", content, 8)[0] if size == 1 else size
         if size < start:
             return
-        file.seek(at + start)
-        yield kind, size - start
-        at += size
-        file.seek(at)
+        yield kind, content[start:size]
+        content = content[size:]
 
 
-def _inside(box: bytes) -> list[tuple[bytes, bytes]]:
-    """Return kind and content of the boxes in a box."""
-    file = BytesIO(box)
-    return [(kind, file.read(length)) for kind, length in _boxes(file)]
-
-
-def _of_video(file: BinaryIO) -> float | None:
+def _of_video(video: memoryview) -> float | None:
     """Return the focal length over the image diagonal that a box, or one inside it, notes."""
-    for kind, length in _boxes(file):
+    for kind, content in _boxes(video):
         found = None
         if kind in (b"moov", b"trak", b"udta"):
-            found = _of_video(BytesIO(file.read(min(length, _LARGEST_INDEX))))
+            found = _of_video(content)
         elif kind == b"meta":
             # ISO files have four bytes of version in front of the boxes, QuickTime has none.
-            content = file.read(min(length, _LARGEST_INDEX))
-            inner = dict(_inside(content if content[4:8] == b"hdlr" else content[4:]))
-            names = [name for _, name in _inside(inner.get(b"keys", b"")[8:])]
+            inner = dict(_boxes(content if content[4:8] == b"hdlr" else content[4:]))
+            names = [bytes(name) for _, name in _boxes(inner.get(b"keys", content[:0])[8:])]
             if VIDEO_KEY in names:
                 place = struct.pack(">I", names.index(VIDEO_KEY) + 1)  # values go by position
-                ((_, value),) = _inside(dict(_inside(inner[b"ilst"]))[place])
+                ((_, value),) = _boxes(dict(_boxes(inner[b"ilst"]))[place])
                 number = _VIDEO_NUMBERS[struct.unpack_from(">I", value)[0]]
                 found = struct.unpack_from(number, value, 8)[0] / FILM_DIAGONAL
         if found:
