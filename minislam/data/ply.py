@@ -22,7 +22,6 @@ PROPERTIES = (
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
     "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 )  # fmt: skip
-_MAX_HEADER = 65536  # byte
 _FORMAT = ["ply", "format binary_little_endian 1.0"]  # the first two lines
 
 
@@ -81,8 +80,8 @@ def _encoded(table: np.ndarray, properties: list[str]) -> bytes:
 def read_ply(path: Path | str) -> GaussianArrays:
     """Read a Gaussian map; of spherical harmonics only the mean colour is kept."""
     content, name = read_bytes(path), str(path)
-    count, names, start = _parse_header(content, name)
-    body = content[start:]
+    header, ended, body = content.partition(b"end_header\n")
+    count, names = _parse_header(header if ended else b"", name)
     if len(body) != 4 * count * len(names):
         raise InputError(
             f"expected {4 * count * len(names)} bytes for {count} Gaussians, found {len(body)} in "
@@ -105,11 +104,10 @@ def read_ply(path: Path | str) -> GaussianArrays:
     return gaussians
 
 
-def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
-    """Return the number of Gaussians, the property names and where the values start."""
-    end = content.find(b"end_header\n", 0, _MAX_HEADER)
-    header = content[: max(end, 0)].decode("ascii", errors="replace").splitlines()
-    lines = [line for line in header if not line.startswith(("comment", "obj_info"))]
+def _parse_header(header: bytes, name: str) -> tuple[int, list[str]]:
+    """Return the number of Gaussians and the property names."""
+    rows = header.decode("ascii", errors="replace").splitlines()
+    lines = [row for row in rows if not row.startswith(("comment", "obj_info"))]
     if lines[:2] != _FORMAT or len(lines) < 3:
         raise InputError(
             f"expected a binary little-endian PLY file with Gaussians, found another kind of file "
@@ -126,7 +124,7 @@ def _parse_header(content: bytes, name: str) -> tuple[int, list[str], int]:
             f"without {', '.join(missing[:3]) or 'them, or with doubles'} in {name}; "
             "give a map.ply"
         )
-    return int(element[2]), names, end + len(b"end_header\n")
+    return int(element[2]), names
 
 
 def _validate(gaussians: GaussianArrays, name: str) -> None:
