@@ -91,7 +91,7 @@ class RecordedSequence:
         if self.refines_focal:
             parts.append("focal length to be refined")
         self.description = f"{recording.kind}: {', '.join(parts)}"
-        truth = RecordedTruth(self, recording)
+        truth = _RecordedTruth(self, recording)
         self.ground_truth: GroundTruth | None = truth if recording.has_truth() else None
 
     def __len__(self) -> int:
@@ -142,27 +142,23 @@ class RecordedSequence:
         return (self.prepare.color if raw.ndim == 3 else self.prepare.nearest)(raw, str(path))
 
 
-class RecordedTruth:
-    """The ground truth of a recording, which the system must not see: a `GroundTruth`."""
+class _RecordedTruth:
+    """The ground truth of a recording: a `GroundTruth`, which says what each method returns."""
 
     def __init__(self, sequence: RecordedSequence, recording: Recording) -> None:
         self.trajectory = recording.trajectory
         self._sequence, self._recording = sequence, recording
 
     def moving_mask(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) bool, True where a dynamic object is seen."""
         return self._sequence.picture(self._recording.mask_paths, frame_index, read_mask)
 
     def static_image(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
         return self._sequence.picture(self._recording.static_paths, frame_index, read_color)
 
     def depth(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
         return self._sequence.sensor_depth(frame_index)
 
     def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
         views, prepare = self._recording.novel_views, self._sequence.prepare
         return [(pose, prepare.color(read_color(path), str(path))) for pose, path in views]
 
