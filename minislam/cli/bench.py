@@ -35,10 +35,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("folders", nargs="+", metavar="FOLDER", help="a sequence, or its parents")
     parser.add_argument("options", nargs=argparse.REMAINDER, help="-o OUT, options of minislam run")
-    parser.set_defaults(run=run_bench)
+    parser.set_defaults(run=_bench)
 
 
-def run_bench(args: argparse.Namespace) -> int:
+def _bench(args: argparse.Namespace) -> int:
     """Run what is not finished, print and write the tables; return the exit code."""
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
     own.add_argument("-o", "--output", default="output/bench", type=Path)

@@ -17,10 +17,10 @@ MAX_SELF_TEST_ERROR = 0.1  # px
 def add_parser(commands: argparse._SubParsersAction) -> None:
     """Add `doctor` to the commands."""
     parser = commands.add_parser("doctor", help="show what is installed and check that it works")
-    parser.set_defaults(run=run_doctor)
+    parser.set_defaults(run=_doctor)
 
 
-def run_doctor(args: argparse.Namespace) -> None:
+def _doctor(args: argparse.Namespace) -> None:
     """Print versions and threads, and compare an estimated flow with the known one."""
     import platform
 

@@ -37,11 +37,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add("--sh-degree", type=int, choices=(1, 2, 3), help="map with zeros up to this degree, in RUN")
     add("--keyframes", action="store_true", help="only keyframes, not all frames")
     add("--overwrite", action="store_true", help="replace files of these names")
-    parser.set_defaults(run=run_export)
+    parser.set_defaults(run=_export)
 
 
-def run_export(args: argparse.Namespace) -> None:
-    """Write what is asked for."""
+def _export(args: argparse.Namespace) -> None:
     folders = [args.colmap, args.nerfstudio, args.depth, args.masks]
     if not any([*folders, args.points, args.sh_degree]):
         raise InputError(

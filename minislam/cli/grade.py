@@ -40,10 +40,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add("--seed", type=int, metavar="N", help="also cases that nobody has seen")
     add("--no-package", action="store_true", help="refuse answers that call the package's own")
     add("--strict", action="store_true", help="exit code 1 below full marks")
-    parser.set_defaults(run=run_grade)
+    parser.set_defaults(run=_grade)
 
 
-def run_grade(args: argparse.Namespace) -> int:
+def _grade(args: argparse.Namespace) -> int:
     """Grade all notebooks, print and write the points; return the exit code."""
     if args.seed is not None and args.seed < 0:
         raise InputError(f"expected --seed N with N at least 0, found {args.seed}; give another")

@@ -20,11 +20,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--student", action="store_true", help="without solutions and outputs")
     kind.add_argument("--solutions", action="store_true", help="with solutions, as without a flag")
-    parser.set_defaults(run=run_notebooks)
+    parser.set_defaults(run=_notebooks)
 
 
-def run_notebooks(args: argparse.Namespace) -> int:
-    """Copy all notebooks and what they name, never over a file; return the exit code."""
+def _notebooks(args: argparse.Namespace) -> None:
+    """Copy all notebooks and what they name, never over a file."""
     # A wheel holds the notebooks inside the package, the repository beside it.
     folder, package = Path(args.folder).expanduser(), Path(minislam.__file__).parent
     sources = [package / "notebooks", package.parent / "notebooks"]
@@ -52,7 +52,6 @@ def run_notebooks(args: argparse.Namespace) -> int:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         atomic_write(folder / name, content)
     print(f"{count} notebooks in {folder}; open them with: jupyter lab {folder}")
-    return 0
 
 
 def without_solutions(notebook: dict) -> dict:

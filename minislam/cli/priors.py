@@ -40,11 +40,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     options.add_settings(parser)
     options.add_input(parser)
     options.add_priors(parser, default_depth="none")
-    parser.set_defaults(run=run_priors)
+    parser.set_defaults(run=_priors)
 
 
-def run_priors(args: argparse.Namespace) -> None:
-    """Write the priors that are asked for."""
+def _priors(args: argparse.Namespace) -> None:
     source, inputs = options.source_of(args), options.input_options(args)
     choice = options.prior_choice(args, "none")
     require_source(source)

@@ -22,11 +22,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "pattern", nargs="?", default="", help="part of a name, or a pattern like tracking.*round*"
     )
-    parser.set_defaults(run=run_settings)
+    parser.set_defaults(run=_settings)
 
 
-def run_settings(args: argparse.Namespace) -> None:
-    """Print the settings whose names fit the pattern."""
+def _settings(args: argparse.Namespace) -> None:
     from minislam.config import PRESETS, SlamConfig
     from minislam.parameters import MOST, leaves
 

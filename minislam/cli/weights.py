@@ -17,17 +17,16 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Add `weights` to the commands."""
     parser = commands.add_parser("weights", help="list, fetch or check official checkpoints")
     actions = parser.add_subparsers(required=True, metavar="list | fetch | check")
-    actions.add_parser("list", help="what there is").set_defaults(run=run_list)
+    actions.add_parser("list", help="what there is").set_defaults(run=_list)
     fetch = actions.add_parser("fetch", help="fetch files of the list from their makers' sites")
     fetch.add_argument("names", nargs="+", metavar="NAME", help="as in the list")
-    fetch.set_defaults(run=run_fetch)
+    fetch.set_defaults(run=_fetch)
     check = actions.add_parser("check", help="which network each file of a folder belongs to")
     check.add_argument("folder", nargs="?", metavar="DIR", help="default: what was fetched")
-    check.set_defaults(run=run_check)
+    check.set_defaults(run=_check)
 
 
-def run_list(args: argparse.Namespace) -> None:
-    """Print one line per published file."""
+def _list(args: argparse.Namespace) -> None:
     rows = list(published_files().values())
     for row in rows:
         here = "fetched" if row.path.exists() else ""
@@ -35,8 +34,7 @@ def run_list(args: argparse.Namespace) -> None:
     print(f"minislam weights fetch NAME... puts them in {rows[0].path.parent}")
 
 
-def run_fetch(args: argparse.Namespace) -> None:
-    """Fetch files by their names."""
+def _fetch(args: argparse.Namespace) -> None:
     from minislam.data.download import download
 
     known = published_files()
@@ -56,8 +54,7 @@ def run_fetch(args: argparse.Namespace) -> None:
         print(f"{row.path}: complete, use it with {row.use}")
 
 
-def run_check(args: argparse.Namespace) -> None:
-    """Print one line per checkpoint file: which network, how large, complete or not, its flag."""
+def _check(args: argparse.Namespace) -> None:
     rows = {row.file: row for row in published_files().values()}
     folder = Path(args.folder or rows["droid.pth"].path.parent).expanduser()
     found = folder.iterdir() if folder.is_dir() else ()
