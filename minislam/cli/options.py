@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from minislam.cli.help import unknown_option
 from minislam.data.files import read_json
+from minislam.data.options import InputOptions
 from minislam.errors import InputError
 from minislam.parameters import flattened, kind_of, with_values
+from minislam.priors.names import PriorChoice, find_weights, require_priors
 
 if TYPE_CHECKING:
     from minislam.config import SlamConfig
-    from minislam.data import InputOptions
     from minislam.evaluation.lpips import Lpips
-    from minislam.priors.names import PriorChoice
 
 Options = TypeVar("Options")  # InputOptions or PriorChoice
 PRESETS = ("laptop", "paper", "paper-fast", "test")  # of minislam.config, which needs torch
@@ -27,8 +27,6 @@ PRESETS = ("laptop", "paper", "paper-fast", "test")  # of minislam.config, which
 
 def add_input(parser: argparse.ArgumentParser) -> None:
     """Add the sequence, and a flag for every field of InputOptions."""
-    from minislam.data import InputOptions
-
     parser.add_argument(
         "sequence",
         nargs="?",
@@ -148,15 +146,11 @@ def source_of(args: argparse.Namespace) -> str:
 
 def input_options(args: argparse.Namespace) -> InputOptions:
     """Return the input options: those of the file of --config, replaced by what is given."""
-    from minislam.data import InputOptions
-
     return _with_given(InputOptions(), args, "input")
 
 
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
     """Return the priors, which exist: those of the file of --config, replaced by what is given."""
-    from minislam.priors.names import PriorChoice, require_priors
-
     choice = _with_given(PriorChoice(depth=default_depth), args, "priors")
     require_priors(choice)
     return choice
@@ -179,7 +173,6 @@ def lpips_of(args: argparse.Namespace) -> Lpips | None:
         [given] = files.keys() - missing
         raise InputError(f"expected {missing[0]} FILE with {given}, found none; give both or none")
     from minislam.evaluation.lpips import Lpips
-    from minislam.priors.names import find_weights
     from minislam.priors.networks.checkpoints import load_checkpoint
 
     paths = [Path(str(find_weights(flag, file))).expanduser() for flag, file in files.items()]
