@@ -18,7 +18,9 @@ import torch
 
 from minislam.cli.main import main
 from minislam.config import SlamConfig, preset, settings_in, with_settings
-from minislam.data import InputOptions, RunFolder, open_sequence, read_ply, read_trajectory
+from minislam.data import InputOptions, RunFolder, open_sequence
+from minislam.data.ply import read_ply
+from minislam.data.trajectory import read_trajectory
 from minislam.evaluation import absolute_trajectory_error
 from minislam.priors.features import ClassicalFeatures
 from minislam.slam import Slam

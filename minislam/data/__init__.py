@@ -8,19 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from minislam.data.options import InputOptions
-    from minislam.data.ply import GaussianArrays, read_ply
+    from minislam.data.ply import GaussianArrays
     from minislam.data.run_folder import RunFolder
     from minislam.data.sequence import RecordedSequence, open_sequence
-    from minislam.data.trajectory import read_trajectory
 
 _MODULES = {
     "InputOptions": "options",
     "GaussianArrays": "ply",
-    "read_ply": "ply",
     "RunFolder": "run_folder",
     "RecordedSequence": "sequence",
     "open_sequence": "sequence",
-    "read_trajectory": "trajectory",
 }
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from minislam.cli.main import main
-from minislam.data import read_ply
+from minislam.data.ply import read_ply
 from tests.cli.test_main import images, run, texture
 
 pytestmark = pytest.mark.slow

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.data import read_ply, read_trajectory
 from minislam.data.images import encode_png, read_color
-from minislam.data.ply import GaussianArrays, encode_ply
+from minislam.data.ply import GaussianArrays, encode_ply, read_ply
 from minislam.data.run_folder import RunFolder, locked
-from minislam.data.trajectory import write_trajectory
+from minislam.data.trajectory import read_trajectory, write_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
 from tests.helpers import random_transforms

@@ -14,8 +14,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from minislam.data import GaussianArrays, InputOptions, open_sequence, read_ply
-from minislam.data.ply import encode_ply
+from minislam.data import GaussianArrays, InputOptions, open_sequence
+from minislam.data.ply import encode_ply, read_ply
 from minislam.errors import InputError
 from minislam.runs import export
 from minislam.uncertainty.weights import MAPPING_CUT, beta_of_mask
