@@ -233,10 +233,9 @@ def mask_files(images: ImageSource, masks: str, chosen: range) -> dict[int, Path
             f"expected --masks {FILES}FOLDER with a folder that exists, found {masks}; check it"
         )
     files = {path.stem: path for path in list_images(folder)}
-    found = {int(name): path for name, path in files.items() if name.isdecimal()}
-    if isinstance(images, FileImages) and any(path.stem in files for path in images.paths):
-        stems = [path.stem for path in images.paths]
-        found = {k: files[stem] for k, stem in enumerate(stems) if stem in files}
+    named = {k: files[path.stem] for k, path in enumerate(images.paths) if path.stem in files}
+    numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
+    found = named if named and isinstance(images, FileImages) else numbered
     if missing := [images.labels[index] for index in chosen if index not in found]:
         raise InputError(
             f"expected a mask of every frame in {folder}, found none for {len(missing)} of "
