@@ -45,8 +45,7 @@ def clipped_beta(beta_raw: Tensor) -> Tensor:
 
 def beta_of_mask(moving: Tensor) -> Tensor:
     """Return the raw beta (H, W) for a given mask (H, W) bool, True on moving pixels."""
-    largest = torch.full(moving.shape, BETA_OF_MASK, device=moving.device)
-    return torch.where(moving, largest, BETA_FLOOR)
+    return torch.where(moving, BETA_OF_MASK, BETA_FLOOR)
 
 
 def stretched(beta: Tensor) -> Tensor:
@@ -66,7 +65,7 @@ def mapping_weight(
 ) -> Tensor:  # (H, W) 0, or from `least` to 5
     """Return the weight of each pixel in L_render, Eq. (6): 0.5 / beta_adj^2, cut and capped."""
     weight = (WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2).clamp_max(MAPPING_CAP)
-    return torch.where(weight < least, torch.zeros_like(weight), weight)
+    return torch.where(weight < least, 0, weight)
 
 
 def tracking_weight(

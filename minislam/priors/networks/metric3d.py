@@ -214,8 +214,7 @@ def convex_upsample(
     factor: int,
 ) -> Tensor:  # (B, C, factor * h, factor * w)
     """Upsample: each fine pixel is a convex combination of the 3x3 coarse ones around it (RAFT)."""
-    batch, channels, height, width = coarse.shape
-    weight = logits.view(batch, 1, 9, factor, factor, height, width).softmax(2)
-    around = functional.unfold(coarse, 3, padding=1).view(batch, channels, 9, 1, 1, height, width)
-    fine = (weight * around).sum(2)  # (B, C, factor, factor, h, w)
-    return fine.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, factor * height, factor * width)
+    weight = logits.unflatten(1, (1, 9, factor, factor)).softmax(2)
+    around = functional.unfold(coarse, 3, padding=1).unflatten(2, coarse.shape[2:])
+    fine = (weight * around.unflatten(1, (-1, 9, 1, 1))).sum(2)  # (B, C, factor, factor, h, w)
+    return functional.pixel_shuffle(fine.flatten(1, 3), factor)
