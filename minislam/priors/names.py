@@ -103,8 +103,8 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
 
     Refuse a name that is unknown and weights that are missing, before anything is loaded.
     """
-    uses = [row.use for row in published_files().values() if row.use.startswith(f"--{kind} ")]
-    learned = list(dict.fromkeys(use.split()[-1] for use in uses))
+    uses = dict.fromkeys(row.use for row in published_files().values())
+    learned = [use.split()[1] for use in uses if use.startswith(f"--{kind} ")]
     if name in learned:
         file = find_weights(f"--{kind} {name}", weights)
         if file is None or not Path(file).expanduser().is_file():

@@ -9,6 +9,7 @@ tensor that was never read is unexpected.
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,11 @@ _SHOWN = 300  # characters of the list of entries in a message
 
 
 class Weights:
-    """The tensors of a checkpoint whose names start with a prefix."""
+    """The tensors of a checkpoint, or of a part of it: those whose names start with a prefix."""
 
-    def __init__(self, tensors: dict[str, Tensor], file: str, prefix: str = "") -> None:
+    def __init__(self, tensors: dict[str, Tensor], file: str) -> None:
         self.file = file  # for messages
-        self.prefix = prefix
+        self.prefix = ""
         self.precision = torch.float32  # in which the layers of large networks compute
         self._tensors = tensors
         self._used: set[str] = set()
@@ -59,8 +60,8 @@ class Weights:
 
     def below(self, prefix: str) -> "Weights":
         """Return the weights whose names start with `prefix`, under their names without it."""
-        part = Weights(self._tensors, self.file, self.prefix + prefix)
-        part._used, part.precision = self._used, self.precision
+        part = copy(self)  # of the same tensors; what it reads counts as read
+        part.prefix += prefix
         return part
 
     def unused(self) -> list[str]:

@@ -153,7 +153,7 @@ class DroidFlow(Stateful):
 
     def start_chain(self, image: Tensor) -> "DroidChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
-        return DroidChain(self, self.encode(image), self.encode(image), None)
+        return DroidChain(self, self.encode(image), self.encode(image))
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "DroidChain":
         """Return the chain whose saved state this is."""
@@ -161,24 +161,25 @@ class DroidFlow(Stateful):
         return DroidChain(self, reference, newest, state["_target"])
 
 
+@dataclass(frozen=True)
 class DroidChain(Stateful):
     """The flow from one reference frame to the newest; a `FlowChain` that never changes."""
 
-    _images: list[Tensor]  # (H, W, 3) of the reference and of the newest frame
-    _target: Tensor | None  # (1, h, w, 2) cells, None: nothing has moved yet
+    flow: DroidFlow
+    reference: EncodedFrame
+    newest: EncodedFrame
+    target: Tensor | None = None  # (1, h, w, 2) cells, None: nothing has moved yet
 
-    def __init__(
-        self, flow: DroidFlow, reference: EncodedFrame, newest: EncodedFrame, target: Tensor | None
-    ) -> None:
-        self._flow, self._reference, self._newest, self._target = flow, reference, newest, target
-        self._images = [reference.image, newest.image]
+    def saved_state(self) -> Tree:
+        """Return the target and the images; the frames are encoded again."""
+        return {"_images": [self.reference.image, self.newest.image], "_target": self.target}
 
     @torch.no_grad()
     def advance(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
-        flow, reference, newest = self._flow, self._reference, self._flow.encode(image)
+        flow, reference, newest = self.flow, self.reference, self.flow.encode(image)
         hidden, context = reference.context
-        target, updates = self._target, flow.config.chain_updates
+        target, updates = self.target, flow.config.chain_updates
         if target is None or updates == 1:
             target = net.cell_grid(hidden.new_zeros(1, *hidden.shape[2:], 2))[None]
         for _ in range(updates):
@@ -190,7 +191,7 @@ class DroidChain(Stateful):
 
     def restart(self) -> "DroidChain":
         """Return a chain that starts at the newest frame."""
-        return DroidChain(self._flow, self._newest, self._newest, None)
+        return DroidChain(self.flow, self.newest, self.newest)
 
 
 def as_matches(targets: Tensor, confidences: Tensor, like: Tensor) -> FlowMatches:

@@ -64,9 +64,8 @@ class VisionTransformer:
         if positions.shape[1] == _TRAINED_GRID**2 + 1:
             # DINOv2 keeps the class token's position in row 0; timm has already added it.
             class_token, positions = class_token + positions[:, :1], positions[:, 1:]
-        leading = [class_token]
-        leading += [weights[n] for n in ("register_tokens", "reg_token") if n in weights]
-        self._leading = torch.cat(leading, 1)
+        registers = [weights[n] for n in ("register_tokens", "reg_token") if n in weights]
+        self._leading = torch.cat([class_token, *registers], 1)
         self._positions = positions.unflatten(1, (_TRAINED_GRID, _TRAINED_GRID)).movedim(-1, 1)
 
     def __call__(
