@@ -39,10 +39,8 @@ def rendering_error(
     ssim = losses.modified_ssim_loss(image, rendered_color, opacity, config)
     ssim = losses.median_filter(resample(ssim, *grid_shape), config.median_size)
 
-    known = reference_depth > 0
-    # Without any reference depth there is no median, and every pixel is masked anyway.
-    median = float(reference_depth[known].median()) if known.any() else 1.0
-    limit = losses.FAR_FACTOR * median
+    # Without any reference depth the median is nan, and every pixel is masked anyway.
+    limit = losses.FAR_FACTOR * float(reference_depth[reference_depth > 0].median())
     depth = losses.depth_loss(rendered_depth, reference_depth, limit) / depth_unit
     depth = resample(depth.clamp_max(config.loss_cap), *grid_shape)
     return RenderingError(ssim, depth, resample(opacity, *grid_shape))

@@ -46,7 +46,7 @@ class EncodedFrame:
 
     def __init__(self, weights: Weights, image: Tensor) -> None:
         self.image = image  # (H, W, 3)
-        self._weights, self._normalised = weights, normalise(image, weights.device)
+        self._weights, self._normalised = weights, normalise(image.to(weights.device))
         self.features = net.encode_features(weights, self._normalised)  # (1, 128, h, w)
 
     @cached_property

@@ -77,7 +77,7 @@ class Metric3DDepth:
     def canonical_depth(self, image: Tensor) -> tuple[Tensor, float]:
         """Return the depth of a 1000 px camera at the network's scale, and that scale."""
         with torch.no_grad():
-            padded, inside, scale = fit(image, self.network_size, self.device)
+            padded, inside, scale = fit(image.to(self.device), self.network_size)
             return self.network(padded)[0][inside], scale
 
     def network(
@@ -122,13 +122,12 @@ class Metric3DDepth:
 def fit(
     image: Tensor,  # (H, W, 3)
     size: tuple[int, int],  # px
-    device: torch.device,
 ) -> tuple[Tensor, tuple[slice, slice], float]:  # (1, 3, *size) normalised, network px per px
     """Return an image padded to a size, its aspect kept; the part where it lies; its scale."""
     scale = min(size[0] / image.shape[0], size[1] / image.shape[1])
     # The small number protects from 616 * (1 - 1e-16) being cut to 615.
     rows, cols = (max(1, int(side * scale + 1e-6)) for side in image.shape[:2])
-    resized = functional.interpolate(normalise(image, device), (rows, cols), mode="bilinear")
+    resized = functional.interpolate(normalise(image), (rows, cols), mode="bilinear")
     top, left = (size[0] - rows) // 2, (size[1] - cols) // 2
     padding = (left, size[1] - cols - left, top, size[0] - rows - top)
     padded = functional.pad(resized, padding)  # 0 is the mean colour of a normalised image

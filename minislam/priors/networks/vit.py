@@ -113,13 +113,10 @@ def _transformer_block(weights: Weights, x: Tensor) -> Tensor:
     return x + weights["ls2.gamma"] * weights.linear("mlp.fc2", functional.gelu(hidden))
 
 
-def normalise(
-    image: Tensor,  # (H, W, 3) RGB in [0, 1]
-    device: torch.device,
-) -> Tensor:  # (1, 3, H, W)
+def normalise(image: Tensor) -> Tensor:  # (H, W, 3) RGB in [0, 1] -> (1, 3, H, W)
     """Return an image as these networks expect it: batch and channels first, ImageNet's scale."""
-    mean, std = (torch.tensor(part, device=device) for part in (_IMAGENET_MEAN, _IMAGENET_STD))
-    return ((image.to(device) - mean) / std).permute(2, 0, 1)[None]
+    mean, std = image.new_tensor(_IMAGENET_MEAN), image.new_tensor(_IMAGENET_STD)
+    return ((image - mean) / std).permute(2, 0, 1)[None]
 
 
 class DinoFeatures:
@@ -138,7 +135,8 @@ class DinoFeatures:
         rows, cols = grid_size(image, PATCH)
         with torch.no_grad():
             size = (PATCH * rows, PATCH * cols)
-            whole = functional.interpolate(normalise(image, self.device), size, mode="bilinear")
+            seen = normalise(image.to(self.device))
+            whole = functional.interpolate(seen, size, mode="bilinear")
             patches = self._transformer(whole)[0].patches[0]
         return patches.permute(1, 2, 0).to(image.device)
 

@@ -18,7 +18,6 @@ from tests.priors.networks import rebuilt
 
 RELATIVE, METRIC = 2e-5, 1e-4  # the official code differs from its own float64 run by 2e-5 m
 INDOOR = 20.0  # metre, largest depth of the training
-CPU = torch.device("cpu")
 
 
 @cache
@@ -33,7 +32,7 @@ def prior_of(shorter_side: int, limit: float = INDOOR) -> DepthAnything:
 @cache
 def raw_output(height: int, width: int) -> torch.Tensor:
     with torch.inference_mode():
-        return prior_of(28).network(normalise(rebuilt.image(height, width), CPU))[0]
+        return prior_of(28).network(normalise(rebuilt.image(height, width)))[0]
 
 
 def frame(image: torch.Tensor) -> tuple[Frame, Camera]:

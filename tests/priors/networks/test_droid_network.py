@@ -63,7 +63,7 @@ def assert_golden(actual: torch.Tensor, name: str) -> None:
 @torch.inference_mode()
 def encoded() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return features, first hidden state and context of three images."""
-    images = torch.cat([normalise(moving_image(f), torch.device("cpu")) for f in range(3)])
+    images = torch.cat([normalise(moving_image(f)) for f in range(3)])
     return encode_features(weights(), images), *encode_context(weights(), images)
 
 

@@ -18,7 +18,6 @@ pytestmark = pytest.mark.slow
 
 # With one or two threads the official code differs from itself by 1e-4 m and 4e-6.
 DEPTH, REST = 1e-3, 5e-5
-CPU = torch.device("cpu")
 SMALL_SIZE = (56, 84)
 
 
@@ -30,7 +29,7 @@ def weights() -> Weights:
 @cache
 def output(height: int, width: int) -> torch.Tensor:
     with torch.inference_mode():
-        return Metric3DDepth(weights()).network(normalise(rebuilt.image(height, width), CPU))
+        return Metric3DDepth(weights()).network(normalise(rebuilt.image(height, width)))
 
 
 def stored(name: str) -> torch.Tensor:
@@ -47,7 +46,7 @@ def test_the_depth_is_that_of_the_official_code(size: tuple[int, int]):
 
 def test_the_finest_map_is_that_of_the_official_code():
     with torch.inference_mode():
-        fine, *_ = Metric3DDepth(weights()).maps(normalise(rebuilt.image(56, 84), CPU))
+        fine, *_ = Metric3DDepth(weights()).maps(normalise(rebuilt.image(56, 84)))
     rebuilt.assert_close(fine[0, ::16], stored("56x84/read_0_every16ch"), REST)
 
 
@@ -80,7 +79,7 @@ def test_depth_is_scaled_by_the_focal_length_of_the_image_the_network_saw():
 
 @pytest.mark.parametrize("size", [(240, 320), (320, 240), (289, 300), (17, 400), (720, 1280)])
 def test_an_image_is_fitted_without_changing_its_aspect(size: tuple[int, int]):
-    image, inside, scale = fit(torch.ones(*size, 3), (616, 1064), CPU)
+    image, inside, scale = fit(torch.ones(*size, 3), (616, 1064))
     assert image.shape == (1, 3, 616, 1064)
     inner = image[0, :, *inside]
     assert inner.shape[1] == 616 or inner.shape[2] == 1064

@@ -18,7 +18,7 @@ from tests.priors.networks import rebuilt
 pytestmark = pytest.mark.slow
 
 META = torch.device("meta")
-IMAGE = torch.zeros(56, 84, 3)
+IMAGE = torch.zeros(56, 84, 3, device=META)
 
 
 def meta_weights(network: str) -> Weights:
@@ -30,17 +30,17 @@ def test_vision_transformers():
     for network in ("dinov2_vits14", "dinov2_vits14_reg", "fit3d_small", "fit3d_reg_small"):
         weights = meta_weights(network)
         transformer = VisionTransformer(weights, is_antialiased(weights))
-        tokens = transformer(normalise(IMAGE, META))[0]
+        tokens = transformer(normalise(IMAGE))[0]
         assert tokens.patches.shape == (1, 384, 4, 6) and tokens.patches.device == META
 
 
 def test_depth_networks_of_both_sizes():
     for network in ("depth_anything_v2_vits", "depth_anything_v2_vitl"):
         prior = DepthAnything(meta_weights(network), DepthAnythingConfig(depth_limit=20.0))
-        assert prior.network(normalise(IMAGE, META)).shape == (1, 56, 84)
+        assert prior.network(normalise(IMAGE)).shape == (1, 56, 84)
     for network in ("metric3d_vit_small", "metric3d_vit_large"):
         prior = Metric3DDepth(meta_weights(network), (112, 168))
-        found = prior.network(fit(IMAGE, prior.network_size, META)[0])
+        found = prior.network(fit(IMAGE, prior.network_size)[0])
         assert found.shape == (1, 112, 168) and found.device == META
 
 

@@ -13,7 +13,6 @@ from tests.priors.networks import rebuilt
 pytestmark = pytest.mark.slow
 
 TOLERANCE = 2e-5  # the official code differs from its own float64 run by 3e-6
-CPU = torch.device("cpu")
 NETWORKS = {  # name: (position resize, names of the stored outputs)
     "dinov2_vits14": (False, "x_norm_patchtokens"),
     "dinov2_vits14_reg": (True, "x_norm_patchtokens"),
@@ -30,7 +29,7 @@ def weights(name: str) -> Weights:
 def tokens(name: str, height: int, width: int) -> Tokens:
     transformer = VisionTransformer(weights(name), NETWORKS[name][0])
     with torch.inference_mode():
-        return transformer(normalise(rebuilt.image(height, width), CPU))[0]
+        return transformer(normalise(rebuilt.image(height, width)))[0]
 
 
 # Known answers
@@ -65,7 +64,7 @@ def test_the_trained_size_needs_no_resize_of_the_positions():
 
 def test_the_other_position_resize_would_be_noticed():
     transformer = VisionTransformer(weights("dinov2_vits14"), True)
-    patches = transformer(normalise(rebuilt.image(56, 84), CPU))[0].patches[0].flatten(1).T
+    patches = transformer(normalise(rebuilt.image(56, 84)))[0].patches[0].flatten(1).T
     expected = rebuilt.golden("dinov2_vits14")["56x84/x_norm_patchtokens"]
     assert (patches - expected).abs().max() > 0.1
 
