@@ -51,7 +51,7 @@ class ClassicalFeatures:
         height, width = grid_size(image, STRIDE)
         lab = cv2.cvtColor(image.detach().cpu().float().numpy(), cv2.COLOR_RGB2LAB)
         channels = [*np.moveaxis(lab, -1, 0), *np.moveaxis(lab * lab, -1, 0)]
-        channels += oriented_edges(lab[..., 0], ORIENTATION_BINS)
+        channels += oriented_edges(lab[..., 0])
         cells = [cv2.resize(c, (width, height), interpolation=cv2.INTER_AREA) for c in channels]
         groups = [_describe(np.stack(cells, -1), side) for side in WINDOWS]
         features = torch.from_numpy(np.concatenate(groups, -1))
@@ -80,7 +80,7 @@ def _describe(
     mean, mean_square, edges = np.split(window, (3, 6), -1)
     contrast = np.sqrt(np.maximum(mean_square - mean * mean, 0.0))  # round-off may be < 0
     strength = edges.sum(-1, keepdims=True)
-    bins = edges.shape[-1]
+    bins = ORIENTATION_BINS
     # Without edges the orientation is noise, so the fractions then tend to 1 / bins.
     fraction = (edges + _EDGE_UNIT / bins) / (strength + _EDGE_UNIT) - 1 / bins
 
@@ -95,13 +95,13 @@ def _describe(
 
 def oriented_edges(
     brightness: np.ndarray,  # (H, W) float32
-    bins: int,
 ) -> list[np.ndarray]:  # per bin (H, W) float32, with the gradient magnitude per px as their sum
     """Split the gradient magnitude among orientation bins over 180 degrees, linearly."""
     # The 3x3 Sobel kernel sums to 8 per unit slope.
     du = cv2.Sobel(brightness, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     dv = cv2.Sobel(brightness, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
     magnitude, angle = cv2.cartToPolar(du, dv)
+    bins = ORIENTATION_BINS
     position = (angle * np.float32(bins / np.pi)) % bins  # in bins; opposite directions are one
     distances = (np.abs(position - k) for k in range(bins))
     return [magnitude * np.maximum(1 - np.minimum(d, bins - d), 0) for d in distances]

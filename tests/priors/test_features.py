@@ -9,8 +9,6 @@ from minislam.errors import InputError
 from minislam.priors.features import ClassicalFeatures, oriented_edges
 from tests.helpers import frame_of, generator
 
-BINS = 8
-
 
 def textured(seed: int, rgb: tuple[float, float, float], height: int = 240, width: int = 320):
     """Return a surface (H, W, 3) of one colour with blurred noise on it."""
@@ -38,17 +36,17 @@ def test_shape_is_one_vector_per_full_cell_and_length_is_sqrt_of_the_dimension()
 def test_a_vertical_ramp_falls_into_the_bin_of_ninety_degrees():
     # Brightness grows by 2 per row, so the gradient is (0, 2): bin 90 / 180 * 8 = 4.
     ramp = np.repeat(2.0 * np.arange(20, dtype=np.float32)[:, None], 20, 1)
-    edges = np.stack(oriented_edges(ramp, BINS), -1)[5:-5, 5:-5]
-    expected = np.zeros(BINS, np.float32)
+    edges = np.stack(oriented_edges(ramp), -1)[5:-5, 5:-5]
+    expected = np.zeros(8, np.float32)
     expected[4] = 2
     np.testing.assert_allclose(edges, np.broadcast_to(expected, edges.shape), atol=1e-3)
 
 
 def test_opposite_gradients_share_a_bin_and_bins_sum_to_the_magnitude():
     image = textured(1, (0.5, 0.5, 0.5))[..., 0] * 100
-    edges = oriented_edges(image, BINS)
+    edges = oriented_edges(image)
     # cv2 computes angles to about 0.01 degree, hence the tolerance.
-    np.testing.assert_allclose(edges, oriented_edges(-image, BINS), atol=0.02)
+    np.testing.assert_allclose(edges, oriented_edges(-image), atol=0.02)
     du = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     dv = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
     np.testing.assert_allclose(sum(edges), np.hypot(du, dv), rtol=1e-4, atol=1e-4)

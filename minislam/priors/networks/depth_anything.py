@@ -44,13 +44,12 @@ class DepthAnything:
         self._transformer = VisionTransformer(weights.below("pretrained."))
         self._head = weights.below("depth_head.")
 
+    @torch.no_grad()
     def __call__(self, frame: Frame, camera: Camera) -> Tensor:
         """Return the depth (H, W) in metres that the network sees in an image."""
-        with torch.no_grad():
-            seen = normalise(self._resized(frame.image).to(self.device))
-            depth = self.depth_limit * torch.sigmoid(self.network(seen))
-            full = resize(depth[None], frame.image.shape[:2])[0, 0]
-        return full.to(frame.image.device)
+        seen = normalise(self._resized(frame.image).to(self.device))
+        depth = self.depth_limit * torch.sigmoid(self.network(seen))
+        return resize(depth[None], frame.image.shape[:2])[0, 0].to(frame.image.device)
 
     def network(
         self,

@@ -74,11 +74,11 @@ class Metric3DDepth:
         metric = full * (camera.fx * scale / CANONICAL_FOCAL)
         return metric.clamp(0, FARTHEST).to(frame.image.device)
 
+    @torch.no_grad()
     def canonical_depth(self, image: Tensor) -> tuple[Tensor, float]:
         """Return the depth of a 1000 px camera at the network's scale, and that scale."""
-        with torch.no_grad():
-            padded, inside, scale = fit(image.to(self.device), self.network_size)
-            return self.network(padded)[0][inside], scale
+        padded, inside, scale = fit(image.to(self.device), self.network_size)
+        return self.network(padded)[0][inside], scale
 
     def network(
         self,

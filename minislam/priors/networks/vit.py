@@ -129,15 +129,14 @@ class DinoFeatures:
         self._transformer = VisionTransformer(weights, is_antialiased(weights))
         self.dimension = self._transformer.width
 
+    @torch.no_grad()
     def __call__(self, frame: Frame) -> Tensor:  # (H // 14, W // 14, C) float32
         """Return one feature per patch of 14 px; the image is stretched to whole patches."""
         image = frame.image
         rows, cols = grid_size(image, PATCH)
-        with torch.no_grad():
-            size = (PATCH * rows, PATCH * cols)
-            seen = normalise(image.to(self.device))
-            whole = functional.interpolate(seen, size, mode="bilinear")
-            patches = self._transformer(whole)[0].patches[0]
+        seen = normalise(image.to(self.device))
+        whole = functional.interpolate(seen, (PATCH * rows, PATCH * cols), mode="bilinear")
+        patches = self._transformer(whole)[0].patches[0]
         return patches.permute(1, 2, 0).to(image.device)
 
 
