@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.errors import InputError
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Frame
 
@@ -48,7 +47,7 @@ class ClassicalFeatures:
     ) -> Tensor:  # (H // stride, W // stride, C) float32, each of length sqrt(C)
         """Return one vector per cell; the cosine of two is the similarity of their surroundings."""
         image = frame.image
-        height, width = grid_size(image, STRIDE)
+        height, width = (side // STRIDE for side in image.shape[:2])
         lab = cv2.cvtColor(image.detach().cpu().float().numpy(), cv2.COLOR_RGB2LAB)
         channels = [*np.moveaxis(lab, -1, 0), *np.moveaxis(lab * lab, -1, 0)]
         channels += oriented_edges(lab[..., 0])
@@ -58,17 +57,6 @@ class ClassicalFeatures:
         # Unit length on average per channel: what an MLP with standard initialisation expects.
         length = features.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # never 0/0
         return (features / length * self.dimension**0.5).to(image.device)
-
-
-def grid_size(image: Tensor, stride: int) -> tuple[int, int]:
-    """Return how many whole cells of `stride` px an image (H, W, 3) has: rows, columns."""
-    rows, columns = image.shape[0] // stride, image.shape[1] // stride
-    if min(rows, columns) < 1:
-        raise InputError(
-            f"expected an image of at least {stride}x{stride} px for the features, found "
-            f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
-        )
-    return rows, columns
 
 
 def _describe(

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.errors import InputError
 from minislam.priors.features import ClassicalFeatures, oriented_edges
 from tests.helpers import frame_of, generator
 
@@ -102,11 +101,3 @@ def test_constant_images_give_finite_features_of_full_length(value: float):
 def test_a_single_cell_works():
     one_cell = frame_of(torch.rand(7, 7, 3, generator=generator(0)))
     assert ClassicalFeatures()(one_cell).shape[:2] == (1, 1)
-
-
-# Errors
-
-
-def test_an_image_smaller_than_a_cell_is_refused_in_one_sentence():
-    with pytest.raises(InputError, match=r"at least 7x7 px.*found 20x6"):
-        ClassicalFeatures()(frame_of(torch.zeros(6, 20, 3)))

@@ -11,7 +11,6 @@ output of an MLP on the token itself:
     x <- x + ls2 * fc2(gelu(fc1(norm2(x))))
 """
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from minislam.errors import InputError
-from minislam.priors.features import grid_size
 from minislam.priors.networks.checkpoints import Weights
 from minislam.records import Frame
 
@@ -106,7 +104,7 @@ def _transformer_block(weights: Weights, x: Tensor) -> Tensor:
     # Every token reads from all: softmax(q k^T / sqrt(64)) v, per head of 64 channels.
     qkv = weights.linear("attn.qkv", weights.layer_norm("norm1", x, _EPSILON))
     q, k, v = qkv.unflatten(-1, (3, -1, _HEAD_WIDTH)).permute(2, 0, 3, 1, 4)  # (B, heads, N, 64)
-    read = functional.scaled_dot_product_attention(q, k, v, scale=1 / math.sqrt(_HEAD_WIDTH))
+    read = functional.scaled_dot_product_attention(q, k, v)
     attended = weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
     x = x + weights["ls1.gamma"] * attended
     hidden = weights.linear("mlp.fc1", weights.layer_norm("norm2", x, _EPSILON))
@@ -133,9 +131,9 @@ class DinoFeatures:
     def __call__(self, frame: Frame) -> Tensor:  # (H // 14, W // 14, C) float32
         """Return one feature per patch of 14 px; the image is stretched to whole patches."""
         image = frame.image
-        rows, cols = grid_size(image, PATCH)
+        whole_patches = [side // PATCH * PATCH for side in image.shape[:2]]
         seen = normalise(image.to(self.device))
-        whole = functional.interpolate(seen, (PATCH * rows, PATCH * cols), mode="bilinear")
+        whole = functional.interpolate(seen, whole_patches, mode="bilinear")
         patches = self._transformer(whole)[0].patches[0]
         return patches.permute(1, 2, 0).to(image.device)
 

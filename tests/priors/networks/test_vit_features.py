@@ -5,7 +5,6 @@ from functools import cache
 import pytest
 import torch
 
-from minislam.errors import InputError
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.vit import DinoFeatures, is_antialiased
 from tests.helpers import frame_of
@@ -55,11 +54,3 @@ def test_features_can_be_trained_on_and_are_repeatable():
     weight = torch.ones(features.shape[-1], requires_grad=True)
     (features @ weight).sum().backward()  # an inference tensor would refuse
     assert torch.isfinite(weight.grad).all()
-
-
-# Errors
-
-
-def test_an_image_smaller_than_a_patch_is_refused():
-    with pytest.raises(InputError, match=r"at least 14x14 px .* found 13x20"):
-        DinoFeatures(weights("fit3d_reg_small"))(frame_of(torch.zeros(20, 13, 3)))
