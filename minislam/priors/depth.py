@@ -1,7 +1,6 @@
 """Metric depth of single images without a network: simulated, from a sensor, none.
 
-All are a `DepthPrior`: called with a frame and its camera they return z-depth (H, W) in world
-units, 0 where it is unknown, or None for a frame without depth.
+Each is a `DepthPrior`, as interfaces.py describes it.
 """
 
 from collections.abc import Callable

@@ -61,10 +61,10 @@ class DroidFlow(Stateful):
     stride = net.STRIDE
     learned_confidence = True
 
-    def __init__(self, weights: Weights, config: DroidFlowConfig | None = None) -> None:
+    def __init__(self, weights: Weights, config: DroidFlowConfig = DroidFlowConfig()) -> None:
         self.weights = weights
         self.update, self.damping = partial(net.update, weights), partial(net.damping, weights)
-        self.config = config or DroidFlowConfig()
+        self.config = config
         self._frames: dict[int, EncodedFrame] = {}
         self._edges: dict[tuple[int, int], EdgeState] = {}  # the last ones were used last
         self._dampings: dict[int, Tensor] = {}  # (N,) px^2

@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.images import resample
 from minislam.parameters import parameter
 from minislam.priors.networks.checkpoints import Weights, resize
 from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
@@ -69,8 +70,7 @@ class Metric3DDepth:
     def __call__(self, frame: Frame, camera: Camera) -> Tensor:
         """Return the depth (H, W) in metres of an image taken by a camera."""
         canonical, scale = self.canonical_depth(frame.image)
-        size = tuple(frame.image.shape[:2])
-        full = functional.interpolate(canonical[None, None], size, mode="bilinear")[0, 0]
+        full = resample(canonical, *frame.image.shape[:2])
         metric = full * (camera.fx * scale / CANONICAL_FOCAL)
         return metric.clamp(0, FARTHEST).to(frame.image.device)
 
