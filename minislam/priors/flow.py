@@ -5,7 +5,6 @@ Every flow starts from an expected one: the prediction of the geometry, or the l
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
@@ -23,7 +22,7 @@ from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
-THREADS = 2  # that compute flows side by side, without effect on the result
+_THREADS = ThreadPoolExecutor(2)  # compute flows side by side, without effect on the result
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ class ClassicalFlow(Stateful):
         # Each direction checks the other, so both are measured anew, or none.
         pairs = dict.fromkeys((min(edge), max(edge)) for edge in moved)
         both = ({e: starts[e] for e in ((i, j), (j, i)) if e in starts} for i, j in pairs)
-        for measured in _threads().map(self._measure, both):
+        for measured in _THREADS.map(self._measure, both):
             self._measured |= measured
         found = [self._measured[edge] for edge in edges]
         return as_matches(
@@ -160,7 +159,7 @@ class FlowChain(Stateful):
 
         # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
         # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
-        measured = _threads().map(follow, (self.flow, self.flow + self.increment))
+        measured = _THREADS.map(follow, (self.flow, self.flow + self.increment))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self.reference, gray, flow, flow - self.flow, self.config)
         return chain, as_matches([targets], [confidence], [texture], image)
@@ -169,8 +168,3 @@ class FlowChain(Stateful):
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
         standing = np.zeros_like(self.flow)
         return FlowChain(self.newest, self.newest, standing, self.increment, self.config)
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(THREADS)

@@ -1,7 +1,6 @@
 """Classical flow: known displacements between keyframes, and chains."""
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 
 import numpy as np
 import pytest
@@ -91,9 +90,9 @@ def test_a_backward_edge_that_is_matched_as_well_is_used(monkeypatch: pytest.Mon
 def test_the_number_of_threads_changes_nothing(other: int, monkeypatch: pytest.MonkeyPatch):
     images = [shifted(3 * d, -d, SIZE) for d in range(4)]
     sources, targets = [0, 1, 1, 2, 3, 0], [1, 0, 2, 3, 2, 3]
-    monkeypatch.setattr(flow_module, "_threads", cache(lambda: ThreadPoolExecutor(1)))
+    monkeypatch.setattr(flow_module, "_THREADS", ThreadPoolExecutor(1))
     one = flow_of(images).match(sources, targets, still(6))
-    monkeypatch.setattr(flow_module, "_threads", cache(lambda: ThreadPoolExecutor(other)))
+    monkeypatch.setattr(flow_module, "_THREADS", ThreadPoolExecutor(other))
     many = flow_of(images).match(sources, targets, still(6))
     assert torch.equal(one.targets, many.targets)
     assert torch.equal(one.confidences, many.confidences)
