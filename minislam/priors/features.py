@@ -116,9 +116,8 @@ class HighResolutionFeatures:
 
     def __call__(self, frame: Frame) -> Tensor:  # (factor * h', factor * w', C)
         """Return the features of a frame on the finer grid."""
-        height, width = frame.image.shape[:2]
-        patch_width = width / (width // self.extractor.stride)
-        patch_height = height / (height // self.extractor.stride)
+        stride = self.extractor.stride
+        patch_height, patch_width = (side / (side // stride) for side in frame.image.shape[:2])
         # A patch is cut into factor x factor parts; the shifts [patches] lead to their centres.
         shifts = [(part + 0.5) / self.factor - 0.5 for part in range(self.factor)]
 
@@ -142,7 +141,5 @@ def shift_image(
     motion = image.new_tensor([[1, 0, 2 * right / width], [0, 1, 2 * down / height]])
     batch = image.permute(2, 0, 1)[None]
     grid = functional.affine_grid(motion[None], list(batch.shape), align_corners=False)
-    shifted = functional.grid_sample(
-        batch, grid, mode="bilinear", padding_mode="border", align_corners=False
-    )
+    shifted = functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
     return shifted[0].permute(1, 2, 0).contiguous()
