@@ -169,4 +169,6 @@ def _decoded(content: bytes, mode: int) -> tuple[np.ndarray | None, bytes]:
         os.close(before)
         os.close(writer)
     with open(reader, "rb") as file:
-        return image, file.read()
+        said = file.read().splitlines(keepends=True)
+    # What libpng only warns of, such as a broken colour profile, does not touch the pixels.
+    return image, b"".join(line for line in said if not line.startswith(b"libpng warning"))

@@ -157,6 +157,35 @@ def test_what_a_decoder_says_stays_off_the_screen(tmp_path: Path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def png_chunk(kind: bytes, data: bytes, checksum: int | None = None) -> bytes:
+    checksum = zlib.crc32(kind + data) if checksum is None else checksum
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        2 * png_chunk(b"gAMA", struct.pack(">I", 45455)),  # twice
+        png_chunk(b"iCCP", b"icc\0\0" + zlib.compress(bytes(200))),  # no profile
+        png_chunk(b"tEXt", b"Author\0me", checksum=5),  # a wrong one
+    ],
+    ids=["gamma", "profile", "text"],
+)
+def test_a_png_whose_notes_are_wrong_is_a_whole_picture(note: bytes, tmp_path: Path, capfd):
+    content = save(tmp_path / "a.png", picture(0)).read_bytes()
+    (tmp_path / "noted.png").write_bytes(content[:33] + note + content[33:])
+    np.testing.assert_array_equal(read_color(tmp_path / "noted.png"), picture(0))
+    assert capfd.readouterr().err == ""
+
+
+def test_a_png_with_a_flipped_byte_in_its_pixels_is_refused(tmp_path: Path):
+    content = bytearray(save(tmp_path / "a.png", picture(0)).read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.png .* is damaged"):
+        read_color(tmp_path / "a.png")
+
+
 def test_a_header_that_claims_ten_giga_pixels_is_refused(tmp_path: Path):
     content = bytearray(save(tmp_path / "a.png", picture(0)).read_bytes())
     content[16:24] = struct.pack(">II", 100_000, 100_000)
