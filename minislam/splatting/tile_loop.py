@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from minislam.geometry import Camera
 from minislam.splatting import compositing
@@ -49,11 +50,9 @@ def composite_image(
     g = visible
     lists = build_tile_lists(g.means2d, g.conics, g.covariances2d, g.opacities, camera)
     # Padding slots take their values from an additional last row or column.
-    channels = torch.cat([channels, channels.new_zeros(1, 4)])
-    padding = channels.new_zeros(6, 1)
-    padding[5] = _LOG_OPACITY_OF_PADDING
-    table = torch.cat([g.means2d, g.conics, g.opacities.log()[None]])
-    table = torch.cat([table, padding], 1)
+    channels = pad(channels, (0, 0, 0, 1))
+    table = pad(torch.cat([g.means2d, g.conics, g.opacities.log()[None]]), (0, 1))
+    table[5, -1] = _LOG_OPACITY_OF_PADDING
 
     centres = tile_centres(camera, channels)
     inside = to_tiles(channels.new_ones(1, camera.height, camera.width), camera)[:, 0]
