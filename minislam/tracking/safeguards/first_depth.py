@@ -4,11 +4,11 @@ The paper starts from the depth prior, so it needs neither.
 """
 
 import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.geometry.distortion import camera_matrix
+from minislam.geometry.se3 import make_transform
 from minislam.tracking.grid import Grid
 
 ESSENTIAL_THRESHOLD = 0.7  # px, RANSAC inlier distance to the epipolar line
@@ -59,6 +59,5 @@ def essential_disparities(
     if essential is None or essential.shape != (3, 3):
         return None
     _, rotation, translation, _ = cv2.recoverPose(essential, source, target, matrix, mask=inliers)
-    T_target_source = np.eye(4)
-    T_target_source[:3, :3], T_target_source[:3, 3] = rotation, translation[:, 0]
-    return triangulate(grid, torch.from_numpy(T_target_source), targets, confident)
+    motion = torch.from_numpy(rotation), torch.from_numpy(translation[:, 0])
+    return triangulate(grid, make_transform(*motion), targets, confident)
