@@ -174,7 +174,6 @@ class MappingHistory:
 
     def add(self, parts: list[float], uncertainty: float, gaussians: int) -> None:
         """Append one iteration, with the first four numbers in `parts`."""
-        for column, value in zip(
-            vars(self).values(), [*parts, uncertainty, gaussians], strict=True
-        ):
+        row = [*parts, uncertainty, gaussians]
+        for column, value in zip(vars(self).values(), row, strict=True):
             column.append(value)

@@ -112,10 +112,9 @@ class MapOptimizer(Stateful):
     def __init__(self, gaussians: GaussianMap, rates: LearningRates) -> None:
         self.rates = rates
         self._set_rows(gaussians)
-        parameters = self.gaussians.parameters
-        self._first = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
-        self._second = {name: torch.zeros_like(p.detach()) for name, p in parameters.items()}
-        self._steps = torch.zeros_like(parameters["opacity_logits"].detach())  # (N,)
+        self._first = {name: torch.zeros_like(p) for name, p in gaussians.parameters.items()}
+        self._second = {name: torch.zeros_like(p) for name, p in gaussians.parameters.items()}
+        self._steps = torch.zeros_like(gaussians.opacity_logits)
 
     def _set_rows(self, gaussians: GaussianMap) -> None:
         leaves = [t.detach().clone().requires_grad_() for t in gaussians.parameters.values()]
@@ -143,11 +142,6 @@ class MapOptimizer(Stateful):
             denominator = (second.sqrt() / correction2.view(rows)).add_(self.EPSILON)
             rate = getattr(self.rates, name) / correction1.view(rows)
             values.sub_(rate * first / denominator)
-        self.zero_grad()
-
-    def zero_grad(self) -> None:
-        """Drop the gradients of all parameters."""
-        for values in self.gaussians.parameters.values():
             values.grad = None
 
     def append(self, new: GaussianMap) -> None:

@@ -15,7 +15,6 @@ def test_the_gradients_are_those_of_the_loss_of_one_keyframe(exposure):
     mapper.initialise([wall_keyframe(0)])
     mapper.keyframes[0].exposure = exposure
     keyframe, gaussians = mapper.keyframes[0], mapper._optimizer.gaussians
-    mapper._optimizer.zero_grad()
     share = view_gradients(*mapper._call(keyframe, CAMERA, trains=False))
     assert all(parameter.grad is None for parameter in gaussians.parameters.values())
 
