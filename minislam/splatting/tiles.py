@@ -60,7 +60,7 @@ def build_tile_lists(
     means2d: Tensor,  # (2, N) px, front to back
     conics: Tensor,  # (3, N) px^-2
     covariances2d: Tensor,  # (3, N) px^2
-    opacities: Tensor,  # (N,)
+    opacities: Tensor,  # (N,) above MIN_ALPHA
     camera: Camera,
 ) -> list[TileGroup]:
     """List the Gaussians of every tile, keeping their order from front to back."""
@@ -96,15 +96,13 @@ def _entries(
     """
     # The small constant keeps pairs that rounding may lift over the threshold.
     level = 2 * (opacities / MIN_ALPHA).log() + 1e-3
-    visible = level > 0
-    level = level.clamp_min(0)
     half_height = (level * covariances2d[2]).sqrt()
     top = (means2d[1] - half_height).ceil().clamp(0, camera.height)
     bottom = (means2d[1] + half_height).floor().clamp(-1, camera.height - 1)
     # long() rounds a negative bound up, which does no harm because the count is zero there.
     first_row = (top / TILE).long()
     row_count = (bottom / TILE).long() - first_row + 1
-    row_count = torch.where(visible & (top <= bottom), row_count, 0)
+    row_count = torch.where(top <= bottom, row_count, 0)
     gaussian, row = _expand(first_row, row_count)
 
     left, right = _column_spans(means2d, conics, covariances2d, level, top, bottom, gaussian, row)
