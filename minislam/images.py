@@ -67,9 +67,7 @@ def resample(
     Both cover the image evenly: on an image of W px, the centre of column j of w' columns lies at
     (j + 0.5) W / w' - 0.5. Nothing is smoothed before a resampling to fewer cells.
     """
-    batch = values[None, None]
-    resampled = functional.interpolate(batch, (height, width), mode="bilinear", align_corners=False)
-    return resampled[0, 0]
+    return functional.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]
 
 
 def shrink_image(image: Tensor, height: int, width: int) -> Tensor:
