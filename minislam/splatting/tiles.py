@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -66,8 +67,7 @@ def build_tile_lists(
     """List the Gaussians of every tile, keeping their order from front to back."""
     gaussian, tile = _entries(means2d, conics, covariances2d, opacities, camera)
     rows, columns = tile_grid(camera)
-    order = tile.int().argsort(stable=True)  # 32 bits are sorted twice as fast as 64
-    gaussian = gaussian.index_select(0, order)
+    gaussian = gaussian.index_select(0, stable_argsort(tile))
     counts = torch.bincount(tile, minlength=rows * columns)
     starts = counts.cumsum(0) - counts
 
@@ -155,3 +155,13 @@ def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     starts = count.cumsum(0) - count
     within = torch.arange(len(index), device=index.device) - (starts - first).index_select(0, index)
     return index, within
+
+
+def stable_argsort(keys: Tensor) -> Tensor:  # (N,) integers in [0, 2^31) -> (N,) int64
+    """Return the stable sorting order of integers."""
+    if keys.device.type != "cpu":
+        return keys.argsort(stable=True)
+    # With its place in the lower half of each key any sort is stable. That of numpy is ten times
+    # as fast as a stable one.
+    keys = keys.long() << 32 | torch.arange(len(keys))
+    return torch.from_numpy(np.sort(keys.numpy())) & 0xFFFFFFFF

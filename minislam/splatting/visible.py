@@ -17,6 +17,7 @@ from minislam.splatting.constants import (
     tangent_limits,
 )
 from minislam.splatting.covariance import covariance_factors, covariance_factors_vjp
+from minislam.splatting.tiles import stable_argsort
 
 # px. The determinant of Sigma' grows with the fourth power of it, and float32 ends at 1e38.
 _MAX_RADIUS = 1e8
@@ -133,9 +134,10 @@ def _visible_front_to_back(
     # A diverged scale would overflow to NaN, and one NaN spoils the pose gradient.
     visible = in_front & near_u & near_v & (radius < _MAX_RADIUS) & (opacities > MIN_ALPHA)
     rows = visible.nonzero()[:, 0]
-    # Positive floats are in the order of their bits, and torch sorts integers ten times as fast.
-    bits = z.index_select(0, rows).view(torch.int32 if z.dtype == torch.float32 else torch.int64)
-    return rows.index_select(0, bits.argsort(stable=True))
+    z = z.index_select(0, rows)
+    if z.dtype != torch.float32:
+        return rows.index_select(0, z.argsort(stable=True))
+    return rows.index_select(0, stable_argsort(z.view(torch.int32)))  # the bits are in order, too
 
 
 def _largest_radius(scales: Tensor, inverse_z: Tensor, camera: Camera) -> Tensor:  # (N,) px
