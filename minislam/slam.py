@@ -256,8 +256,6 @@ class Slam(Stateful):
             result.append(record)
         return result
 
-    # Results ------------------------------------------------------------------------------
-
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames that were not lost; before the end, those of keyframes."""
         if not self._poses:
