@@ -163,7 +163,7 @@ def check_map_loss(student: Function) -> Verdict:
         none = depth.new_zeros(len(scales))
         points, quats = none[:, None].expand(-1, 3), none[:, None].expand(-1, 4)
         gaussians = GaussianMap(points, quats, scales.log(), none, points, none.long())
-        rendering = Rendering(color, depth, torch.zeros_like(depth), none, none)
+        rendering = Rendering(color, depth, torch.zeros_like(depth), none)
         view = image, reference_depth, weight
         loss = render_loss(gaussians, rendering, *view, METRIC_MEDIAN, config)
         unknown = (reference_depth == 0).double()

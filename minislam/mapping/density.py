@@ -19,7 +19,7 @@ PRUNE_SCALE = 0.2  # median depths: larger ones are removed, official 0.6 m
 
 def screen_gradients(
     v_screen: Tensor,  # (N, 2) dL/d(pixel)
-    radii: Tensor,  # (N,) px, 0 where not seen
+    weight_sums: Tensor,  # (N,) px, 0 where not seen
     camera: Camera,
 ) -> Tensor:  # (2, N)
     """Return the length of dL/d(projected mean) in a view, 0 where not seen, and 1 where seen.
@@ -27,7 +27,7 @@ def screen_gradients(
     The unit of length is half an image, so that one threshold holds for every image size.
     """
     half_image = v_screen.new_tensor([camera.width / 2, camera.height / 2])
-    seen = (radii > 0).to(v_screen)
+    seen = (weight_sums > 0).to(v_screen)
     return torch.stack([seen * (v_screen * half_image).norm(dim=-1), seen])
 
 

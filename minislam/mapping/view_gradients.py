@@ -46,7 +46,7 @@ def view_gradients(
     loss = render_loss(gaussians, rendering, *reference)
     *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])
     by_parameter = dict(zip(inputs, gradients, strict=True))
-    screen = screen_gradients(by_pixel, rendering.radii, camera)
+    screen = screen_gradients(by_pixel, rendering.weight_sums, camera)
     parts = torch.stack([loss.total, loss.color, loss.depth, loss.isotropic])  # one transfer
     error = keyframe_rendering_error(rendering, comparison) if comparison else None
     return ViewGradients(by_parameter, screen, parts.tolist(), error)

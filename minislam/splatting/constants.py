@@ -25,8 +25,7 @@ class Rendering(NamedTuple):
     color: Tensor  # (H, W, 3)
     depth: Tensor  # (H, W) sum of weight * z in world units, NOT divided by the opacity
     opacity: Tensor  # (H, W) in [0, 1], 1 - transmittance
-    radii: Tensor  # (N,) px, three standard deviations in the image; 0 where invisible
-    weight_sums: Tensor  # (N,) px, blending weight T alpha of a Gaussian, summed over all pixels
+    weight_sums: Tensor  # (N,) px, blending weight T alpha summed over all pixels; 0: invisible
 
 
 def tangent_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:

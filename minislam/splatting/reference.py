@@ -50,10 +50,7 @@ def render_reference(
 
     weight_sums = torch.zeros_like(gaussians.opacities.detach())
     weight_sums[rows] = weights.detach().sum((1, 2))
-    radii = torch.zeros_like(weight_sums)
-    radii[rows] = 3 * torch.linalg.eigvalsh(covariances2d.detach())[:, 1].sqrt()
-    radii = radii * (weight_sums > 0)
-    return Rendering(image[..., :3], image[..., 3], 1 - transmittance, radii, weight_sums)
+    return Rendering(image[..., :3], image[..., 3], 1 - transmittance, weight_sums)
 
 
 def project_gaussians(

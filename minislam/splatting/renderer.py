@@ -66,7 +66,7 @@ class _Render(torch.autograd.Function):
         T: Tensor,  # (4, 4) camera_world
         background: Tensor,  # (4,) RGB and depth
         camera: Camera,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         if twist is not None and twist.any():
             T = se3_exp(twist).to(T) @ T
         with _denormals_flushed():
@@ -74,14 +74,13 @@ class _Render(torch.autograd.Function):
             channels = colors.index_select(0, visible.rows)
             channels = torch.cat([channels, visible.points_camera[2:].T], 1)
             image = composite_image(visible, channels, background, camera)
-        per_gaussian = means.new_zeros(2, len(means))
-        per_gaussian[0, visible.rows] = visible.radii * (image.weight_sums > 0)
-        per_gaussian[1, visible.rows] = image.weight_sums
+        weight_sums = means.new_zeros(len(means))
+        weight_sums[visible.rows] = image.weight_sums
         color = image.channels[:3].permute(1, 2, 0).contiguous()
-        outputs = color, image.channels[3].clone(), image.opacity, per_gaussian[0], per_gaussian[1]
+        outputs = color, image.channels[3].clone(), image.opacity, weight_sums
         tiles = image.groups, image.workspace
         ctx.state = visible, tiles, T, background, camera, len(means), twist
-        ctx.mark_non_differentiable(*outputs[3:])
+        ctx.mark_non_differentiable(weight_sums)
         return outputs
 
     @staticmethod
@@ -91,7 +90,6 @@ class _Render(torch.autograd.Function):
         v_color: Tensor,  # (H, W, 3)
         v_depth: Tensor,  # (H, W)
         v_opacity: Tensor,  # (H, W)
-        _v_radii: Tensor,
         _v_weight_sums: Tensor,
     ) -> tuple[Tensor | None, ...]:
         visible, (groups, workspace), T, background, camera, count, twist = ctx.state

@@ -37,13 +37,6 @@ class VisibleGaussians(NamedTuple):
     conics: Tensor  # (3, V) a, b, c of Q = [[a, b], [b, c]]
     covariances2d: Tensor  # (3, V) xx, xy, yy of Sigma'
 
-    @property
-    def radii(self) -> Tensor:
-        """Return three standard deviations along the longer axis, (V,) px."""
-        xx, xy, yy = self.covariances2d
-        largest = (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-        return 3 * largest.sqrt()
-
 
 class VisibleGradients(NamedTuple):
     """dL/d of the visible Gaussians' parameters, in the order of `VisibleGaussians.rows`."""

@@ -32,8 +32,8 @@ def over_three_views(means: torch.Tensor) -> torch.Tensor:
 
 def test_screen_gradient_is_in_half_images_and_counts_only_views_that_see():
     camera = Camera(10.0, 10.0, 4.0, 2.0, 20, 10)
-    radii = torch.tensor([2.0, 0.0])
-    first = screen_gradients(torch.tensor([[0.3, 0.4], [1.0, 1.0]]), radii, camera)
+    weight_sums = torch.tensor([2.0, 0.0])
+    first = screen_gradients(torch.tensor([[0.3, 0.4], [1.0, 1.0]]), weight_sums, camera)
     # |(0.3 * 10, 0.4 * 5)| = sqrt(13).
     torch.testing.assert_close(first, torch.tensor([[13**0.5, 0.0], [1.0, 0.0]]))
 

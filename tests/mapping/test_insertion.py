@@ -19,7 +19,7 @@ CONFIG = InsertionConfig()
 
 
 def rendering_with(depth: torch.Tensor, opacity: torch.Tensor) -> Rendering:
-    return Rendering(torch.zeros(*depth.shape, 3), depth, opacity, torch.ones(1), torch.ones(1))
+    return Rendering(torch.zeros(*depth.shape, 3), depth, opacity, torch.ones(1))
 
 
 # Known answers

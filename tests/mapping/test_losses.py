@@ -65,7 +65,7 @@ def one_gaussian() -> GaussianMap:
 
 
 def rendering_of(color: torch.Tensor, depth: torch.Tensor) -> Rendering:
-    return Rendering(color, depth, torch.ones_like(depth), torch.ones(1), torch.ones(1))
+    return Rendering(color, depth, torch.ones_like(depth), torch.ones(1))
 
 
 # Identities

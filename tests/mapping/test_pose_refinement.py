@@ -129,7 +129,7 @@ def test_no_step_raises_the_rendering_error():
 def random_rendering(seed: int) -> Rendering:
     values = torch.rand(5, 6, 5, generator=generator(seed), dtype=torch.float64)
     empty = torch.zeros(0, dtype=torch.float64)
-    return Rendering(values[..., :3], 1 + values[..., 3], values[..., 4], empty, empty)
+    return Rendering(values[..., :3], 1 + values[..., 3], values[..., 4], empty)
 
 
 def test_loss_gradient_agrees_with_finite_differences_and_opacity_is_held():

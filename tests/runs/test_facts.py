@@ -128,5 +128,5 @@ def test_without_the_counter_of_unix_the_package_still_imports():
 def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():
     # Rendered depth is a sum over blending weights: 1.8 at an opacity of 0.9 is a surface at 2.
     depth, opacity = torch.tensor([[1.8, 0.4]]), torch.tensor([[0.9, 0.2]])
-    rendering = Rendering(torch.zeros(1, 2, 3), depth, opacity, torch.ones(1), torch.ones(1))
+    rendering = Rendering(torch.zeros(1, 2, 3), depth, opacity, torch.ones(1))
     torch.testing.assert_close(facts.surface_depth(rendering), torch.tensor([[2.0, 0.0]]))
