@@ -71,7 +71,6 @@ class AdjustmentCount:
 
     count: int = 0
     failed: int = 0
-    last_reason: str = ""  # of the last failure
 
 
 @dataclass(frozen=True)
@@ -167,13 +166,11 @@ class MappingHistory:
 
     render: list[float] = field(default_factory=list)  # L_render
     color: list[float] = field(default_factory=list)  # weighted L_color
-    depth: list[float] = field(default_factory=list)  # weighted L_depth
-    isotropic: list[float] = field(default_factory=list)  # L_iso
     uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
     gaussians: list[int] = field(default_factory=list)  # size of the map
 
     def add(self, parts: list[float], uncertainty: float, gaussians: int) -> None:
-        """Append one iteration, with the first four numbers in `parts`."""
+        """Append one iteration, with L_render and L_color in `parts`."""
         row = [*parts, uncertainty, gaussians]
         for column, value in zip(vars(self).values(), row, strict=True):
             column.append(value)

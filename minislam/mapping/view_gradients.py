@@ -20,7 +20,7 @@ class ViewGradients:
 
     by_parameter: dict[str, Tensor]  # dL_render/d(parameter), by its name in the map
     screen: Tensor  # (2, N) `screen_gradients`
-    losses: list[float]  # L_render, its colour, its depth, L_iso
+    losses: list[float]  # L_render, and its colour
     error: RenderingError | None  # that the MLP learns from
 
 
@@ -47,6 +47,6 @@ def view_gradients(
     *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.weight_sums, camera)
-    parts = torch.stack([loss.total, loss.color, loss.depth, loss.isotropic])  # one transfer
+    parts = torch.stack([loss.total, loss.color])  # one transfer
     error = keyframe_rendering_error(rendering, comparison) if comparison else None
     return ViewGradients(by_parameter, screen, parts.tolist(), error)

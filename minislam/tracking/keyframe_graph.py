@@ -95,8 +95,7 @@ class KeyframeGraph(Stateful):
         """Count an adjustment; a run warns at its end of those that failed."""
         before = self.adjustments
         failed = before.failed + (not report.converged)
-        reason = before.last_reason if report.converged else report.reason
-        self.adjustments = AdjustmentCount(before.count + 1, failed, reason)
+        self.adjustments = AdjustmentCount(before.count + 1, failed)
 
     def append(
         self,

@@ -207,5 +207,4 @@ def test_adjustments_that_all_fail_are_counted_and_keep_the_state(monkeypatch: p
     adjust(graph, first_free=2, iterations=3)
     final_global_ba(graph)
     assert graph.adjustments.failed == 1 + graph.config.final_rounds
-    assert "singular" in graph.adjustments.last_reason
     assert_same_bits(graph.state, before)
