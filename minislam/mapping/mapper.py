@@ -14,7 +14,13 @@ from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
-from minislam.mapping.safeguards import FIRST_VIEWS, LEAST_VIEWS, least_weight
+from minislam.mapping.safeguards import (
+    FIRST_VIEWS,
+    LEAST_STATIC,
+    LEAST_VIEWS,
+    blending_weights,
+    least_weight,
+)
 from minislam.mapping.views import MappedKeyframe, median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
@@ -91,7 +97,8 @@ class Mapper(JointOptimisation):
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size.
 
-        Half way, what is now known to move is excluded. A resumed run goes on after what is done.
+        Half way, what is now known to move is excluded; at the end, what nothing static shows. A
+        resumed run goes on after what is done.
         """
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
@@ -102,6 +109,8 @@ class Mapper(JointOptimisation):
             if half >= LEAST_VIEWS * len(self.keyframes):
                 self._exclude_upper_mode()
         self._optimise(*how, range(max(done, half), iterations))
+        if self.uncertainty.enabled:
+            self._remove_unsupported()
         self.shown = [self._shown_fraction(keyframe) for keyframe in self.keyframes]
 
     def refine_poses(
@@ -161,6 +170,21 @@ class Mapper(JointOptimisation):
         if least > self.least_weight and self.uncertainty.enabled:
             self.least_weight = least
             self._replace_dynamic_gaussians()
+
+    def _remove_unsupported(self) -> None:
+        """Remove Gaussians that hardly any static pixel shows: no image speaks for them.
+
+        They were inserted on an object that moves, before the MLP knew, and where it always covers
+        the view no weight has pulled at them since.
+        """
+        sums = self.gaussians.means.new_zeros(2, len(self.gaussians))
+        camera = self._online_camera
+        for keyframe in self.keyframes:
+            weight = self.static_weight(self.beta_of(keyframe), camera)
+            sums += blending_weights(self.gaussians, camera, keyframe.T_camera_world, weight)
+        static, whole = sums
+        self._optimizer.prune(static >= LEAST_STATIC * whole)
+        self._reset_gradients()
 
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""

@@ -146,6 +146,14 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("tracking/safeguards/first_frame.py", "tracking/safeguards/test_first_frame.py"): [
         ("lost >= len(followed)", "lost > len(followed)"),
     ],
+    ("mapping/safeguards.py", "mapping/test_safeguards.py"): [
+        ("[weight > 0].sum()", ".sum()"),
+        ("[weight > 0].sum()", "[weight == 0].sum()"),
+    ],
+    ("mapping/mapper.py", "mapping/test_safeguards.py"): [
+        ("self._remove_unsupported()", "pass"),
+        ("static >= LEAST_STATIC * whole", "static < LEAST_STATIC * whole"),
+    ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
         ("weak >= LONG or _is", "_is"),
         ("or held < MIN_CONTINUITY", ""),
@@ -157,6 +165,9 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("max(holding)", "min(holding)"),
         ("min(agreeing,", "max(agreeing,"),
         ("index - last <= HEALED_AFTER", "False"),
+        ("if target == source + 1", "if target == source - 9"),
+        ("infinitely_far), POSE_ITERATIONS", "infinitely_far), 0"),
+        ("infinitely_far = grid.rays.new_zeros(", "infinitely_far = grid.rays.new_ones("),
     ],
     ("tracking/disparity_prior.py", "tracking/test_disparity_prior.py"): [
         ("(depth > 0) & (warped > 0)", "(warped > 0)"),

@@ -4,7 +4,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from minislam.mapping.safeguards import confirmed_beta, doubted_error, least_weight
+from minislam.mapping.safeguards import (
+    blending_weights,
+    confirmed_beta,
+    doubted_error,
+    least_weight,
+)
 from minislam.uncertainty import RenderingError
 from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
@@ -101,3 +106,35 @@ def test_a_refinement_that_is_resumed_half_way_ends_at_the_same_map():
     resumed.refine(48, None, 24)
     assert resumed.least_weight == whole.least_weight
     assert torch.equal(resumed.gaussians.means, whole.gaussians.means)
+
+
+# What nothing static shows
+
+
+def test_the_blending_weights_of_two_parts_of_a_view_are_those_of_all():
+    mapper, pose = make_mapper(), wall_keyframe(1).T_camera_world
+    mapper.initialise([wall_keyframe(0), wall_keyframe(2)])
+    left = torch.zeros(CAMERA.height, CAMERA.width)
+    left[:, : CAMERA.width // 3] = 0.5  # any weight but 0 is static
+    parts = [blending_weights(mapper.gaussians, CAMERA, pose, w) for w in (left, (left == 0) * 1.0)]
+    torch.testing.assert_close(parts[0][0] + parts[1][0], parts[0][1], atol=1e-4, rtol=1e-4)
+    assert torch.equal(parts[0][1], mapper.render(pose).weight_sums)
+    pixels = CAMERA.project(mapper.gaussians.means.detach() @ pose[:3, :3].T.float() + pose[:3, 3])
+    is_far_right = pixels[:, 0] > CAMERA.width / 2
+    assert parts[0][0][is_far_right].max() < 1e-3 < parts[1][0][is_far_right].max()
+
+
+@pytest.mark.slow
+def test_what_only_moving_pixels_show_leaves_the_map_at_the_end():
+    on_the_right = torch.arange(CAMERA.width).expand(CAMERA.height, CAMERA.width) >= 20
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+    before = len(mapper.gaussians)
+    mapper.refine(0)
+    assert len(mapper.gaussians) >= 0.98 * before
+    for keyframe in mapper.keyframes:
+        keyframe.given_beta = torch.where(on_the_right, 4.0, 0.1)
+    mapper.refine(0)
+    pose = mapper.keyframes[0].T_camera_world
+    seen = [mapper.render(pose).opacity[:, columns] for columns in (slice(2, 16), slice(27, None))]
+    assert seen[0].min() > 0.8 and seen[1].max() < 0.1

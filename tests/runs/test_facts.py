@@ -20,8 +20,9 @@ def slam(**parts: object) -> SimpleNamespace:
     """Return a finished run of four frames without anything to warn of, but for these parts."""
     failed = parts.pop("failed", 0)
     graph = SimpleNamespace(
-        adjustments=AdjustmentCount(2 + failed, failed, "singular" if failed else ""),
+        adjustments=AdjustmentCount(2 + failed, failed),
         least_parallax=1.0,
+        pixel_scale=1.0,
         seeks_focal=parts.pop("seeks_focal", False),
         focal_is_free=parts.pop("focal_is_free", False),
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
@@ -32,6 +33,7 @@ def slam(**parts: object) -> SimpleNamespace:
         graph=graph,
         watch=SimpleNamespace(
             diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
+            parallax=parts.pop("between", 3.0),
             breaks=parts.pop("breaks", []),
             segments=[(0, 1), (3, 3)],
         ),
@@ -74,6 +76,16 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
     assert not list(facts._warnings(slam()))
     (warning,) = facts._warnings(slam(**parts))
     assert words in warning
+
+
+def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_depth():
+    weak = {"between": 0.9 * facts.WEAK_PARALLAX}
+    assert not list(facts._warnings(slam(**weak)))
+    warning, _ = facts._warnings(slam(**weak, has_prior=False))
+    assert "only 0.45 px of the flow, in the median, are more than a turn" in warning
+    assert len(list(facts._warnings(slam(between=None, has_prior=False)))) == 1
+    warning, _ = facts._warnings(slam(**weak, has_prior=False, parallax=[0.1]))  # said once
+    assert "hardly any parallax" in warning
 
 
 @pytest.mark.parametrize(

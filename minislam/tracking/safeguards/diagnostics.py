@@ -8,17 +8,20 @@ large dynamic object takes the place of the scene, hardly anything that held the
 holds this one, or what is left of it does not fit.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.state.stateful import Stateful
-from minislam.tracking.bundle_adjustment import residuals
+from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, residuals
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.pose_from_flow import POSE_ITERATIONS, motion_only_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
@@ -35,6 +38,7 @@ MIN_CONTINUITY = 0.007  # of the view; healthy .009 to .5, broken 0 to .006
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MIN_EVIDENCE = 0.005  # of the view, for an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
+MOST_PAIRS = 100  # of neighbouring keyframes, which tell the parallax of a whole clip
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class Watch(Stateful):
 
     diagnostics: list[KeyframeDiagnostics]
     breaks: list[Break]  # known at the end, because the newest depths are rough
+    parallax: float | None = None  # px, at the end: `parallax_between_neighbours`
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._graph = graph
@@ -77,6 +82,7 @@ class Watch(Stateful):
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
         self.breaks = find_breaks(self.diagnostics)
+        self.parallax = parallax_between_neighbours(self._graph)
 
     @property
     def segments(self) -> list[tuple[int, int]]:
@@ -188,6 +194,32 @@ def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
         before = keyframes.motion_weights[keyframe - 1]
         weight = weight * inherit_motion_weight(graph.grid, matches, before)
     return weight if keyframes.overlay is None else weight * keyframes.overlay
+
+
+def parallax_between_neighbours(graph: KeyframeGraph) -> float | None:  # px
+    """Return the flow between neighbouring keyframes that no turn of the camera explains.
+
+    A turn moves all points as if they were infinitely far away. The best one takes the place of any
+    translation that looks like it, so that what is left, in the median, tells depth. It asks the
+    flow alone: poses that are wrong can claim any parallax. None: no link.
+    """
+    grid, links, keyframes = graph.grid, graph.links, graph.keyframes
+    pairs = [p for p, (source, target) in enumerate(links.edges) if target == source + 1]
+    pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)] if pairs else []
+    if not pairs:
+        return None
+    weights = [links.confidences[p] * keyframes.cell_weights[links.edges[p][0]] for p in pairs]
+    numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
+    ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
+    measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
+    problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
+    poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
+    infinitely_far = grid.rays.new_zeros(len(numbers), len(grid.rays))
+    turned, _ = bundle_adjust(problem, BundleState(poses, infinitely_far), POSE_ITERATIONS)
+    left = lengths(residuals(problem, turned)[0])
+    medians = [weighted_median(*pair) for pair in zip(left, problem.weights[:, 0], strict=True)]
+    known = [median for median in medians if median is not None]
+    return float(np.median(known)) if known else None
 
 
 def is_unexplained(newest: KeyframeDiagnostics) -> bool:

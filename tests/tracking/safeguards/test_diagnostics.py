@@ -9,6 +9,7 @@ import torch
 from minislam.geometry import se3_exp
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust
 from minislam.tracking.safeguards.diagnostics import (
     Break,
@@ -18,6 +19,7 @@ from minislam.tracking.safeguards.diagnostics import (
     diagnose,
     find_breaks,
     is_unexplained,
+    parallax_between_neighbours,
     weight_so_far,
 )
 from minislam.tracking.safeguards.motion_memory import judge_all
@@ -140,6 +142,40 @@ def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
     before = graph.keyframes.disparities.clone()
     adjust(graph, first_free=2, iterations=3)
     assert torch.equal(graph.keyframes.disparities, before)
+
+
+def seen_moving(positions: torch.Tensor) -> KeyframeGraph:
+    """Return two keyframes between which the cells move to positions (N, 2)."""
+    graph = true_graph([0, 1])
+    graph.match([(0, 1), (1, 0)])
+    graph.links.targets[0] = positions.T.float()
+    graph.links.confidences[0] = torch.ones_like(graph.links.targets[0])
+    return graph
+
+
+def test_a_turn_is_no_parallax_whatever_the_poses_claim():
+    turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
+    graph = seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
+    assert parallax_between_neighbours(graph) < 1e-3 < 3 < diagnose(graph, 1).parallax
+
+
+def test_walking_ahead_is_parallax_that_no_turn_explains():
+    from_centre = GRID.pixels - GRID.pixels.new_tensor([CAMERA.cx, CAMERA.cy])
+    found = parallax_between_neighbours(seen_moving(GRID.pixels + 0.05 * from_centre))
+    assert found == pytest.approx(0.05 * float(from_centre.norm(dim=1).median()), rel=0.05)
+
+
+def test_sliding_along_a_far_wall_looks_like_a_turn():
+    slid = GRID.pixels + GRID.pixels.new_tensor([5.0, 0.0])
+    assert parallax_between_neighbours(seen_moving(slid)) < 0.2 * 5
+
+
+def test_without_links_or_weight_there_is_no_parallax():
+    assert parallax_between_neighbours(true_graph([0, 1])) is None
+    graph = true_graph([0, 1])
+    graph.match([(0, 1), (1, 0)])
+    graph.keyframes.static_weights.zero_()
+    assert parallax_between_neighbours(graph) is None
 
 
 def test_a_keyframe_without_links_is_reported_as_such():
