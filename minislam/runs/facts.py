@@ -207,8 +207,9 @@ def _warnings(slam: Slam) -> Iterator[str]:
         yield (
             f"the trajectory is broken at frames {where}: motion or depth contradicts the images, "
             "or the camera follows something that came into view. "
-            f"Before and after, scale and direction do not belong together; each piece (frames "
-            f"{pieces or 'none'}) stands for itself"
+            "Before and after, scale and direction do not belong together; look at each piece "
+            f"(frames {pieces or 'none'}) by itself. If the images lie far apart, give more frames "
+            "per second (a smaller --stride)"
         )
     if graph.adjustments.failed:
         yield (

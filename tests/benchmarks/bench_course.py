@@ -74,8 +74,7 @@ def whole_run(clip: str, options: dict[str, Any], settings: dict[str, Any]) -> d
         given = {"preset": "test", "settings": settings, "quiet": True, **options}
         run = minislam.run(f"synth:{clip}", f"{folder}/run", **given)
         metrics = run.folder.read_metrics()
-        found = {name: metrics[name] for name in SHOWN if metrics.get(name) is not None}
-        return {**found, "seconds": run.folder.read_run()["seconds"]["total"]}
+        return {name: metrics[name] for name in SHOWN if metrics.get(name) is not None}
 
 
 def tracking_alone(

@@ -58,7 +58,7 @@ ZOOMED = FocalLengthFit(272.0, 1.4, 0.52, half=(8, 15))
 WARNINGS = [
     ({"lost": 1}, "1 of 4 frames could not be tracked"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
-    ({"breaks": [Break(2, 2)]}, "each piece (frames 0 to 1, 3 to 3) stands for itself"),
+    ({"breaks": [Break(2, 2)]}, "look at each piece (frames 0 to 1, 3 to 3) by itself"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
