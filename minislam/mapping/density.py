@@ -19,7 +19,7 @@ PRUNE_SCALE = 0.2  # median depths: larger ones are removed, official 0.6 m
 
 def screen_gradients(
     v_screen: Tensor,  # (N, 2) dL/d(pixel)
-    weight_sums: Tensor,  # (N,) px, 0 where not seen
+    weight_sums: Tensor,  # (N,) px, as of a `Rendering`: 0 where not seen
     camera: Camera,
 ) -> Tensor:  # (2, N)
     """Return the length of dL/d(projected mean) in a view, 0 where not seen, and 1 where seen.

@@ -28,7 +28,7 @@ from minislam.tracking.optimisation import bundle_problem, typical_residual
 # Of the static pixels, in the mean of the keyframes [-]: 78 good runs show .94 to 1, a trajectory
 # that hangs together badly .65, a camera on a tripod .03 to .17.
 LEAST_SHOWN = 0.75
-# px at 320x240: five real clips whose depth is inside out or that tell little have .15 to .38, one
+# px at 320x240: four real clips whose depth is inside out, or nearly so, have .15 to .38, one
 # whose depth is flat .76, those with a good one .58 (a dog), then 1.1 to 8.
 WEAK_PARALLAX = 0.5
 

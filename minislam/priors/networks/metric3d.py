@@ -28,7 +28,7 @@ from minislam.priors.networks.vit import PATCH, VisionTransformer, normalise
 from minislam.records import Frame
 
 CANONICAL_FOCAL = 1000.0  # px, of the camera that all training images were turned into
-FARTHEST = 300.0  # world units (metre); the official cut of the scaled depth
+LARGEST_SCALED = 300.0  # world units (metre); the official cut of the scaled depth
 NETWORK_SIZE = (616, 1064)  # px (height, width), as in the training
 _SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling of the coarsest map needs an even grid
 _ROUNDS = {12: 4, 24: 8}  # of refinement, by the number of blocks of the ViT (S, L)
@@ -72,7 +72,7 @@ class Metric3DDepth:
         canonical, scale = self.canonical_depth(frame.image)
         full = resample(canonical, *frame.image.shape[:2])
         metric = full * (camera.fx * scale / CANONICAL_FOCAL)
-        return metric.clamp(0, FARTHEST).to(frame.image.device)
+        return metric.clamp(0, LARGEST_SCALED).to(frame.image.device)
 
     @torch.no_grad()
     def canonical_depth(self, image: Tensor) -> tuple[Tensor, float]:
