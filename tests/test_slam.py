@@ -38,7 +38,7 @@ METRICS = [
     "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db",
     "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
-    "shown_static", "path_length", "reprojection_px", "parallax_px",
+    "shown_static", "path_length", "reprojection_px", "beyond_turns_px",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0

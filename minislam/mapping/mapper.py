@@ -175,7 +175,8 @@ class Mapper(JointOptimisation):
         """Remove Gaussians that hardly any static pixel shows: no image speaks for them.
 
         They were inserted on an object that moves, before the MLP knew, and where it always covers
-        the view no weight has pulled at them since.
+        the view no weight has pulled at them since. Where nothing is static, all stay, and so do
+        those that no keyframe shows.
         """
         sums = self.gaussians.means.new_zeros(2, len(self.gaussians))
         camera = self._online_camera
@@ -183,8 +184,9 @@ class Mapper(JointOptimisation):
             weight = self.static_weight(self.beta_of(keyframe), camera)
             sums += blending_weights(self.gaussians, camera, keyframe.T_camera_world, weight)
         static, whole = sums
-        self._optimizer.prune(static >= LEAST_STATIC * whole)
-        self._reset_gradients()
+        if static.any():
+            self._optimizer.prune(static >= LEAST_STATIC * whole)
+            self._reset_gradients()
 
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""

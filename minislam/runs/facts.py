@@ -28,9 +28,8 @@ from minislam.tracking.optimisation import bundle_problem, typical_residual
 # Of the static pixels, in the mean of the keyframes [-]: 78 good runs show .94 to 1, a trajectory
 # that hangs together badly .65, a camera on a tripod .03 to .17.
 LEAST_SHOWN = 0.75
-# px at 320x240: four real clips whose depth is inside out, or nearly so, have .15 to .38, one
-# whose depth is flat .76, those with a good one .58 (a dog), then 1.1 to 8.
-WEAK_PARALLAX = 0.5
+# px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
+LEAST_BEYOND_TURNS = 0.5
 
 
 def run_facts(
@@ -137,8 +136,8 @@ def has_large_holes(slam: Slam) -> bool:
 
 def is_hardly_more_than_a_turn(slam: Slam) -> bool:
     """Tell whether the images alone say too little of depth, and no prior says more."""
-    parallax, least = slam.tracker.watch.parallax, WEAK_PARALLAX * slam.tracker.graph.pixel_scale
-    return parallax is not None and parallax < least and not slam.tracker.keyframes.has_prior
+    seen = slam.tracker.watch.beyond_turns
+    return seen is not None and seen < LEAST_BEYOND_TURNS and not slam.tracker.keyframes.has_prior
 
 
 def _ties(slam: Slam) -> dict[str, float | None]:
@@ -150,7 +149,7 @@ def _ties(slam: Slam) -> dict[str, float | None]:
     return {
         "path_length": float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
         "reprojection_px": error,
-        "parallax_px": slam.tracker.watch.parallax,
+        "beyond_turns_px": slam.tracker.watch.beyond_turns,
     }
 
 
@@ -232,10 +231,10 @@ def _warnings(slam: Slam) -> Iterator[str]:
         )
     elif is_hardly_more_than_a_turn(slam):
         yield (
-            f"between neighbouring keyframes only {watch.parallax:.2f} px of the flow, in the "
-            "median, are more than a turn of the camera: depth is hardly determined, and near and "
-            "far may be exchanged; look at the pictures of the depth, and film while you walk "
-            "sideways"
+            f"between neighbouring keyframes only {watch.beyond_turns:.2f} px of the flow, in the "
+            "median and in an image of 320x240, are more than a turn of the camera: depth is "
+            "hardly determined, and near and far may be exchanged; look at the pictures of the "
+            "depth, and film while you walk sideways"
         )
     if keyframes.overlay is not None:
         yield (

@@ -151,6 +151,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("[weight > 0].sum()", "[weight == 0].sum()"),
     ],
     ("mapping/mapper.py", "mapping/test_safeguards.py"): [
+        ("if static.any():", "if True:"),
         ("self._remove_unsupported()", "pass"),
         ("static >= LEAST_STATIC * whole", "static < LEAST_STATIC * whole"),
     ],
@@ -166,8 +167,10 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("min(agreeing,", "max(agreeing,"),
         ("index - last <= HEALED_AFTER", "False"),
         ("if target == source + 1", "if target == source - 9"),
-        ("infinitely_far), POSE_ITERATIONS", "infinitely_far), 0"),
-        ("infinitely_far = grid.rays.new_zeros(", "infinitely_far = grid.rays.new_ones("),
+        ("turned, POSE_ITERATIONS", "turned, 0"),
+        ("for kernel in (None, *kernels)", "for kernel in (None,)"),
+        ("BundleState(poses, grid.rays.new_zeros(", "BundleState(poses, grid.rays.new_ones("),
+        ("/ graph.pixel_scale if known", "if known"),
     ],
     ("tracking/disparity_prior.py", "tracking/test_disparity_prior.py"): [
         ("(depth > 0) & (warped > 0)", "(warped > 0)"),
@@ -211,6 +214,10 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if slam.tracker.watch.breaks:", "if False:"),
     ],
     ("runs/facts.py", "runs/test_facts.py"): [
+        ("keyframe.exposed(rendering.color), keyframe", "rendering.color, keyframe"),
+        ("keyframe.image, static\n", "keyframe.image, None\n"),
+        ("if static.any() else None", "if True else None"),
+        ("seen < LEAST_BEYOND_TURNS", "seen < 0"),
         ("2 * without >= len", "2 * without < len"),
         ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),
     ],

@@ -138,3 +138,14 @@ def test_what_only_moving_pixels_show_leaves_the_map_at_the_end():
     pose = mapper.keyframes[0].T_camera_world
     seen = [mapper.render(pose).opacity[:, columns] for columns in (slice(2, 16), slice(27, None))]
     assert seen[0].min() > 0.8 and seen[1].max() < 0.1
+
+
+@pytest.mark.slow
+def test_where_nothing_is_static_the_map_stays():
+    mapper = make_mapper()
+    mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+    before = len(mapper.gaussians)
+    for keyframe in mapper.keyframes:
+        keyframe.given_beta = torch.full((CAMERA.height, CAMERA.width), 4.0)
+    mapper.refine(0)
+    assert len(mapper.gaussians) == before > 0

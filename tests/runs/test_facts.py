@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.records import AdjustmentCount
+from minislam.records import AdjustmentCount, Pictured
 from minislam.runs import facts
 from minislam.splatting import Rendering
 from minislam.tracking.safeguards.diagnostics import Break
@@ -22,7 +22,6 @@ def slam(**parts: object) -> SimpleNamespace:
     graph = SimpleNamespace(
         adjustments=AdjustmentCount(2 + failed, failed),
         least_parallax=1.0,
-        pixel_scale=1.0,
         seeks_focal=parts.pop("seeks_focal", False),
         focal_is_free=parts.pop("focal_is_free", False),
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
@@ -33,7 +32,7 @@ def slam(**parts: object) -> SimpleNamespace:
         graph=graph,
         watch=SimpleNamespace(
             diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
-            parallax=parts.pop("between", 3.0),
+            beyond_turns=parts.pop("beyond_turns", 3.0),
             breaks=parts.pop("breaks", []),
             segments=[(0, 1), (3, 3)],
         ),
@@ -79,11 +78,11 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
 
 
 def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_depth():
-    weak = {"between": 0.9 * facts.WEAK_PARALLAX}
+    weak = {"beyond_turns": 0.9 * facts.LEAST_BEYOND_TURNS}
     assert not list(facts._warnings(slam(**weak)))
     warning, _ = facts._warnings(slam(**weak, has_prior=False))
-    assert "only 0.45 px of the flow, in the median, are more than a turn" in warning
-    assert len(list(facts._warnings(slam(between=None, has_prior=False)))) == 1
+    assert "only 0.45 px of the flow, in the median" in warning
+    assert len(list(facts._warnings(slam(beyond_turns=None, has_prior=False)))) == 1
     warning, _ = facts._warnings(slam(**weak, has_prior=False, parallax=[0.1]))  # said once
     assert "hardly any parallax" in warning
 
@@ -142,3 +141,38 @@ def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():
     depth, opacity = torch.tensor([[1.8, 0.4]]), torch.tensor([[0.9, 0.2]])
     rendering = Rendering(torch.zeros(1, 2, 3), depth, opacity, torch.ones(1))
     torch.testing.assert_close(facts.surface_depth(rendering), torch.tensor([[2.0, 0.0]]))
+
+
+def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
+    color, opacity = torch.full((4, 6, 3), 0.4), torch.full((4, 6), 0.9)
+    opacity[0, 0] = 0.1  # a gap
+    rendering = Rendering(color, 2 * opacity, opacity, torch.ones(1))
+    static = torch.zeros(4, 6)
+    static[:, :3] = 1
+    image = torch.where(static[..., None] > 0, 0.9, 0.0).expand(4, 6, 3)  # .8 if exposed, .1 off
+    keyframes = [
+        SimpleNamespace(frame_index=8, T_camera_world=0, beta=static),
+        SimpleNamespace(frame_index=16, T_camera_world=1, beta=0 * static),
+    ]
+    for keyframe, exposure in zip(keyframes, (torch.full((3,), 2.0), None), strict=True):
+        picture = Pictured()
+        picture.pixels, picture.exposure = image, exposure
+        keyframe.image, keyframe.exposed = picture.image, picture.exposed
+    mapper = SimpleNamespace(
+        keyframes=keyframes,
+        camera=CAMERA,
+        render=lambda pose: rendering._replace(color=color + 0.1 * pose),
+        beta_of=lambda keyframe: keyframe.beta,
+        static_weight=lambda beta, camera: beta,
+    )
+    uncertainty = SimpleNamespace(is_learnt=True)
+    run = SimpleNamespace(mapper=mapper, config=SimpleNamespace(uncertainty=uncertainty))
+    run.beta_image = lambda index: 0.5 + index
+    first, second = facts.mapped_views(run)
+    assert (first.frame_index, second.frame_index) == (8, 16)
+    assert first.static_psnr == pytest.approx(20, abs=1e-3) and second.static_psnr is None
+    assert first.color.max() == pytest.approx(0.4) and second.color.max() == pytest.approx(0.5)
+    assert first.depth[0, 0] == 0 and first.depth[1, 1] == pytest.approx(2)
+    assert (first.beta, second.beta) == (0.5, 1.5)
+    uncertainty.is_learnt = False
+    assert all(view.beta is None for view in facts.mapped_views(run))

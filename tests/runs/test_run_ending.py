@@ -15,7 +15,7 @@ def ended(
     broken: bool = False,
     shown: tuple[float, ...] = (1.0, 0.9),
 ) -> object:
-    graph = SimpleNamespace(adjustments=AdjustmentCount(5, failed, ""))
+    graph = SimpleNamespace(adjustments=AdjustmentCount(5, failed))
     tracker = SimpleNamespace(graph=graph, watch=SimpleNamespace(breaks=broken))
     sequence = SimpleNamespace(lost=[(0.1, "damaged")] * undecoded)
     parts = {"tracker": tracker, "sequence": sequence, "mapper": SimpleNamespace(shown=shown)}

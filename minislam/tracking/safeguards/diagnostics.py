@@ -10,9 +10,9 @@ holds this one, or what is left of it does not fit.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import median
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +21,11 @@ from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, resi
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.pose_from_flow import POSE_ITERATIONS, motion_only_problem
+from minislam.tracking.pose_from_flow import (
+    POSE_ITERATIONS,
+    ROBUST_WIDENING,
+    motion_only_problem,
+)
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
@@ -38,7 +42,7 @@ MIN_CONTINUITY = 0.007  # of the view; healthy .009 to .5, broken 0 to .006
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MIN_EVIDENCE = 0.005  # of the view, for an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
-MOST_PAIRS = 100  # of neighbouring keyframes, which tell the parallax of a whole clip
+MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ class Watch(Stateful):
 
     diagnostics: list[KeyframeDiagnostics]
     breaks: list[Break]  # known at the end, because the newest depths are rough
-    parallax: float | None = None  # px, at the end: `parallax_between_neighbours`
+    beyond_turns: float | None = None  # px of a 320x240 image, at the end: `flow_beyond_turns`
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._graph = graph
@@ -82,7 +86,7 @@ class Watch(Stateful):
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
         self.breaks = find_breaks(self.diagnostics)
-        self.parallax = parallax_between_neighbours(self._graph)
+        self.beyond_turns = flow_beyond_turns(self._graph)
 
     @property
     def segments(self) -> list[tuple[int, int]]:
@@ -196,12 +200,12 @@ def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
     return weight if keyframes.overlay is None else weight * keyframes.overlay
 
 
-def parallax_between_neighbours(graph: KeyframeGraph) -> float | None:  # px
+def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 image
     """Return the flow between neighbouring keyframes that no turn of the camera explains.
 
-    A turn moves all points as if they were infinitely far away. The best one takes the place of any
-    translation that looks like it, so that what is left, in the median, tells depth. It asks the
-    flow alone: poses that are wrong can claim any parallax. None: no link.
+    A turn moves all points as if they were infinitely far away. The best one, under the robust
+    weight, takes the place of any translation that looks like it, so that what is left, in the
+    median, tells depth, whatever parallax the poses claim. None: no link has any weight.
     """
     grid, links, keyframes = graph.grid, graph.links, graph.keyframes
     pairs = [p for p, (source, target) in enumerate(links.edges) if target == source + 1]
@@ -214,12 +218,14 @@ def parallax_between_neighbours(graph: KeyframeGraph) -> float | None:  # px
     measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
     problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
-    infinitely_far = grid.rays.new_zeros(len(numbers), len(grid.rays))
-    turned, _ = bundle_adjust(problem, BundleState(poses, infinitely_far), POSE_ITERATIONS)
+    turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
+    kernels = [graph.robust.widened(width) for width in ROBUST_WIDENING] if graph.robust else []
+    for kernel in (None, *kernels):
+        turned, _ = bundle_adjust(replace(problem, robust=kernel), turned, POSE_ITERATIONS)
     left = lengths(residuals(problem, turned)[0])
     medians = [weighted_median(*pair) for pair in zip(left, problem.weights[:, 0], strict=True)]
-    known = [median for median in medians if median is not None]
-    return float(np.median(known)) if known else None
+    known = [found for found in medians if found is not None]
+    return median(known) / graph.pixel_scale if known else None
 
 
 def is_unexplained(newest: KeyframeDiagnostics) -> bool:

@@ -18,8 +18,8 @@ from minislam.tracking.safeguards.diagnostics import (
     continuity,
     diagnose,
     find_breaks,
+    flow_beyond_turns,
     is_unexplained,
-    parallax_between_neighbours,
     weight_so_far,
 )
 from minislam.tracking.safeguards.motion_memory import judge_all
@@ -156,26 +156,36 @@ def seen_moving(positions: torch.Tensor) -> KeyframeGraph:
 def test_a_turn_is_no_parallax_whatever_the_poses_claim():
     turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
     graph = seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
-    assert parallax_between_neighbours(graph) < 1e-3 < 3 < diagnose(graph, 1).parallax
+    assert flow_beyond_turns(graph) < 1e-3 < 3 < diagnose(graph, 1).parallax
 
 
-def test_walking_ahead_is_parallax_that_no_turn_explains():
+@pytest.mark.parametrize("moving", [0.1, 0.3])
+def test_what_moves_in_front_of_a_turning_camera_is_no_sign_of_depth(moving: float):
+    turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
+    positions = CAMERA.project(GRID.rays.double() @ turn[:3, :3].T)
+    positions[GRID.pixels[:, 0] < moving * CAMERA.width] += 20  # px
+    assert flow_beyond_turns(seen_moving(positions)) < 0.02
+
+
+def test_walking_ahead_is_more_than_any_turn():
     from_centre = GRID.pixels - GRID.pixels.new_tensor([CAMERA.cx, CAMERA.cy])
-    found = parallax_between_neighbours(seen_moving(GRID.pixels + 0.05 * from_centre))
-    assert found == pytest.approx(0.05 * float(from_centre.norm(dim=1).median()), rel=0.05)
+    graph = seen_moving(GRID.pixels + 0.05 * from_centre)
+    expected = 0.05 * float(from_centre.norm(dim=1).median()) / graph.pixel_scale
+    assert flow_beyond_turns(graph) == pytest.approx(expected, rel=0.05)
 
 
 def test_sliding_along_a_far_wall_looks_like_a_turn():
     slid = GRID.pixels + GRID.pixels.new_tensor([5.0, 0.0])
-    assert parallax_between_neighbours(seen_moving(slid)) < 0.2 * 5
+    graph = seen_moving(slid)
+    assert flow_beyond_turns(graph) < 0.2 * 5 / graph.pixel_scale
 
 
 def test_without_links_or_weight_there_is_no_parallax():
-    assert parallax_between_neighbours(true_graph([0, 1])) is None
+    assert flow_beyond_turns(true_graph([0, 1])) is None
     graph = true_graph([0, 1])
     graph.match([(0, 1), (1, 0)])
     graph.keyframes.static_weights.zero_()
-    assert parallax_between_neighbours(graph) is None
+    assert flow_beyond_turns(graph) is None
 
 
 def test_a_keyframe_without_links_is_reported_as_such():
