@@ -21,11 +21,7 @@ from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, resi
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.pose_from_flow import (
-    POSE_ITERATIONS,
-    ROBUST_WIDENING,
-    motion_only_problem,
-)
+from minislam.tracking.pose_from_flow import POSE_ITERATIONS, motion_only_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
@@ -42,6 +38,7 @@ MIN_CONTINUITY = 0.007  # of the view; healthy .009 to .5, broken 0 to .006
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MIN_EVIDENCE = 0.005  # of the view, for an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
+TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
 MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
 
 
@@ -203,7 +200,7 @@ def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
 def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 image
     """Return the flow between neighbouring keyframes that no turn of the camera explains.
 
-    A turn moves all points as if they were infinitely far away. The best one, under the robust
+    A turn moves all points as if they were infinitely far away. The best one, under a wide robust
     weight, takes the place of any translation that looks like it, so that what is left, in the
     median, tells depth, whatever parallax the poses claim. None: no link has any weight.
     """
@@ -219,7 +216,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
     turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
-    kernels = [graph.robust.widened(width) for width in ROBUST_WIDENING] if graph.robust else []
+    kernels = [graph.robust.widened(width) for width in TURN_WIDENING] if graph.robust else []
     for kernel in (None, *kernels):
         turned, _ = bundle_adjust(replace(problem, robust=kernel), turned, POSE_ITERATIONS)
     left = lengths(residuals(problem, turned)[0])
