@@ -81,7 +81,7 @@ def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_
     weak = {"beyond_turns": 0.9 * facts.LEAST_BEYOND_TURNS}
     assert not list(facts._warnings(slam(**weak)))
     warning, _ = facts._warnings(slam(**weak, has_prior=False))
-    assert "only 0.45 px of the flow, in the median" in warning
+    assert "only 0.41 px of the flow, in the median" in warning
     assert len(list(facts._warnings(slam(beyond_turns=None, has_prior=False)))) == 1
     warning, _ = facts._warnings(slam(**weak, has_prior=False, parallax=[0.1]))  # said once
     assert "hardly any parallax" in warning
