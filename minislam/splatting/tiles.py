@@ -163,5 +163,5 @@ def stable_argsort(keys: Tensor) -> Tensor:  # (N,) integers in [0, 2^31) -> (N,
         return keys.argsort(stable=True)
     # With its place in the lower half of each key any sort is stable. That of numpy is ten times
     # as fast as a stable one.
-    keys = keys.long() << 32 | torch.arange(len(keys))
+    keys = keys.long() << 32 | torch.arange(len(keys), device=keys.device)
     return torch.from_numpy(np.sort(keys.numpy())) & 0xFFFFFFFF
