@@ -3,12 +3,17 @@
 A hypothesis is a guess of the first keyframe's disparities. It fixes the pose of the second
 keyframe, whose disparities follow, and so on. Rotation and sideways translation look alike in a
 small field of view, so a bad guess can end in a wrong minimum with small residuals. Therefore the
-hypothesis of lowest cost after bundle adjustment is kept.
+hypothesis of lowest cost after bundle adjustment is kept. An unknown focal length must be free in
+that comparison: under a wrong one, depth that is inside out can fit better than the right one.
+
+Under a long lens, or where the camera hardly walks, a scene and its mirror image in depth have
+nearly the same flow. So of nearly equal costs that one wins whose ground is nearer than its sky.
 """
 
 import itertools
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,17 +26,21 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
 from minislam.tracking.safeguards.first_depth import essential_disparities
-from minislam.tracking.safeguards.focal_length import seek_focal_length
+from minislam.tracking.safeguards.focal_length import fit_focal_length
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 
 HYPOTHESIS_ITERATIONS = 8  # Gauss-Newton steps per width before hypotheses are compared
-ROBUST_NARROWING = (0.5, 0.25)  # [-], times the final width
+WIDENINGS = [*ROBUST_WIDENING, 0.5, 0.25]  # of the robust weight, times the final width [-]
+GROUND_SLOPE = 3.0  # disparity at the lower edge of the image / at its upper edge [-]
+SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
 # Starts of an unknown focal length beside its guess: the search reaches 0.7 to 1.4 times the truth.
 OTHER_FOCALS = (math.log(0.5), math.log(2.0))
-# Of 21 clips, two whose guess was far off saved 12 and 14 % of the cost; no other one 3 %. [-]
-FOCAL_WORTH_SAVING = 0.08
+FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guessed focal length [-]
+RELIEF_WORTH_SAVING = 0.1  # of the cost, if disparities do not correlate with the usual ones [-]
+
+Found = tuple[BundleState, BundleReport]
 
 
 def first_disparity_hypotheses(
@@ -41,11 +50,14 @@ def first_disparity_hypotheses(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
-    They are the depth prior, if there is one, a wall, and essential matrices. The prior comes
-    first, because of equal costs the first wins, as where no flow tells any depth.
+    They are the depth prior, if there is one, a wall, a ground that is nearer below, and essential
+    matrices. The prior comes first, because of equal costs the first wins, as where no flow tells
+    any depth.
     """
+    height = grid.pixels[:, 1] / grid.camera.height  # 0 above to 1 below
+    wall, ground = torch.ones_like(height), GROUND_SLOPE ** (height - 0.5)
     triangulated = [essential_disparities(grid, *measured) for measured in from_first]
-    alone = [torch.ones_like(known_disparities[0]), *(d for d in triangulated if d is not None)]
+    alone = [wall, ground, *(d for d in triangulated if d is not None)]
     guesses = [(disparities, torch.zeros_like(known_disparities)) for disparities in alone]
     known = (first := known_disparities[0]) > 0
     if bool(known.any()):
@@ -79,53 +91,87 @@ def chain_state(
     return BundleState(torch.stack(poses), torch.stack(disparities))
 
 
-def best_hypothesis(
+def minima(
     problem: BundleProblem,
     states: list[BundleState],
     workers: Workers | None = None,  # adjust side by side
-) -> tuple[BundleState, BundleReport]:
-    """Adjust every hypothesis on the same measurements and return the one of lowest cost.
+) -> list[Found]:
+    """Adjust every hypothesis on the same measurements and return where they end, each place once.
 
     A wide robust weight lets a bad guess leave its wrong minimum, but under the widest one a large
     dynamic object may outvote the room. So every hypothesis starts from the two widest. Costs are
     compared under a narrow one, which a compromise between room and dynamic object does not fit.
     """
-    widenings = [*ROBUST_WIDENING, *ROBUST_NARROWING]
-    starts = [widenings, widenings[1:]] if problem.robust else [[1.0]]
+    starts = [WIDENINGS, WIDENINGS[1:]] if problem.robust else [[1.0]]
     calls = [(problem, *pair, HYPOTHESIS_ITERATIONS) for pair in itertools.product(states, starts)]
-    results = (workers or Workers()).map(adjust_narrowing, calls)
-    return min(results, key=lambda result: result[1].cost_after)
+    found: list[Found] = []
+    for state, report in (workers or Workers()).map(adjust_narrowing, calls):
+        cost = report.cost_after
+        if all(abs(cost - other.cost_after) > SAME_COST * cost for _, other in found):
+            found.append((state, report))
+    return found
+
+
+def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) -> int:
+    """Return the position of the lowest cost; what is usual decides between nearly equal ones.
+
+    Usual are the guessed focal length, and disparities that grow with those of the depth prior, or
+    without one towards the lower edge of the image.
+    """
+    known = known_disparities > 0  # (K, N)
+    usual, cells = grid.pixels[:, 1].expand_as(known), torch.ones_like(known)
+    if known.any():
+        usual, cells = known_disparities.log(), known
+
+    def implausible_cost(result: Found) -> float:
+        state, report = result
+        disparities = state.disparities.log()
+        agrees = torch.corrcoef(torch.stack([usual[cells], disparities[cells]]))[0, 1]
+        doublings = abs(state.log_focal) / math.log(2)
+        unusual = FOCAL_WORTH_SAVING * doublings - RELIEF_WORTH_SAVING * float(agrees.nan_to_num())
+        return report.cost_after * (1 + unusual)
+
+    costs = [implausible_cost(result) for result in found]
+    return costs.index(min(costs))
 
 
 def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None:
     """Estimate poses and disparities of all keyframes of the warm-up, and an unknown focal length.
 
-    Flow alone decides: a depth prior is one start of the search and gives the unit of length.
+    Flow alone decides: a depth prior is one start of the search and gives the unit of length. The
+    focal length stays as guessed if the motion does not tell it.
     """
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
-    keyframes = graph.keyframes
+    workers, keyframes = workers or Workers(), graph.keyframes
     keyframes.overlay = overlay_weights(flow_to_next, graph.grid)
     for target in range(1, len(keyframes)):
         graph.match_composed(target)
     problem = bundle_problem(graph, range(len(graph.links)), first_free=0, lambda_prior=0.0)
 
-    def start(log_focal: float) -> tuple[BundleState, BundleReport]:
+    def start(log_focal: float) -> list[Found]:
         grid = replace(graph.grid)
         grid.zoom(log_focal)
         known, weights = keyframes.prior_disparities, keyframes.cell_weights[0]
         guesses = first_disparity_hypotheses(grid, known, graph.links.flow_from(0))
         chains = [chain_state(grid, flow_to_next, *g, graph.robust, weights) for g in guesses]
-        states = [replace(chain, log_focal=log_focal) for chain in chains]
-        return best_hypothesis(problem, states, workers)
+        return minima(problem, [replace(chain, log_focal=log_focal) for chain in chains], workers)
 
-    state, report = start(0.0)
+    choose = partial(most_plausible, graph.grid, keyframes.prior_disparities)
+    held = start(0.0)
+    state, report = held[choose(held)]
     if graph.seeks_focal:
-        other = min((start(s) for s in OTHER_FOCALS), key=lambda found: found[1].cost_after)
-        graph.focal_is_free = other[1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after
-        state, report = other if graph.focal_is_free else (state, report)
+        starts = [state for found in (held, *map(start, OTHER_FOCALS)) for state, _ in found]
+        free = replace(problem, free_focal=True)
+        calls = [(free, start, WIDENINGS[1:], HYPOTHESIS_ITERATIONS) for start in starts]
+        freed = workers.map(adjust_narrowing, calls)
+        best = choose(freed)
+        fit, fitted = fit_focal_length(problem, starts[best], workers)
+        if fit.factor is not None:
+            graph.focal_is_free, state = True, fitted
+        elif freed[best][1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after:
+            graph.focal_is_free, (state, report) = True, freed[best]
     graph.grid.zoom(state.log_focal)
     graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)
     keyframes.normalise_scale()
-    seek_focal_length(graph)
