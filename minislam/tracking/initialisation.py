@@ -161,16 +161,17 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
     held = start(0.0)
     state, report = held[choose(held)]
     if graph.seeks_focal:
-        starts = [state for found in (held, *map(start, OTHER_FOCALS)) for state, _ in found]
         free = replace(problem, free_focal=True)
-        calls = [(free, start, WIDENINGS[1:], HYPOTHESIS_ITERATIONS) for start in starts]
+        found = [*held, *(result for other in OTHER_FOCALS for result in start(other))]
+        calls = [(free, state, WIDENINGS[1:], HYPOTHESIS_ITERATIONS) for state, _ in found]
         freed = workers.map(adjust_narrowing, calls)
-        best = choose(freed)
-        fit, fitted = fit_focal_length(problem, starts[best], workers)
+        chosen = choose(freed)
+        best, at_guess = freed[chosen], held[chosen] if chosen < len(held) else (state, report)
+        fit, fitted = fit_focal_length(problem, at_guess[0], workers, best[0])
         if fit.factor is not None:
             graph.focal_is_free, state = True, fitted
-        elif freed[best][1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after:
-            graph.focal_is_free, (state, report) = True, freed[best]
+        elif best[1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after:
+            graph.focal_is_free, (state, report) = True, best
     graph.grid.zoom(state.log_focal)
     graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)

@@ -119,10 +119,12 @@ def fit_focal_length(
     problem: BundleProblem,
     state: BundleState,
     workers: Workers | None = None,  # adjust side by side
+    start: BundleState | None = None,  # of the search; None: from the state
 ) -> tuple[FocalLengthFit, BundleState]:
     """Return the focal length at which the adjusted cost is lowest, and the state there."""
     workers, free = workers or Workers(), replace(problem, free_focal=True)
-    starts = [(p, state, WIDENINGS, ITERATIONS) for p in (problem, free)]
+    pairs = (problem, state), (free, start or state)
+    starts = [(*pair, WIDENINGS, ITERATIONS) for pair in pairs]
     (_, present), (found, best) = workers.map(adjust_narrowing, starts)
     for _ in range(MAX_TRIES):
         ends = [replace(found, log_focal=found.log_focal + step) for step in (-STEP, STEP)]
