@@ -169,7 +169,8 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
         best, at_guess = freed[chosen], held[chosen] if chosen < len(held) else (state, report)
         fit, fitted = fit_focal_length(problem, at_guess[0], workers, best[0])
         if fit.factor is not None:
-            graph.focal_is_free, state = True, fitted
+            graph.focal_is_free = True
+            state, report = adjust_narrowing(free, fitted, WIDENINGS[2:], HYPOTHESIS_ITERATIONS)
         elif best[1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after:
             graph.focal_is_free, (state, report) = True, best
     graph.grid.zoom(state.log_focal)
