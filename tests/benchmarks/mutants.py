@@ -91,9 +91,18 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("np.argmin(slam.mapper.shown)", "np.argmax(slam.mapper.shown)"),
     ],
     ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
-        ("report.cost_after\n        state", "2 * report.cost_after\n        state"),
         ("replace(chain, log_focal=log_focal)", "chain"),
-        ("key=lambda found: found[1]", "key=lambda found: -found[1]"),
+        ("GROUND_SLOPE ** (height - 0.5)", "GROUND_SLOPE ** (0.5 - height)"),
+        ("> SAME_COST * cost", "> SAME_COST"),
+        ("* doublings - RELIEF", "* doublings + RELIEF"),
+        ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
+        ("usual, cells = known_disparities.log(), known", "pass"),
+        ("for other in OTHER_FOCALS for result", "for other in () for result"),
+        ("(1 - FOCAL_WORTH_SAVING) * report", "0 * report"),
+        ("else (state, report)", "else best"),
+    ],
+    ("tracking/safeguards/focal_length.py", "tracking/safeguards/test_focal_length.py"): [
+        ("(free, start or state)", "(free, state)"),
     ],
     ("tracking/bundle_adjustment.py", "tracking/test_bundle_adjustment_steps.py"): [
         ("trial <= cost", "trial <= 1.001 * cost"),

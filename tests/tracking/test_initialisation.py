@@ -131,6 +131,15 @@ def test_a_prior_says_what_is_usual():
     assert most_plausible(GRID, torch.zeros_like(ceiling), ways) == 0
 
 
+def test_results_of_one_cost_are_one_minimum():
+    class Told(Workers):
+        def map(self, function, calls):
+            return [found(cost) for cost in (100, 100.05, 200, 99.95, 300)]
+
+    results = minima(known_problem().problem, [], Told())
+    assert [report.cost_after for _, report in results] == [100, 200, 300]
+
+
 @pytest.mark.slow
 def test_the_best_hypothesis_is_the_one_that_explains_the_matches():
     truth, disparities = sideways(), room_disparities()

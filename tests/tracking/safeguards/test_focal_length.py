@@ -59,6 +59,22 @@ def test_the_true_focal_length_is_found(factor: float):
     assert fit.is_doubtful == (factor != 1)
 
 
+def test_the_search_goes_on_from_its_start():
+    asked = []
+
+    class Recording(Workers):
+        def map(self, function, calls):
+            asked.append(calls)
+            return super().map(function, calls)
+
+    known, workers = known_problem(keyframes=8), Recording()
+    problem, start = seen_through(noisy(known, NOISE), 1.3), replace(known.truth, log_focal=-0.2)
+    fit, _ = fit_focal_length(problem, known.truth, workers, start)
+    (held, state, *_), (free, begun, *_) = asked[0]
+    assert state is known.truth and begun is start and free.free_focal and not held.free_focal
+    assert fit.factor * 1.3 == pytest.approx(1, rel=FOUND)
+
+
 @pytest.mark.slow
 def test_two_processes_find_the_same():
     known = known_problem()
