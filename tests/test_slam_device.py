@@ -68,7 +68,7 @@ SHORT = {
 ROOMS_BORDERS = {
     "priors/dense_flow.py", "priors/flow.py", "priors/features.py",
     "tracking/bundle_adjustment.py", "tracking/frame_graph.py", "tracking/keyframe_graph.py",
-    "tracking/pose_from_flow.py", "tracking/safeguards/first_depth.py",
+    "tracking/pose_from_flow.py",
     "tracking/safeguards/motion_memory.py", "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py", "tracking/safeguards/rolling_shutter.py",
     "mapping/view_gradients.py", "mapping/safeguards.py", "stereo/second_adjustment.py",

@@ -54,11 +54,6 @@ class FrameGraph(Stateful):
         for column in (self.edges, self.targets, self.confidences, self.matched_ratios):
             del column[len(column) - count :]
 
-    def flow_from(self, source: int) -> list[tuple[Tensor, Tensor]]:
-        """Return targets [px] and confidences, each (N, 2), of the edges that leave a keyframe."""
-        leaving = [p for p, edge in enumerate(self.edges) if edge[0] == source]
-        return [(self.targets[p].mT, self.confidences[p].mT) for p in leaving]
-
     def select(self, first: int) -> list[int]:
         """Return the positions of the edges with an end at keyframe `first` or later."""
         return [p for p, edge in enumerate(self.edges) if max(edge) >= first]

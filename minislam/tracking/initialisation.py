@@ -5,9 +5,6 @@ keyframe, whose disparities follow, and so on. Rotation and sideways translation
 small field of view, so a bad guess can end in a wrong minimum with small residuals. Therefore the
 hypothesis of lowest cost after bundle adjustment is kept. An unknown focal length must be free in
 that comparison: under a wrong one, depth that is inside out can fit better than the right one.
-
-Under a long lens, or where the camera hardly walks, a scene and its mirror image in depth have
-nearly the same flow. So of nearly equal costs that one wins whose ground is nearer than its sky.
 """
 
 import itertools
@@ -20,12 +17,12 @@ from torch import Tensor
 
 from minislam.geometry import se3_interpolate, se3_inverse
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleReport, BundleState
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
-from minislam.tracking.safeguards.first_depth import essential_disparities
+from minislam.tracking.safeguards.first_depth import FOCAL_WORTH_SAVING, Found, most_plausible
 from minislam.tracking.safeguards.focal_length import fit_focal_length
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
@@ -37,27 +34,19 @@ GROUND_SLOPE = 3.0  # disparity at the lower edge of the image / at its upper ed
 SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
 # Starts of an unknown focal length beside its guess: the search reaches 0.7 to 1.4 times the truth.
 OTHER_FOCALS = (math.log(0.5), math.log(2.0))
-FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guessed focal length [-]
-RELIEF_WORTH_SAVING = 0.1  # of the cost, if disparities do not correlate with the usual ones [-]
-
-Found = tuple[BundleState, BundleReport]
 
 
 def first_disparity_hypotheses(
     grid: Grid,
     known_disparities: Tensor,  # (K, N) of the depth prior, 0 where there is none
-    from_first: list[tuple[Tensor, Tensor]],  # targets [px] and confidences (N, 2) to followers
 ) -> list[tuple[Tensor, Tensor]]:
     """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
-    They are the depth prior, if there is one, a wall, a ground that is nearer below, and essential
-    matrices. The prior comes first, because of equal costs the first wins, as where no flow tells
-    any depth.
+    They are the depth prior, if there is one, a wall, and a ground that is nearer below. The prior
+    comes first, because of equal costs the first wins, as where no flow tells any depth.
     """
     height = grid.pixels[:, 1] / grid.camera.height  # 0 above to 1 below
-    wall, ground = torch.ones_like(height), GROUND_SLOPE ** (height - 0.5)
-    triangulated = [essential_disparities(grid, *measured) for measured in from_first]
-    alone = [wall, ground, *(d for d in triangulated if d is not None)]
+    alone = torch.ones_like(height), GROUND_SLOPE ** (height - 0.5)
     guesses = [(disparities, torch.zeros_like(known_disparities)) for disparities in alone]
     known = (first := known_disparities[0]) > 0
     if bool(known.any()):
@@ -112,29 +101,6 @@ def minima(
     return found
 
 
-def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) -> int:
-    """Return the position of the lowest cost; what is usual decides between nearly equal ones.
-
-    Usual are the guessed focal length, and disparities that grow with those of the depth prior, or
-    without one towards the lower edge of the image.
-    """
-    known = known_disparities > 0  # (K, N)
-    usual, cells = grid.pixels[:, 1].expand_as(known), torch.ones_like(known)
-    if known.any():
-        usual, cells = known_disparities.log(), known
-
-    def implausible_cost(result: Found) -> float:
-        state, report = result
-        disparities = state.disparities.log()
-        agrees = torch.corrcoef(torch.stack([usual[cells], disparities[cells]]))[0, 1]
-        doublings = abs(state.log_focal) / math.log(2)
-        unusual = FOCAL_WORTH_SAVING * doublings - RELIEF_WORTH_SAVING * float(agrees.nan_to_num())
-        return report.cost_after * (1 + unusual)
-
-    costs = [implausible_cost(result) for result in found]
-    return costs.index(min(costs))
-
-
 def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None:
     """Estimate poses and disparities of all keyframes of the warm-up, and an unknown focal length.
 
@@ -153,7 +119,7 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
         grid = replace(graph.grid)
         grid.zoom(log_focal)
         known, weights = keyframes.prior_disparities, keyframes.cell_weights[0]
-        guesses = first_disparity_hypotheses(grid, known, graph.links.flow_from(0))
+        guesses = first_disparity_hypotheses(grid, known)
         chains = [chain_state(grid, flow_to_next, *g, graph.robust, weights) for g in guesses]
         return minima(problem, [replace(chain, log_focal=log_focal) for chain in chains], workers)
 

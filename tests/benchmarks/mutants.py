@@ -94,12 +94,14 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("replace(chain, log_focal=log_focal)", "chain"),
         ("GROUND_SLOPE ** (height - 0.5)", "GROUND_SLOPE ** (0.5 - height)"),
         ("> SAME_COST * cost", "> SAME_COST"),
-        ("* doublings - RELIEF", "* doublings + RELIEF"),
-        ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
-        ("usual, cells = known_disparities.log(), known", "pass"),
         ("for other in OTHER_FOCALS for result", "for other in () for result"),
         ("(1 - FOCAL_WORTH_SAVING) * report", "0 * report"),
         ("else (state, report)", "else best"),
+    ],
+    ("tracking/safeguards/first_depth.py", "tracking/safeguards/test_first_depth.py"): [
+        ("* doublings - RELIEF", "* doublings + RELIEF"),
+        ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
+        ("usual, cells = known_disparities.log(), known", "pass"),
     ],
     ("tracking/safeguards/focal_length.py", "tracking/safeguards/test_focal_length.py"): [
         ("(free, start or state)", "(free, state)"),

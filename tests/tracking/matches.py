@@ -35,8 +35,3 @@ def room_disparities(seed: int = 0) -> Tensor:
 
 def sideways(length: float = 0.25) -> Tensor:
     return se3_exp(torch.tensor([length, 0.04, 0.05, 0.02, -0.03, 0.04], dtype=torch.float64))
-
-
-def flat(matches: FlowMatches) -> tuple[Tensor, Tensor]:
-    """Return targets [px] and confidences, each (N, 2)."""
-    return matches.targets[0].T, matches.confidences[0].T

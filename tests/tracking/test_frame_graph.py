@@ -56,16 +56,6 @@ def test_an_edge_keeps_what_it_has_against_clearly_less():
     assert float(graph.targets[0][0, 0]) == 4.0 and len(graph) == 1  # 0.35 > 0.8 * 0.41
 
 
-def test_what_a_keyframe_measured_is_that_of_its_own_edges():
-    graph = FrameGraph()
-    graph.record([(0, 1)], matches_of(1.0, 1))
-    graph.record([(1, 0), (0, 2)], matches_of(2.0, 2))
-    measured = graph.flow_from(0)
-    assert [float(targets[0, 0]) for targets, _ in measured] == [1.0, 2.0]
-    assert all(t.shape == c.shape == (len(RAYS), 2) for t, c in measured)
-    assert graph.flow_from(2) == []
-
-
 def test_recorded_targets_keep_the_order_of_cells():
     graph = FrameGraph()
     targets = GRID.pixels.T[None]

@@ -7,7 +7,7 @@ settling         which disparities parallax has measured; only these are handed 
 relocalisation   finds a lost camera among the keyframes
 pose_support     tries other starts for poses between keyframes that little of the flow supports
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
-first_depth      depth of the first keyframe from matches alone
+first_depth      which of several first depths is taken, where their costs are nearly equal
 diagnostics      how well each keyframe is tied to the others
 focal_length     estimates an unknown focal length, tells whether a given one was wrong; the readout
 focal_column     the focal length as one more unknown of the bundle adjustment

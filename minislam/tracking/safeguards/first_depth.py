@@ -1,63 +1,41 @@
-"""The first depth from flow alone: an essential matrix, then triangulation.
+"""Which of several first depths is taken, where the flow hardly tells them apart.
 
-The paper starts from the depth prior, so it needs neither.
+Under a long lens, or where the camera hardly walks, a scene and its mirror image in depth have
+nearly the same flow. The paper starts from the depth prior, which tells them apart.
 """
 
-import cv2
+import math
+
 import torch
 from torch import Tensor
 
-from minislam.geometry.distortion import camera_matrix
-from minislam.geometry.se3 import make_transform
+from minislam.tracking.bundle_adjustment import BundleReport, BundleState
 from minislam.tracking.grid import Grid
 
-ESSENTIAL_THRESHOLD = 0.7  # px, RANSAC inlier distance to the epipolar line
-MIN_CELLS_FOR_ESSENTIAL = 40  # confident cells; five define the matrix, noise wants many more
-DISPARITY_SPREAD = 20.0  # largest ratio of a triangulated disparity to the median, both ways
+FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guessed focal length [-]
+RELIEF_WORTH_SAVING = 0.1  # of the cost, if disparities do not correlate with the usual ones [-]
+
+Found = tuple[BundleState, BundleReport]
 
 
-def triangulate(
-    grid: Grid,
-    T_target_source: Tensor,  # (4, 4)
-    targets: Tensor,  # (N, 2) px
-    confident: Tensor,  # (N,) bool
-) -> Tensor:  # (N,)
-    """Return the disparities that best explain matches under a known motion.
+def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) -> int:
+    """Return the position of the lowest cost; what is usual decides between nearly equal ones.
 
-    R rho + d t must be parallel to the matched ray: two equations linear in d, by least squares.
+    Usual are the guessed focal length, and disparities that grow with those of the depth prior, or
+    without one towards the lower edge of the image.
     """
-    T_target_source = T_target_source.to(grid.rays)
-    rotated, t = grid.rays @ T_target_source[:3, :3].T, T_target_source[:3, 3]
-    seen = grid.camera.rays(targets)[:, :2]
-    factor = t[:2] - seen * t[2]
-    value = seen * rotated[:, 2:] - rotated[:, :2]
-    disparities = (factor * value).sum(1) / factor.square().sum(1).clamp_min(1e-12)
-    usable = confident & (disparities > 0)
-    if not usable.any():
-        return torch.ones_like(disparities)
-    typical = disparities[usable].median()
-    usable &= disparities < DISPARITY_SPREAD * typical
-    usable &= disparities > typical / DISPARITY_SPREAD
-    return torch.where(usable, disparities, typical) / typical
+    known = known_disparities > 0  # (K, N)
+    usual, cells = grid.pixels[:, 1].expand_as(known), torch.ones_like(known)
+    if known.any():
+        usual, cells = known_disparities.log(), known
 
+    def implausible_cost(result: Found) -> float:
+        state, report = result
+        disparities = state.disparities.log()
+        agrees = torch.corrcoef(torch.stack([usual[cells], disparities[cells]]))[0, 1]
+        doublings = abs(state.log_focal) / math.log(2)
+        unusual = FOCAL_WORTH_SAVING * doublings - RELIEF_WORTH_SAVING * float(agrees.nan_to_num())
+        return report.cost_after * (1 + unusual)
 
-def essential_disparities(
-    grid: Grid,
-    targets: Tensor,  # (N, 2) px
-    confidences: Tensor,  # (N, 2)
-) -> Tensor | None:  # (N,)
-    """Return disparities of the source from an essential matrix, median 1, or None."""
-    confident = confidences[:, 0] > 0.5
-    if int(confident.sum()) < MIN_CELLS_FOR_ESSENTIAL:
-        return None
-    source, target = (pixels[confident].double().cpu().numpy() for pixels in (grid.pixels, targets))
-    matrix = camera_matrix(grid.camera)
-    cv2.setRNGSeed(0)
-    essential, inliers = cv2.findEssentialMat(
-        source, target, matrix, cv2.RANSAC, 0.999, ESSENTIAL_THRESHOLD
-    )
-    if essential is None or essential.shape != (3, 3):
-        return None
-    _, rotation, translation, _ = cv2.recoverPose(essential, source, target, matrix, mask=inliers)
-    motion = torch.from_numpy(rotation), torch.from_numpy(translation[:, 0])
-    return triangulate(grid, make_transform(*motion), targets, confident)
+    costs = [implausible_cost(result) for result in found]
+    return costs.index(min(costs))
