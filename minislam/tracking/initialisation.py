@@ -30,7 +30,7 @@ from minislam.workers import Workers
 
 HYPOTHESIS_ITERATIONS = 8  # Gauss-Newton steps per width before hypotheses are compared
 WIDENINGS = [*ROBUST_WIDENING, 0.5, 0.25]  # of the robust weight, times the final width [-]
-GROUND_SLOPE = 3.0  # disparity at the lower edge of the image / at its upper edge [-]
+SLOPE = 3.0  # largest disparity of a ground or of a slanted wall / smallest one [-]
 SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
 # Starts of an unknown focal length beside its guess: the search reaches 0.7 to 1.4 times the truth.
 OTHER_FOCALS = (math.log(0.5), math.log(2.0))
@@ -42,11 +42,13 @@ def first_disparity_hypotheses(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
-    They are the depth prior, if there is one, a wall, and a ground that is nearer below. The prior
-    comes first, because of equal costs the first wins, as where no flow tells any depth.
+    They are the depth prior, if there is one, a wall before the camera, a ground that is nearer
+    below, and walls that are nearer on the left or on the right. The prior comes first, because of
+    equal costs the first wins, as where no flow tells any depth.
     """
-    height = grid.pixels[:, 1] / grid.camera.height  # 0 above to 1 below
-    alone = torch.ones_like(height), GROUND_SLOPE ** (height - 0.5)
+    camera = grid.camera
+    right, below = (grid.pixels / grid.pixels.new_tensor([camera.width, camera.height]) - 0.5).T
+    alone = [torch.ones_like(right), *(SLOPE**slope for slope in (below, -right, right))]
     guesses = [(disparities, torch.zeros_like(known_disparities)) for disparities in alone]
     known = (first := known_disparities[0]) > 0
     if bool(known.any()):

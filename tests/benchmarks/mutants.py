@@ -92,7 +92,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
         ("replace(chain, log_focal=log_focal)", "chain"),
-        ("GROUND_SLOPE ** (height - 0.5)", "GROUND_SLOPE ** (0.5 - height)"),
+        ("(below, -right, right)", "(-below, -right, right)"),
         ("> SAME_COST * cost", "> SAME_COST"),
         ("for other in OTHER_FOCALS for result", "for other in () for result"),
         ("(1 - FOCAL_WORTH_SAVING) * report", "0 * report"),

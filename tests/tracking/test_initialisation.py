@@ -68,11 +68,12 @@ def test_a_chain_carries_disparities_where_none_are_known():
 # Hypotheses
 
 
-def test_without_a_prior_the_hypotheses_are_a_wall_and_a_ground():
-    (wall, knows), (ground, _) = first_disparity_hypotheses(GRID, UNKNOWN)
+def test_without_a_prior_the_hypotheses_are_walls_and_a_ground():
+    (wall, knows), *slanted = first_disparity_hypotheses(GRID, UNKNOWN)
     assert torch.equal(wall, torch.ones(CELLS)) and not knows.any()
-    heights = GRID.pixels[:, 1] / CAMERA.height
-    torch.testing.assert_close(ground, math.sqrt(1 / 3) * 3**heights)  # trebles from edge to edge
+    x, y = GRID.pixels[:, 0] / CAMERA.width, GRID.pixels[:, 1] / CAMERA.height
+    for (found, _), along in zip(slanted, (y, 1 - x, x), strict=True):
+        torch.testing.assert_close(found, math.sqrt(1 / 3) * 3**along)  # from edge to edge x 3
 
 
 def test_a_prior_is_the_first_hypothesis_and_not_the_only_one():
