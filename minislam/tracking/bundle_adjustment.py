@@ -19,7 +19,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
 from minislam.tracking.reprojection import Linearisation, relative_transforms
-from minislam.tracking.safeguards.focal_column import reproject_with_focal
+from minislam.tracking.safeguards.focal_column import reproject_with_focal, within_reach
 from minislam.tracking.safeguards.parts import in_parts, joined
 from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
 from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
@@ -296,4 +296,4 @@ def _damped_step(
     zoom = common.pop(0) if problem.free_focal else 0.0
     later = common if common else (0.0, 0.0)
     readout = state.readout[0] + later[0], state.readout[1] + later[1]
-    return BundleState(poses, disparities, state.log_focal + zoom, readout)
+    return BundleState(poses, disparities, within_reach(state.log_focal + zoom), readout)

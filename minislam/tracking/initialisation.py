@@ -10,7 +10,6 @@ that comparison: under a wrong one, depth that is inside out can fit better than
 import itertools
 import math
 from dataclasses import replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -22,7 +21,12 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
-from minislam.tracking.safeguards.first_depth import FOCAL_WORTH_SAVING, Found, most_plausible
+from minislam.tracking.safeguards.first_depth import (
+    FARTHEST,
+    FOCAL_WORTH_SAVING,
+    Found,
+    most_plausible,
+)
 from minislam.tracking.safeguards.focal_length import fit_focal_length
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
@@ -125,21 +129,22 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
         chains = [chain_state(grid, flow_to_next, *g, graph.robust, weights) for g in guesses]
         return minima(problem, [replace(chain, log_focal=log_focal) for chain in chains], workers)
 
-    choose = partial(most_plausible, graph.grid, keyframes.prior_disparities)
     held = start(0.0)
-    state, report = held[choose(held)]
+    state, report = min(held, key=lambda result: result[1].cost_after)
     if graph.seeks_focal:
         free = replace(problem, free_focal=True)
         found = [*held, *(result for other in OTHER_FOCALS for result in start(other))]
         calls = [(free, state, WIDENINGS[1:], HYPOTHESIS_ITERATIONS) for state, _ in found]
         freed = workers.map(adjust_narrowing, calls)
-        chosen = choose(freed)
+        chosen = most_plausible(graph.grid, keyframes.prior_disparities, freed)
         best, at_guess = freed[chosen], held[chosen] if chosen < len(held) else (state, report)
         fit, fitted = fit_focal_length(problem, at_guess[0], workers, best[0])
         if fit.factor is not None:
             graph.focal_is_free = True
             state, report = adjust_narrowing(free, fitted, WIDENINGS[2:], HYPOTHESIS_ITERATIONS)
-        elif best[1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after:
+        elif abs(best[0].log_focal) <= FARTHEST and (
+            best[1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after
+        ):
             graph.focal_is_free, (state, report) = True, best
     graph.grid.zoom(state.log_focal)
     graph.count_adjustment(report)

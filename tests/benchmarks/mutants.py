@@ -30,30 +30,23 @@ ALARM = 120  # s; a mutant that takes longer hangs, and that is noticed
 MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("cli/main.py", "cli/test_main.py"): [
         (', "TRIM_THRESHOLD_": (-1, 64 << 20)', ""),
-        ('os.environ[f"MALLOC_{name}"] = str(value)', "pass"),
         ('if f"MALLOC_{name}" not in os.environ:', "if True:"),
     ],
     ("geometry/se3.py", "geometry/test_se3.py"): [
         ("-(rotation_t @ transforms", "(rotation_t @ transforms"),
-        ("aw * by - ax * bz", "aw * by + ax * bz"),
         ("1.5 * eye - 0.5 *", "1.5 * eye - 0.4 *"),
         ("torch.where(q[..., :1] < 0, -q, q)", "q"),
     ],
     ("geometry/camera.py", "geometry/test_camera.py"): [
         ("(self.cx + 0.5) * sx - 0.5", "self.cx * sx"),
         ("fx * (1 + a * a)", "fx * (1 - a * a)"),
-        ("self.cx - left", "self.cx + left"),
-        ("u <= self.width - 1", "u <= self.width"),
     ],
     ("geometry/alignment.py", "geometry/test_alignment.py"): [
-        ("signs[2] = -1.0", "signs[2] = 1.0"),
         ("target_mean - scale *", "target_mean -"),
     ],
     ("uncertainty/weights.py", "uncertainty/test_weights.py"): [
         ("1 + (1 - position)", "1 - (1 - position)"),
-        (".clamp_max(TRACKING_CAP)", ""),
         ("torch.where(weight < least", "torch.where(weight > least"),
-        ("weight.quantile(1 - STATIC_FRACTION)", "weight.quantile(STATIC_FRACTION)"),
         ("(weight / weight.quantile(1 - STATIC_FRACTION))", "weight"),
     ],
     ("uncertainty/losses.py", "uncertainty/test_losses.py"): [
@@ -91,16 +84,13 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("np.argmin(slam.mapper.shown)", "np.argmax(slam.mapper.shown)"),
     ],
     ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
-        ("replace(chain, log_focal=log_focal)", "chain"),
         ("(below, -right, right)", "(-below, -right, right)"),
-        ("> SAME_COST * cost", "> SAME_COST"),
         ("for other in OTHER_FOCALS for result", "for other in () for result"),
         ("(1 - FOCAL_WORTH_SAVING) * report", "0 * report"),
         ("else (state, report)", "else best"),
     ],
     ("tracking/safeguards/first_depth.py", "tracking/safeguards/test_first_depth.py"): [
         ("* doublings - RELIEF", "* doublings + RELIEF"),
-        ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
         ("usual, cells = known_disparities.log(), known", "pass"),
     ],
     ("tracking/safeguards/focal_length.py", "tracking/safeguards/test_focal_length.py"): [

@@ -12,7 +12,9 @@ from torch import Tensor
 from minislam.tracking.bundle_adjustment import BundleReport, BundleState
 from minislam.tracking.grid import Grid
 
+# Chosen on five real clips, four in which the camera hardly does more than turn, judged on others.
 FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guessed focal length [-]
+FARTHEST = math.log(4)  # of the guessed focal length: what is farther is one of a failed start
 RELIEF_WORTH_SAVING = 0.1  # of the cost, if disparities do not correlate with the usual ones [-]
 
 Found = tuple[BundleState, BundleReport]
@@ -31,6 +33,8 @@ def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) ->
 
     def implausible_cost(result: Found) -> float:
         state, report = result
+        if abs(state.log_focal) > FARTHEST:
+            return math.inf
         disparities = state.disparities.log()
         agrees = torch.corrcoef(torch.stack([usual[cells], disparities[cells]]))[0, 1]
         doublings = abs(state.log_focal) / math.log(2)

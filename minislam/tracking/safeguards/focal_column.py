@@ -20,6 +20,13 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.tracking import reprojection
 
+MOST_ZOOM = math.log(20)  # either way: where nothing moves any focal length fits, even an infinite
+
+
+def within_reach(log_focal: float) -> float:
+    """Return the nearest s that a lens could have."""
+    return min(max(log_focal, -MOST_ZOOM), MOST_ZOOM)
+
 
 def zoomed(camera: Camera, rays: Tensor, log_focal: float) -> tuple[Camera, Tensor]:
     """Return camera and rays (N, 3) of the same pixels with both focal lengths exp(s) as long."""

@@ -30,6 +30,7 @@ def found_at(cost: float, log_focal: float = 0.0, slope: float = 1.0) -> Found:
         ([found_at(112, slope=2.0)], 0),
         ([found_at(90, slope=0.5), found_at(104, slope=2.0)], 2),
         ([found_at(80, slope=0.5), found_at(104, slope=2.0)], 1),
+        ([found_at(1, math.log(4.1)), found_at(1, math.log(0.24))], 0),  # a failed start
     ],
 )
 def test_of_nearly_equal_costs_the_usual_one_wins(others: list, expected: int):

@@ -11,7 +11,7 @@ from minislam.geometry import Camera, se3_exp
 from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust
 from minislam.tracking.reference import moved, predicted_positions
 from minislam.tracking.reprojection import reproject
-from minislam.tracking.safeguards.focal_column import focal_jacobian, zoomed
+from minislam.tracking.safeguards.focal_column import focal_jacobian, within_reach, zoomed
 from minislam.tracking.safeguards.robust import RobustKernel
 from tests.tracking.scene import (
     CAMERA,
@@ -148,3 +148,8 @@ def test_a_focal_length_that_is_not_free_stays_and_is_used():
     end, _ = bundle_adjust(problem, start, iterations=10)
     assert end.log_focal == back
     assert distance(end, known.truth) < 1e-8
+
+
+def test_where_nothing_moves_the_focal_length_stays_that_of_a_lens():
+    assert within_reach(0.3) == 0.3
+    assert within_reach(40.0) == -within_reach(-40.0) == pytest.approx(math.log(20))
