@@ -1,0 +1,214 @@
+"""The lines that `mutants.py` breaks, and the tests that shall notice."""
+
+# (file below minislam/, test files below tests/): what it says, what the mutant says
+MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
+    ("cli/main.py", "cli/test_main.py"): [
+        (', "TRIM_THRESHOLD_": (-1, 64 << 20)', ""),
+        ('os.environ[f"MALLOC_{name}"] = str(value)', "pass"),
+        ('if f"MALLOC_{name}" not in os.environ:', "if True:"),
+    ],
+    ("geometry/se3.py", "geometry/test_se3.py"): [
+        ("-(rotation_t @ transforms", "(rotation_t @ transforms"),
+        ("aw * by - ax * bz", "aw * by + ax * bz"),
+        ("1.5 * eye - 0.5 *", "1.5 * eye - 0.4 *"),
+        ("torch.where(q[..., :1] < 0, -q, q)", "q"),
+    ],
+    ("geometry/camera.py", "geometry/test_camera.py"): [
+        ("(self.cx + 0.5) * sx - 0.5", "self.cx * sx"),
+        ("fx * (1 + a * a)", "fx * (1 - a * a)"),
+        ("self.cx - left", "self.cx + left"),
+        ("u <= self.width - 1", "u <= self.width"),
+    ],
+    ("geometry/alignment.py", "geometry/test_alignment.py"): [
+        ("signs[2] = -1.0", "signs[2] = 1.0"),
+        ("target_mean - scale *", "target_mean -"),
+    ],
+    ("uncertainty/weights.py", "uncertainty/test_weights.py"): [
+        ("1 + (1 - position)", "1 - (1 - position)"),
+        (".clamp_max(TRACKING_CAP)", ""),
+        ("torch.where(weight < least", "torch.where(weight > least"),
+        ("weight.quantile(1 - STATIC_FRACTION)", "weight.quantile(STATIC_FRACTION)"),
+        ("(weight / weight.quantile(1 - STATIC_FRACTION))", "weight"),
+    ],
+    ("uncertainty/losses.py", "uncertainty/test_losses.py"): [
+        ("contrast.clamp_max(STRUCTURE_CAP)", "contrast"),
+        ("opacity >= SURFACE_OPACITY", "opacity >= 0"),
+        ("& (reference_depth < far_limit)", ""),
+        ('mode="reflect"', 'mode="constant"'),
+        ("/ beta**2 +", "/ beta +"),
+    ],
+    ("mapping/window.py", "mapping/test_window.py"): [
+        ("min(int(seen_a.sum()), ", "max(int(seen_a.sum()), "),
+        ("non_overlapping[-1]", "non_overlapping[0]"),
+        ("crowding = candidates.sum(-1)", "crowding = -candidates.sum(-1)"),
+        ("(1 - window_probability) / (", "window_probability / ("),
+    ],
+    ("mapping/insertion.py", "mapping/test_insertion.py"): [
+        ("& (weight > 0)", ""),
+        ("opacity < EXPLAINED_OPACITY", "opacity > EXPLAINED_OPACITY"),
+        ("torch.where(known, priority, -1)", "priority"),
+        ("in_front & (weight", "(weight"),
+        ("config.cell * z / focal", "config.cell / focal"),
+    ],
+    ("mapping/losses.py", "mapping/test_losses.py"): [
+        ("slopes * (v_loss / -len(x))", "slopes * (v_loss / len(x))"),
+        ("image.sum(-1) > BLACK", "image.sum(-1) >= 0"),
+        ("in_front & (opacity", "(opacity"),
+        ("(scales - scales.mean(-1, keepdim=True))", "scales"),
+    ],
+    ("mapping/mapper.py", "mapping/test_mapper.py"): [
+        ("self.camera) > 0\n        shown", "self.camera) > -1\n        shown"),
+        ("opacity[static] > OPAQUE", "opacity[static] < OPAQUE"),
+    ],
+    ("runs/facts.py", "runs/test_facts.py runs/test_run_ending.py"): [
+        ("shown is not None and shown < LEAST_SHOWN", "bool(shown) and shown < LEAST_SHOWN"),
+        ("np.argmin(slam.mapper.shown)", "np.argmax(slam.mapper.shown)"),
+    ],
+    ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
+        ("replace(chain, log_focal=log_focal)", "chain"),
+        ("> SAME_COST * cost", "> SAME_COST"),
+        ("(below, -right, right)", "(-below, -right, right)"),
+        ("for other in OTHER_FOCALS for result", "for other in () for result"),
+        ("(1 - FOCAL_WORTH_SAVING) * report", "0 * report"),
+        ("else (state, report)", "else best"),
+    ],
+    ("tracking/safeguards/first_depth.py", "tracking/safeguards/test_first_depth.py"): [
+        ("* doublings - RELIEF", "* doublings + RELIEF"),
+        ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
+        ("return math.inf", "return 0.0"),
+        ("usual, cells = known_disparities.log(), known", "pass"),
+    ],
+    ("tracking/safeguards/focal_length.py", "tracking/safeguards/test_focal_length.py"): [
+        ("(free, start or state)", "(free, state)"),
+    ],
+    ("tracking/bundle_adjustment.py", "tracking/test_bundle_adjustment_steps.py"): [
+        ("trial <= cost", "trial <= 1.001 * cost"),
+    ],
+    ("tracking/bundle_adjustment.py",
+     "tracking/test_bundle_adjustment_steps.py tracking/test_bundle_adjustment.py"): [
+        ("max(level / 10, damping)", "damping"),
+    ],
+    ("tracking/safeguards/robust.py", "tracking/safeguards/test_robust.py"): [
+        ("-self.power", "-1"),
+        ("self.scale**2 * torch.log1p", "torch.log1p"),
+        ("max(residual, MIN_RESIDUAL)", "residual"),
+        ("min(width, self.scale)", "width"),
+    ],
+    ("tracking/optimisation.py", "tracking/test_optimisation.py"): [
+        ("settled=is_last", "settled=True"),
+        ("0, len(problem.rays), EVERY", "0, len(problem.rays) // 2, EVERY"),
+        ("lengths(residual), weights[:, 0]", "lengths(residual), 1 + 0 * weights[:, 0]"),
+        ("static[:, None]", "of_cell[source][:, None]"),
+    ],
+    ("tracking/safeguards/motion_memory.py", "tracking/safeguards/test_motion_memory.py"): [
+        ("LOSS_RATE, RECOVERY_RATE)", "RECOVERY_RATE, LOSS_RATE)"),
+        ('"amin"', '"amax"'),
+        ("+ DEPTH_ERROR**2 * parallax", ""),
+    ],
+    ("tracking/safeguards/settling.py", "tracking/safeguards/test_settling.py"): [
+        ("information > SETTLED", "information < SETTLED"),
+        (".clamp_min(LEAST)", ""),
+    ],
+    ("tracking/safeguards/scale_drift.py", "tracking/safeguards/test_scale_drift.py"): [
+        ("(-drift).exp()", "drift.exp()"),
+        ("(drift[1:] + drift[:-1]) / 2", "drift[1:]"),
+        ("drift - drift.mean()", "drift"),
+        ("SLOW_ERROR**2 + noise", "0 * noise"),
+        ("log_ratio[told].diff()", "0 * log_ratio[told]"),
+        ("-0.5 * ((position", "-5.0 * ((position"),
+    ],
+    ("tracking/safeguards/motion_memory.py",
+     "tracking/safeguards/test_motion_memory_overlay.py"): [
+        ("counts & (flow < STANDS)", "flow < STANDS"),
+        ("> MOVES", "> 0"),
+        (">= ALWAYS", "> 0"),
+        ("len(still) < MIN_PAIRS", "not still"),
+        ("*grid.shape), 3, 1, 1)", "*grid.shape), 1, 1, 0)"),
+    ],
+    ("tracking/safeguards/pose_support.py", "tracking/safeguards/test_pose_support.py"): [
+        ("fits[index].support < LOST_SUPPORT", "fits[index].support < 0 *"),
+        ("key=lambda fit: fit.support", "key=lambda fit: -fit.support"),
+    ],
+    ("tracking/safeguards/first_frame.py", "tracking/safeguards/test_first_frame.py"): [
+        ("lost >= len(followed)", "lost > len(followed)"),
+    ],
+    ("mapping/safeguards.py", "mapping/test_safeguards.py"): [
+        ("[weight > 0].sum()", ".sum()"),
+        ("[weight > 0].sum()", "[weight == 0].sum()"),
+    ],
+    ("mapping/mapper.py", "mapping/test_safeguards.py"): [
+        ("if static.any():", "if True:"),
+        ("self._remove_unsupported()", "pass"),
+        ("static >= LEAST_STATIC * whole", "static < LEAST_STATIC * whole"),
+    ],
+    ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
+        ("weak >= LONG or _is", "_is"),
+        ("or held < MIN_CONTINUITY", ""),
+        ("or agreement < MIN_AGREEMENT", ""),
+        ("matched * fits[i, keyframe]", "matched"),
+        ("known[i] * graph.links.conf", "graph.links.conf"),
+        ("fitted * graph.keyframes.motion_weights[i]", "fitted"),
+        ("matched * graph.keyframes.static_weights[i]", "matched"),
+        ("max(holding)", "min(holding)"),
+        ("min(agreeing,", "max(agreeing,"),
+        ("index - last <= HEALED_AFTER", "False"),
+        ("if target == source + 1", "if target == source - 9"),
+        ("turned, POSE_ITERATIONS", "turned, 0"),
+        ("for kernel in (None, *kernels)", "for kernel in (None,)"),
+        ("BundleState(poses, grid.rays.new_zeros(", "BundleState(poses, grid.rays.new_ones("),
+        ("/ graph.pixel_scale if known", "if known"),
+    ],
+    ("tracking/disparity_prior.py", "tracking/test_disparity_prior.py"): [
+        ("(depth > 0) & (warped > 0)", "(warped > 0)"),
+        ('"amin"', '"amax"'),
+        ("counts.consistent < ", "counts.consistent <= "),
+    ],
+    ("tracking/frame_graph.py", "tracking/test_frame_graph.py"): [
+        ("ratio >= KEPT_FRACTION *", "ratio >= 0 *"),
+        ("(without_rotation, 1 - rotation_weight)", "(without_rotation, rotation_weight)"),
+        ("min(abs(i - j) - 2, suppression)", "suppression"),
+    ],
+    ("stereo/aggregation.py", "stereo/test_aggregation.py"): [
+        ("before[:, :-1] + STEP_COST", "before[:, :-1]"),
+        ("0.5 * (left - right)", "0.5 * (right - left)"),
+    ],
+    ("stereo/votes.py", "stereo/test_votes.py"): [
+        ("expected - 2 * tolerance", "expected"),
+        ("& (other.cost.take(place) < WELL_MATCHED)", ""),
+    ],
+    ("evaluation/images.py", "evaluation/test_images_separability.py"): [
+        ('("left", "right")', '("left", "left")'),
+    ],
+    ("evaluation/images.py", "evaluation/test_images_depth.py"): [
+        ("scale * depth - reference", "depth - reference"),
+    ],
+    ("evaluation/trajectory.py", "evaluation/test_trajectory.py"): [
+        ("<= max_difference", "<= 2 * max_difference"),
+    ],
+    ("data/sources.py", "data/test_sources.py"): [
+        ("self.promised > len(self) > 1", "len(self) > 1"),
+    ],
+    ("data/checkpoint.py", "data/test_checkpoint.py"): [
+        ("allow_pickle=False", "allow_pickle=True"),
+    ],
+    ("data/run_folder.py", "data/test_run_folder.py"): [
+        ("fcntl.LOCK_EX |", "fcntl.LOCK_SH |"),
+    ],
+    ("runs/run.py", "runs/test_run_ending.py"): [
+        ("if slam.lost_frames() or slam.sequence.lost:", "if False:"),
+        ("2 * adjustments.failed > adjustments.count", "adjustments.failed > adjustments.count"),
+        ("if slam.tracker.watch.breaks:", "if False:"),
+    ],
+    ("runs/facts.py", "runs/test_facts.py"): [
+        ("keyframe.exposed(rendering.color), keyframe", "rendering.color, keyframe"),
+        ("keyframe.image, static\n", "keyframe.image, None\n"),
+        ("if static.any() else None", "if True else None"),
+        ("seen < LEAST_BEYOND_TURNS", "seen < 0"),
+        ("2 * without >= len", "2 * without < len"),
+        ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),
+    ],
+    ("viz/report.py", "viz/test_report.py"): [
+        ("name: escape(getattr(report, name))", "name: getattr(report, name)"),
+        ('class="warning">{escape(text)}', 'class="warning">{text}'),
+    ],
+}  # fmt: skip
