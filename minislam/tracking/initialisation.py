@@ -3,12 +3,9 @@
 A hypothesis is a guess of the first keyframe's disparities. It fixes the pose of the second
 keyframe, whose disparities follow, and so on. Rotation and sideways translation look alike in a
 small field of view, so a bad guess can end in a wrong minimum with small residuals. Therefore the
-hypothesis of lowest cost after bundle adjustment is kept. An unknown focal length must be free in
-that comparison: under a wrong one, depth that is inside out can fit better than the right one.
+hypothesis of lowest cost after bundle adjustment is kept (safeguards/first_camera.py).
 """
 
-import itertools
-import math
 from dataclasses import replace
 
 import torch
@@ -16,28 +13,16 @@ from torch import Tensor
 
 from minislam.geometry import se3_interpolate, se3_inverse
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.bundle_adjustment import BundleState
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
-from minislam.tracking.pose_from_flow import ROBUST_WIDENING, start_pose, warp_disparities
-from minislam.tracking.safeguards.first_depth import (
-    FARTHEST,
-    FOCAL_WORTH_SAVING,
-    Found,
-    most_plausible,
-)
-from minislam.tracking.safeguards.focal_length import fit_focal_length
+from minislam.tracking.pose_from_flow import start_pose, warp_disparities
+from minislam.tracking.safeguards.first_camera import lowest_minimum
 from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, overlay_weights
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 
-HYPOTHESIS_ITERATIONS = 8  # Gauss-Newton steps per width before hypotheses are compared
-WIDENINGS = [*ROBUST_WIDENING, 0.5, 0.25]  # of the robust weight, times the final width [-]
 SLOPE = 3.0  # largest disparity of a ground or of a slanted wall / smallest one [-]
-SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
-# Starts of an unknown focal length beside its guess: the search reaches 0.7 to 1.4 times the truth.
-OTHER_FOCALS = (math.log(0.5), math.log(2.0))
 
 
 def first_disparity_hypotheses(
@@ -86,66 +71,27 @@ def chain_state(
     return BundleState(torch.stack(poses), torch.stack(disparities))
 
 
-def minima(
-    problem: BundleProblem,
-    states: list[BundleState],
-    workers: Workers | None = None,  # adjust side by side
-) -> list[Found]:
-    """Adjust every hypothesis on the same measurements and return where they end, each place once.
-
-    A wide robust weight lets a bad guess leave its wrong minimum, but under the widest one a large
-    dynamic object may outvote the room. So every hypothesis starts from the two widest. Costs are
-    compared under a narrow one, which a compromise between room and dynamic object does not fit.
-    """
-    starts = [WIDENINGS, WIDENINGS[1:]] if problem.robust else [[1.0]]
-    calls = [(problem, *pair, HYPOTHESIS_ITERATIONS) for pair in itertools.product(states, starts)]
-    found: list[Found] = []
-    for state, report in (workers or Workers()).map(adjust_narrowing, calls):
-        cost = report.cost_after
-        if all(abs(cost - other.cost_after) > SAME_COST * cost for _, other in found):
-            found.append((state, report))
-    return found
-
-
 def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None:
-    """Estimate poses and disparities of all keyframes of the warm-up, and an unknown focal length.
+    """Estimate poses and disparities of all keyframes of the warm-up, and an unknown camera.
 
-    Flow alone decides: a depth prior is one start of the search and gives the unit of length. The
-    focal length stays as guessed if the motion does not tell it.
+    Flow alone decides: a depth prior is one start of the search and gives the unit of length.
     """
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
-    workers, keyframes = workers or Workers(), graph.keyframes
+    keyframes = graph.keyframes
     keyframes.overlay = overlay_weights(flow_to_next, graph.grid)
     for target in range(1, len(keyframes)):
         graph.match_composed(target)
-    problem = bundle_problem(graph, range(len(graph.links)), first_free=0, lambda_prior=0.0)
+    known, weights = keyframes.prior_disparities, keyframes.cell_weights[0]
 
-    def start(log_focal: float) -> list[Found]:
+    def start(log_focal: float) -> list[BundleState]:
         grid = replace(graph.grid)
         grid.zoom(log_focal)
-        known, weights = keyframes.prior_disparities, keyframes.cell_weights[0]
         guesses = first_disparity_hypotheses(grid, known)
         chains = [chain_state(grid, flow_to_next, *g, graph.robust, weights) for g in guesses]
-        return minima(problem, [replace(chain, log_focal=log_focal) for chain in chains], workers)
+        return [replace(chain, log_focal=log_focal) for chain in chains]
 
-    held = start(0.0)
-    state, report = min(held, key=lambda result: result[1].cost_after)
-    if graph.seeks_focal:
-        free = replace(problem, free_focal=True)
-        found = [*held, *(result for other in OTHER_FOCALS for result in start(other))]
-        calls = [(free, state, WIDENINGS[1:], HYPOTHESIS_ITERATIONS) for state, _ in found]
-        freed = workers.map(adjust_narrowing, calls)
-        chosen = most_plausible(graph.grid, keyframes.prior_disparities, freed)
-        best, at_guess = freed[chosen], held[chosen] if chosen < len(held) else (state, report)
-        fit, fitted = fit_focal_length(problem, at_guess[0], workers, best[0])
-        if fit.factor is not None:
-            graph.focal_is_free = True
-            state, report = adjust_narrowing(free, fitted, WIDENINGS[2:], HYPOTHESIS_ITERATIONS)
-        elif abs(best[0].log_focal) <= FARTHEST and (
-            best[1].cost_after < (1 - FOCAL_WORTH_SAVING) * report.cost_after
-        ):
-            graph.focal_is_free, (state, report) = True, best
+    state, report = lowest_minimum(graph, start, workers)
     graph.grid.zoom(state.log_focal)
     graph.count_adjustment(report)
     keyframes.set_geometry(state.T_camera_world, state.disparities)

@@ -20,8 +20,13 @@ RELIEF_WORTH_SAVING = 0.1  # of the cost, if disparities do not correlate with t
 Found = tuple[BundleState, BundleReport]
 
 
-def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) -> int:
-    """Return the position of the lowest cost; what is usual decides between nearly equal ones.
+def cost_of(found: Found) -> float:  # px^2
+    """Return the cost at which an adjustment ended."""
+    return found[1].cost_after
+
+
+def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) -> Found:
+    """Return the result of lowest cost; what is usual decides between nearly equal ones.
 
     Usual are the guessed focal length, and disparities that grow with those of the depth prior, or
     without one towards the lower edge of the image.
@@ -41,5 +46,4 @@ def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) ->
         unusual = FOCAL_WORTH_SAVING * doublings - RELIEF_WORTH_SAVING * float(agrees.nan_to_num())
         return report.cost_after * (1 + unusual)
 
-    costs = [implausible_cost(result) for result in found]
-    return costs.index(min(costs))
+    return min(found, key=implausible_cost)

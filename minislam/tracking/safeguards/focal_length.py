@@ -166,7 +166,4 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
     if held.cost_after - free.cost_after > READOUT_WORTH_SAVING * max(held.cost_after, floor):
-        (across, down), moved = state.readout, columns.abs().mean((0, 2, 3))
-        is_down = bool(abs(down) * moved[1] > abs(across) * moved[0])
-        shutter.axis = int(is_down)
-        shutter.lengthen((0.0, down) if is_down else (across, 0.0))
+        shutter.take(state.readout, columns)

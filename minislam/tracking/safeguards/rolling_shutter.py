@@ -18,6 +18,7 @@ a readout is found.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -122,16 +123,29 @@ class RollingShutter(Stateful):
         columns = self.columns(edges, matches.targets, next_frame)
         return replace(matches, targets=matches.targets + displacements(columns, self.readout))
 
-    def link_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
-        """Return c of the links at these positions in the graph, None if nothing is estimated."""
+    def link_columns(
+        self,
+        positions: Sequence[int],  # of links in the graph
+        usual: bool = False,  # only along the shorter side of the image, as most sensors are read
+    ) -> Tensor | None:  # (E, 2, 2, N) px/s
+        """Return c of some links for the readouts that are free, None if nothing is estimated."""
         if not (self.is_on and positions):
             return None
         edges = self._links.edges
         targets = torch.stack([self._links.targets[position] for position in positions])
         columns = self.columns([edges[position] for position in positions], targets)
-        if self.axis is not None:
-            columns[:, 1 - self.axis] = 0
+        shorter = int(self._grid.camera.width >= self._grid.camera.height) if usual else None
+        axis = shorter if self.axis is None else self.axis
+        if axis is not None:
+            columns[:, 1 - axis] = 0
         return columns
+
+    def take(self, found: Readout, columns: Tensor) -> None:  # columns (E, 2, 2, N) px/s
+        """Set the readout that displaces the flow more: a sensor is read along one axis."""
+        moved = columns.abs().mean((0, 2, 3))
+        is_down = bool(abs(found[1]) * moved[1] > abs(found[0]) * moved[0])
+        self.axis = int(is_down)
+        self.lengthen((0.0, found[1]) if is_down else (found[0], 0.0))
 
     def lengthen(self, seconds: Readout) -> None:
         """Make the readouts longer, and correct the flow along all links accordingly."""
