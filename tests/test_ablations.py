@@ -20,7 +20,7 @@ from minislam.priors.flow import ClassicalFlow
 from minislam.records import Sequence
 from minislam.slam import Priors, Slam
 from minislam.stereo import second_adjustment
-from minislam.tracking import initialisation
+from minislam.tracking.safeguards import first_camera
 
 pytestmark = pytest.mark.slow
 
@@ -68,7 +68,7 @@ SIGNS = [
 def sequence(root: Path) -> Iterator[Sequence]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(second_adjustment, "COARSE_WIDTH", 24)
-        patch.setattr(initialisation, "HYPOTHESIS_ITERATIONS", 3)
+        patch.setattr(first_camera, "ITERATIONS", 3)
         options = InputOptions(stride=6, max_frames=FRAMES, size=(64, 48))
         yield open_sequence("synth:person", options)
 

@@ -33,8 +33,8 @@ from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam
 from minislam.state.stateful import Tree
 from minislam.stereo import second_adjustment
-from minislam.tracking import initialisation, pose_from_flow
-from minislam.tracking.safeguards import focal_length, relocalisation
+from minislam.tracking import pose_from_flow
+from minislam.tracking.safeguards import first_camera, focal_length, relocalisation
 from tests.brief import plots_left_out
 from tests.checkpoint_files import calm_droid, tiny_fit3d
 from tests.pretended_gpu import GPU, PACKAGE, GpuTensor, pretended_gpu
@@ -96,7 +96,7 @@ class Run:
 def short_stages(root: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module, name in (
-            (initialisation, "HYPOTHESIS_ITERATIONS"), (pose_from_flow, "POSE_ITERATIONS"),
+            (first_camera, "ITERATIONS"), (pose_from_flow, "POSE_ITERATIONS"),
             (focal_length, "ITERATIONS"), (focal_length, "MAX_TRIES"),
         ):  # fmt: skip
             patch.setattr(module, name, 1)

@@ -65,18 +65,29 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("np.argmin(slam.mapper.shown)", "np.argmax(slam.mapper.shown)"),
     ],
     ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
-        ("replace(chain, log_focal=log_focal)", "chain"),
-        ("> SAME_COST * cost", "> SAME_COST"),
         ("(below, -right, right)", "(-below, -right, right)"),
-        ("for other in OTHER_FOCALS for result", "for other in () for result"),
-        ("(1 - FOCAL_WORTH_SAVING) * report", "0 * report"),
-        ("else (state, report)", "else best"),
     ],
-    ("tracking/safeguards/first_depth.py", "tracking/safeguards/test_first_depth.py"): [
+    (
+        "tracking/initialisation.py",
+        "tracking/safeguards/test_first_camera.py",
+    ): [("replace(chain, log_focal=log_focal)", "chain")],
+    ("tracking/safeguards/first_camera.py", "tracking/safeguards/test_first_camera.py"): [
+        ("> SAME_COST * cost", "> SAME_COST"),
+        ("for log_focal in OTHER_FOCALS", "for log_focal in ()"),
+        ("(1 - FOCAL_WORTH_SAVING) * min", "0 * min"),
+        ("columns = graph.shutter.link_columns(links)", "columns = None"),
+        ("camera.width < problem", "camera.width > problem"),
+        ("(1 - READOUT_WORTH_SAVING) * min", "2 * min"),
+        ("problem = flow_problem()  # corrected", "pass"),
+        ("replace(rolled[0], readout=(0.0, 0.0))", "rolled[0]"),
         ("* doublings - RELIEF", "* doublings + RELIEF"),
         ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
         ("return math.inf", "return 0.0"),
         ("usual, cells = known_disparities.log(), known", "pass"),
+    ],
+    ("tracking/safeguards/rolling_shutter.py", "tracking/safeguards/test_rolling_shutter.py"): [
+        ("> abs(found[0]) * moved[0]", "> abs(found[0])"),
+        ("self.lengthen((0.0, found[1])", "self.lengthen(found"),
     ],
     ("tracking/safeguards/focal_length.py", "tracking/safeguards/test_focal_length.py"): [
         ("(free, start or state)", "(free, state)"),

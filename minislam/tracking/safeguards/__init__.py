@@ -7,7 +7,7 @@ settling         which disparities parallax has measured; only these are handed 
 relocalisation   finds a lost camera among the keyframes
 pose_support     tries other starts for poses between keyframes that little of the flow supports
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
-first_depth      which of several first depths is taken, where their costs are nearly equal
+first_camera     which minimum the start takes, with an unknown focal length and readout
 diagnostics      how well each keyframe is tied to the others
 focal_length     estimates an unknown focal length, tells whether a given one was wrong; the readout
 focal_column     the focal length as one more unknown of the bundle adjustment

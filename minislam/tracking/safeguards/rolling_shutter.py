@@ -18,7 +18,6 @@ a readout is found.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -123,21 +122,15 @@ class RollingShutter(Stateful):
         columns = self.columns(edges, matches.targets, next_frame)
         return replace(matches, targets=matches.targets + displacements(columns, self.readout))
 
-    def link_columns(
-        self,
-        positions: Sequence[int],  # of links in the graph
-        usual: bool = False,  # only along the shorter side of the image, as most sensors are read
-    ) -> Tensor | None:  # (E, 2, 2, N) px/s
-        """Return c of some links for the readouts that are free, None if nothing is estimated."""
+    def link_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
+        """Return c of the links at these positions in the graph, None if nothing is estimated."""
         if not (self.is_on and positions):
             return None
         edges = self._links.edges
         targets = torch.stack([self._links.targets[position] for position in positions])
         columns = self.columns([edges[position] for position in positions], targets)
-        shorter = int(self._grid.camera.width >= self._grid.camera.height) if usual else None
-        axis = shorter if self.axis is None else self.axis
-        if axis is not None:
-            columns[:, 1 - axis] = 0
+        if self.axis is not None:
+            columns[:, 1 - self.axis] = 0
         return columns
 
     def take(self, found: Readout, columns: Tensor) -> None:  # columns (E, 2, 2, N) px/s

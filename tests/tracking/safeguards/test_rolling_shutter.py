@@ -211,6 +211,16 @@ def test_once_an_axis_is_found_the_other_readout_is_held():
     assert torch.equal(one[:, 1], both[:, 1])
 
 
+def test_the_readout_that_displaces_the_flow_more_is_taken():
+    shutter, _ = linked()
+    columns = torch.tensor([3.0, 1.0]).reshape(1, 2, 1, 1).expand(1, 2, 2, 4)
+    shutter.take((0.01, 0.02), columns)
+    assert (shutter.axis, shutter.readout) == (0, (0.01, 0.0))
+    shutter, _ = linked()
+    shutter.take((0.01, -0.035), columns)
+    assert (shutter.axis, shutter.readout) == (1, (0.0, -0.035))
+
+
 def test_no_readout_is_longer_than_the_time_between_two_frames():
     shutter, _ = linked()
     shutter.lengthen((0.3, -0.3))
