@@ -159,6 +159,15 @@ def test_a_turn_is_no_parallax_whatever_the_poses_claim():
     assert flow_beyond_turns(graph) < 1e-3 < 3 < diagnose(graph, 1).parallax
 
 
+def test_under_a_wrong_focal_length_a_turn_is_no_parallax_either():
+    turn = se3_exp(torch.tensor([0, 0, 0, 0.1, 0.15, 0.3], dtype=torch.float64))
+    graph = seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
+    graph.grid.zoom(math.log(1.5))
+    assert flow_beyond_turns(graph) > 1  # px: the focal length is given
+    graph.seeks_focal = True
+    assert flow_beyond_turns(graph) < 0.01
+
+
 @pytest.mark.parametrize("moving", [0.1, 0.2])
 def test_what_moves_in_front_of_a_turning_camera_is_no_sign_of_depth(moving: float):
     turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
