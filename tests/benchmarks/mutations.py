@@ -79,7 +79,6 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("camera.width < problem", "camera.width > problem"),
         ("(1 - READOUT_WORTH_SAVING) * min", "2 * min"),
         ("problem = flow_problem()  # corrected", "pass"),
-        ("replace(rolled[0], readout=(0.0, 0.0))", "rolled[0]"),
         ("* doublings - RELIEF", "* doublings + RELIEF"),
         ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
         ("return math.inf", "return 0.0"),
@@ -153,6 +152,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("static >= LEAST_STATIC * whole", "static < LEAST_STATIC * whole"),
     ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
+        ("free_focal=graph.seeks_focal and", "free_focal=False and"),
+        ("graph.seeks_focal and not graph.focal_is_free", "graph.seeks_focal"),
         ("weak >= LONG or _is", "_is"),
         ("or held < MIN_CONTINUITY", ""),
         ("or agreement < MIN_AGREEMENT", ""),

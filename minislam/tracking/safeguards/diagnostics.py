@@ -203,7 +203,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     A turn moves all points as if they were infinitely far away. The best one, under a wide robust
     weight, takes the place of any translation that looks like it, so that what is left, in the
     median, tells depth, whatever parallax the poses claim. Under a wrong focal length a turn looks
-    like parallax, so one that is sought is free here, too. None: no link has any weight.
+    like parallax, so one that is sought and not told is free. None: no link has any weight.
     """
     grid, links, keyframes = graph.grid, graph.links, graph.keyframes
     pairs = [p for p, (source, target) in enumerate(links.edges) if target == source + 1]
@@ -215,7 +215,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
     measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
     problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
-    problem = replace(problem, free_focal=graph.seeks_focal)
+    problem = replace(problem, free_focal=graph.seeks_focal and not graph.focal_is_free)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
     turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
     kernels = [graph.robust.widened(width) for width in TURN_WIDENING] if graph.robust else []

@@ -166,6 +166,8 @@ def test_under_a_wrong_focal_length_a_turn_is_no_parallax_either():
     assert flow_beyond_turns(graph) > 1  # px: the focal length is given
     graph.seeks_focal = True
     assert flow_beyond_turns(graph) < 0.01
+    graph.focal_is_free = True  # the motion has told it
+    assert flow_beyond_turns(graph) > 1
 
 
 @pytest.mark.parametrize("moving", [0.1, 0.2])
