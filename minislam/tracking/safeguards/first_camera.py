@@ -59,6 +59,7 @@ def minima(
 
 
 def _each_once(found: list[Found]) -> list[Found]:
+    """Return the first of those that have met in one minimum."""
     kept: list[Found] = []
     for state, report in found:
         cost = report.cost_after
