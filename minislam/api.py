@@ -13,8 +13,8 @@ from typing import Any
 from minislam.cli.progress import ProgressLine, SilentProgress, ending_signals, plan_of
 from minislam.config import preset as preset_of
 from minislam.config import with_settings
-from minislam.data import InputOptions, open_sequence
-from minislam.data.options import default_depth
+from minislam.data.options import InputOptions, default_depth
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run

@@ -66,14 +66,6 @@ class Keyframe(Pictured):
 
 
 @dataclass(frozen=True)
-class AdjustmentCount:
-    """How many adjustments ran, and how many failed, which left the state as it was."""
-
-    count: int = 0
-    failed: int = 0
-
-
-@dataclass(frozen=True)
 class Trajectory:
     """Stamped camera poses, in the order of their timestamps."""
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from minislam.config import PRESETS, SlamConfig, preset, with_settings
-from minislam.data import InputOptions, open_sequence
+from minislam.data.options import InputOptions
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.priors.depth import SimulatedDepth
 from minislam.priors.features import ClassicalFeatures

@@ -18,8 +18,10 @@ import torch
 
 from minislam.cli.main import main
 from minislam.config import SlamConfig, preset, settings_in, with_settings
-from minislam.data import InputOptions, RunFolder, open_sequence
+from minislam.data.options import InputOptions
 from minislam.data.ply import read_ply
+from minislam.data.run_folder import RunFolder
+from minislam.data.sequence import open_sequence
 from minislam.data.trajectory import read_trajectory
 from minislam.evaluation import absolute_trajectory_error
 from minislam.priors.features import ClassicalFeatures

@@ -17,8 +17,10 @@ import pytest
 import torch
 
 from minislam.config import SlamConfig, with_settings
-from minislam.data import InputOptions, RunFolder, open_sequence
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
+from minislam.data.options import InputOptions
+from minislam.data.run_folder import RunFolder
+from minislam.data.sequence import open_sequence
 from minislam.priors.choice import PriorChoice
 from minislam.priors.depth import NoDepth, SimulatedDepth
 from minislam.priors.features import ClassicalFeatures

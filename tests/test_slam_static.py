@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from minislam.config import preset, with_settings
-from minislam.data import InputOptions, open_sequence
+from minislam.data.options import InputOptions
+from minislam.data.sequence import open_sequence
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.images import psnr
 from minislam.priors.depth import SensorDepth

@@ -129,7 +129,7 @@ def config_file(args: argparse.Namespace) -> dict[str, Any]:
     if args.config:
         tree = read_json(args.config)
     elif getattr(args, "resume", False):
-        from minislam.data import RunFolder
+        from minislam.data.run_folder import RunFolder
 
         tree = RunFolder(args.output).read_config()
     flattened(tree)  # refuses what is no JSON object
@@ -189,7 +189,7 @@ def settings(args: argparse.Namespace) -> SlamConfig:
 
     base = preset("laptop" if args.preset is None else args.preset)
     if getattr(args, "resume", False) and args.preset is None:
-        from minislam.data import RunFolder
+        from minislam.data.run_folder import RunFolder
 
         base = with_settings(base, settings_in(RunFolder(args.output).read_config()))
     if args.config:

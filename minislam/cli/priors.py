@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from minislam.config import SlamConfig
-    from minislam.data import RecordedSequence
+    from minislam.data.sequence import RecordedSequence
     from minislam.priors.choice import PriorChoice
     from minislam.records import Frame
 
@@ -53,7 +53,7 @@ def _priors(args: argparse.Namespace) -> None:
         )
     import torch
 
-    from minislam.data import open_sequence
+    from minislam.data.sequence import open_sequence
 
     config, progress = options.settings(args), ProgressLine()
     torch.set_num_threads(config.threads)

@@ -56,7 +56,7 @@ def _run(args: argparse.Namespace) -> int:
             also = " (or --resume, to go on with an interrupted run)"
             require_free(args.output, args.overwrite, also)
         choice = options.prior_choice(args, default_depth(source))
-        from minislam.data import open_sequence
+        from minislam.data.sequence import open_sequence
         from minislam.runs.run import default_output, run_in_folder
         from minislam.runs.summary import as_text, summarise
 

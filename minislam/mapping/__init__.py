@@ -20,7 +20,5 @@ from minislam.mapping.config import (
     InsertionConfig,
     MappingConfig,
     PoseRefinementConfig,
-    paper_mapping,
 )
 from minislam.mapping.mapper import Mapper
-from minislam.records import MappingHistory

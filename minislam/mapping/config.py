@@ -130,32 +130,3 @@ class MappingConfig:
             opacity_logits=factor * self.opacity_rate,
             colors=factor * self.colors_rate,
         )
-
-
-def paper_mapping() -> MappingConfig:
-    """Return the constants of the paper and of the official code, in our units.
-
-    The official learning rate of the means is 9.6e-4 m, here divided by a median depth of 2 m. The
-    official first scale is 0.22 of the distance between neighbours, here 0.22 cells.
-    """
-    return MappingConfig(
-        image_scale=1.0,
-        views_per_step=1,
-        init_iterations=1050,
-        keyframe_iterations=450,
-        refine_iterations=20000,
-        refine_full_fraction=1.0,
-        freeze_iterations=20,
-        color_weight=0.5,
-        mean_background=False,
-        means_rate=4.8e-4,
-        means_rate_end=0.01,
-        rate_iterations=30000,
-        quats_rate=1e-3,
-        log_scales_rate=6e-3,
-        colors_rate=7.05e-4,
-        refine_rate_end=1.0,
-        insertion=InsertionConfig(cell=4, footprint=0.22, opacity=0.5),
-        density=DensityConfig(max_gaussians=1_000_000),
-        pose_refinement=PoseRefinementConfig(enabled=True),
-    )

@@ -90,7 +90,8 @@ class Mapper(JointOptimisation):
         assert len(T_camera_world) == len(self.keyframes), len(T_camera_world)
         old = torch.stack([keyframe.T_camera_world for keyframe in self.keyframes])
         new = T_camera_world.double()
-        self._optimizer.replace(deform_rigidly(self.gaussians, self.anchor_rows(), old, new))
+        anchors = self.gaussians.anchor_keyframe
+        self._optimizer.replace(deform_rigidly(self.gaussians, anchors, old, new))
         for keyframe, pose in zip(self.keyframes, new, strict=True):
             keyframe.T_camera_world = pose
 
@@ -126,12 +127,6 @@ class Mapper(JointOptimisation):
         calls = [(self.gaussians, self.camera, *view, *fixed) for view in views]
         return self._workers.map(refine_pose, calls)
 
-    def anchor_rows(self) -> Tensor:
-        """Return (N,) the position in `keyframes` of the keyframe that inserted each Gaussian."""
-        anchors = self._optimizer.gaussians.anchor_keyframe
-        known = anchors.new_tensor([keyframe.keyframe_index for keyframe in self.keyframes])
-        return torch.searchsorted(known, anchors)
-
     @torch.no_grad()
     def _insert(self, keyframe: MappedKeyframe) -> None:
         """Add Gaussians for what a keyframe sees and the map does not show."""
@@ -151,11 +146,11 @@ class Mapper(JointOptimisation):
 
     def _remove_dynamic_gaussians(self, positions: Iterable[int]) -> None:
         """Remove Gaussians that keyframes inserted on an object before the MLP knew it moves."""
-        gaussians, rows = self.gaussians, self.anchor_rows()
-        keep = torch.ones_like(rows, dtype=torch.bool)
+        gaussians = self.gaussians
+        keep = torch.ones_like(gaussians.anchor_keyframe, dtype=torch.bool)
         for position in positions:
             keyframe = self.keyframes[position]
-            anchored = (rows == position).nonzero().squeeze(-1)
+            anchored = (gaussians.anchor_keyframe == position).nonzero().squeeze(-1)
             weight = self.static_weight(self.beta_of(keyframe), self._online_camera)
             keep[anchored] = ~is_on_dynamic_object(
                 gaussians.means[anchored], self._online_camera, keyframe.T_camera_world, weight

@@ -1,6 +1,5 @@
 """What is said the moment something goes wrong; the summary at the end has the final verdict."""
 
-import os
 from collections.abc import Iterator
 
 from minislam.slam import Slam
@@ -21,16 +20,3 @@ def alarms(slam: Slam) -> Iterator[str]:
             f"frame {diagnostics[-1].frame_index}: the estimated motion explains only "
             f"{diagnostics[-1].explained:.0%} of the optical flow; the trajectory may break here"
         )
-
-
-def check_finite(slam: Slam) -> None:
-    """Raise FloatingPointError at the first NaN or infinity, under MINISLAM_DEBUG=1 only."""
-    if not os.environ.get("MINISLAM_DEBUG"):
-        return
-    names = ("T_camera_world", "disparities", "static_weights")  # of the keyframes
-    parts = {name: getattr(slam.tracker.keyframes, name) for name in names}
-    for name, tensor in (parts | slam.mapper.gaussians.parameters).items():
-        if wrong := int((~tensor.isfinite()).sum()):
-            raise FloatingPointError(
-                f"expected finite numbers in {name}, found {wrong} of {tensor.numel()} that are not"
-            )

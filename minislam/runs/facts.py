@@ -36,7 +36,7 @@ def run_facts(
     slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int | None
 ) -> dict[str, Any]:
     """Return the content of run.json: the command, how long the run took, and how it ended."""
-    adjustments, fit = slam.tracker.graph.adjustments, slam.focal_length
+    graph, fit = slam.tracker.graph, slam.focal_length
     stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
     return {
         "version": minislam.__version__,
@@ -57,14 +57,14 @@ def run_facts(
         "frames": len(slam.tracker.tracked),
         "keyframes": len(slam.tracker.keyframes),
         "lost_frames": len(slam.lost_frames()),
-        "adjustments": adjustments.count,
-        "failed_adjustments": adjustments.failed,
+        "adjustments": graph.adjustments,
+        "failed_adjustments": graph.failed_adjustments,
         "gaussians": len(slam.mapper.gaussians),
         "unit": unit_of(slam),
         "camera": asdict(slam.tracker.grid.camera),
         "focal_length": {"used": focal_length_note(slam)}
         | (asdict(fit) | {"is_doubtful": fit.is_doubtful} if fit else {}),
-        "readout_seconds": list(slam.tracker.graph.shutter.readout),
+        "readout_seconds": list(graph.shutter.readout),
         # Numbered images are a second apart.
         "frame_seconds": float(np.median(np.diff(stamps))) if len(stamps) > 1 else None,
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
@@ -210,9 +210,9 @@ def _warnings(slam: Slam) -> Iterator[str]:
             f"(frames {pieces or 'none'}) by itself. If the images lie far apart, give more frames "
             "per second (a smaller --stride)"
         )
-    if graph.adjustments.failed:
+    if graph.failed_adjustments:
         yield (
-            f"{graph.adjustments.failed} of {graph.adjustments.count} bundle adjustments failed "
+            f"{graph.failed_adjustments} of {graph.adjustments} bundle adjustments failed "
             "and changed nothing: poses and depths there are those of the start"
         )
     if has_large_holes(slam):
@@ -248,14 +248,14 @@ def _warnings(slam: Slam) -> Iterator[str]:
 
 def _focal_length_warnings(slam: Slam) -> Iterator[str]:
     fit, graph = slam.focal_length, slam.tracker.graph
-    if graph.seeks_focal and graph.adjustments.count and not graph.focal_is_free:
+    if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
         yield (
             "the focal length is unknown and the motion does not tell it: trajectory and map may "
             "be bent; give --fx or a calibration file"
         )
         return
     # The flow of a broken run fits whatever focal length.
-    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.adjustments.failed
+    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
     if fit is None or not fit.is_doubtful or is_broken:
         return
     found = (

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from minislam.config import SlamConfig, settings_in, settings_of, with_settings
-from minislam.data import InputOptions, RecordedSequence, RunFolder, open_sequence
 from minislam.data.files import read_bytes, read_json, read_text
+from minislam.data.options import InputOptions
 from minislam.data.ply import GaussianArrays, read_ply
-from minislam.data.run_folder import CAMERA, MAP, PLOTS, VIEWER
+from minislam.data.run_folder import CAMERA, MAP, PLOTS, VIEWER, RunFolder
+from minislam.data.sequence import RecordedSequence, open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_inverse
 from minislam.images import resample

@@ -11,10 +11,9 @@ import numpy as np
 
 from minislam import viz
 from minislam.config import PRESETS, SlamConfig, preset, settings_of
-from minislam.data import RunFolder
 from minislam.data.files import write_text
 from minislam.data.images import encode_jpeg, encode_png
-from minislam.data.run_folder import KEYFRAMES, PLOTS, REPORT, VIEWER
+from minislam.data.run_folder import KEYFRAMES, PLOTS, REPORT, VIEWER, RunFolder
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.runs.facts import surface_depth

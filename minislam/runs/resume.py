@@ -8,7 +8,7 @@ from typing import Any
 
 import minislam
 from minislam.config import SlamConfig
-from minislam.data import RunFolder
+from minislam.data.run_folder import RunFolder
 from minislam.errors import InputError, MinislamError
 from minislam.parameters import flattened
 from minislam.priors.choice import PriorChoice

@@ -12,17 +12,17 @@ from typing import Any
 import torch
 
 from minislam.config import SlamConfig
-from minislam.data import GaussianArrays, RunFolder
 from minislam.data import run_folder as names
 from minislam.data.files import atomic_write, write_json
-from minislam.data.ply import encode_ply
+from minislam.data.ply import GaussianArrays, encode_ply
+from minislam.data.run_folder import RunFolder
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
 from minislam.records import Sequence
-from minislam.runs.alarms import alarms, check_finite
+from minislam.runs.alarms import alarms
 from minislam.runs.facts import has_large_holes, measure, run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
@@ -88,7 +88,6 @@ def run_in_folder(
                     if text not in said:
                         observer.warn(text)
                         said.add(text)
-                check_finite(slam)
                 preview.update(slam, facts_of)
                 checkpoints.save(slam, force)
 
@@ -146,8 +145,8 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     """Return the state of run.json and the exit code."""
     if interrupted:
         return "interrupted", INTERRUPTED_EXIT
-    adjustments = slam.tracker.graph.adjustments
-    if 2 * adjustments.failed > adjustments.count:
+    graph = slam.tracker.graph
+    if 2 * graph.failed_adjustments > graph.adjustments:
         return "finished, most bundle adjustments failed", LOST_EXIT
     if slam.tracker.watch.breaks:
         return "finished, broken", LOST_EXIT

@@ -83,21 +83,3 @@ class TrackingConfig:
     def for_learned_flow(self) -> "TrackingConfig":
         """Return the settings for a flow whose confidence is learned."""
         return replace(self, **vars(self.learned))
-
-
-def paper_schedule() -> LearnedFlowConfig:
-    """Return the official counts for a learned flow.
-
-    The official code makes a keyframe at 24 px, 3 cells, in 512x384: that is 15 px in 320x240.
-    """
-    return LearnedFlowConfig(
-        keyframe_flow=15.0,
-        keyframe_flow_without_prior=15.0,
-        warmup_rounds=8 + 8,
-        warmup_rounds_with_beta=8,
-        window=25,
-        rounds=8 + 4,
-        active_edges=75,
-        final_rounds=7 + 12,
-        pose_rounds=12,
-    )

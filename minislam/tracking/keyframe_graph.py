@@ -13,7 +13,7 @@ from torch import Tensor
 from minislam.geometry import Camera, se3_interpolate, se3_inverse
 from minislam.geometry.camera import pixel_scale
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
-from minislam.records import AdjustmentCount, Frame
+from minislam.records import Frame
 from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import BundleReport, BundleState, bundle_adjust, residuals
 from minislam.tracking.config import TrackingConfig
@@ -61,7 +61,8 @@ class KeyframeGraph(Stateful):
     links: FrameGraph
     flow: FlowEstimator
     shutter: RollingShutter
-    adjustments: AdjustmentCount = AdjustmentCount()
+    adjustments: int = 0  # that ran
+    failed_adjustments: int = 0  # of these, which left the state as it was
     seeks_focal: bool = False  # the focal length is only a first guess
     focal_is_free: bool = False  # the motion has told it; adjustments of all keyframes refine it
 
@@ -93,9 +94,8 @@ class KeyframeGraph(Stateful):
 
     def count_adjustment(self, report: BundleReport) -> None:
         """Count an adjustment; a run warns at its end of those that failed."""
-        before = self.adjustments
-        failed = before.failed + (not report.converged)
-        self.adjustments = AdjustmentCount(before.count + 1, failed)
+        self.adjustments += 1
+        self.failed_adjustments += not report.converged
 
     def append(
         self,

@@ -9,7 +9,7 @@ Read the files in this order:
     config        the settings
 """
 
-from minislam.uncertainty.config import UncertaintyConfig, paper_uncertainty
+from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.training import RenderingError, UncertaintyTrainer, rendering_error
 from minislam.uncertainty.weights import beta_of_mask, mapping_weight, tracking_weight

@@ -69,8 +69,3 @@ class UncertaintyConfig:
                 f"expected an odd median window of at least 1 cell, found {self.median_size}; "
                 "set uncertainty.median_size to 1, 3 or 5"
             )
-
-
-def paper_uncertainty() -> UncertaintyConfig:
-    """Return the official constants, for the many iterations of `paper_mapping`."""
-    return UncertaintyConfig(learning_rate=4e-4, median_size=5)

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from minislam.data import open_sequence
+from minislam.data.sequence import open_sequence
 from minislam.tracking.config import TrackingConfig
 from tests.benchmarks.bench_movers import SEED, SEQUENCES, errors
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from minislam.data import open_sequence
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.evaluation import absolute_trajectory_error
 from minislam.geometry import se3_inverse

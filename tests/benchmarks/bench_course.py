@@ -22,8 +22,9 @@ import torch
 
 import minislam
 from minislam.config import preset, with_settings
-from minislam.data import InputOptions, open_sequence
 from minislam.data.files import atomic_write
+from minislam.data.options import InputOptions
+from minislam.data.sequence import open_sequence
 from tests.benchmarks.bench_movers import errors
 
 ROOT = Path(__file__).parent.parent.parent

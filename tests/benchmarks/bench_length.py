@@ -15,7 +15,8 @@ import torch
 
 from minislam.cli.main import set_malloc
 from minislam.config import SlamConfig
-from minislam.data import InputOptions, open_sequence
+from minislam.data.options import InputOptions
+from minislam.data.sequence import open_sequence
 from minislam.evaluation.metrics import ate_cm
 from minislam.priors.choice import PriorChoice
 from minislam.runs.run import choose_priors

@@ -19,7 +19,8 @@ import torch
 
 from data_synth.cli import parse_size
 from minislam.config import PRESETS, SlamConfig, preset, with_settings
-from minislam.data import InputOptions, open_sequence
+from minislam.data.options import InputOptions
+from minislam.data.sequence import open_sequence
 from minislam.evaluation.metrics import MappedView, measure_run
 from minislam.geometry import se3_inverse
 from minislam.priors.choice import PriorChoice

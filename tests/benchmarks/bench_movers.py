@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from minislam.config import SlamConfig
-from minislam.data import open_sequence
+from minislam.data.sequence import open_sequence
 from minislam.evaluation import absolute_trajectory_error
 from minislam.geometry import se3_inverse
 from minislam.priors.choice import PriorChoice

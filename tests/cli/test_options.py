@@ -19,7 +19,7 @@ from minislam.cli.options import (
     take_settings,
 )
 from minislam.config import SlamConfig, settings_of, with_settings
-from minislam.data import InputOptions
+from minislam.data.options import InputOptions
 from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from minislam.cli.main import main
-from minislam.data import RunFolder
 from minislam.data.ply import read_ply
+from minislam.data.run_folder import RunFolder
 from minislam.priors.networks.metric3d import Metric3DDepth
 from minislam.priors.networks.vit import DinoFeatures
 from tests.checkpoint_files import calm_droid, tiny_fit3d, write_all

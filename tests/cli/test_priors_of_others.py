@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from minislam.cli.main import main
-from minislam.data import RunFolder
 from minislam.data.images import encode_png, read_mask
+from minislam.data.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
 

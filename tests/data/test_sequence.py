@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minislam.data import InputOptions, open_sequence
+from minislam.data.options import InputOptions
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from tests.data.test_metadata import exif

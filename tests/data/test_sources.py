@@ -7,7 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from minislam.data import InputOptions, RecordedSequence, sources
+from minislam.data import sources
+from minislam.data.options import InputOptions
+from minislam.data.sequence import RecordedSequence
 from minislam.data.sources import VideoImages, read_video
 from minislam.errors import InputError
 from tests.recordings import picture, save, video

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minislam.data import InputOptions, RecordedSequence, open_sequence
 from minislam.data.images import encode_png
+from minislam.data.options import InputOptions
+from minislam.data.sequence import RecordedSequence, open_sequence
 from minislam.data.tum import read_tum_folder
 from minislam.errors import InputError
 from tests.recordings import picture, tum_folder, video

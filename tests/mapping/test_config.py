@@ -2,9 +2,9 @@ from dataclasses import fields
 
 import pytest
 
-from minislam.config import SlamConfig, with_settings
+from minislam.config import SlamConfig, preset, with_settings
 from minislam.errors import InputError
-from minislam.mapping import MappingConfig, paper_mapping
+from minislam.mapping import MappingConfig
 from minislam.parameters import leaves
 from minislam.splatting import LearningRates
 
@@ -35,7 +35,7 @@ def test_impossible_values_are_refused_in_one_sentence():
 
 
 def test_the_paper_values_are_the_official_ones():
-    mapping = paper_mapping()
+    mapping = preset("paper").mapping
     # The step of the means of a scene of median depth 2 m, before and after its decay.
     assert mapping.rates_at(0, 2.0, 1.0).means == pytest.approx(9.6e-4)
     assert mapping.rates_at(30000, 2.0, 1.0).means == pytest.approx(9.6e-6)

@@ -232,14 +232,6 @@ def test_a_map_that_lost_all_its_gaussians_recovers_with_the_next_keyframe():
     assert len(mapper.gaussians) > 100
 
 
-def test_one_keyframe_per_frame_index_gap_keeps_its_anchor():
-    mapper = make_mapper(replace(CONFIG, init_iterations=1))
-    mapper.initialise([replace(wall_keyframe(0), keyframe_index=3)])
-    mapper.integrate(replace(wall_keyframe(3), keyframe_index=7))
-    assert set(mapper.gaussians.anchor_keyframe.tolist()) == {3, 7}
-    assert set(mapper.anchor_rows().tolist()) == {0, 1}
-
-
 # Errors
 
 

@@ -14,8 +14,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from minislam.data import GaussianArrays, InputOptions, open_sequence
-from minislam.data.ply import encode_ply, read_ply
+from minislam.data.options import InputOptions
+from minislam.data.ply import GaussianArrays, encode_ply, read_ply
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.runs import export
 from minislam.uncertainty.weights import MAPPING_CUT, beta_of_mask

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.records import AdjustmentCount, Pictured
+from minislam.records import Pictured
 from minislam.runs import facts
 from minislam.splatting import Rendering
 from minislam.tracking.safeguards.diagnostics import Break
@@ -20,7 +20,8 @@ def slam(**parts: object) -> SimpleNamespace:
     """Return a finished run of four frames without anything to warn of, but for these parts."""
     failed = parts.pop("failed", 0)
     graph = SimpleNamespace(
-        adjustments=AdjustmentCount(2 + failed, failed),
+        adjustments=2 + failed,
+        failed_adjustments=failed,
         least_parallax=1.0,
         seeks_focal=parts.pop("seeks_focal", False),
         focal_is_free=parts.pop("focal_is_free", False),

@@ -12,8 +12,8 @@ import torch
 
 import minislam
 from minislam import api
-from minislam.data import open_sequence
 from minislam.data.files import write_json
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.mapping import Mapper

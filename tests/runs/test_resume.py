@@ -15,8 +15,8 @@ import torch
 import minislam
 from minislam.cli.main import main
 from minislam.cli.progress import ProgressLine
-from minislam.data import RunFolder
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
+from minislam.data.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
 

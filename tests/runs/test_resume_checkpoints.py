@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from minislam.config import preset, with_settings
-from minislam.data import InputOptions, open_sequence
+from minislam.data.options import InputOptions
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 from minislam.runs import resume

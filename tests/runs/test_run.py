@@ -6,7 +6,7 @@ import pytest
 
 from minislam import slam
 from minislam.cli.main import main
-from minislam.data import RunFolder
+from minislam.data.run_folder import RunFolder
 from minislam.errors import InputError
 from minislam.runs import pictures
 from minislam.tracking import bundle_adjustment

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from minislam.records import AdjustmentCount
 from minislam.runs.run import _ending
 
 
@@ -15,7 +14,7 @@ def ended(
     broken: bool = False,
     shown: tuple[float, ...] = (1.0, 0.9),
 ) -> object:
-    graph = SimpleNamespace(adjustments=AdjustmentCount(5, failed))
+    graph = SimpleNamespace(adjustments=5, failed_adjustments=failed)
     tracker = SimpleNamespace(graph=graph, watch=SimpleNamespace(breaks=broken))
     sequence = SimpleNamespace(lost=[(0.1, "damaged")] * undecoded)
     parts = {"tracker": tracker, "sequence": sequence, "mapper": SimpleNamespace(shown=shown)}

@@ -73,8 +73,8 @@ def test_the_first_pose_is_the_world():
 
 
 def test_no_adjustment_failed():
-    adjustments = finished(with_depth=True).graph.adjustments
-    assert adjustments.count > 0 == adjustments.failed
+    graph = finished(with_depth=True).graph
+    assert graph.adjustments > 0 == graph.failed_adjustments
 
 
 def test_the_modes_follow_each_other():

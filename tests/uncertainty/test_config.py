@@ -2,8 +2,9 @@ from dataclasses import fields
 
 import pytest
 
+from minislam.config import preset
 from minislam.errors import InputError
-from minislam.uncertainty import UncertaintyConfig, paper_uncertainty
+from minislam.uncertainty import UncertaintyConfig
 
 
 def test_every_constant_says_what_it_means():
@@ -17,7 +18,7 @@ def test_beta_is_learnt_unless_it_is_switched_off_or_given():
 
 
 def test_the_paper_values_are_the_official_ones():
-    paper = paper_uncertainty()
+    paper = preset("paper").uncertainty
     assert (paper.lambda_depth, paper.learning_rate, paper.median_size) == (0.2, 4e-4, 5)
 
 

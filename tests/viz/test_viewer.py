@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.data import GaussianArrays
+from minislam.data.ply import GaussianArrays
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.splatting import GaussianMap, constants, render
 from minislam.viz import Page, build_viewer
