@@ -161,7 +161,7 @@ class Slam(Stateful):
     def _adjust_all(self) -> None:
         self.tracker.end()
         self._map_new_keyframes()
-        seek_focal_length(self.tracker.graph)
+        seek_focal_length(self.tracker.graph, self.workers)
         self.tracker.finish(self.steps.on_progress("final adjustment"))
         self._move_map()
 

@@ -201,11 +201,16 @@ def check_prior_mask(student: Function) -> Verdict:
         depth[10:30, 8:30] *= patched
         for number, (seen, _) in enumerate(others):
             seen[8 * number : 8 * number + 20, 30:50] *= 0.6  # in front of the wall, for one view
+        seen, T = others[0]
+        T[:3, 3] = doubles(0.0117, 0.0233, 1) * 0.5  # its centre falls on a cell
+        seen[:] = wall(T)
+        seen[::2] = 0  # unknown
         return Case((depth, others, camera, stride, 0.02), description)
 
     cases = [
         case(4, 0.7, "a region whose depth is 30 % too small"),
         case(4, 1.01, "a region whose depth is 1 % too large"),
+        case(4, 1.0202, "a region whose depth is 2.02 % too large"),
         case(4, 0.0, "a region without depth"),
         case(1, 0.7, "a single other view"),
         *drawn(lambda seed: case(3, 0.8, "three drawn views", seed)),

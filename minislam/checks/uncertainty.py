@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch.nn import functional
 from minislam.checks.cases import Case, doubles, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera
+from minislam.uncertainty import weights
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import variance_regulariser
 from minislam.uncertainty.mlp import UncertaintyMLP
@@ -108,7 +110,8 @@ def check_training(student: Function) -> Verdict:
 
     The answer is compared together with what the MLP then predicts.
     """
-    errors = 2 * normals(1, 2, 2, 3, 4).abs()
+    # Small, because some beta are near 0.1: the loss is divided by their square.
+    errors = 0.02 * normals(1, 2, 2, 3, 4).abs()
     holes = torch.where(normals(2, 2, 3, 4) > -0.5, 0.95, 0.5).double()
 
     def trained(*views: Any, flaw: str = "") -> Tensor:
@@ -120,7 +123,8 @@ def check_training(student: Function) -> Verdict:
             t = 0 if flaw == "first" else step % len(features)
             beta, sample = mlp(features[t]), features[t].flatten(0, 1)
             error = RenderingError(ssim[t], depth[t], opacity[t] + (flaw == "holes"))
-            losses.append(uncertainty_loss(beta, error, beta.flatten(), sample, config))
+            own = beta.clamp_min(0.1) if flaw == "clipped" else beta
+            losses.append(uncertainty_loss(beta, error, own.flatten(), sample, config))
             if flaw != "gathered":
                 optimizer.zero_grad()
             losses[-1].backward()
@@ -130,6 +134,8 @@ def check_training(student: Function) -> Verdict:
 
     def outcome(train: Function, features: Tensor, *rest: Any, flaw: str = "") -> Tensor | None:
         mlp = UncertaintyMLP(5, torch.Generator().manual_seed(1)).to(features)
+        with torch.no_grad():
+            mlp.biases[-1].sub_(3)  # some beta_raw are below 0.1
         # Plain descent: Adam would hide a loss that is twice too large.
         descent = torch.optim.SGD(mlp.parameters(), lr=0.02)
         asked = {"flaw": flaw} if flaw else {}
@@ -147,6 +153,8 @@ def check_training(student: Function) -> Verdict:
         case(holes, 4, "four steps on two views"),
         *drawn(lambda seed: case(holes, 3, f"features {seed}", seed)),
     ]
+    answered, right = partial(outcome, student), partial(outcome, trained)
+    no_floor = patch.object(weights, "BETA_FLOOR", 0.0)(right)
     mistakes = [
         ("lambda_depth", "L_depth is missing in the error."),
         ("lambda_variance", "L_reg_V is missing."),
@@ -155,6 +163,7 @@ def check_training(student: Function) -> Verdict:
         ("first", "The views take turns: step s looks at view s modulo T."),
         ("gathered", "Gradients add up: call zero_grad before backward."),
         ("still", "The MLP did not change: call optimizer.step()."),
+        (no_floor, "The floor of beta is missing: max(beta_raw, 0.1)."),
+        ("clipped", "L_reg_V uses beta_raw, without the floor."),
     ]
-    answered, right = partial(outcome, student), partial(outcome, trained)
     return check_function(answered, right, cases, 1e-6, mistakes)

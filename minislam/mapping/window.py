@@ -65,7 +65,7 @@ def sampling_probabilities(
     While the window holds a larger fraction of all keyframes, all are equally likely, so the
     window is still drawn at least that often. This includes a window of all keyframes.
     """
-    if len(window) > window_probability * count:
+    if len(window) >= window_probability * count:
         return torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
     others = (1 - window_probability) / (count - len(window))
     probabilities = torch.full((count,), others, dtype=torch.float64, device="cpu")

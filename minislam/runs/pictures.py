@@ -79,7 +79,7 @@ def write_pictures(
     path = viz.trajectory_plot(estimate, true_path, unit)
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
     plots += [
-        ("trajectory", "Path of the camera, from above and from behind", path),
+        ("trajectory", "Path of the camera, in the planes x-z and x-y", path),
         ("losses", "Losses while the map was optimised", viz.loss_curves(curves)),
         ("gaussians", "Size of the map", viz.map_growth(history.gaussians)),
     ]

@@ -1,5 +1,6 @@
 """The frame graph: its edges link covisible keyframes and hold the flow between them."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -12,7 +13,7 @@ from minislam.tracking.reprojection import lengths, relative_transforms, reproje
 
 # Fraction of cells that must stay in view, else a pair has no meaningful distance. DROID-SLAM: 0.75
 MIN_VISIBLE_FRACTION = 0.5
-FAR = 1000.0  # px, the distance of a pair below this fraction
+FAR = math.inf  # px, the distance of a pair below this fraction
 COARSE, COARSE_MARGIN = 16, 2.0  # one cell in so many tells, to a factor, which pairs are far
 # New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8

@@ -57,7 +57,8 @@ class KeyframeGraph(Stateful):
 
     grid: Grid
     keyframes: KeyframeStore
-    flow_to_next: list[FlowMatches | None]  # keyframe k to k + 1 (E = 1), None across a loss
+    # Keyframe k to k + 1 (E = 1), as the images show it; None across a loss
+    flow_to_next: list[FlowMatches | None]
     links: FrameGraph
     flow: FlowEstimator
     shutter: RollingShutter
@@ -237,7 +238,7 @@ class KeyframeGraph(Stateful):
         """Return edges from a new keyframe to covisible older ones."""
         start = max(0, keyframe + 1 - HORIZON * self.config.window)
         newest = range(keyframe, keyframe + 1)
-        near = neighbourhood_edges(keyframe, keyframe + 1, NEIGHBOURHOOD)
+        near = self.neighbour_edges(keyframe)
         return self._covisible_edges(start, newest, near, PROXIMITY_DISTANCE, PROXIMITY_EDGES)
 
     def global_edges(self) -> list[Edge]:

@@ -41,8 +41,8 @@ class KeyframeStore(Stateful):
 
     @property
     def has_prior(self) -> bool:
-        """Tell whether any keyframe came with a depth prior."""
-        return any(depth is not None for depth in self.metric_depths)
+        """Tell whether any keyframe came with a depth prior that knows something."""
+        return bool((self.prior_disparities > 0).any())
 
     @property
     def cell_weights(self) -> Tensor:  # (K, N) in [0, 1]

@@ -93,8 +93,9 @@ def adjust(
     if free_camera:
         columns = graph.shutter.link_columns(positions) if graph.shutter.axis is not None else None
         problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
-    # Without parallax the flow does not measure depth. Such a keyframe keeps its first disparities,
-    # and they keep the scale until the camera moves again. In the start only a prior is worth it.
+    # Without parallax the flow does not measure depth. In a local BA such a keyframe keeps its
+    # disparities, which hold the scale until the camera moves again; where all keyframes are
+    # adjusted, only one with a prior does.
     worth_keeping = (graph.keyframes.prior_disparities > 0).any(1) | (first_free > 0)
     measured = _has_parallax(graph, problem) | ~worth_keeping
     problem = replace(problem, free_disparities=problem.free_disparities & measured)

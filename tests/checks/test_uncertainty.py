@@ -43,14 +43,15 @@ def trained(mlp, optimizer, features, ssim, depth, opacity, steps, flaw: str = "
     for step in range(steps):
         t = 0 if flaw == "first" else step % len(features)
         beta_raw = mlp(features[t])
-        beta = beta_raw.clamp_min(0.1) + 0.001
+        beta = beta_raw.clamp_min(0.0 if flaw == "no floor" else 0.1) + 0.001
         error = ssim[t] + (0 if flaw == "no depth" else 0.2) * depth[t]
         loss = error / beta ** (1 if flaw == "power" else 2)
         loss = loss + (0 if flaw == "no log" else 0.5 * beta.log())
         loss = loss if flaw == "holes" else torch.where(opacity[t] >= 0.9, loss, 0)
         loss = loss.sum() if flaw == "sum" else loss.mean()
         if flaw != "no reg_V":
-            loss = loss + feature_variance(beta_raw.flatten(), features[t].flatten(0, 1))
+            own = beta_raw.clamp_min(0.1) if flaw == "clipped" else beta_raw
+            loss = loss + feature_variance(own.flatten(), features[t].flatten(0, 1))
         if flaw != "gathered":
             optimizer.zero_grad()
         loss.backward()
@@ -91,5 +92,7 @@ def test_a_training_is_told_from_a_wrong_one():
         "did not change": partial(trained, flaw="still"),
         "beta, not its square": partial(trained, flaw="power"),
         "a sum": partial(trained, flaw="sum"),
+        "no floor": partial(trained, flaw="no floor"),
+        "L_reg_V of the clipped beta": partial(trained, flaw="clipped"),
     }
     assert_variants(check_training, {"one": trained, "other": trained_cell_by_cell}, wrong)

@@ -53,6 +53,7 @@ def test_a_full_window_drops_a_keyframe_that_is_far_and_close_to_another():
         (30, 0.7, 0.07, 0.015),
         (13, 0.5, 1 / 13, 1 / 13),
         (20, 0.5, 0.05, 0.05),
+        (10, 1.0, 0.1, 0.1),
     ],
 )
 def test_sampling_of_a_window_of_ten(count, share, inside, outside):

@@ -1,4 +1,4 @@
-"""Links of the keyframe graph on exact flow: what is confirmed, and how far keyframes are apart."""
+"""Links of the keyframe graph on exact flow: what is linked, and what is confirmed."""
 
 import pytest
 
@@ -21,6 +21,16 @@ def test_flow_between_the_newest_keyframe_and_its_predecessors_is_measured_both_
     graph = true_graph([0, 1, 2])
     graph.match_composed(2)
     assert graph.links.edges == [(1, 2), (2, 1), (0, 2), (2, 0)]
+
+
+def test_after_a_loss_a_keyframe_is_linked_with_what_was_seen_before_it():
+    graph = true_graph(list(range(12)))
+    graph.flow_to_next[9] = None  # keyframe 10 was relocalised
+    for keyframe in range(1, 11):
+        graph.match(graph.neighbour_edges(keyframe))
+    graph.match([(10, 9), (9, 10)])
+    assert graph.neighbour_edges(11) == [(11, 10), (10, 11)]
+    assert graph.proximity_edges(11) == [(11, 9), (9, 11), (11, 8), (8, 11)]
 
 
 def test_many_links_are_measured_in_parts_as_all_at_once(monkeypatch: pytest.MonkeyPatch):

@@ -28,7 +28,7 @@ def test_a_prior_asks_for_less_flow_once_the_start_is_over():
     graph = true_graph([0])
     wide = CONFIG.keyframe_flow_without_prior * graph.pixel_scale
     assert keyframe_flow(graph, True) == keyframe_flow(graph, False) == wide
-    graph.keyframes.metric_depths[0] = torch.ones(1, 1)
+    graph.keyframes.prior_disparities[0, 3] = 1.0
     assert keyframe_flow(graph, True) == CONFIG.keyframe_flow * graph.pixel_scale
     assert keyframe_flow(graph, False) == wide
 

@@ -96,6 +96,13 @@ def test_the_first_prior_gives_its_unit_to_keyframes_that_came_without():
         torch.testing.assert_close(moved, before.T_camera_world[:, :3, 3])
 
 
+def test_a_depth_image_that_knows_nothing_is_no_prior():
+    store, cells = filled(0), torch.ones(CELLS)
+    frame, pose = Frame(0, 0.0, torch.zeros(6, 8, 3)), torch.eye(4)
+    store.append(frame, torch.zeros(2, 2, 5), torch.zeros(6, 8), pose, cells, torch.zeros(CELLS))
+    assert not store.has_prior and filled(1).has_prior
+
+
 def test_a_later_prior_leaves_the_unit():
     store, before = filled(3), filled(3)
     store.start_from_prior()

@@ -128,7 +128,8 @@ def lowest_minimum(
     chosen = best(found)
     columns = graph.shutter.link_columns(links)
     if columns is not None and columns.any():
-        columns[:, int(problem.camera.width < problem.camera.height)] = 0  # read along the shorter
+        # Sensors are read along the shorter side: the readout along the longer one is held.
+        columns[:, int(problem.camera.width < problem.camera.height)] = 0
         rolled = best(adjusted(replace(free, shutter=columns), found))
         if cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found)):
             graph.shutter.take(rolled[0].readout, columns)
@@ -138,13 +139,14 @@ def lowest_minimum(
     if not graph.seeks_focal:
         return chosen
     own = replace(chosen[0], log_focal=0.0), chosen[1]  # its minimum under the guess
-    held = adjusted(problem, [own, *at_guess])
+    held = adjusted(problem, [own])
     fit, fitted = fit_focal_length(problem, held[0][0], workers, chosen[0])
     if fit.factor is not None:
         chosen = adjust_narrowing(free, fitted, WIDENINGS[2:], ITERATIONS)
-    elif abs(chosen[0].log_focal) > FARTHEST or (
-        cost_of(chosen) >= (1 - FOCAL_WORTH_SAVING) * min(map(cost_of, held))
-    ):
-        return best(held)
+    else:
+        held = _each_once([*held, *adjusted(problem, at_guess)])
+        saving = 1 - cost_of(chosen) / min(map(cost_of, held))
+        if abs(chosen[0].log_focal) > FARTHEST or saving <= FOCAL_WORTH_SAVING:
+            return best(held)
     graph.focal_is_free = True
     return chosen

@@ -25,7 +25,7 @@ class FirstFrame(Stateful):
     def next_frame(self, tracker: Tracker, count: int) -> int | None:
         """Return which of `count` frames the tracker shall see next, None after the last."""
         tracked = tracker.tracked
-        if tracked and not tracker.initialised and not self.is_repeated:
+        if len(tracker.keyframes) and not tracker.initialised and not self.is_repeated:
             start, is_over = tracker.keyframes.frames[0].frame_index, len(tracked) == count
             followed = [t.frame_index for t in tracked[start:] if t.status.is_followed]
             worth, lost = (can_tell_depth(tracker), len(followed)), len(tracked) - 1 - followed[-1]
@@ -40,7 +40,10 @@ class FirstFrame(Stateful):
 
 
 def has_warmed_up(tracker: Tracker) -> bool:
-    """Tell whether the warm-up has its few keyframes: motion is remembered only from then on."""
+    """Tell whether the warm-up has enough keyframes for the first geometry.
+
+    They are few, because motion is remembered only after it.
+    """
     return len(tracker.keyframes) >= tracker.config.warmup_keyframes
 
 

@@ -100,7 +100,7 @@ def _of_few_cells(
     return of_cells(problem, state, cells[::EVERY, ::EVERY].flatten())
 
 
-def seek_focal_length(graph: KeyframeGraph) -> None:
+def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> None:
     """Replace an unknown focal length by the one that the flow fits, if the motion tells it.
 
     From then on the adjustments of all keyframes refine it.
@@ -108,7 +108,7 @@ def seek_focal_length(graph: KeyframeGraph) -> None:
     if not graph.seeks_focal:
         return
     problem = bundle_problem(graph, range(len(graph.links)), 0, lambda_prior=0.0)
-    fit, state = fit_focal_length(problem, graph.state)
+    fit, state = fit_focal_length(problem, graph.state, workers)
     if fit.factor is not None:
         graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
         graph.grid.zoom(state.log_focal)
@@ -154,9 +154,11 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     adjustments of all keyframes refine it from then on.
     """
     shutter, edges = graph.shutter, enumerate(graph.links.edges)
+    if shutter.axis is not None:
+        return
     positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
     columns = shutter.link_columns(positions)
-    if columns is None or shutter.axis is not None:
+    if columns is None:
         return
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)

@@ -40,7 +40,8 @@ def judge_all(graph: KeyframeGraph) -> None:
         if matches is None:
             keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
         else:
-            remember(graph, matches, keyframes.T_camera_world[index], index - 1)
+            unrolled = graph.shutter.corrected(matches, [(index - 1, index)])
+            remember(graph, unrolled, keyframes.T_camera_world[index], index - 1)
             inherit(graph, matches, index)
 
 

@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 from minislam.geometry.distortion import camera_matrix
 from minislam.geometry.se3 import make_transform, so3_exp
 from minislam.priors.dense_flow import grayscale
+from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.frame_graph import both_directions
 from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.optimisation import FIRST_WIDENING, adjust
@@ -122,6 +123,7 @@ def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
     edges = graph.filter_confirmed(both_directions([(newest, index) for index in around]))
     if (newest, similar) not in edges:
         return False
+    mask_priors(graph.keyframes, graph.grid, edges, graph.config, first=newest)
     for _ in range(graph.config.rounds):
         graph.match(edges)
         adjust(graph, newest, graph.config.iterations, widening=FIRST_WIDENING)

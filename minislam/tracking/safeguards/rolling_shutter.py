@@ -50,11 +50,15 @@ class ImageMotion(Stateful):
         self._grid, self.velocities = grid, []
 
     def see(self, frame: Frame) -> None:
-        """Measure how the image has moved since the frame before. Frames come in their order."""
+        """Measure how the image has moved since the frame before, unless that is known already.
+
+        Frames come in their order, but a start that is given up lets some come again.
+        """
+        if frame.frame_index < len(self.velocities):
+            return
         before, self._newest = self._newest, frame
-        del self.velocities[frame.frame_index :]
         velocity = torch.zeros_like(self._grid.pixels.T)
-        if before is not None and before.frame_index == frame.frame_index - 1:
+        if before is not None:
             seconds = frame.timestamp - before.timestamp
             back = residual_flow(grayscale(frame.image), grayscale(before.image))
             cells = back[:: self._grid.stride, :: self._grid.stride].reshape(-1, 2).T.copy()
@@ -90,7 +94,7 @@ class RollingShutter(Stateful):
         self.motion = ImageMotion(grid)
 
     def see(self, frame: Frame) -> None:
-        """Measure how the image has moved since the frame before. Frames come in their order."""
+        """Measure how the image has moved since the frame before."""
         if self.is_on:
             self.motion.see(frame)
 
@@ -104,7 +108,8 @@ class RollingShutter(Stateful):
         camera, pixels = self._grid.camera, self._grid.pixels
         frames = [frame.frame_index for frame in self._keyframes.frames]
         frames += [] if next_frame is None else [next_frame]
-        u = {end: self.motion.velocity(frames[end]) for edge in edges for end in edge}
+        ends = {end for edge in edges for end in edge}
+        u = {end: self.motion.velocity(frames[end]) for end in ends}
         u_source = torch.stack([u[source] for source, _ in edges])
         u_target = torch.stack([u[target].mT for _, target in edges])
         u_target = self._grid.sample(u_target, positions.mT).mT

@@ -176,3 +176,12 @@ def test_an_interrupted_choice_goes_on(tmp_path: Path):
     write_checkpoint(tmp_path / "a.npz", given.saved_state())
     restored.restore_state(read_checkpoint(tmp_path / "a.npz"), lambda index: None)
     assert vars(restored) == vars(given)
+
+
+def test_a_choice_that_was_saved_between_two_starts_goes_on():
+    shown = renumbered(black(1) + [frame.image for frame in frames()[:6]])
+    tracker, first = new_tracker(with_depth=True, shown=[0, *range(6)]), FirstFrame()
+    for _ in range(2):
+        tracker.track(shown[first.next_frame(tracker, len(shown))])
+    assert first.next_frame(tracker, len(shown)) == 1 and len(tracker.keyframes) == 0
+    assert first.next_frame(tracker, len(shown)) == 1
