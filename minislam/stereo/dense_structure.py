@@ -83,16 +83,17 @@ def _small(camera: Camera, width: int) -> Camera:
 def dense_depths(
     read: Callable[[int], Frame],  # a frame by its index
     camera: Camera,  # of its images
-    poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
+    poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
     keyframes: list[int],  # K frame indices, increasing
     disparities: list[np.ndarray],  # K x (n,) 1/world unit, known; they place the nearest plane
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
+    chosen: list[int] | None = None,  # frames that are swept, keyframes and others; None: usual
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe in turn."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
-    frames = swept_frames(keyframes, list(poses))
+    frames = swept_frames(keyframes, list(poses)) if chosen is None else chosen
     swept: list[votes.SweptView] = []
     for first in range(0, len(frames), AT_ONCE):
         sweeps = []

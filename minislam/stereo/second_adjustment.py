@@ -39,13 +39,14 @@ def adjust_again(
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
     followed = [frame.frame_index for frame in tracked if frame.status.is_followed]
-    # The other frames took 40 to 80 % of the time and gained nothing (RESULTS.md).
+    # To pose all frames took five times as long and gained nothing.
     wanted = {*swept_frames(keyframes, followed)}
     tracker.tracked = [frame for frame in tracked if frame.frame_index in wanted]
     poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))
     tracker.tracked = tracked
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
-    swept = sweep_keyframes(tracker.graph, sequence, poses, on_sweep, workers, COARSE_WIDTH)
+    how = on_sweep, workers, COARSE_WIDTH, sorted(poses)
+    swept = sweep_keyframes(tracker.graph, sequence, poses, *how)
     adjust_confirmed(tracker.graph, swept, on_round)
     tracker.watch.conclude()
 
@@ -53,15 +54,16 @@ def adjust_again(
 def sweep_keyframes(
     graph: KeyframeGraph,
     sequence: Sequence,
-    poses: dict[int, Tensor],  # T_camera_world (4, 4) of every followed frame, by frame index
+    poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
+    chosen: list[int] | None = None,  # frames that are swept, keyframes and others; None: usual
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each keyframe in turn."""
     frames = [frame.frame_index for frame in graph.keyframes.frames]
     known = [agreed_disparities(graph, index).cpu().numpy() for index in range(len(frames))]
-    inputs = graph.grid.camera, poses, frames, known, progress, workers, width
+    inputs = graph.grid.camera, poses, frames, known, progress, workers, width, chosen
     swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return ((depth.to(device), confirmation.to(device)) for depth, confirmation in swept)

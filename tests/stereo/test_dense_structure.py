@@ -92,10 +92,10 @@ def test_depths_are_enlarged_one_by_one(monkeypatch):
 def test_progress_counts_the_swept_frames():
     told = []
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
-    dense_depths(
-        sequence().frame, camera(), poses, [0, 2], [np.ones(3)] * 2, lambda *step: told.append(step)
-    )
-    assert told == [(2, 2)]
+    inputs = sequence().frame, camera(), poses, [0, 2], [np.ones(3)] * 2
+    dense_depths(*inputs, lambda *step: told.append(step))
+    dense_depths(*inputs, lambda *step: told.append(step), chosen=[0, 1, 2])
+    assert told == [(2, 2), (3, 3)]
 
 
 def test_a_helper_sweeps_to_the_same_bits():

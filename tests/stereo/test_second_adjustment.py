@@ -133,12 +133,12 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
         tracker.tracked[0] = lost
         return {0: torch.eye(4)}
 
-    def sweep(graph, sequence, poses, progress, workers, width):
-        done.append((sorted(poses), width))
+    def sweep(graph, sequence, poses, progress, workers, width, chosen):
+        done.append((sorted(poses), width, chosen))
         return swept(graph)
 
     monkeypatch.setattr(second_adjustment, "pose_all_frames", pose_all_frames)
     monkeypatch.setattr(second_adjustment, "sweep_keyframes", sweep)
     adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
-    assert done == [([0], COARSE_WIDTH), ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end
+    assert done == [([0], COARSE_WIDTH, [0]), ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end
