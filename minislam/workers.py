@@ -58,6 +58,8 @@ class Workers:
     ) -> None:
         if count < 1:
             raise InputError(f"expected at least 1 worker, found {count}; give --workers 1 or more")
+        if count > (most := os.cpu_count() or count):
+            warn(f"{count} workers on {most} processors are slower; give --workers {most} or fewer")
         self._warn = warn
         self._helpers: list[_Helper] = []
         try:

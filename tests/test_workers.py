@@ -22,6 +22,11 @@ def two():
         yield workers
 
 
+@pytest.fixture
+def four_cores(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)  # no warning of too few
+
+
 def is_running(pid: int) -> bool:
     try:
         with open(f"/proc/{pid}/stat") as file:
@@ -71,7 +76,7 @@ def test_tensors_and_records_come_through_unchanged(two):
 
 
 @pytest.mark.slow
-def test_the_map_has_the_same_bytes_with_one_and_two_workers_and_with_one_killed(two):
+def test_the_map_has_the_same_bytes_with_one_and_two_workers_and_with_one_killed(two, four_cores):
     def optimised(workers, kills=None):
         mapper = make_mapper(replace(CONFIG, init_iterations=7))
         mapper._workers = workers
@@ -98,8 +103,17 @@ def test_the_map_has_the_same_bytes_with_one_and_two_workers_and_with_one_killed
 # Degenerate input
 
 
+def test_more_workers_than_processors_are_warned_of(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    warnings: list[str] = []
+    Workers(1, warn=warnings.append).close()
+    assert not warnings
+    Workers(2, warn=warnings.append).close()
+    assert warnings == ["2 workers on 1 processors are slower; give --workers 1 or fewer"]
+
+
 @pytest.mark.slow
-def test_a_helper_that_dies_at_a_call_is_replaced_by_this_process():
+def test_a_helper_that_dies_at_a_call_is_replaced_by_this_process(four_cores):
     warnings = []
     with Workers(3, warn=warnings.append) as workers:
         calls = [(os.getpid(), number) for number in range(4)]

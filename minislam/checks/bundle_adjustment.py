@@ -201,6 +201,10 @@ def check_prior_mask(student: Function) -> Verdict:
         depth[10:30, 8:30] *= patched
         for number, (seen, _) in enumerate(others):
             seen[8 * number : 8 * number + 20, 30:50] *= 0.6  # in front of the wall, for one view
+        seen, T = others[-1]
+        T[2, 3] = -0.5
+        seen[:] = wall(T)
+        seen[:20, 40:] = 0.3  # behind this view
         seen, T = others[0]
         T[:3, 3] = doubles(0.0117, 0.0233, 1) * 0.5  # its centre falls on a cell
         seen[:] = wall(T)
@@ -216,12 +220,17 @@ def check_prior_mask(student: Function) -> Verdict:
         *drawn(lambda seed: case(3, 0.8, "three drawn views", seed)),
     ]
     back = "T_this_other takes points of the other view to this one, not back."
+    known = "A depth of 0 is unknown in the other views, too."
+    relative = "Divide the difference by the other's depth."
     mistakes = [
         (lambda *a: reference(*a, seen=0), "Where fewer than two views have a depth, M stays 1."),
         (lambda *a: 1 - reference(*a), "M is 1 where the prior counts, 0 where views contradict."),
         (lambda d, o, *a: reference(d, [(x, se3_inverse(T)) for x, T in o], *a), back),
         (lambda *a: reference(*a, agree=1), "Two views must agree, not one."),
         # Where all depths are near 3 m, an absolute error is a third of it, relatively.
-        (lambda *a: reference(*a[:2], a[-1] / 3), "Divide the difference by the other's depth."),
+        (lambda *a: reference(*a[:2], a[-1] / 3), relative),
+        # An error relative to the own depth, where that is the larger of the two.
+        (lambda *a: reference(*a[:2], a[-1] / (1 - a[-1])), relative),
+        (lambda d, o, *a: reference(d, [(x.clamp_min(1e-9), T) for x, T in o], *a), known),
     ]
     return check_function(student, reference, cases, 1e-9, mistakes)

@@ -3,18 +3,19 @@
 from dataclasses import replace
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
 from minislam.checks.cases import CAMERA, Case, doubles, drawn, normals
-from minislam.checks.grading import Function, Verdict, check_function
+from minislam.checks.grading import Function, Mistakes, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
+from minislam.mapping import pose_refinement
 from minislam.mapping.config import InsertionConfig, MappingConfig, PoseRefinementConfig
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import EXPLAINED_OPACITY, gaussians_at_pixels
 from minislam.mapping.losses import METRIC_MEDIAN, render_loss
-from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.window import sampling_probabilities
 from minislam.splatting import GaussianMap, Rendering, render
 
@@ -155,7 +156,10 @@ def check_insertion(student: Function) -> Verdict:
 
 
 def check_map_loss(student: Function) -> Verdict:
-    """Check (colour, depth, image, reference depth, weight, scales) -> Eq. (6) without SSIM."""
+    """Check (colour, depth, image, reference depth, weight, scales) -> Eq. (6) without SSIM.
+
+    The answer is compared together with its derivative by the colour.
+    """
     config = MappingConfig(lambda_ssim=0.0)
 
     def reference(*a: Tensor, shares: Any = (0.8, 0.2, 10.0), flaw: str = "") -> Tensor:
@@ -172,6 +176,16 @@ def check_map_loss(student: Function) -> Verdict:
             depth_loss = depth_loss + (weight * unknown * depth).mean()
         return shares[0] * loss.color + shares[1] * depth_loss + shares[2] * loss.isotropic
 
+    def outcome(loss: Function, color: Tensor, *rest: Tensor) -> Any:
+        """Return the loss and its derivative by the colour, 0 if it has none."""
+        leaf = color.clone().requires_grad_()
+        value = loss(leaf.clone(), *rest)
+        if isinstance(value, Tensor) and value.requires_grad:
+            value.sum().backward()
+            value = value.detach()
+        gradient = torch.zeros_like(color) if leaf.grad is None else leaf.grad
+        return None if value is None else (value, gradient)
+
     source = torch.Generator().manual_seed(1)
     (color, image), (weight, hidden) = random(source, 2, 5, 6, 3), random(source, 2, 5, 6)
     depth, full = 1 + random(source, 2, 5, 6)
@@ -184,16 +198,20 @@ def check_map_loss(student: Function) -> Verdict:
         Case((color, depth, image, holes, weight, scales), "depth that is unknown in places"),
         Case((color, depth, image, holes, weight, needles), "thin Gaussians"),
     ]
-    mistakes = [
+    mistakes: Mistakes = [
         (lambda *a: reference(*a[:4], one, a[5]), "Each pixel has its weight."),
         (lambda *a: reference(*a[:4], a[4] / a[4].mean(), a[5]), "Divide by the number of pixels."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 1)), "L_iso is multiplied by 10."),
         (lambda *a: reference(*a, shares=(0.2, 0.8, 10)), "0.8 is for colour, 0.2 for depth."),
-        ("of known", "The mean is over all pixels; one of unknown depth counts 0."),
-        ("with unknown", "Where the reference depth is 0 it is unknown and costs nothing."),
+        (partial(reference, flaw="of known"), "The mean is over all pixels: unknown ones count 0."),
+        (partial(reference, flaw="with unknown"), "Depth 0 is unknown and costs nothing."),
+        (lambda *a: reference(*a).detach(), "Return a tensor that autograd can differentiate."),
     ]
-    return check_function(student, reference, cases, 1e-7, mistakes)
+    mistakes = [(partial(outcome, mistake), hint) for mistake, hint in mistakes]
+    answered, right = partial(outcome, student), partial(outcome, reference)
+    returns = "the loss", "its derivative by the colour"
+    return check_function(answered, right, cases, 1e-7, mistakes, returns)
 
 
 def check_followed_pose(student: Function) -> Verdict:
@@ -203,27 +221,32 @@ def check_followed_pose(student: Function) -> Verdict:
     What is compared is where the pose sees the centres of the Gaussians [px].
     """
     camera, count = Camera(24.0, 24.0, 15.5, 11.5, 32, 24), 60
-    source = torch.Generator().manual_seed(3)
-    depth, pixels, colors = (random(source, count, n) for n in (1, 2, 3))
-    z = 1 + 3 * depth
-    means = camera.backproject(pixels * doubles(40, 32) - 4, z[:, 0])
-    rows = torch.tensor([1.0, 0, 0, 0]).expand(count, 4), (0.165 * z).log().expand(-1, 3).float()
-    looks = torch.full((count,), 2.0), colors.float()
+    source = torch.Generator().manual_seed(23)
+    depth, places, colors = (random(source, count, n) for n in (1, 2, 3))
+    z, pixels = 1 + 3 * depth, places * doubles(40, 32) - 4
+    means = camera.backproject(pixels, z[:, 0])
+    rows = torch.tensor([1.0, 0, 0, 0]).expand(count, 4), (0.13 * z).log().expand(-1, 3).float()
+    looks = torch.full((count,), 2.0), colors.round().float()
 
-    def case(turn: float, start: Tensor, mover: bool, description: str) -> tuple[Case, Tensor]:
+    def case(
+        turn: float, start: Tensor, mover: bool, description: str, last: float = 99.0
+    ) -> tuple[Case, Tensor]:
+        """Return a case whose map holds the columns up to the last one [px], and its answer."""
         true, weight = se3_exp(doubles(0.1, 0, 0.1, 0, turn, 0)), torch.ones(24, 32)
         world = transform_points(se3_inverse(true), means).float()
         gaussians = GaussianMap(world, *rows, *looks, torch.zeros(count, dtype=torch.int64))
         image = render(gaussians, camera, true.float()).color
         if mover:  # the left half of the image moves to the right
             image[:, 3:17], weight[:, :17] = image[:, :14].clone(), 0
-        inputs = gaussians, camera, se3_exp(start) @ true, image, weight, 15
+        gaussians = gaussians.prune(pixels[:, 0] < last)
+        inputs = gaussians, camera, se3_exp(start) @ true, image, weight, 12
         return Case(inputs, description), true
 
     pairs = [
-        case(0.2, doubles(0.04, -0.03, 0.03, 0, 0, 0), False, "a camera that has moved"),
-        case(0.8, doubles(0.04, 0, 0, 0, 0, 0.03), False, "a camera that has turned"),
+        case(0.2, doubles(0.12, -0.09, 0.09, 0, 0, 0), False, "a camera that has moved"),
+        case(0.8, doubles(0.12, 0, 0, 0, 0, 0.09), False, "a camera that has turned"),
         case(0.2, doubles(-0.03, 0.03, 0, 0, 0, 0), True, "an object that moves in the image"),
+        case(0.2, doubles(0.04, -0.03, 0.03, 0, 0, 0), False, "a map of half of the image", 14.0),
     ]
 
     def true_pose(*a: Any) -> Tensor:
@@ -239,21 +262,27 @@ def check_followed_pose(student: Function) -> Verdict:
     def motion(*a: Any) -> Tensor:
         return true_pose(*a) @ se3_inverse(a[2])
 
-    def unweighted(*a: Any) -> Tensor:
-        gaussians, camera, start, image, weight, _ = a
-        settings = PoseRefinementConfig(iterations=30, tolerance=0.0)
-        equal, black = torch.ones_like(weight), torch.zeros(3)
-        return refine_pose(gaussians, camera, start, image, equal, black, settings)
+    def refined(*a: Any, steps: int) -> Tensor:
+        gaussians, camera, start, image, weight, *_ = a
+        view, black = (start, image, weight), torch.zeros(3)
+        settings = PoseRefinementConfig(iterations=steps, tolerance=0.0)
+        return pose_refinement.refine_pose(gaussians, camera, *view, black, settings)
 
+    def unweighted(*a: Any) -> Tensor:
+        return refined(*a[:4], torch.ones_like(a[4]), steps=30)
+
+    # Its first step is damped by 0.3 times this: by 0.1, as in the exercise.
+    one_step = patch.object(pose_refinement, "_FIRST_DAMPING", 1 / 3)(partial(refined, steps=1))
     mistakes = [
         (lambda *a: a[2], "The pose has not moved: return exp(twist) times the first pose."),
         (lambda *a: se3_inverse(true_pose(*a)), "This is T_world_camera."),
         (motion, "This is the motion alone."),
         (lambda *a: a[2] @ motion(*a), "The twist is applied on the left: exp(twist) @ T."),
         (lambda *a: se3_inverse(motion(*a)) @ a[2], "The pose moves the other way."),
+        (one_step, "Repeat the step, each time from the pose of the last one."),
         (unweighted, "The camera follows the dynamic object: each pixel has its weight."),
     ]
     mistakes = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
     cases = [case for case, _ in pairs]
     answered, right = partial(pixels_of, student), partial(pixels_of, true_pose)
-    return check_function(answered, right, cases, 0.016, mistakes)
+    return check_function(answered, right, cases, 0.02, mistakes)

@@ -34,7 +34,7 @@ def check_projected_covariance(student: Function) -> Verdict:
     cases = [
         case(-0.1, 0.0, "a camera that is not turned"),
         case(0.6, 0.2, "a turned camera"),
-        *drawn(lambda seed: case(0.2 * seed - 0.3, 0.15, "any camera", seed)),
+        *drawn(lambda seed: case(0.2 * (seed % 7) - 0.3, 0.15, "any camera", seed)),
     ]
     low_pass = LOW_PASS_VARIANCE * torch.eye(2).double()
     off_diagonal = LOW_PASS_VARIANCE - low_pass
@@ -87,16 +87,21 @@ def check_pixel_color(student: Function) -> Verdict:
 
 def check_rendered_image(student: Function) -> Verdict:
     """Check (means, covariances, opacities, colors, T_camera_world, camera) -> image (H, W, 3)."""
-    factors, colors = normals(1, 2, 5, 3, 3)
-    means = doubles([0.1, 0, 3], [0, 0.1, 2], [-0.2, -0.1, 4], [0.3, 0, -2], [-0.3, 0.2, 2.5])
-    values = (means, 0.1 * factors @ factors.mT, doubles(0.8, 0.6, 0.9, 0.7, 1), colors[:, 0].abs())
+    factors, colors = normals(1, 2, 7, 3, 3)
+    five = [0.1, 0, 3], [0, 0.1, 2], [-0.2, -0.1, 4], [0.3, 0, -2], [-0.3, 0.2, 2.5]
+    # One too near, and one that is nearer by its depth than by its distance.
+    means = doubles(*five, [0, 0, 0.04], [1.2, 0, 2.8])
+    opacities = doubles(0.8, 0.6, 0.9, 0.7, 1, 0.5, 0.9)
+    values = means, 0.1 * factors @ factors.mT, opacities, colors[:, 0].abs()
 
     def rendered(*view: Any, flaw: str = "") -> Tensor:
         means, covariances, opacities, colors, pose, camera = view
         points = transform_points(pose, means)
-        kept = ((points[:, 2] > NEAR_DEPTH) | (flaw == "behind")).nonzero()[:, 0]
+        nearest = {"behind": -torch.inf, "near": 0.0}.get(flaw, NEAR_DEPTH)
+        kept = (points[:, 2] > nearest).nonzero()[:, 0]
+        far = points.norm(dim=-1) if flaw == "distance" else points[:, 2]
         if flaw != "unsorted":
-            kept = kept[points[kept, 2].argsort(descending=flaw == "far first")]
+            kept = kept[far[kept].argsort(descending=flaw == "far first")]
         wide = project_covariances(covariances[kept], points[kept], pose, camera)
         wide = wide - (flaw == "sharp") * LOW_PASS_VARIANCE * torch.eye(2, dtype=wide.dtype)
         wide = wide / 2 if flaw == "whole" else wide
@@ -114,12 +119,15 @@ def check_rendered_image(student: Function) -> Verdict:
         case(1, torch.eye(4).double(), "one Gaussian"),
         case(3, turned, "three Gaussians in any order"),
         case(5, turned, "five Gaussians, one behind the camera"),
+        case(7, torch.eye(4).double(), "seven Gaussians, one nearer than 0.05 m"),
         *drawn(lambda seed: case(5, any_pose(seed), f"five Gaussians and pose {seed}")),
     ]
     mistakes = [
         ("unsorted", "Sort by the depth in the camera frame: the list has no order."),
         ("far first", "This is sorted the wrong way: the nearest Gaussian comes first."),
         ("behind", "A Gaussian behind the camera (z < 0.05) is not seen: leave it out."),
+        ("near", "What is nearer than 0.05 m is not seen: leave it out."),
+        ("distance", "Sort by the depth z, not by the distance."),
         ("sharp", "The low-pass filter is missing: add 0.3 I to Sigma'."),
         ("whole", "The exponent is -1/2 of the squared distance."),
         ("added", "Light is used up on its way: multiply T by 1 - alpha after each Gaussian."),

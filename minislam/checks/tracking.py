@@ -12,8 +12,8 @@ from torch import Tensor
 from minislam.checks.cases import CAMERA, Case, doubles, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import se3_exp
-from minislam.priors.dense_flow import composed_flow, reverse_flow
-from minislam.priors.grid_flow import grid_matches
+from minislam.priors import grid_flow
+from minislam.priors.dense_flow import composed_flow, reverse_flow, warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.tracking.frame_graph import flow_distances, proximity_pairs
 from minislam.tracking.grid import Grid
@@ -133,7 +133,10 @@ def check_keyframes(student: Function) -> Verdict:
         for n, image in enumerate(images[1:], 1):
             flow = composed_flow(start, image, flow)
             back = reverse_flow(start, image, flow)
-            _, sure = grid_matches(flow, cells, back, cells[..., 0] + 1, 8)
+            _, sure = grid_flow.grid_matches(flow, cells, back, cells[..., 0] + 1, 8)
+            if flaw == "outside":
+                round_trip = (flow + warp(back, flow))[::8, ::8]
+                sure = np.exp(-0.5 * (round_trip**2).sum(-1) / 0.6**2)
             weight = np.ones_like(sure) if flaw == "equal" else sure
             length = np.linalg.norm(flow[::8, ::8], axis=-1)
             mean = (weight * length).sum() / max(weight.sum(), 1e-9)
@@ -158,6 +161,9 @@ def check_keyframes(student: Function) -> Verdict:
         moving = shown([20.0 + speed * n for n in range(5)])
         return Case((moving, 2.5 * speed, 20), f"{speed} px a frame")
 
+    sizes = 1 + 0.1 * np.arange(8)
+    growth = [np.array([[s, 0, 80 - 180 * s], [0, s, 60 - 120 * s]]) for s in sizes]
+    closer = [cv2.warpAffine(wide[0], zoom, (160, 120)) for zoom in growth]
     slide = [2.0 * n for n in range(9)]
     leap = shown(slide[:3] + [column + 150 for column in slide[3:5]])
     cases = [
@@ -165,14 +171,21 @@ def check_keyframes(student: Function) -> Verdict:
         Case((shown([0.2 * n for n in range(6)]), 20.0, 3), "a camera that hardly moves"),
         Case((leap, 500.0, 20), "a camera that leaps to another place"),
         Case((shown(slide[:6], blinking=True), 6.9, 20), "a screen that blinks"),
+        Case(([*closer, leap[-1]], 500.0, 20), "a camera that comes closer, then leaps"),
+        Case((closer[:3], 9.2, 20), "cells that leave the image"),
         *drawn(draw),
     ]
+    one_way = patch.object(grid_flow, "sample", lambda flow, _: flow[::8, ::8])(choice)
+    narrow = patch.object(grid_flow, "CONSISTENCY_SCALE", 0.6 / 2**0.5)(choice)
     mistakes = [
+        ("outside", "The confidence is 0 where p + f(p) leaves the image."),
         ("equal", "The mean is weighted by the confidence of each cell."),
         ("unmatched", "A frame of which too little is matched is kept as well."),
         ("no restart", "The flow starts anew, from the frame that was kept last."),
         (lambda a, b, _: choice(a, b, 99), "At the latest `interval` frames after the last one."),
         (lambda *a: choice(*a)[1:], "Frame 0 is the first that is kept."),
+        (one_way, "The way back starts where the way forth ends: b(p + f(p))."),
+        (narrow, "The exponent is a half of |e|^2 / 0.6^2."),
     ]
     return check_function(student, choice, cases, 1e-9, mistakes)
 
@@ -222,8 +235,15 @@ def check_motion_memory(student: Function) -> Verdict:
         case([0.0] * 6, 3.0, 1.0, "a camera that stands still"),
         case([0.5, 0.1, 0.0, 0.0, 0.02, 0.0], 5.0, 1.0, "a camera that moves"),
         case([0.4, 0.0, 0.3, 0.02, 0.1, 0.1], 12.0, 0.6, "cells that are not matched"),
+        case([0.1, 0.0, -2.5, 0.0, 0.0, 0.0], 5.0, 1.0, "cells behind the next camera"),
         *drawn(lambda seed: case(any_twist(seed, 0.025), 6.0, 0.8, "a drawn motion", seed)),
     ]
+
+    def all_valid(*a: Any) -> tuple[Tensor, Tensor]:
+        positions, valid = reproject(*a)
+        return positions, torch.ones_like(valid)
+
+    behind = "A cell that is not valid, behind the next camera, keeps its weight."
     nearest = "A cell to which nothing flows takes the weight of the nearest one."
     changed: dict[str, dict[str, Any]] = {
         "It falls fast and recovers slowly.": {"LOSS_RATE": 0.1, "RECOVERY_RATE": 0.9},
@@ -236,5 +256,6 @@ def check_motion_memory(student: Function) -> Verdict:
     mistakes = [
         *((patch.multiple(motion_memory, **c)(reference), hint) for hint, c in changed.items()),
         (motion_memory.update_motion_weight, handed_on),
+        (patch.object(motion_memory, "reproject", all_valid)(reference), behind),
     ]
     return check_function(student, reference, cases, 1e-4, mistakes)

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from minislam.cli.progress import ending_signals, say
-from minislam.data.files import read_json, write_json, write_text
+from minislam.data.files import make_folder, read_json, write_json, write_text
 from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, USAGE_EXIT, InputError
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
@@ -44,12 +44,12 @@ def _bench(args: argparse.Namespace) -> int:
     own.add_argument("-o", "--output", default="output/bench", type=Path)
     given, options = own.parse_known_args(args.options)
     sequences, noted = find_sequences(args.folders), given.output / "options.json"
+    make_folder(given.output)
     if noted.exists() and (then := read_json(noted)) != options:
         raise InputError(
             f"expected the options of the bench in {given.output}, {then}, found {options}; repeat "
             "those, because a table is of one kind of run, or give another -o"
         )
-    given.output.mkdir(parents=True, exist_ok=True)
     write_json(noted, options)
     ours: dict[str, str] = {}
     tables, code = "", 0

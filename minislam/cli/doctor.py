@@ -23,15 +23,20 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def _doctor(args: argparse.Namespace) -> None:
     """Print versions and threads, and compare an estimated flow with the known one."""
     import platform
+    from importlib.util import find_spec
+
+    print(f"minislam {minislam.__version__}, Python {platform.python_version()}")
+    names = ("numpy", "scipy", "torch", "cv2", "matplotlib")
+    if missing := [name for name in names if find_spec(name) is None]:
+        raise ModuleNotFoundError(name=", ".join(missing))  # `main` makes a sentence of it
+    for name in names:
+        print(f"  {name:11s} {importlib.import_module(name).__version__}")
 
     import torch
 
     from minislam.priors.conformance import flow_error, shifted_images
     from minislam.priors.flow import ClassicalFlow
 
-    print(f"minislam {minislam.__version__}, Python {platform.python_version()}")
-    for name in ("numpy", "scipy", "torch", "cv2", "matplotlib"):
-        print(f"  {name:11s} {importlib.import_module(name).__version__}")
     print(f"  processors  {os.cpu_count()}, torch uses {torch.get_num_threads()} threads")
     print(f"  CUDA        {torch.cuda.get_device_name() if torch.cuda.is_available() else 'none'}")
     for warning in installation_warnings(torch.cuda.is_available()):

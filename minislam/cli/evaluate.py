@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minislam.data.files import atomic_write, write_json
+from minislam.data.files import atomic_write, require_new, write_json
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add("-p", "--plot", action="store_true", help="show the trajectories")
     add("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
     add("--save_results", metavar="FILE.json", help="write the numbers to a file")
+    add("--overwrite", action="store_true", help="replace files of these names")
     add("-v", "--verbose", action="store_true", help="say more")
     add("--silent", action="store_true", help="print nothing")
     parser.set_defaults(run=run_eval)
@@ -51,6 +52,8 @@ def run_eval(args: argparse.Namespace) -> None:
 
     if Path(args.estimate).is_dir():
         args.estimate = str(Path(args.estimate) / TRAJECTORY)
+    plot = args.save_plot and args.save_plot + ("" if Path(args.save_plot).suffix else ".png")
+    require_new([args.save_results, plot], args.overwrite, [args.reference, args.estimate])
     estimate, truth = read_trajectory(args.estimate), read_trajectory(args.reference)
     shifted = Trajectory(estimate.timestamps + args.t_offset, estimate.T_world_camera)
     alignment = _alignment(args)
@@ -87,8 +90,7 @@ def run_eval(args: argparse.Namespace) -> None:
 
         figure = trajectory_plot(result.estimate, result.truth, unit="m")
         if args.save_plot:
-            path = Path(args.save_plot)
-            atomic_write(path if path.suffix else path.with_suffix(".png"), figure_png(figure))
+            atomic_write(plot, figure_png(figure))
         if args.plot:
             show_figure(figure)
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from minislam.cli.progress import ProgressLine, say
-from minislam.data.files import atomic_write, require_free
+from minislam.data.files import atomic_write, require_free, require_new
 from minislam.errors import InputError
 
 SH_MAP = "map_sh.ply"  # in the run folder
@@ -49,12 +49,8 @@ def _export(args: argparse.Namespace) -> None:
         )
     for folder in filter(None, folders):
         require_free(folder, args.overwrite)
-    padded = Path(args.folder) / SH_MAP
-    for file in (args.points and Path(args.points), args.sh_degree and padded):
-        if file and file.exists() and not args.overwrite:
-            raise InputError(
-                f"expected a new file, but {file} exists; choose another name or add --overwrite"
-            )
+    padded, own = (Path(args.folder) / name for name in (SH_MAP, "map.ply"))
+    require_new([args.points, args.sh_degree and padded], args.overwrite, [own])
     import minislam
     from minislam.data.ply import encode_ply
     from minislam.runs import export

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import minislam
-from minislam.data.files import read_json, write_json, write_text
+from minislam.data.files import read_json, require_new, write_json, write_text
 from minislam.errors import InputError
 
 SILENCE = 120.0  # seconds without a verdict after which an exercise is given up
@@ -37,6 +37,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add("notebooks", metavar="NOTEBOOK", nargs="+", help="a student's .ipynb file")
     add("--json", metavar="FILE", help="write all verdicts as JSON")
     add("--csv", metavar="FILE", help="write one line an exercise")
+    add("--overwrite", action="store_true", help="replace files of these names")
     add("--seed", type=int, metavar="N", help="also cases that nobody has seen")
     add("--no-package", action="store_true", help="refuse answers that call the package's own")
     add("--strict", action="store_true", help="exit code 1 below full marks")
@@ -47,6 +48,7 @@ def _grade(args: argparse.Namespace) -> int:
     """Grade all notebooks, print and write the points; return the exit code."""
     if args.seed is not None and args.seed < 0:
         raise InputError(f"expected --seed N with N at least 0, found {args.seed}; give another")
+    require_new([args.json, args.csv], args.overwrite, args.notebooks)
     graded = []
     for name in args.notebooks:
         try:

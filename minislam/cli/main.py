@@ -13,7 +13,7 @@ from importlib import import_module
 import minislam
 from minislam.cli.help import UsageError, nearest, unknown_option
 from minislam.cli.options import take_settings
-from minislam.cli.progress import ending_signals, say
+from minislam.cli.progress import ProgressLine, ending_signals, say
 from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, USAGE_EXIT, MinislamError
 
 # The modules of minislam.cli that add the commands, in the order of the help.
@@ -41,8 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             exit_code = _command(sys.argv[1:] if arguments is None else list(arguments))
             sys.stdout.flush()
         return exit_code
-    except KeyboardInterrupt:
-        say("minislam: interrupted", "stderr")
+    except KeyboardInterrupt as error:
+        ProgressLine().tell(f"minislam: {str(error) or 'interrupted'}")
         return INTERRUPTED_EXIT
     except BrokenPipeError:  # `minislam weights list | head`: the reader has seen enough
         return FAILED_EXIT
@@ -50,13 +50,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("MINISLAM_DEBUG"):
             raise
         text = str(error)
-        if not isinstance(error, MinislamError):
+        if isinstance(error, ModuleNotFoundError) and error.name:
+            text = (
+                f"expected {error.name} in this Python, {sys.executable}, found none; activate the "
+                "environment of minislam, or pip install -r environment.txt"
+            )
+        elif not isinstance(error, MinislamError):
             text = (
                 f"expected to finish this command, found {type(error).__name__}: "
                 f"{' '.join(text.split())[:300]}; check names, permissions, space and "
                 "settings, and set MINISLAM_DEBUG=1 to see where it happened"
             )
-        say(f"minislam: {text}", "stderr")
+        ProgressLine().tell(f"minislam: {text}")
         return USAGE_EXIT if isinstance(error, UsageError) else FAILED_EXIT
     finally:
         say("", end="")  # what is still in the buffer, or else nothing

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import minislam
-from minislam.data.files import atomic_write, read_bytes, require_no_file
+from minislam.data.files import atomic_write, make_folder, read_bytes
 from minislam.errors import InputError
 
 SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
@@ -41,15 +41,14 @@ def _notebooks(args: argparse.Namespace) -> None:
     for path in (source / "SYLLABUS.md", source / "LICENSE", source.parent / "LICENSE"):
         if path.is_file():
             copies[path.name] = read_bytes(path)
-    require_no_file(folder)
-    there = [name for name in copies if (folder / name).exists()]
-    if there:
+    make_folder(folder)
+    if there := [name for name in copies if (folder / name).exists()]:
         raise InputError(
             f"expected a folder without these notebooks, found {there[0]} in {folder}; give "
             "another one, so that nobody's work is lost"
         )
     for name, content in copies.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        make_folder((folder / name).parent)
         atomic_write(folder / name, content)
     print(f"{count} notebooks in {folder}; open them with: jupyter lab {folder}")
 

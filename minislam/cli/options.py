@@ -6,11 +6,12 @@ Whatever needs torch is imported where it is used: `minislam --help` answers at 
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from minislam.cli.help import unknown_option
+from minislam.cli.help import UsageError, unknown_option
 from minislam.data.files import read_json
 from minislam.data.options import InputOptions
 from minislam.errors import InputError
@@ -103,6 +104,9 @@ def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str | None
 
     Names with a dot are settings. Which of them there are is known only with torch.
     """
+    behind = arguments[arguments.index("--") + 1 :] if "--" in arguments else []
+    if len(behind) > 1:
+        raise UsageError(f"expected one name after --, found also {behind[1]}; put options first")
     rest: list[str] = []
     given: dict[str, str | None] = {}
     todo = iter(arguments)
@@ -127,6 +131,10 @@ def config_file(args: argparse.Namespace) -> dict[str, Any]:
     """Return the file given with --config, or config.json of the run that --resume goes on with."""
     tree: Any = {}
     if args.config:
+        path, is_folder = Path(args.config), os.path.isdir(args.config)
+        wanted = (path if is_folder else path.parent) / "config.json"
+        if (is_folder or path.name in ("run.json", "metrics.json")) and wanted.is_file():
+            raise InputError(f"expected a file of settings, found {path} of a run; give {wanted}")
         tree = read_json(args.config)
     elif getattr(args, "resume", False):
         from minislam.data.run_folder import RunFolder
@@ -193,7 +201,7 @@ def settings(args: argparse.Namespace) -> SlamConfig:
 
         base = with_settings(base, settings_in(RunFolder(args.output).read_config()))
     if args.config:
-        base = with_settings(base, settings_in(read_json(args.config)))
+        base = with_settings(base, settings_in(config_file(args)))
     known, given = settings_of(base), dict(args.settings)
     unknown = [name for name in given if name not in known]
     if unknown:

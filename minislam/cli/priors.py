@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from minislam.cli import options
 from minislam.cli.help import add_command
 from minislam.cli.progress import ProgressLine
-from minislam.data.files import atomic_file, read_text, write_text
+from minislam.data.files import atomic_file, make_folder, read_text, write_text
 from minislam.data.options import require_source
 from minislam.errors import InputError
 
@@ -102,7 +102,7 @@ def _write_kind(
     from minislam.priors.files import INDEX, index_text
 
     index = index_text(origin, [(frame.frame_index, frame.timestamp) for frame in sequence])
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / INDEX
     if any(folder.iterdir()) and not (path.exists() and read_text(path) == index):
         raise InputError(

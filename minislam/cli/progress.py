@@ -9,7 +9,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, TypeVar
 
@@ -102,6 +102,7 @@ class ProgressLine:
         self._terminal = sys.stderr.isatty() and not (is_quiet or is_verbose)
         self._plain_step = 0.0 if is_verbose else PLAIN_STEP
         self._should_stop = False
+        self._is_open = False  # on a terminal: the line has no end yet
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of all steps of a stage are done. Stages may take turns."""
@@ -119,10 +120,9 @@ class ProgressLine:
             left = "" if in_all else f", {(total - done) / rate:.0f} s left"
             text += f" ({rate:.1f}/s{left})"
         text += in_all
-        if self._should_stop:
-            text += ", stopping after this step; Ctrl-C again stops at once"
         if self._terminal:
-            say(f"\r\033[K{text}", "stderr", end="\n" if fraction >= 1 else "")
+            self._is_open = fraction < 1
+            say(f"\r\033[K{text}", "stderr", end="" if self._is_open else "\n")
         elif fraction >= 1 or fraction >= self._shown[stage] + self._plain_step:
             self._shown[stage] = fraction % 1  # 0 when it is done, since it may come again
             say(text, self._stream)
@@ -160,8 +160,17 @@ class ProgressLine:
 
     def warn(self, text: str) -> None:
         """Print a warning on a line of its own."""
-        start = "\r\033[K" if self._terminal else ""
-        say(f"{start}WARNING: {text}", "stderr")
+        self.tell(f"WARNING: {text}")
+
+    def tell(self, text: str) -> None:
+        """Print a line of its own in place of an open one."""
+        self._is_open = False
+        say(("\r\033[K" if self._terminal else "") + text, "stderr")
+
+    def close(self) -> None:
+        """End an open line, so that nothing else is printed behind it."""
+        if self._is_open:
+            say("", "stderr")
 
     def should_stop(self) -> bool:
         """Tell whether Ctrl-C was pressed."""
@@ -172,6 +181,8 @@ class ProgressLine:
         if self._should_stop:
             raise KeyboardInterrupt
         self._should_stop = True
+        with suppress(RuntimeError):  # the signal came while a line was being printed
+            self.tell("stopping after this step; Ctrl-C again stops at once")
 
 
 class SilentProgress(ProgressLine):
@@ -180,8 +191,8 @@ class SilentProgress(ProgressLine):
     def show(self, stage: str, done: int, total: int) -> None:
         """Say nothing of a step."""
 
-    def warn(self, text: str) -> None:
-        """Say nothing of a warning; run.json has it."""
+    def tell(self, text: str) -> None:
+        """Say nothing, of a warning neither; run.json has it."""
 
 
 def _duration(seconds: float) -> str:

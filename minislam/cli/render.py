@@ -4,6 +4,7 @@ import argparse
 
 from minislam.cli.options import size_of
 from minislam.cli.progress import ProgressLine, say
+from minislam.data.files import require_new
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -24,6 +25,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="along the camera's trajectory, in a circle around the middle keyframe, or along the "
         "trajectory beside input and uncertainty; default trajectory",
     )
+    add("--overwrite", action="store_true", help="replace a file of this name")
     add("--size", type=size_of, metavar="WIDTHxHEIGHT", help="of the images, default as in the run")
     parser.set_defaults(run=_render)
 
@@ -37,6 +39,8 @@ def _render(args: argparse.Namespace) -> None:
 
     run = Run(args.folder)
     require_bounds("--size", args.size, MINIMUM_SIDE, 16384)
+    inputs = [run.folder.read_config()["sequence"]] if args.overwrite else []  # a video, or none
+    require_new([args.output], args.overwrite, inputs)
     camera = run.camera.resized(*args.size) if args.size else run.camera
     rate, count = flythrough.frame_rate(run), len(run.poses)
     if args.path == "trajectory":

@@ -2,6 +2,7 @@
 
 import argparse
 import shlex
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from minislam.cli.progress import ProgressLine, ending_signals, plan_of, say
 from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
 from minislam.errors import InputError
+from minislam.parameters import require_bounds
 
 DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
 
@@ -44,6 +46,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    require_bounds("--workers", args.workers, 1, 256)
     if args.resume and args.output is None:
         raise InputError(
             "expected --output FOLDER with --resume, found none; give that of the interrupted run"
@@ -51,15 +54,23 @@ def _run(args: argparse.Namespace) -> int:
     with recorded(args.quiet) as log:
         # What may be wrong is looked for in the order of the time that it takes.
         source, inputs = options.source_of(args), options.input_options(args)
-        require_source(source)
+        try:
+            require_source(source)
+        except InputError as error:
+            where = f", move it back, or correct sequence, which {args.output}/config.json names"
+            raise InputError(f"{error}{where if args.resume else ''}") from error
         if args.output and not args.resume:
             also = " (or --resume, to go on with an interrupted run)"
             require_free(args.output, args.overwrite, also)
         choice = options.prior_choice(args, default_depth(source))
         from minislam.data.sequence import open_sequence
+        from minislam.runs.resume import way_on
         from minislam.runs.run import default_output, run_in_folder
         from minislam.runs.summary import as_text, summarise
 
+        if args.resume and not way_on(args.output):
+            found = f"expected an interrupted run in {args.output}, found no checkpoint.npz"
+            raise InputError(f"{found}, as in a finished run; see report.html, or start a new run")
         config, lpips = options.settings(args), options.lpips_of(args)
         progress = ProgressLine(args.quiet, args.verbose)
         sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
@@ -71,7 +82,7 @@ def _run(args: argparse.Namespace) -> int:
             say(f"WARNING: {warning}", "stderr")
         progress.plan = plan_of(config, choice, sequence)
         log.folder = Path(output)
-        with ending_signals(progress.interrupt):
+        with closing(progress), ending_signals(progress.interrupt):
             metrics, facts = run_in_folder(
                 sequence, config, choice, output, progress, lpips, args.overwrite, args.resume,
                 args.workers,

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -57,6 +57,30 @@ def require_free(folder: Path | str, overwrite: bool, also: str = "") -> None:
         )
 
 
+def require_new(files: Iterable[Any], overwrite: bool, inputs: Iterable[Path | str]) -> None:
+    """Refuse files to write that exist, are inputs, or cannot be, before they are computed."""
+    for path in filter(None, files):  # None: not asked for
+        folder, wrong = os.path.dirname(os.path.realpath(path)), ""
+        if not (os.path.isdir(folder) and os.access(folder, os.W_OK)):
+            wrong = f"{folder} is no writable folder; make it, or choose another"
+        elif os.path.exists(path):
+            wrong = "" if overwrite else f"{path} exists; choose another name or add --overwrite"
+            if any(os.path.samefile(path, file) for file in filter(os.path.exists, inputs)):
+                wrong = f"{path} exists and is an input; choose another name"
+        if wrong:
+            raise InputError(f"expected a new file, but {wrong}")
+
+
+def make_folder(path: Path) -> None:
+    """Make an output folder and those above it, or say in one sentence why it cannot be."""
+    require_no_file(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        text = f"expected to make the folder {path}, but the system says: {error.strerror}"
+        raise InputError(f"{text}; choose another name, or change its permissions") from error
+
+
 def require_no_file(folder: Path) -> None:
     """Refuse an output folder that is a file, or that would lie below one."""
     for path in (folder, *folder.parents):
@@ -106,7 +130,7 @@ def read_json(path: Path | str) -> Any:
         return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:  # also a number of 5000 digits
         raise InputError(
-            f"expected JSON in {path}, but found a mistake: {error}; correct it or delete the file"
+            f"expected JSON in {path}, found a mistake: {error}; correct it, or give another file"
         ) from error
 
 
@@ -123,4 +147,5 @@ def finite_numbers(fields: list[str], where: str) -> list[float]:
         if all(map(math.isfinite, numbers)):
             return numbers
     shown = " ".join(fields)[:80]
-    raise InputError(f"expected finite numbers in {where}, found '{shown}'; correct this line")
+    hint = "write a decimal point" if "," in shown else "correct this line"
+    raise InputError(f"expected finite numbers in {where}, found '{shown}'; {hint}")

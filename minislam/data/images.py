@@ -4,8 +4,8 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -109,7 +109,8 @@ def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     writer, code = cv2.VideoWriter(), cv2.VideoWriter.fourcc(*"VP80")
     for frame in frames:
         if not writer.isOpened():
-            writer.open(str(file), code, rate, (frame.shape[1], frame.shape[0]))
+            with _standard_error():  # where FFmpeg says that WebM has another code for VP8
+                writer.open(str(file), code, rate, (frame.shape[1], frame.shape[0]))
         writer.write(frame)
     writer.release()
 
@@ -156,19 +157,25 @@ def _is_complete(content: bytes) -> bool:
 
 def _decoded(content: bytes, mode: int) -> tuple[np.ndarray | None, bytes]:
     """Decode, and catch what libjpeg writes to standard error: only there it tells of damage."""
+    image = None
+    with _standard_error() as said, suppress(cv2.error):  # of a header that claims 10^10 px
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
+    # What libpng only warns of, such as a broken colour profile, does not touch the pixels.
+    return image, b"".join(line for line in said if not line.startswith(b"libpng warning"))
+
+
+@contextmanager
+def _standard_error() -> Iterator[list[bytes]]:
+    """Keep what C libraries write to standard error off the screen; afterwards yield its lines."""
     reader, writer = os.pipe()
     os.set_blocking(writer, False)  # what does not fit is dropped, rather than waited for
-    before = os.dup(2)
+    before, said = os.dup(2), list[bytes]()
     os.dup2(writer, 2)
-    image = None
     try:
-        with suppress(cv2.error):  # of a header that claims 10^10 px
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
+        yield said
     finally:
         os.dup2(before, 2)
         os.close(before)
         os.close(writer)
-    with open(reader, "rb") as file:
-        said = file.read().splitlines(keepends=True)
-    # What libpng only warns of, such as a broken colour profile, does not touch the pixels.
-    return image, b"".join(line for line in said if not line.startswith(b"libpng warning"))
+        with open(reader, "rb") as file:
+            said += file.read().splitlines(keepends=True)

@@ -27,8 +27,8 @@ class InputOptions:
     pixels: int = parameter(
         320 * 240, "about width * height of the chosen working size [px]", MINIMUM_SIDE**2
     )
-    fx: float | None = parameter(None, "focal length of the raw images, x [px]")
-    fy: float | None = parameter(None, "focal length of the raw images, y; none: as fx [px]")
+    fx: float | None = parameter(None, "focal length of the raw images, x [px]", 1, 1e6)
+    fy: float | None = parameter(None, "focal length of raw images, y; none: as fx [px]", 1, 1e6)
     cx: float | None = parameter(None, "principal point of raw images, x; none: centre [px]", -1)
     cy: float | None = parameter(None, "principal point of raw images, y; none: centre [px]", -1)
     calibration: str | None = parameter(

@@ -54,10 +54,11 @@ class RecordedSequence:
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
         self._chosen = chosen[: options.max_frames]
-        if len(self._chosen) == 0:
+        if len(self._chosen) < 2:
             raise InputError(
-                f"expected frames from number {options.start} on, but {recording.name} has "
-                f"{len(recording.images)}; choose a smaller start"
+                f"expected at least two frames, found {len(self._chosen)} among "
+                f"{len(recording.images)} images of {recording.name} after --start, --stride and "
+                "--max-frames; change these, or give more images"
             )
         stamps = recording.timestamps[self._chosen.start : self._chosen.stop : self._chosen.step]
         self.lost = [row for row in recording.lost if stamps[0] < row[0] < stamps[-1]]
@@ -67,14 +68,16 @@ class RecordedSequence:
         self._masks = recording.mask_paths
         if options.masks is not None:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
-        height, width = recording.images.read(self._chosen[0]).shape[:2]
+        height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
         calibration = _calibration(recording, options, width, height)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
         self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels)
         self.name = recording.name
         self.camera = self.prepare.camera
         self.preparation = self.prepare.steps
-        self.warnings = list(recording.warnings)
+        given_fx = 0.0 if calibration.is_rough else camera.fx
+        doubts = _doubts(first, recording.images.labels[self._chosen[0]], given_fx)
+        self.warnings = [*recording.warnings, *doubts]
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
         if calibration.is_rough and not self.refines_focal:
@@ -161,6 +164,17 @@ class _RecordedTruth:
     def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
         views, prepare = self._recording.novel_views, self._sequence.prepare
         return [(pose, prepare.color(read_color(path), str(path))) for pose, path in views]
+
+
+def _doubts(raw: np.ndarray, label: str, fx: float) -> Iterator[str]:
+    """Yield what is likely a mistake in a raw image, or in a given focal length [px], 0 if none."""
+    if label.lower().endswith(".png") and 0 < raw.max() < 16:
+        what = f"{label} is almost black, its largest value {raw.max()} of 255"
+        yield f"{what}: if it holds 10 or 12 bits in 16, multiply all images by 64 or 16"
+    angle = 2 * np.degrees(np.arctan(raw.shape[1] / 2 / fx)) if fx else 60
+    if not 15 <= angle <= 130:  # degree
+        how = "in millimetres" if angle > 130 else "for larger images"
+        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: was it given {how}?"
 
 
 def _calibration(

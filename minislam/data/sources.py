@@ -16,6 +16,7 @@ from minislam.records import Trajectory
 
 FILES = "files:"  # before the name of a folder
 _IMAGE_FOLDERS = ("images", "rgb")
+_OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
 _ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
@@ -96,9 +97,13 @@ class VideoImages:
         self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         self._grabbed = 0  # calls of grab() since the start
         if not self._capture.isOpened():
+            size, hint = self.path.stat().st_size, "convert it to MP4 (H.264) or give images"
+            content = np.memmap(self.path, mode="r").data if size else memoryview(b"")
+            # The table of contents, which cameras write at the end of an MP4
+            if content[4:8] == b"ftyp" and not re.search(b"(?s)moov....mvhd", content):
+                hint = "the file is cut short, copy it again"
             raise InputError(
-                f"expected a video, but {self.path} ({self.path.stat().st_size} bytes) cannot be "
-                "opened as one; convert it to MP4 (H.264) or give a folder of images"
+                f"expected a video, but {self.path} ({size} bytes) cannot be opened as one; {hint}"
             )
 
 
@@ -148,7 +153,7 @@ def read_image_folder(folder: Path) -> Recording:
     candidates = [folder, *(folder / name for name in _IMAGE_FOLDERS)]
     paths = next(filter(None, map(list_images, candidates)), [])
     if not paths:
-        raise InputError(f"expected PNG or JPEG images in {folder}, found none; {_hint(folder)}")
+        raise InputError(f"expected PNG or JPEG images in {folder}, found {_found(folder)}")
     stamps, source = stamps_of_names(paths)
     return Recording(
         name=folder_name(folder),
@@ -215,14 +220,19 @@ def folder_name(path: Path) -> str:
     return re.sub(r"[^\w.-]+", "_", path.resolve().name).strip("._") or "sequence"
 
 
-def _hint(folder: Path) -> str:
-    """Say what the user may have meant: often the video or data set lies one level deeper."""
+def _found(folder: Path) -> str:
+    """Say what is there, and what to do: often the video or data set lies one level deeper."""
+    if (folder / "run.json").is_file():
+        return f"the folder of a run; to repeat it, give --config {folder / 'config.json'}"
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     if videos := [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]:
-        return f"give the video itself, {videos[0]}"
+        return f"none; give the video itself, {videos[0]}"
+    suffixes = [path.suffix.lower() for path in entries]
+    if others := [suffix for suffix in suffixes if suffix in _OTHER_IMAGES]:
+        return f"{suffixes.count(others[0])} {others[0]}; convert them to JPEG or PNG"
     if folders := [path for path in entries if path.is_dir()]:
-        return f"perhaps you mean {folders[0]}"
-    return "give a folder that holds images, a video file, or synth:NAME"
+        return f"none; perhaps you mean {folders[0]}"
+    return "none; give a folder that holds images, a video file, or synth:NAME"
 
 
 def mask_files(images: ImageSource, masks: str, chosen: range) -> dict[int, Path]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from minislam.data.files import atomic_file, atomic_write, write_json, write_text
+from minislam.data.files import atomic_file, atomic_write, make_folder, write_json, write_text
 from minislam.data.images import encode_png
 from minislam.data.ply import encode_points
 from minislam.errors import InputError
@@ -75,7 +75,7 @@ def export_depth(run: Run, folder: Path, frames: Iterable[int]) -> None:
 
     camera.json holds the intrinsics, for pixel centres at integers, and the unit of length.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    _make_apart(run, folder)
     for frame in frames:
         with atomic_file(folder / _name(frame, ".npy")) as file:
             np.save(file, np.asarray(run.render_depth(run.poses[frame]), np.float32))
@@ -85,7 +85,7 @@ def export_depth(run: Run, folder: Path, frames: Iterable[int]) -> None:
 def export_masks(run: Run, folder: Path, frames: Iterable[int]) -> None:
     """Write a mask of every frame at the size of the source: 255 where static, 0 where it moves."""
     camera = run.sequence.prepare.full_camera(run.camera)
-    folder.mkdir(parents=True, exist_ok=True)
+    _make_apart(run, folder)
     for frame in frames:
         atomic_write(folder / _name(frame), encode_png(static_mask(run, frame, camera)))
 
@@ -108,14 +108,7 @@ def static_mask(run: Run, frame: int, camera: Camera) -> np.ndarray:  # (H, W) u
 def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera, list[int]]:
     """Write images/ and masks/; return the camera of both, and the frames."""
     sequence = run.sequence
-    inside = [path for path in sequence.files if path.resolve().is_relative_to(folder.resolve())]
-    if inside:
-        raise InputError(
-            f"expected a folder without images of the sequence itself, found {inside[0]} in "
-            f"{folder}; choose another folder"
-        )
-    for part in (IMAGES, MASKS, "sparse/0"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
+    _make_apart(run, folder, IMAGES, MASKS, "sparse/0")
     camera, written = sequence.prepare.full_camera(run.camera), list[int]()
     for frame in frames:
         image, mask = sequence.full_image(frame), static_mask(run, frame, camera)
@@ -128,6 +121,19 @@ def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera
         atomic_write(folder / MASKS / _name(frame), encode_png(mask))
         written.append(frame)
     return camera, written
+
+
+def _make_apart(run: Run, folder: Path, *parts: str) -> None:
+    """Make an output folder and its parts; refuse one that holds images of the run's source."""
+    make_folder(folder := folder.resolve())
+    if any(folder.iterdir()):  # only then, because depth can be written without the source
+        if inside := [f for f in run.sequence.files if f.resolve().is_relative_to(folder)]:
+            raise InputError(
+                f"expected a folder without images of the sequence itself, found {inside[0]} in "
+                f"{folder}; choose another folder"
+            )
+    for part in parts:
+        make_folder(folder / part)
 
 
 def _working_pixels(run: Run, camera: Camera) -> np.ndarray:  # (H, W, 2)

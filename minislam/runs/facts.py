@@ -16,7 +16,8 @@ from torch import Tensor
 import minislam
 from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
-from minislam.evaluation.metrics import MappedView, ate_cm, measure_run
+from minislam.evaluation.metrics import MAX_DIFFERENCE, MappedView, ate_cm, measure_run
+from minislam.evaluation.trajectory import associate
 from minislam.mapping.mapper import OPAQUE
 from minislam.priors.choice import PriorChoice
 from minislam.records import Trajectory
@@ -93,8 +94,11 @@ def focal_length_note(slam: Slam) -> str:
 def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     """Return the content of metrics.json."""
     truth, paths = slam.sequence.ground_truth, (slam.trajectory(), slam.keyframe_trajectory())
+    errors = measure_run(truth, *paths, mapped_views(slam), slam.render, lpips)
+    if errors["ate_all_cm"] is None:  # then there is nothing to compare a straight walk with
+        errors["ate_straight_line_cm"] = None
     return {
-        **measure_run(truth, *paths, mapped_views(slam), slam.render, lpips),
+        **errors,
         **_segment_errors(slam),
         "focal_length_px": slam.tracker.grid.camera.fx,
         "seconds_total": seconds,
@@ -195,6 +199,14 @@ def _warnings(slam: Slam) -> Iterator[str]:
     watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
     diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
     yield from slam.sequence.warnings
+    path = slam.sequence.ground_truth and slam.sequence.ground_truth.trajectory
+    stamps = np.array([tracked.timestamp for tracked in slam.tracker.tracked])
+    if path and len(stamps) and not len(associate(stamps, path.timestamps, MAX_DIFFERENCE)[0]):
+        yield (
+            f"no frame has a true pose within {MAX_DIFFERENCE:g} s, so there is no ATE: frames "
+            f"begin at {stamps[0]:.3f} s, the ground truth at {path.timestamps[0]:.3f} s; shift "
+            "its times"
+        )
     if lost:
         yield (
             f"{lost} of {len(slam.tracker.tracked)} frames could not be tracked and have no "

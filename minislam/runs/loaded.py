@@ -1,5 +1,6 @@
 """A run read back from its folder: camera, poses, map and beta, to render, plot and export."""
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,12 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.linalg import det
 
 from minislam.config import SlamConfig, settings_in, settings_of, with_settings
 from minislam.data.files import read_bytes, read_json, read_text
 from minislam.data.options import InputOptions
 from minislam.data.ply import GaussianArrays, read_ply
-from minislam.data.run_folder import CAMERA, MAP, PLOTS, VIEWER, RunFolder
+from minislam.data.run_folder import CAMERA, CONFIG, MAP, PLOTS, VIEWER, RunFolder
 from minislam.data.sequence import RecordedSequence, open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_inverse
@@ -24,6 +26,7 @@ from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
 from minislam.runs.facts import surface_depth, unit_of
+from minislam.runs.resume import way_on
 from minislam.runs.summary import Line, summarise
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
@@ -77,10 +80,11 @@ class Run:
         self.folder = RunFolder(folder)
         path = self.folder.path / CAMERA
         if not path.is_file():
-            raise InputError(
-                f"expected a run with a map in {folder}, found no camera.json; give the --output "
-                f"of a finished run, or repeat it: minislam run --config {folder}/config.json"
-            )
+            advice, config = "give the --output of a finished run", self.folder.path / CONFIG
+            if config.is_file():
+                advice += f", or repeat it: minislam run --config {config}"
+            found = f"expected a run with a map in {folder}, found no camera.json"
+            raise InputError(f"{found}; {way_on(folder) or advice}")
         scene = read_json(path)
         try:
             self.name: str = scene["sequence"]["name"]
@@ -218,7 +222,16 @@ class Run:
         return mlp
 
     def _rendering(self, T_world_camera: np.ndarray, camera: Camera | None) -> Rendering:
-        T_camera_world = se3_inverse(torch.from_numpy(np.asarray(T_world_camera, np.float64)))
+        is_pose = False
+        with suppress(IndexError, RuntimeError, TypeError, ValueError):  # of another shape or kind
+            pose = torch.from_numpy(np.asarray(T_world_camera, np.float64))
+            T_camera_world, one = se3_inverse(pose), torch.eye(4, dtype=pose.dtype)
+            is_pose = torch.allclose(pose @ T_camera_world, one, atol=1e-3) and bool(det(pose) > 0)
+        if not is_pose or pose.shape != (4, 4):
+            raise InputError(
+                "expected T_world_camera (4, 4), a rotation and a position over 0 0 0 1, found "
+                f"{' '.join(repr(T_world_camera).split())[:100]}; give one like those of run.poses"
+            )
         background = torch.from_numpy(self.background)
         rows = {name: torch.from_numpy(values) for name, values in vars(self.gaussians).items()}
         anchors = torch.zeros(len(self.gaussians), dtype=torch.int64)

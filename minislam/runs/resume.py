@@ -2,18 +2,26 @@
 
 import functools
 import json
+import shlex
 import time
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import minislam
 from minislam.config import SlamConfig
-from minislam.data.run_folder import RunFolder
+from minislam.data.run_folder import CHECKPOINT, RunFolder
 from minislam.errors import InputError, MinislamError
 from minislam.parameters import flattened
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
 from minislam.slam import Slam
+
+
+def way_on(folder: Path | str) -> str:
+    """Return how to go on with a run, or nothing where it has no checkpoint."""
+    command = f"go on with: minislam run --resume -o {shlex.quote(str(folder))}"
+    return command if (Path(folder) / CHECKPOINT).is_file() else ""
 
 
 class Checkpoints:
@@ -65,7 +73,8 @@ class Checkpoints:
             self._folder.write_checkpoint(tree)
             self.problem = None
         except InputError as error:
-            self.problem = f"the last checkpoint is older than this state: {error}"
+            reason = str(error).partition("; ")[0]  # another folder does not help this run
+            self.problem = f"the last checkpoint is older than this state: {reason}; free space"
         self._last = time.perf_counter()
         self._cost = self._last - begun
         self.seconds += self._cost
@@ -78,17 +87,21 @@ class Checkpoints:
         device, where = self._origin["priors"]["device"], self._folder.path
         found = self._folder.read_checkpoint(device)
         try:
-            then = flattened({name: found.get(name) for name in self._origin})
+            inputs = {"input": json.loads(json.dumps(slam.sequence.opened_as["input"]))}
+            present = flattened(inputs | self._origin)  # an option says more than a description
+            then = flattened(inputs | {name: found.get(name) for name in self._origin})
+            then |= flattened({"input": self._folder.read_config().get("input")})
             if device == "cpu" and then.get("priors.device") != "cpu":
                 for name in ("device", "precision"):
                     then[f"priors.{name}"] = self._origin["priors"][name]
-            for name, now in flattened(self._origin).items():
-                if then.get(name) != now:
-                    raise InputError(
-                        f"expected {name} = {then.get(name)} like the interrupted run in {where}, "
-                        f"found {now}; repeat its command with --resume, or start anew in another "
-                        "folder"
-                    )
+            differing = [name for name, now in present.items() if then.get(name) != now]
+            if not all(name.startswith("input.") for name in differing):
+                name = differing[0]
+                raise InputError(
+                    f"expected {name} = {then.get(name)} like the interrupted run in {where}, "
+                    f"found {present[name]}; repeat its command with --resume, or start anew in "
+                    "another folder"
+                )
             for index, checksum in found["checksums"].items():
                 slam.sequence.frame(int(index))
                 if slam.sequence.checksums[int(index)] != checksum:

@@ -1,5 +1,6 @@
 """One run from a name to a folder: read the sequence, do SLAM, measure it, write everything."""
 
+import errno
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -27,7 +28,7 @@ from minislam.runs.facts import has_large_holes, measure, run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
 from minislam.runs.pictures import Preview, write_pictures, write_preview
-from minislam.runs.resume import Checkpoints
+from minislam.runs.resume import Checkpoints, way_on
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer
 from minislam.workers import Workers, idle_cores
@@ -84,12 +85,12 @@ def run_in_folder(
             preview, said = Preview(folder), set[str]()
 
             def between_steps(force: bool) -> None:
-                for text in alarms(slam):
-                    if text not in said:
+                checkpoints.save(slam, force)
+                for text in (*alarms(slam), checkpoints.problem):
+                    if text is not None and text not in said:
                         observer.warn(text)
                         said.add(text)
                 preview.update(slam, facts_of)
-                checkpoints.save(slam, force)
 
             slam = Slam(sequence, config, priors, observer, between_steps, choice.device, helpers)
             facts_of = partial(run_facts, slam, choice, checkpoints)
@@ -127,6 +128,11 @@ def _run(
         clip_is_written()
         write_json(folder.path / names.RUN, facts)
     except (Exception, KeyboardInterrupt) as error:
+        if way := way_on(path := folder.path):
+            if isinstance(error, KeyboardInterrupt):
+                error.args = (f"interrupted; {way}",)
+            elif getattr(error.__cause__, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+                error.args = (f"expected space in {path}, found none; free space, then {way}",)
         ending = f"failed: {str(error) or repr(error)}", FAILED_EXIT
         if isinstance(error, KeyboardInterrupt):
             ending = "interrupted", INTERRUPTED_EXIT

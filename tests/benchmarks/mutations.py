@@ -74,8 +74,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("tracking/safeguards/first_camera.py", "tracking/safeguards/test_first_camera.py"): [
         ("> SAME_COST * cost", "> SAME_COST"),
         ("for log_focal in OTHER_FOCALS", "for log_focal in ()"),
-        ("(1 - FOCAL_WORTH_SAVING) * min", "0 * min"),
-        ("columns = graph.shutter.link_columns(links)", "columns = None"),
+        ("saving <= FOCAL_WORTH_SAVING", "False"),
+        ("link_columns(links) if tells_camera else None", "link_columns([])"),
         ("camera.width < problem", "camera.width > problem"),
         ("(1 - READOUT_WORTH_SAVING) * min", "2 * min"),
         ("problem = flow_problem()  # corrected", "pass"),

@@ -89,14 +89,14 @@ def test_bundle_adjustment():
     assert "expected 2: poses, disparities" in two.sentence
 
 
-def arriving(seen, T_this_other, camera, stride, nearest=True):
+def arriving(seen, T_this_other, camera, stride, nearest=True, known=True, before=True):
     """Return the depth that arrives at each cell, inf where none does."""
     pixels = camera.pixel_grid(dtype=seen.dtype).flatten(0, 1)
     points = transform_points(T_this_other, camera.backproject(pixels, seen.flatten()))
     shape = len(range(0, camera.height, stride)), len(range(0, camera.width, stride))
     depth = torch.full(shape, torch.inf, dtype=seen.dtype)
     u, v = camera.project(points).round().T
-    known = (seen.flatten() > 0) & (points[:, 2] > 0)
+    known = ((seen.flatten() > 0) | (not known)) & ((points[:, 2] > 0) | (not before))
     known &= (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     for n in (known & (u % stride == 0) & (v % stride == 0)).nonzero().flatten().tolist():
         cell = int(v[n]) // stride, int(u[n]) // stride
@@ -105,12 +105,16 @@ def arriving(seen, T_this_other, camera, stride, nearest=True):
 
 
 def voted(
-    depth, others, camera, stride, error, seen_by=2, agreeing=2, nearest=True, change=lambda T: T
-):
+    depth, others, camera, stride, error,
+    seen_by=2, agreeing=2, change=lambda T: T, by_own=False, **arrival,
+):  # fmt: skip
     cells = depth[::stride, ::stride]
-    warped = [arriving(seen, change(T), camera, stride, nearest) for seen, T in others]
+    warped = [arriving(seen, change(T), camera, stride, **arrival) for seen, T in others]
     both = [(cells > 0) & w.isfinite() for w in warped]
-    agree = [b & ((cells - w).abs() < error * w) for b, w in zip(both, warped, strict=True)]
+    agree = [
+        b & ((cells - w).abs() < error * (cells if by_own else w))
+        for b, w in zip(both, warped, strict=True)
+    ]
     seen_often = sum(b.long() for b in both) >= seen_by
     return ~seen_often | (sum(a.long() for a in agree) >= agreeing)
 
@@ -130,6 +134,9 @@ def test_prior_mask():
         "absolute error": lambda *a: voted(*a[:-1], a[-1] / 3),
         "last instead of nearest": lambda *a: voted(*a, nearest=False),
         "always": lambda *a: voted(*a) | True,
+        "unknown depth as well": lambda *a: voted(*a, known=False),
+        "behind the camera": lambda *a: voted(*a, before=False),
+        "relative to the own depth": lambda *a: voted(*a, by_own=True),
     }
     assert_variants(check_prior_mask, right, wrong, named=0.7)
 

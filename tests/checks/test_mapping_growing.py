@@ -75,8 +75,8 @@ def loss_in_a_loop(c, d, i, r, w, s):
     total = 0.0
     for v in range(d.shape[0]):
         for u in range(d.shape[1]):
-            total += 0.8 * float(w[v, u]) * sum(map(float, (c[v, u] - i[v, u]).abs())) / 3
-            total += 0.2 * float(w[v, u]) * abs(float(d[v, u] - r[v, u])) * float(r[v, u] > 0)
+            total = total + 0.8 * w[v, u] * sum((c[v, u] - i[v, u]).abs()) / 3
+            total = total + 0.2 * w[v, u] * abs(float(d[v, u] - r[v, u])) * float(r[v, u] > 0)
     spread = [abs(float(x) - float(row.mean())) for row in s for x in row]
     return total / d.numel() + 10 * sum(spread) / len(spread)
 
@@ -91,11 +91,14 @@ def test_map_loss():
         "shares exchanged": lambda *a: of_parts(*a, shares=(0.2, 0.8, 10.0)),
         "unknown depth too": lambda *a: of_parts(*a, mask=False),
         "squares": lambda c, d, i, r, w, s: of_parts(c**2, d, i**2, r, w, s),
+        "a float": lambda *a: of_parts(*a).item(),
+        "detached": lambda *a: of_parts(*a).detach(),
+        "a new tensor": lambda *a: torch.tensor(of_parts(*a).item(), requires_grad=True),
     }
     assert_variants(check_map_loss, {"mean": of_parts, "loop": loss_in_a_loop}, wrong)
 
 
-def followed(gaussians, camera, T, image, weight, steps, rate=0.006, shrink=0.96, **how):
+def followed(gaussians, camera, T, image, weight, steps, rate=0.025, shrink=0.96, **how):
     """Descend with Adam, 60 steps; `sign`, `result`, `fold`: how it goes wrong, or another way."""
     twist, pose = torch.zeros(6, requires_grad=True), T
     optimizer = torch.optim.Adam([twist], lr=rate)
@@ -122,13 +125,14 @@ def followed(gaussians, camera, T, image, weight, steps, rate=0.006, shrink=0.96
     return results[how.get("result", "left")]
 
 
-def newton(gaussians, camera, T, image, weight, steps):
+def newton(gaussians, camera, T, image, weight, steps, transparent=True):
     """Divide the gradient by the curvature."""
     for _ in range(steps):
         twist = torch.zeros(6, requires_grad=True)
         view = render(gaussians, camera, T, twist=twist)
         error = (view.color - image).abs().mean(-1)
-        (weight * view.opacity.detach() * error).mean().backward()
+        seen = view.opacity.detach() if transparent else 1
+        (weight * seen * error).mean().backward()
         H = curvature(view, image, weight, camera)
         step = torch.linalg.solve(H + 0.1 * H.diagonal().diag(), twist.grad.double())
         T = se3_exp(-step) @ T
@@ -141,6 +145,8 @@ def test_followed_pose():
     right = {"Newton": newton, "Adam": followed, "folded": lambda *a: followed(*a, fold=True)}
     ways = ("right", "inverse", "motion", "world", "start")
     wrong = {way: (lambda *a, way=way: followed(*a, result=way)) for way in ways}
-    wrong["uphill"] = lambda *a: followed(*a, sign=-1)
+    wrong["uphill"] = lambda *a: followed(*a, sign=-1, rate=0.006)
     wrong["equal weights"] = lambda *a: followed(*a, equal=True)
+    wrong["one step"] = lambda *a: newton(*a[:-1], 1)
+    wrong["holes of the map count"] = lambda *a: newton(*a, transparent=False)
     assert_variants(check_followed_pose, right, wrong)

@@ -78,11 +78,12 @@ def test_known_mistakes_of_gradients_are_named():
 
 def rendered(means, covariances, opacities, colors, pose, camera, flaw: str = "") -> Tensor:
     points = means @ pose[:3, :3].T + pose[:3, 3]
-    order = {"unsorted": points.argsort(0)[:, 0].sort().values}.get(flaw, points[:, 2].argsort())
+    order = (points.norm(dim=1) if flaw == "distance" else points[:, 2]).argsort()
+    order = order.sort().values if flaw == "unsorted" else order
     image = torch.zeros(camera.height, camera.width, 3, dtype=means.dtype)
     light = torch.ones(camera.height, camera.width, 1, dtype=means.dtype)
     for n in order.flip(0) if flaw == "far first" else order:
-        if points[n, 2] < 0.05 and flaw != "behind":
+        if points[n, 2] < (0.0 if flaw == "near" else 0.05) and flaw != "behind":
             continue
         wide = projected(covariances[n], means[n], pose, camera)
         wide = wide - 0.3 * torch.eye(2, dtype=wide.dtype) if flaw == "sharp" else wide
@@ -124,5 +125,7 @@ def test_a_rendered_image_is_told_from_a_wrong_one():
         "multiply T": partial(rendered, flaw="added"),
         "no cap": partial(rendered, flaw="opaque"),
         "u and v": partial(rendered, flaw="exchanged"),
+        "nearer than 0.05 m": partial(rendered, flaw="near"),
+        "by distance": partial(rendered, flaw="distance"),
     }
     assert_variants(check_rendered_image, {"one": rendered, "other": rendered_by_pixels}, wrong)

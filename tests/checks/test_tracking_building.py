@@ -15,6 +15,7 @@ from tests.helpers import assert_variants
 def kept(
     images, max_flow, interval,
     weighted=True, restart=True, matched=0.2, forced=True, stride=8, by_remap=False,
+    warped=True, half=0.5, masked=True,
 ):  # fmt: skip
     height, width = images[0].shape
     u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -23,12 +24,15 @@ def kept(
         flow = dense_flow.composed_flow(start, image, flow)
         back = dense_flow.reverse_flow(start, image, flow)
         to_u, to_v = (u + flow[..., 0]).astype(np.float32), (v + flow[..., 1]).astype(np.float32)
-        if by_remap:
+        if not warped:
+            home = back
+        elif by_remap:
             home = cv2.remap(back, to_u, to_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         else:
             home = dense_flow.warp(back, flow)
-        sure = np.exp(-((flow + home) ** 2).sum(-1) / (2 * 0.36))
-        sure *= (to_u >= 0) & (to_u <= width - 1) & (to_v >= 0) & (to_v <= height - 1)
+        sure = np.exp(-half * ((flow + home) ** 2).sum(-1) / 0.36)
+        if masked:
+            sure *= (to_u >= 0) & (to_u <= width - 1) & (to_v >= 0) & (to_v <= height - 1)
         sure, length = sure[::stride, ::stride], np.hypot(*np.moveaxis(flow, -1, 0))
         length = length[::stride, ::stride]
         mean = np.average(length, weights=sure if weighted else None)
@@ -53,6 +57,10 @@ def test_keyframes():
         "never forced": lambda *a: kept(*a, forced=False),
         "without the first": lambda *a: kept(*a)[1:],
         "every frame": lambda *a: list(range(len(a[0]))),
+        "back flow not warped": lambda *a: kept(*a, warped=False),
+        "no half in the exponent": lambda *a: kept(*a, half=1.0),
+        "twice the matched ratio": lambda *a: kept(*a, matched=0.4),
+        "also outside of the image": lambda *a: kept(*a, masked=False),
     }
     assert_variants(check_keyframes, right, wrong)
 
@@ -60,6 +68,7 @@ def test_keyframes():
 def remembered(
     grid, matches, disparities, motion, weight, scale,
     fall=0.9, rise=0.1, parallax_part=0.01, confident=0.1, hand_on=True, fill=True, smallest=True,
+    behind=False,
 ):  # fmt: skip
     T = motion[None].to(disparities)
     seen, valid = reproject(T, disparities[None], grid.rays, grid.camera)
@@ -69,7 +78,8 @@ def remembered(
     agreement = (1 + squared / (scale**2 + parallax_part * parallax)) ** -2
     matched = matches.confidences[0].mean(0) > confident
     rate = torch.where(agreement < weight, fall, rise)
-    moved = torch.where(matched & valid[0], (1 - rate) * weight + rate * agreement, weight)
+    updated = matched & (valid[0] | behind)
+    moved = torch.where(updated, (1 - rate) * weight + rate * agreement, weight)
     if not hand_on:
         return moved
     height, width = grid.shape
@@ -110,6 +120,7 @@ def test_motion_memory():
         "holes": lambda *a: remembered(*a, fill=False),
         "last instead of smallest": lambda *a: remembered(*a, smallest=False),
         "falls only": lambda *a: remembered(*a, rise=0.0),
+        "behind the camera": lambda *a: remembered(*a, behind=True),
     }
     assert_variants(check_motion_memory, right, wrong)
 

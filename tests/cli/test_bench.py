@@ -149,6 +149,14 @@ def test_folders_without_sequences_and_equal_names_are_one_sentence(made: Bench,
     assert "found two called crowd" in capsys.readouterr().err
 
 
+def test_an_output_that_is_a_file_is_one_sentence(made: Bench, capsys):
+    made.sequence("ball")
+    made.out.write_text("mine")
+    assert made.run() == 1
+    assert f"expected an output folder, but {made.out} is a file" in capsys.readouterr().err
+    assert made.out.read_text() == "mine"
+
+
 @pytest.mark.slow
 def test_the_command_of_a_run_is_one_that_minislam_knows(tmp_path: Path, capfd):
     folder = tum_folder(tmp_path / "crowd", 2)

@@ -1,6 +1,7 @@
 """Doctor tries the installation out, and says if something is wrong with it."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,16 @@ def test_a_flow_that_is_wrong_is_one_sentence(monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.setattr(conformance, "flow_error", lambda *_: float("nan"))
     assert main(["doctor"]) == 1
     assert "expected the self-test to be exact to 0.1 px, found nan px" in capsys.readouterr().err
+
+
+def test_what_is_missing_is_said_and_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys):
+    for name in ("torch", "cv2"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["doctor"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out.startswith("minislam ")
+    found = f"minislam: expected torch, cv2 in this Python, {sys.executable}, found none; activate"
+    assert printed.err.startswith(found) and "environment.txt" in printed.err
 
 
 class Package:

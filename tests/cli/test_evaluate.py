@@ -99,7 +99,8 @@ def test_relative_errors_are_those_of_a_drift_that_is_known(tmp_path: Path, caps
         (["--delta", "3", "--delta_unit", "f"], "3 f (3 poses)", 3),
     ]:
         results = tmp_path / "rpe.json"
-        run_eval(parse(*names, "--rpe", "--no_align", "--save_results", str(results), *flags))
+        save = ["--save_results", str(results), "--overwrite"]
+        run_eval(parse(*names, "--rpe", "--no_align", *save, *flags))
         out = capsys.readouterr().out
         shift, angle = json.loads(results.read_text())["rpe"].values()
         assert f"RPE w.r.t. translation part (m) over {over}" in out
@@ -155,6 +156,22 @@ def test_contradicting_flags_and_strange_clocks(files):
         run_eval(parse(*files, "-a", "--no_align"))
     with pytest.raises(InputError, match="--t_offset"):
         run_eval(parse(*files, "--t_offset", "1000"))
+
+
+def test_files_of_the_user_stay(files, tmp_path: Path):
+    for name in ("ate.json", "plot.png"):
+        (tmp_path / name).write_text("mine")
+    for flag, name in (("--save_results", "ate.json"), ("--save_plot", "plot")):
+        with pytest.raises(InputError, match=r"but .*(ate\.json|plot\.png) exists; .* --overwrite"):
+            run_eval(parse(*files, flag, str(tmp_path / name)))
+        for file in files:
+            before = Path(file).read_text()
+            with pytest.raises(InputError, match="exists and is an input; choose another name"):
+                run_eval(parse(*files, flag, file, "--overwrite"))
+            assert Path(file).read_text() == before
+        run_eval(parse(*files, "--silent", flag, str(tmp_path / name), "--overwrite"))
+    assert json.loads((tmp_path / "ate.json").read_text())["pairs"] == 20
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_help_does_not_wait_for_torch():

@@ -47,6 +47,7 @@ def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
     [
         ([], "expected at least one of --colmap"),
         (["--points", "mine.ply"], "expected a new file, but mine.ply exists"),
+        (["--points", "new/sub/p.ply"], "new/sub is no writable folder; make it, or"),
         (["--depth", "mine"], "expected a new or empty output folder, but mine holds files"),
         (["--masks", "mine.ply", "--overwrite"], "but mine.ply is a file"),
         (["--nerfstudio", "mine.ply/a/b"], "but mine.ply is a file; choose another name"),
@@ -61,6 +62,18 @@ def test_files_of_the_user_stay(arguments, words, folder: Path, tmp_path, monkey
     assert words in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.txt", "mine", "mine.ply"]
     assert (tmp_path / "mine.ply").read_text() == "mine"
+
+
+def test_images_of_the_source_and_the_map_are_never_replaced(folder: Path, capsys):
+    source, before = folder.parent / "in", (folder / "map.ply").read_bytes()
+    images_before = [path.read_bytes() for path in sorted(source.iterdir())]
+    for flag in ("--masks", "--depth", "--colmap"):
+        assert export(folder, flag, source, "--overwrite") == 1
+        assert "without images of the sequence itself, found" in capsys.readouterr().err
+    assert [path.read_bytes() for path in sorted(source.iterdir())] == images_before
+    assert export(folder, "--points", folder / "map.ply", "--overwrite") == 1
+    assert "exists and is an input" in capsys.readouterr().err
+    assert (folder / "map.ply").read_bytes() == before
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path, capsys):

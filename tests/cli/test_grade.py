@@ -90,6 +90,22 @@ def test_strict_needs_full_marks_and_a_seed_is_a_number(tmp_path: Path, capsys):
             assert main(["grade", "a.ipynb"]) == 0
 
 
+def test_files_of_the_teacher_and_of_the_students_stay(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    full = {"file": "a", "points": 4, "of": 4, "exercises": []}
+    for name in ("a.ipynb", "marks.json", "marks.csv"):
+        Path(name).write_text("mine")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(grade, "_graded", lambda *_: pytest.fail("it grades"))
+        for words in ("--json marks.json", "--csv marks.csv", "--csv a.ipynb --overwrite"):
+            assert main(["grade", "a.ipynb", *words.split()]) == 1
+            assert f"expected a new file, but {words.split()[1]} exists" in capsys.readouterr().err
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"mine"}
+    monkeypatch.setattr(grade, "_graded", lambda *_: full)
+    assert main(["grade", "a.ipynb", "--json", "marks.json", "--overwrite"]) == 0
+    assert json.loads(Path("marks.json").read_text())["points"] == 4
+
+
 def test_strict_mode_fails_in_nbmake_where_an_answer_is_missing(tmp_path: Path):
     notebook = solved("04")
     first = next(cell for cell in notebook["cells"] if cell["cell_type"] == "code")

@@ -206,7 +206,7 @@ def test_a_wrong_depth_costs_no_earlier_run_its_files(depth: str, tmp_path: Path
         (["--tracking.window", "many"], "tracking.window to be of type int like 10, found 'many'"),
         (["--config", "nowhere.json"], "a readable file nowhere.json"),
         (["--stride", "0"], "stride of at least 1 and at most 1e+09, found 0"),
-        (["--start", "5"], "frames from number 5 on, but input has 2"),
+        (["--start", "5"], "at least two frames, found 0 among 2 images of input"),
         (["--fx", "nan"], "fx to be a finite number, found nan"),
         (["--preset", ""], "a preset among laptop"),
         (["--seed", "-1"], "seed of at least 0"),
@@ -214,7 +214,7 @@ def test_a_wrong_depth_costs_no_earlier_run_its_files(depth: str, tmp_path: Path
         (["--threads", "100000"], "threads of at least 1 and at most 256, found 100000"),
         (["--tracking.window", "0"], "tracking.window of at least 1"),
         (["--size", "100000x100000"], "size of at least 16 and at most 16384"),
-        (["--fx", "1e300"], "fx of at least 0 and at most"),
+        (["--fx", "1e300"], "fx of at least 1 and at most 1e+06"),
         (["--depth", "sensor"], "expected a sensor's depth in input, found none"),
     ],
 )

@@ -39,6 +39,16 @@ def test_a_foreign_error_is_one_sentence_too(error: Exception, tmp_path: Path, m
         run(source, "-o", tmp_path / "again")
 
 
+def test_on_a_terminal_the_last_sentence_is_not_behind_an_open_progress_line(monkeypatch, capsys):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("minislam.cli.main._command", interrupted)
+    assert main(["run"]) == 130
+    assert capsys.readouterr().err == "\r\033[Kminislam: interrupted\n"
+
+
 @pytest.mark.parametrize("source", ["~nouserhere/x", "a" * 5000, "a\0b"])
 def test_a_name_that_no_system_knows_is_one_sentence(source: str, tmp_path: Path, capsys):
     assert run(source, "-o", tmp_path / "out") == 1

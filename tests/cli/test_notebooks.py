@@ -81,6 +81,11 @@ def test_a_file_is_no_folder(tmp_path: Path, monkeypatch, capsys, name: str):
     assert Path("mine").read_text() == "mine"
 
 
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path, capsys):
+    assert main(["notebooks", str(tmp_path / ("a" * 300))]) == 1
+    assert "expected to make the folder" in capsys.readouterr().err
+
+
 def test_a_package_without_notebooks_says_so(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr(minislam, "__file__", str(tmp_path / "minislam/__init__.py"))
     assert main(["notebooks", str(tmp_path / "course")]) == 1

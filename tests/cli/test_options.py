@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import minislam.config
+from minislam.cli.help import UsageError
 from minislam.cli.options import (
     PRESETS,
     add_input,
@@ -61,6 +62,12 @@ def test_the_presets_are_those_of_the_configuration():
 def test_names_with_a_dot_are_settings_wherever_they_stand():
     rest, given = take_settings(["--a.b", "-3", "x.mp4", "-o", "y.z", "--c.d=e=f", "--g"])
     assert rest == ["x.mp4", "-o", "y.z", "--g"] and given == {"a.b": "-3", "c.d": "e=f"}
+
+
+def test_behind_two_dashes_there_is_one_name():
+    assert take_settings(["-q", "--", "-dash.mp4"]) == (["-q", "--", "-dash.mp4"], {})
+    with pytest.raises(UsageError, match="one name after --, found also --preset; put options fi"):
+        take_settings(["--", "-dash.mp4", "--preset", "test"])
 
 
 def test_settings_without_a_dot_are_options():
@@ -120,6 +127,16 @@ def test_a_wrong_value_in_the_file_is_named(part: str, value: object, words: str
     with pytest.raises(InputError, match=f"expected {words}"):
         input_options(args)
         prior_choice(args, "none")
+
+
+@pytest.mark.parametrize("name", ["", "run.json", "metrics.json"])
+def test_what_is_not_the_settings_of_a_run_names_them(name: str, file: str, tmp_path: Path):
+    (tmp_path / "run.json").write_text('{"version": "1"}')
+    args = parse("--config", str(tmp_path / name))
+    for read in (source_of, settings):
+        with pytest.raises(InputError, match=r"a file of settings, .*; give .*config\.json"):
+            read(args)
+    assert parse("--config", file).config == file and settings(parse("--config", file)).seed == 7
 
 
 def test_masks_from_files_are_used_unless_that_is_switched_off():

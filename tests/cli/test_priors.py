@@ -166,7 +166,7 @@ def test_what_is_written_is_not_made_again_and_other_files_are_left_alone(tmp_pa
     assert "other/features with other files" in the_sentence(capsys)
     (tmp_path / "file").write_text("x")
     assert main([*command[:-1], str(tmp_path / "file")]) == 1
-    assert "Not a directory: " in the_sentence(capsys)
+    assert "file is a file; choose another name" in the_sentence(capsys)
 
 
 # Errors

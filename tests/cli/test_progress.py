@@ -36,6 +36,34 @@ def test_a_warning_has_a_line_of_its_own(capsys):
     assert capsys.readouterr().err.splitlines()[-1] == "WARNING: frame 3: the camera is lost"
 
 
+def test_on_a_terminal_an_open_line_is_ended_once_and_a_signal_takes_its_place(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    progress = ProgressLine()
+    progress.show("walking", 1, 10)
+    assert capsys.readouterr().err == "\r\033[Kwalking: 1/10"
+    progress.interrupt(2, None)
+    progress.close()  # nothing is open
+    stopping = "\r\033[Kstopping after this step; Ctrl-C again stops at once\n"
+    assert capsys.readouterr().err == stopping
+    progress.show("walking", 2, 10)
+    progress.close()
+    assert capsys.readouterr().err.endswith("/s, 0 s left)\n")
+    progress.show("walking", 10, 10)
+    assert capsys.readouterr().err.endswith(" s)\n")
+    progress.close()
+    assert capsys.readouterr().err == ""
+
+
+def test_a_signal_in_the_middle_of_a_print_ends_nothing(monkeypatch):
+    def reentrant(*_: object) -> None:
+        raise RuntimeError("reentrant call inside <_io.BufferedWriter>")
+
+    progress = ProgressLine()
+    monkeypatch.setattr(progress, "tell", reentrant)
+    progress.interrupt(2, None)
+    assert progress.should_stop()
+
+
 @pytest.mark.parametrize("name", ENDING)
 def test_a_signal_waits_for_the_end_of_a_step_and_a_second_does_not(name: str, capsys):
     number = getattr(signal, name)
@@ -45,11 +73,10 @@ def test_a_signal_waits_for_the_end_of_a_step_and_a_second_does_not(name: str, c
         assert not progress.should_stop()
         signal.raise_signal(number)
         assert progress.should_stop()
-        progress.show("walking", 1, 1)
+        assert "stopping after this step; Ctrl-C again stops at once" in capsys.readouterr().err
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
     assert signal.getsignal(number) is before
-    assert "stopping after this step; Ctrl-C again stops at once" in capsys.readouterr().err
 
 
 def test_what_is_ignored_stays_ignored():

@@ -6,6 +6,8 @@ import cv2
 import pytest
 
 from minislam.cli.main import main
+from minislam.data.run_folder import RunFolder
+from minislam.runs import flythrough
 
 pytestmark = pytest.mark.slow
 
@@ -41,3 +43,36 @@ def test_nonsense_is_one_sentence(folder: str, tmp_path: Path, capsys):
     assert main(["render", folder, "-o", str(tmp_path / "a.gif")]) == 1
     assert "ends in .webm or .webp, found .gif" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_is_replaced_only_if_asked_for_and_the_source_never(
+    folder: str, tmp_path: Path, monkeypatch, capsys
+):
+    film, source = tmp_path / "fly.webp", tmp_path / "my.webm"
+    film.write_bytes(b"mine")
+    source.write_bytes(b"video")
+    command = ["render", folder, "--size", "32x24", "-o"]
+    assert main([*command, str(film)]) == 1
+    assert f"expected a new file, but {film} exists" in capsys.readouterr().err
+    assert film.read_bytes() == b"mine"
+    assert main([*command, str(film), "--overwrite"]) == 0
+    assert film.read_bytes()[:4] == b"RIFF"
+    capsys.readouterr()
+    monkeypatch.setattr(RunFolder, "read_config", lambda self: {"sequence": str(source)})
+    for more in ([], ["--overwrite"]):
+        assert main([*command, str(source), *more]) == 1
+        assert f"expected a new file, but {source} exists" in capsys.readouterr().err
+        assert source.read_bytes() == b"video"
+    (tmp_path / "link.webm").symlink_to(source)
+    assert main([*command, str(tmp_path / "link.webm"), "--overwrite"]) == 1
+    assert "exists and is an input; choose another name" in capsys.readouterr().err
+    assert source.read_bytes() == b"video"
+
+
+def test_a_folder_that_is_not_there_is_said_before_the_film_is_made(
+    folder: str, tmp_path: Path, monkeypatch, capsys
+):
+    monkeypatch.setattr(flythrough, "fly_along", lambda *_: pytest.fail("it renders"))
+    assert main(["render", folder, "-o", str(tmp_path / "new/x/a.webm")]) == 1
+    said = capsys.readouterr().err
+    assert f"{tmp_path}/new/x is no writable folder; make it, or choose another" in said

@@ -22,6 +22,12 @@ def test_settings_may_stand_before_the_sequence(tmp_path: Path, capsys):
     assert "tracking.window of at least 1" in the_sentence(capsys)
 
 
+@pytest.mark.parametrize("count", ["0", "-1", "257"])
+def test_a_number_of_workers_is_refused_before_the_input_is_read(count: str, capsys):
+    assert main(["run", "nowhere", "--workers", count]) == 1
+    assert "expected --workers of at least 1 and at most 256, found" in the_sentence(capsys)
+
+
 def test_quiet_prints_warnings_only_and_the_log_has_everything(tmp_path: Path, capsys):
     source, out = images(tmp_path / "in", [texture(0), texture(3)]), tmp_path / "out"
     assert run(source, "-o", out, "--mapping.refine_iterations", "2", "-q") == 0

@@ -12,9 +12,11 @@ from minislam.data.files import (
     atomic_write,
     data_rows,
     finite_numbers,
+    make_folder,
     read_bytes,
     read_json,
     read_text,
+    require_new,
     write_json,
 )
 from minislam.errors import InputError
@@ -117,6 +119,35 @@ def test_writing_where_there_is_no_folder_is_refused(tmp_path: Path):
         atomic_write(tmp_path / "missing" / "a.txt", b"")
 
 
+def test_a_folder_is_made_or_the_reason_is_said(tmp_path: Path, monkeypatch):
+    make_folder(tmp_path / "a/b")
+    make_folder(tmp_path / "a/b")
+    assert (tmp_path / "a/b").is_dir()
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="file is a file; choose another name"):
+        make_folder(tmp_path / "file/a")
+    with pytest.raises(InputError, match=r"expected to make the folder .* says: .*; choose"):
+        make_folder(tmp_path / ("a" * 300))
+
+
+def test_only_new_files_are_written_unless_asked_and_inputs_never(tmp_path: Path, monkeypatch):
+    old, new, link = (tmp_path / name for name in ("old", "new", "link"))
+    old.write_text("mine")
+    link.symlink_to("old")
+    require_new([None, new, ""], False, [old, tmp_path / "nowhere"])
+    require_new([old, link], True, [new])
+    with pytest.raises(InputError, match="old exists; choose another name or add --overwrite"):
+        require_new([new, old], False, [])
+    for overwrite in (True, False):
+        with pytest.raises(InputError, match="link exists and is an input"):
+            require_new([link], overwrite, [old])
+    with pytest.raises(InputError, match="nowhere is no writable folder"):
+        require_new([tmp_path / "nowhere/a"], True, [])
+    monkeypatch.setattr(files.os, "access", lambda path, mode: False)
+    with pytest.raises(InputError, match="is no writable folder; make it, or choose another"):
+        require_new([new], True, [])
+
+
 def test_missing_and_binary_files_are_named(tmp_path: Path):
     with pytest.raises(InputError, match=r"nothing\.txt"):
         read_bytes(tmp_path / "nothing.txt")
@@ -129,7 +160,7 @@ def test_missing_and_binary_files_are_named(tmp_path: Path):
 
 def test_broken_json_is_named(tmp_path: Path):
     (tmp_path / "c.json").write_text('{"a": 1,}')
-    with pytest.raises(InputError, match=r"c\.json.*line 1"):
+    with pytest.raises(InputError, match=r"c\.json.*line 1.*; correct it, or give another file"):
         read_json(tmp_path / "c.json")
     (tmp_path / "c.json").write_text('{"seed": ' + "9" * 5000 + "}")
     with pytest.raises(InputError, match=r"c\.json.*digits"):

@@ -27,8 +27,9 @@ def test_webp_holds_the_images_in_order(tmp_path: Path):
     assert list(animation.durations) == [100] * len(REDS)
 
 
-def test_webm_holds_the_images_in_order(tmp_path: Path):
+def test_webm_holds_the_images_in_order(tmp_path: Path, capfd):
     write_animation(tmp_path / "a.webm", images(), 10.0)
+    assert capfd.readouterr() == ("", "")
     assert (tmp_path / "a.webm").read_bytes()[:4] == b"\x1a\x45\xdf\xa3"  # EBML, as browsers expect
     capture = cv2.VideoCapture(str(tmp_path / "a.webm"))
     found = [capture.read()[1][16, 12, 2] / 255 for _ in REDS]

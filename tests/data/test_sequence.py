@@ -70,6 +70,29 @@ def test_what_the_user_gives_wins(tmp_path: Path):
     assert known.camera == Camera(60, 60, 23.5, 15.5, 48, 32)
 
 
+@pytest.mark.parametrize(
+    ("fx", "words"),
+    [
+        (3.0, "fx 3 px means a field of view of 166 degrees: was it given in millimetres?"),
+        (400.0, "fx 400 px means a field of view of 7 degrees: was it given for larger images?"),
+        (12.0, None),  # 127 degrees
+    ],
+)
+def test_a_focal_length_that_no_lens_has_is_warned_of(tmp_path: Path, fx: float, words: str | None):
+    sequence = open_sequence(str(tum_folder(tmp_path)), InputOptions(fx=fx))
+    assert sequence.warnings == ([words] if words else [])
+
+
+def test_a_picture_of_10_bits_in_16_is_warned_of(tmp_path: Path):
+    for number in range(2):
+        save(tmp_path / f"{number}.png", picture(number).astype(np.uint16) * 4)
+    (warning,) = open_sequence(str(tmp_path)).warnings
+    assert "0.png is almost black, its largest value 3 of 255: if it holds 10 or 12" in warning
+    for number in range(2):
+        save(tmp_path / f"{number}.png", picture(number).astype(np.uint16) * 256)
+    assert open_sequence(str(tmp_path)).warnings == []
+
+
 def test_the_focal_length_is_refined_where_it_is_not_known(tmp_path: Path):
     folder = tum_folder(tmp_path / "a")
     expected = {"auto": False, "fixed": False, "refine": True}
@@ -169,14 +192,24 @@ def test_images_of_another_size_are_named(tmp_path: Path):
 
 
 def test_one_pixel_images_are_refused(tmp_path: Path):
-    save(tmp_path / "1.png", picture(1, 1, 1))
+    for number in range(2):
+        save(tmp_path / f"{number}.png", picture(1, 1, 1))
     with pytest.raises(InputError, match="found 1x1"):
         open_sequence(str(tmp_path))
 
 
-def test_a_start_behind_the_end_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="has 6; choose a smaller start"):
-        open_sequence(str(tum_folder(tmp_path)), InputOptions(start=6))
+@pytest.mark.parametrize(
+    ("options", "count"), [({"start": 6}, 0), ({"start": 5}, 1), ({"stride": 50}, 1)]
+)
+def test_less_than_two_frames_are_refused(tmp_path: Path, options: dict, count: int):
+    folder = str(tum_folder(tmp_path))
+    with pytest.raises(InputError, match=f"at least two frames, found {count} among 6 images of"):
+        open_sequence(folder, InputOptions(**options))
+
+
+def test_a_video_of_which_one_frame_is_wanted_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="found 1 among 1 images of v after --start, --stride and"):
+        open_sequence(str(video(tmp_path / "v.mp4")), InputOptions(max_frames=1))
 
 
 def test_a_frame_outside_the_sequence_is_an_index_error(tmp_path: Path):

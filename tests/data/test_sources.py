@@ -166,6 +166,16 @@ def test_files_that_are_no_video_are_named(tmp_path: Path, kind: str):
         read_video(path, None)
 
 
+def test_an_mp4_without_its_end_is_cut_short(tmp_path: Path):
+    whole = video(tmp_path / "whole.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(whole[: whole.index(b"moov") - 4])
+    with pytest.raises(InputError, match="cannot be opened as one; the file is cut short, copy it"):
+        read_video(tmp_path / "cut.mp4", None)
+    (tmp_path / "text.mp4").write_bytes(b"hello\n" * 99)
+    with pytest.raises(InputError, match="cannot be opened as one; convert it to MP4"):
+        read_video(tmp_path / "text.mp4", None)
+
+
 def test_a_single_picture_is_no_video(tmp_path: Path):
     with pytest.raises(InputError, match="single image"):
         read_video(save(tmp_path / "a.png", picture(0)), None)

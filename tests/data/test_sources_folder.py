@@ -56,6 +56,20 @@ def test_an_empty_folder_is_refused_and_the_likely_mistake_named(tmp_path: Path)
         read_image_folder(tmp_path)
 
 
+def test_pictures_of_another_kind_are_counted(tmp_path: Path):
+    for name in ("a.HEIC", "b.heic", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match=r"found 2 \.heic; convert them to JPEG or PNG"):
+        read_image_folder(tmp_path)
+
+
+def test_the_folder_of_a_run_is_known(tmp_path: Path):
+    (tmp_path / "keyframes").mkdir()
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(InputError, match=r"the folder of a run; .* --config .*config\.json"):
+        read_image_folder(tmp_path)
+
+
 def test_two_files_with_one_stamp_are_refused(tmp_path: Path):
     save(tmp_path / "01.png", picture(0))
     save(tmp_path / "1.png", picture(0))

@@ -119,8 +119,8 @@ def test_wrong_masks_are_one_sentence(given, sentence: str, tmp_path: Path):
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path: Path):
-    source = photos(tmp_path / "photos", "a")
-    given = masks(tmp_path / "given", "a")
+    source = photos(tmp_path / "photos", "a", "b")
+    given = masks(tmp_path / "given", "a", "b")
     (tmp_path / "given/a.png").write_bytes(encode_png(np.zeros((9, 9), np.uint8)))
     with pytest.raises(InputError, match=r"of one size, .* found 9x9 in .*a\.png"):
         open_sequence(source, InputOptions(masks=given)).given_mask(0)

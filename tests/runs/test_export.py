@@ -240,3 +240,24 @@ def test_images_of_the_sequence_are_never_written_over(run, tmp_path: Path):
     with pytest.raises(InputError, match="expected a folder without images of the sequence"):
         export.export_colmap(run, tmp_path, FRAMES)
     assert not (tmp_path / "masks").exists()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "images").iterdir()}
+    for write in (export.export_masks, export.export_depth, export.export_nerfstudio):
+        with pytest.raises(InputError, match=r"found .*images/0\.png in .*; choose another"):
+            write(run, tmp_path / "images", FRAMES)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "images").iterdir()} == before
+
+
+def test_depth_needs_no_sequence_for_a_new_folder(run, tmp_path: Path):
+    del run.sequence
+    export.export_depth(run, tmp_path / "depth", FRAMES)
+    assert (tmp_path / "depth/camera.json").is_file()
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(run, tmp_path: Path, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    for write in (export.export_masks, export.export_depth, export.export_colmap):
+        with pytest.raises(InputError, match=r"make the folder .*out, but .*: Permission denied;"):
+            write(run, tmp_path / "out", FRAMES)

@@ -5,11 +5,12 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.records import Pictured
+from minislam.records import Pictured, Trajectory
 from minislam.runs import facts
 from minislam.splatting import Rendering
 from minislam.tracking.safeguards.diagnostics import Break
@@ -29,7 +30,7 @@ def slam(**parts: object) -> SimpleNamespace:
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
     tracker = SimpleNamespace(
-        tracked=[None] * 4,
+        tracked=[SimpleNamespace(timestamp=k / 30) for k in range(4)],
         graph=graph,
         watch=SimpleNamespace(
             diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
@@ -41,11 +42,15 @@ def slam(**parts: object) -> SimpleNamespace:
             has_prior=parts.pop("has_prior", True), overlay=parts.pop("overlay", None)
         ),
     )
+    truth = parts.pop("truth", None)  # s, of the true poses
+    if truth is not None:
+        poses = np.tile(np.eye(4), (len(truth), 1, 1))
+        truth = SimpleNamespace(trajectory=Trajectory(np.array(truth), poses))
     lost, shown = parts.pop("lost", 0), parts.pop("shown", [1.0])
     keyframes = [SimpleNamespace(frame_index=8 * k) for k in range(len(shown))]
     return SimpleNamespace(
         mapper=SimpleNamespace(shown=shown, keyframes=keyframes),
-        sequence=SimpleNamespace(warnings=[], camera=CAMERA),
+        sequence=SimpleNamespace(warnings=[], camera=CAMERA, ground_truth=truth),
         lost_frames=lambda: [None] * lost,
         tracker=tracker,
         focal_length=parts.pop("focal_length", None),
@@ -59,6 +64,8 @@ WARNINGS = [
     ({"lost": 1}, "1 of 4 frames could not be tracked"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
     ({"breaks": [Break(2, 2)]}, "look at each piece (frames 0 to 1, 3 to 3) by itself"),
+    ({"truth": [9.0, 9.5]}, "no frame has a true pose within 0.02 s, so there is no ATE"),
+    ({"truth": [9.0]}, "frames begin at 0.000 s, the ground truth at 9.000 s; shift its times"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
@@ -76,6 +83,21 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
     assert not list(facts._warnings(slam()))
     (warning,) = facts._warnings(slam(**parts))
     assert words in warning
+
+
+def test_a_truth_that_a_frame_matches_is_not_warned_of():
+    assert not list(facts._warnings(slam(truth=[0.05, 9.0])))
+
+
+def test_without_an_ate_there_is_no_straight_walk(monkeypatch: pytest.MonkeyPatch):
+    run, path = slam(), Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    run.trajectory = run.keyframe_trajectory = lambda: path
+    run.tracker.grid, run.render = run.tracker.graph.grid, None
+    monkeypatch.setattr(facts, "_ties", lambda run: {})
+    for ate, line in ((None, None), (0.0, 86.0)):
+        errors = {"ate_all_cm": ate, "ate_straight_line_cm": 86.0}
+        monkeypatch.setattr(facts, "measure_run", lambda *_, found=errors: found)
+        assert facts.measure(run, 1.0, None)["ate_straight_line_cm"] == line
 
 
 def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_depth():

@@ -103,11 +103,35 @@ def test_what_a_notebook_shows(run: minislam.Run):
 
 
 def test_a_damaged_or_missing_camera_is_said(run: minislam.Run, tmp_path: Path):
-    with pytest.raises(InputError, match="expected a run with a map"):
+    with pytest.raises(InputError, match=r"expected a run with a map.*of a finished run$"):
+        minislam.load(tmp_path)
+    write_json(tmp_path / "config.json", {})
+    with pytest.raises(InputError, match=r"or repeat it: minislam run --config .*config.json$"):
+        minislam.load(tmp_path)
+    (tmp_path / "checkpoint.npz").touch()
+    with pytest.raises(InputError, match=r"json; go on with: minislam run --resume -o .*$"):
         minislam.load(tmp_path)
     write_json(tmp_path / "camera.json", {"camera": 3})
     with pytest.raises(InputError, match=r"expected camera\.json of a run"):
         minislam.load(tmp_path)
+
+
+def poses_that_are_none() -> list[object]:
+    nan, mirror, shear = np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(4)
+    nan[0, 3], shear[0, 1] = np.nan, 0.1
+    moved = np.eye(4)
+    moved[3, 0] = 1.0  # transposed
+    return [np.eye(3), 4, None, "pose", [[1], [1, 2]], nan, np.full((4, 4), np.inf), 2 * np.eye(4),
+            mirror, shear, moved, np.eye(4)[None], torch.eye(4, requires_grad=True)]  # fmt: skip
+
+
+@pytest.mark.parametrize("pose", poses_that_are_none(), ids=str)
+def test_what_is_no_pose_is_refused(run: minislam.Run, pose: object):
+    for render in (run.render, run.render_depth):
+        with pytest.raises(
+            InputError, match=r"expected T_world_camera \(4, 4\), a rotation .* give"
+        ):
+            render(pose)
 
 
 def test_a_run_of_a_version_with_other_settings_is_read(run: minislam.Run, tmp_path: Path):

@@ -33,7 +33,7 @@ class Folder:
     def write_checkpoint(self, tree: dict[str, object]) -> None:
         self.clock.now += 2
         if self.is_full:
-            raise InputError("expected to be able to write, but the disk is full")
+            raise InputError("expected to be able to write, but the disk is full; choose another")
         self.written += 1
 
 
@@ -70,7 +70,8 @@ def test_a_full_disk_ends_no_run(root: Path, clock: SimpleNamespace):
     kept = checkpoints(folder, "0.01")
     folder.is_full = True
     kept.save(SLAM, True)
-    assert "the last checkpoint is older" in kept.problem and "the disk is full" in kept.problem
+    assert "the last checkpoint is older" in kept.problem and "; free space" in kept.problem
+    assert "the disk is full" in kept.problem and "choose another" not in kept.problem
     folder.is_full = False
     kept.save(SLAM, True)
     assert kept.problem is None

@@ -1,5 +1,7 @@
 """A run from its name to its folder, and again from the config.json of that folder alone."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ from minislam.cli.main import main
 from minislam.data.run_folder import RunFolder
 from minislam.errors import InputError
 from minislam.runs import pictures
+from minislam.state.steps import Steps
 from minislam.tracking import bundle_adjustment
 
 pytestmark = pytest.mark.slow
@@ -48,6 +51,29 @@ def test_a_run_whose_every_adjustment_fails_says_so(root: Path, monkeypatch, cap
     warning = f"{facts['adjustments']} of {facts['adjustments']} bundle adjustments failed"
     assert any(warning in text for text in facts["warnings"])
     assert warning in capsys.readouterr().err and facts["state"] != "finished"
+
+
+def test_on_a_full_disk_the_way_on_is_said(root: Path, monkeypatch, capsys):
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    fill = [False]
+    fsync, finish = os.fsync, Steps.finish
+    monkeypatch.setattr(os, "fsync", lambda file: full(file) if fill[0] else fsync(file))
+
+    def finish_and_fill(steps: Steps, stage: str, done: int, total: int) -> None:
+        fill[0] |= done == 4
+        finish(steps, stage, done, total)
+
+    monkeypatch.setattr(Steps, "finish", finish_and_fill)
+    out = root / "full"
+    assert main([*COMMAND, "--checkpoint_fraction", "1e9", "-o", str(out)]) == 1
+    said = capsys.readouterr().err.splitlines()
+    warned = [line for line in said if "the last checkpoint is older" in line]
+    assert len(warned) == 1 and warned[0].endswith("No space left on device; free space")
+    command = f"go on with: minislam run --resume -o {out}"
+    space = f"minislam: expected space in {out}, found none; free space, then {command}"
+    assert said[-1] == space and (out / "checkpoint.npz").exists()
 
 
 def test_a_run_that_ends_without_a_map_keeps_its_trajectory(root: Path, monkeypatch):

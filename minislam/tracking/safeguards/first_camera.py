@@ -23,7 +23,7 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import ROBUST_WIDENING
-from minislam.tracking.safeguards.focal_length import fit_focal_length
+from minislam.tracking.safeguards.focal_length import LEAST_KEYFRAMES, fit_focal_length
 from minislam.workers import Workers
 
 ITERATIONS = 8  # Gauss-Newton steps per width before hypotheses are compared
@@ -105,8 +105,11 @@ def lowest_minimum(
     """Return the geometry of the warm-up that is most plausible, adjusted with its camera.
 
     The focal length stays as guessed if the motion does not tell it, and the readout at zero if it
-    saves too little: a global shutter would follow noise and dynamic objects.
+    saves too little: a global shutter would follow noise and dynamic objects. Of few keyframes both
+    stay.
     """
+    tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
+    seeks_focal = graph.seeks_focal and tells_camera
     workers, links = workers or Workers(), list(range(len(graph.links)))
     flow_problem = partial(bundle_problem, graph, links, first_free=0, lambda_prior=0.0)
 
@@ -120,13 +123,13 @@ def lowest_minimum(
         return most_plausible(graph.grid, graph.keyframes.prior_disparities, found)
 
     problem = flow_problem()
-    free = replace(problem, free_focal=graph.seeks_focal)
+    free = replace(problem, free_focal=seeks_focal)
     found = at_guess = minima(problem, start(0.0), workers)
-    if graph.seeks_focal:
+    if seeks_focal:
         others = (minima(problem, start(log_focal), workers) for log_focal in OTHER_FOCALS)
         found = adjusted(free, [*found, *itertools.chain(*others)])
     chosen = best(found)
-    columns = graph.shutter.link_columns(links)
+    columns = graph.shutter.link_columns(links) if tells_camera else None
     if columns is not None and columns.any():
         # Sensors are read along the shorter side: the readout along the longer one is held.
         columns[:, int(problem.camera.width < problem.camera.height)] = 0
@@ -134,9 +137,9 @@ def lowest_minimum(
         if cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found)):
             graph.shutter.take(rolled[0].readout, columns)
             problem = flow_problem()  # corrected
-            free = replace(problem, free_focal=graph.seeks_focal)
+            free = replace(problem, free_focal=seeks_focal)
             chosen = adjust_narrowing(free, rolled[0], WIDENINGS[2:], ITERATIONS)
-    if not graph.seeks_focal:
+    if not seeks_focal:
         return chosen
     own = replace(chosen[0], log_focal=0.0), chosen[1]  # its minimum under the guess
     held = adjusted(problem, [own])
