@@ -57,7 +57,7 @@ class KeyframeGraph(Stateful):
 
     grid: Grid
     keyframes: KeyframeStore
-    # Keyframe k to k + 1 (E = 1), as the images show it; None across a loss
+    # Keyframe k to k + 1 (E = 1), corrected by the readout known then; None across a loss
     flow_to_next: list[FlowMatches | None]
     links: FrameGraph
     flow: FlowEstimator

@@ -6,11 +6,6 @@ from torch import Tensor
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
 
-COLUMNS = (
-    "frames features metric_depths T_camera_world disparities prior_disparities prior_masks"
-    " static_weights motion_weights"
-)
-
 
 class KeyframeStore(Stateful):
     """All data of the tracker's keyframes. Only the methods of this class change the columns."""
@@ -73,8 +68,9 @@ class KeyframeStore(Stateful):
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
-        for column in COLUMNS.split():
-            setattr(self, column, getattr(self, column)[:-1])
+        for column, rows in vars(self).items():
+            if column != "overlay":
+                setattr(self, column, rows[:-1])
 
     def set_geometry(self, T_camera_world: Tensor, disparities: Tensor) -> None:
         """Replace the poses (K, 4, 4) and disparities (K, N) of all keyframes."""

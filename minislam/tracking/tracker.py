@@ -167,7 +167,7 @@ class Tracker(Stateful):
         """Make a frame a keyframe: its pose from its flow, its disparities from the last one's."""
         pose, disparities = self.keyframes.T_camera_world[-1], self.keyframes.disparities[-1]
         edge = len(self.keyframes) - 1, len(self.keyframes)
-        seen, matches = matches, self.graph.shutter.corrected(matches, [edge], frame.frame_index)
+        matches = self.graph.shutter.corrected(matches, [edge], frame.frame_index)
         if self.initialised:  # before, initialise() will estimate all poses together
             information = self._settling.information()
             trust = self._settling.certainty(information)
@@ -179,10 +179,10 @@ class Tracker(Stateful):
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()
         self.last_non_keyframe = None
-        self.graph.flow_to_next.append(seen)
+        self.graph.flow_to_next.append(matches)
         self._add_keyframe(frame, self._features(frame), pose, disparities)
         if self.initialised:
-            motion_memory.inherit(self.graph, seen)
+            motion_memory.inherit(self.graph, matches)
             local_ba(self.graph)
             self.watch.judge(first=len(self.keyframes) - 1)
             self._adjust_all_if_due()

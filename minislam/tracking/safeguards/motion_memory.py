@@ -40,8 +40,7 @@ def judge_all(graph: KeyframeGraph) -> None:
         if matches is None:
             keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
         else:
-            unrolled = graph.shutter.corrected(matches, [(index - 1, index)])
-            remember(graph, unrolled, keyframes.T_camera_world[index], index - 1)
+            remember(graph, matches, keyframes.T_camera_world[index], index - 1)
             inherit(graph, matches, index)
 
 

@@ -122,8 +122,7 @@ def graph_of(store: KeyframeStore, flow: list, scale: float = SCALE) -> SimpleNa
     """Return the part of a keyframe graph that the motion memory sees."""
     config = SimpleNamespace(motion_memory=scale)
     known = {"grid": GRID, "keyframes": store, "flow_to_next": flow}
-    shutter = SimpleNamespace(corrected=lambda matches, edges: matches)
-    return SimpleNamespace(config=config, pixel_scale=1.0, shutter=shutter, **known)
+    return SimpleNamespace(config=config, pixel_scale=1.0, **known)
 
 
 def test_all_keyframes_are_judged_anew_from_the_first_on():
@@ -142,22 +141,6 @@ def test_all_keyframes_are_judged_anew_from_the_first_on():
     before = store.motion_weights.clone()
     judge_all(graph)  # what was judged before has no effect
     assert torch.equal(store.motion_weights, before)
-
-
-def test_under_a_rolling_shutter_flow_is_judged_as_a_global_one_would_have_seen_it():
-    rolled, unrolled = matches_of(torch.full((CELLS, 2), 30.0)), matches_of(torch.zeros(CELLS, 2))
-    edges = []
-
-    def corrected(matches, edge):
-        edges.extend(edge)
-        return unrolled if matches is rolled else matches
-
-    graph, store = graph_of(store_of(2), [rolled]), store_of(2)
-    graph.shutter.corrected = corrected
-    judge_all(graph)
-    judge_all(graph_of(store, [unrolled]))
-    assert edges == [(0, 1)]
-    assert torch.equal(graph.keyframes.motion_weights[0], store.motion_weights[0])
 
 
 def test_memory_begins_anew_where_the_camera_was_relocalised():
