@@ -129,7 +129,7 @@ class Sequence(Protocol):
     checksums: dict[int, int]  # of the images read so far, by frame index
     ground_truth: GroundTruth | None
     depth_scale: float  # units of a stored depth image per metre
-    files: list[Path]  # that hold the images
+    files: list[Path]  # that hold the images and masks
     opened_as: dict[str, Any]  # "sequence" and "input", the part of config.json that opens it
     preparation: dict[str, Any]  # how raw images became working images, see `ImagePreparation`
 

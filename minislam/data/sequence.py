@@ -64,10 +64,10 @@ class RecordedSequence:
         self.lost = [row for row in recording.lost if stamps[0] < row[0] < stamps[-1]]
         self.checksums: dict[int, int] = {}
         self._kept = KeptImages()
-        self.files = recording.images.paths  # of all images
         self._masks = recording.mask_paths
         if options.masks is not None:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
+        self.files = [*recording.images.paths, *self._masks.values()]
         height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
         calibration = _calibration(recording, options, width, height)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion

@@ -228,7 +228,8 @@ def test_timestamps_that_files_cannot_tell_apart_are_refused_before_a_run(tmp_pa
 def test_every_image_is_named_and_every_image_that_was_read_has_a_checksum(tmp_path: Path):
     folder = tum_folder(tmp_path / "desk")
     sequence = open_sequence(str(folder))
-    assert sequence.files == sorted(folder.glob("rgb/*.png"))
+    names = [*sorted(folder.glob("rgb/*.png")), *sorted(folder.glob("masks/*.png"))]
+    assert sequence.files == names
     before = dict(sequence.checksums)
     sequence.frame(3), sequence.frame(1)
     assert set(sequence.checksums) - set(before) == {1, 3}

@@ -5,6 +5,7 @@ exported files are read back here by hand and must project the point onto the ex
 """
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -245,6 +246,13 @@ def test_images_of_the_sequence_are_never_written_over(run, tmp_path: Path):
         with pytest.raises(InputError, match=r"found .*images/0\.png in .*; choose another"):
             write(run, tmp_path / "images", FRAMES)
     assert {path.name: path.read_bytes() for path in (tmp_path / "images").iterdir()} == before
+
+
+def test_masks_that_were_given_are_never_written_over(run, tmp_path: Path):
+    shutil.copytree(tmp_path / "in", tmp_path / "own")
+    run.sequence = open_sequence(str(tmp_path / "in"), InputOptions(masks=f"files:{tmp_path}/own"))
+    with pytest.raises(InputError, match=r"found .*own/.*; choose another"):
+        export.export_masks(run, tmp_path / "own", FRAMES)
 
 
 def test_depth_needs_no_sequence_for_a_new_folder(run, tmp_path: Path):
