@@ -105,9 +105,9 @@ def _of_few_cells(
 def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> None:
     """Replace an unknown focal length by the one that the flow fits, if the motion tells it.
 
-    From then on the adjustments of all keyframes refine it, so it is sought no more.
+    From then on the adjustments of all keyframes refine it.
     """
-    if not graph.seeks_focal or graph.focal_is_free or len(graph.keyframes) < LEAST_KEYFRAMES:
+    if not graph.seeks_focal or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
     problem = bundle_problem(graph, range(len(graph.links)), 0, lambda_prior=0.0)
     fit, state = fit_focal_length(problem, graph.state, workers)
