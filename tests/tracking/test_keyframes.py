@@ -97,7 +97,7 @@ def test_the_first_prior_gives_its_unit_to_keyframes_that_came_without():
 
 
 def test_a_depth_image_that_knows_nothing_is_no_prior():
-    store, cells = filled(0), torch.ones(CELLS)
+    store, cells = KeyframeStore(torch.zeros(CELLS)), torch.ones(CELLS)
     frame, pose = Frame(0, 0.0, torch.zeros(6, 8, 3)), torch.eye(4)
     store.append(frame, torch.zeros(2, 2, 5), torch.zeros(6, 8), pose, cells, torch.zeros(CELLS))
     assert not store.has_prior and filled(1).has_prior
