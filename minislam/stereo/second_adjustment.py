@@ -39,7 +39,7 @@ def adjust_again(
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
     followed = [frame.frame_index for frame in tracked if frame.status.is_followed]
-    # To pose all frames took five times as long and gained nothing.
+    # To pose all frames took two to five times as long, for the same accuracy (RESULTS.md).
     wanted = {*swept_frames(keyframes, followed)}
     tracker.tracked = [frame for frame in tracked if frame.frame_index in wanted]
     poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))

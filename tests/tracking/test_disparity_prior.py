@@ -19,6 +19,7 @@ from minislam.tracking.disparity_prior import (
 )
 from minislam.tracking.grid import Grid
 from minislam.tracking.optimisation import bundle_problem
+from minislam.tracking.safeguards.relocalisation import attach_newest
 from tests.tracking.scene import CAMERA, STRIDE, uniform
 from tests.tracking.wall import true_graph
 
@@ -209,6 +210,14 @@ def test_the_prior_of_a_masked_cell_has_no_weight():
     weights = bundle_problem(graph, range(len(EDGES)), first_free=0).prior_weights
     strength = CONFIG.lambda_disparity_prior * CAMERA.fx**2
     assert torch.allclose(weights, strength * mask.float())
+
+
+def test_a_keyframe_that_is_found_again_gets_its_mask():
+    graph = graph_with_depths(CONFIG)
+    graph.flow_to_next[2] = None  # the camera was lost before the last
+    assert attach_newest(graph, 1)
+    last = graph.keyframes.prior_masks[3].reshape(graph.grid.shape)
+    assert last[:, 5:].all() and not last[2:5, 2:5].any()
 
 
 def test_the_mask_can_be_switched_off():
