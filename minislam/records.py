@@ -52,17 +52,16 @@ class Frame(Pictured):
 
 @dataclass(frozen=True)
 class Keyframe(Pictured):
-    """A frame that the tracker kept, as the mapper receives it."""
+    """A frame that the map is built from. Bundle adjustment changes its pose."""
 
-    keyframe_index: int  # position among the keyframes: 0, 1, 2, ...
     frame_index: int  # position among the frames
-    timestamp: float  # second
     pixels: Tensor  # (H, W, 3) uint8 RGB
     features: Tensor  # (h', w', C) float32, one vector per patch of the feature grid
     depth: Tensor  # (H, W) float32 world units, 0 where unknown: the mapper's reference D~
     T_camera_world: Tensor  # (4, 4) float64
     moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
+    exposure: Tensor | None = None  # (3,) as of all that has an image
 
 
 @dataclass(frozen=True)

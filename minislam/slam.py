@@ -9,7 +9,7 @@ The two arrows that go back are two calls. The tracker calls `_static_weight` to
 beta into the weight of each cell. `_move_map` deforms the map when an adjustment moves keyframes.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,9 +26,9 @@ from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimat
 from minislam.records import Frame, Keyframe, Sequence, Trajectory
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.stereo.dense_structure import with_swept_depth
+from minislam.stereo.dense_structure import swept_frames, with_swept_depth
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
-from minislam.stereo.second_adjustment import adjust_again, sweep_keyframes
+from minislam.stereo.second_adjustment import adjust_again, sweep
 from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
@@ -171,13 +171,17 @@ class Slam(Stateful):
         self._move_map()
 
     def _rebuild_map(self) -> None:
-        """Build map and MLP anew, on depth that all views have measured together."""
+        """Build map and MLP anew on swept depth, from the tracker's keyframes and some between."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
-        swept = sweep_keyframes(graph, self.sequence, self._poses, progress, self.workers)
+        known = [frame.frame_index for frame in graph.keyframes.frames]
+        frames = swept_frames(known, list(self._poses))
+        parts = graph, self.sequence, self._poses, frames, frames
+        swept, exposures = sweep(*parts, progress, self.workers), keyframe_exposures(graph)
+        keyframes = self._keyframes(others=sorted({*frames} - {*known}))
+        keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
         self.mapper = self._new_mapper(self.config.mapping.insertion.cell)
-        keyframes = with_swept_depth(graph.grid.camera, self._keyframes(), swept)
-        progress, exposures = self.steps.on_progress("first map"), keyframe_exposures(graph)
-        self.mapper.initialise(keyframes, progress, exposures)
+        progress = self.steps.on_progress("first map")
+        self.mapper.initialise([with_exposure(k, exposures) for k in keyframes], progress)
 
     def _refine_map(self) -> None:
         stage = "refining the map"
@@ -238,23 +242,20 @@ class Slam(Stateful):
             )
         return torch.from_numpy(mask).to(self.device)
 
-    def _keyframes(self, first: int = 0) -> list[Keyframe]:
-        """Return the tracker's keyframes from `first` on in the form that the mapper takes."""
+    def _keyframes(self, first: int = 0, others: Iterable[int] = ()) -> list[Keyframe]:
+        """Return the tracker's keyframes from `first` on, and other frames, for the mapper."""
         store, shutter = self.tracker.keyframes, self.tracker.graph.shutter
-        size = self.sequence.camera.height, self.sequence.camera.width
-        unknown = torch.zeros(size, device=self.device)
+        columns = store.frames, store.features, store.metric_depths, store.T_camera_world
+        rows = list(zip(*(column[first:] for column in columns), strict=True))
+        for frame in map(self.frame, others):
+            rows.append((frame, self._features(frame), None, self._poses[frame.frame_index]))
         result = []
-        for index in range(first, len(store)):
-            frame, depth = shutter.undone(store.frames[index]), store.metric_depths[index]
-            record = Keyframe(
-                keyframe_index=index, frame_index=frame.frame_index, timestamp=frame.timestamp,
-                pixels=frame.pixels, features=store.features[index],
-                depth=unknown if depth is None else depth,
-                T_camera_world=store.T_camera_world[index],
-                moving_mask=self._given_mask(frame.frame_index),
-            )  # fmt: skip
-            result.append(record)
-        return result
+        for frame, features, depth, pose in rows:
+            pixels, mask = shutter.undone(frame).pixels, self._given_mask(frame.frame_index)
+            unknown = torch.zeros((), device=self.device).expand(pixels.shape[:2])
+            seen = pixels, features, unknown if depth is None else depth, pose, mask
+            result.append(Keyframe(frame.frame_index, *seen))
+        return sorted(result, key=lambda keyframe: keyframe.frame_index)
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames that were not lost; before the end, those of keyframes."""

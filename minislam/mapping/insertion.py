@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.mapping.config import InsertionConfig
-from minislam.mapping.views import MappedKeyframe
+from minislam.records import Keyframe
 from minislam.splatting import GaussianMap, Rendering
 from minislam.uncertainty.losses import FAR_FACTOR
 
@@ -17,7 +17,8 @@ _SMALLEST_SCALE = 1e-12  # world units; a scale must be positive, because its lo
 
 
 def gaussians_of_keyframe(
-    keyframe: MappedKeyframe,
+    keyframe: Keyframe,
+    position: int,  # among the keyframes of the map
     camera: Camera,
     rendering: Rendering | None,  # the map from this view, None while it is empty
     weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
@@ -31,7 +32,7 @@ def gaussians_of_keyframe(
     pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
     return gaussians_at_pixels(
         pixels, keyframe.levelled, keyframe.depth, camera,
-        keyframe.T_camera_world, keyframe.keyframe_index, config,
+        keyframe.T_camera_world, position, config,
     )  # fmt: skip
 
 
@@ -80,7 +81,7 @@ def gaussians_at_pixels(
     depth: Tensor,  # (H, W) world units
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4) float64
-    keyframe_index: int,  # the new Gaussians are anchored to this keyframe
+    position: int,  # of the keyframe that the new Gaussians are anchored to
     config: InsertionConfig,
 ) -> GaussianMap:
     """Back-project pixels to round Gaussians that just cover their cells.
@@ -101,7 +102,7 @@ def gaussians_at_pixels(
         scales.log()[:, None].expand(count, 3).clone(),
         torch.full_like(z, logit),
         image[row, column].to(z),
-        torch.full((count,), keyframe_index, dtype=torch.int64, device=z.device),
+        torch.full((count,), position, dtype=torch.int64, device=z.device),
     )
 
 

@@ -21,7 +21,7 @@ from minislam.mapping.safeguards import (
     blending_weights,
     least_weight,
 )
-from minislam.mapping.views import MappedKeyframe, median_depth
+from minislam.mapping.views import median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
 
@@ -37,24 +37,20 @@ class Mapper(JointOptimisation):
         self,
         keyframes: list[Keyframe],
         progress: Progress | None = None,
-        exposures: Tensor | None = None,  # (K, 3) how bright the keyframes are, if they differ
         online: bool = False,  # more keyframes will come
     ) -> None:
         """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
         assert keyframes, "a map starts from at least one keyframe"
         self.median_depth = median_depth(keyframes)
-        self.keyframes = [MappedKeyframe.from_record(keyframe) for keyframe in keyframes]
-        if exposures is not None:
-            for keyframe, exposure in zip(self.keyframes, exposures, strict=True):
-                keyframe.exposure = exposure
+        self.keyframes = list(keyframes)
         if self.config.mean_background:
             means = [keyframe.levelled.mean((0, 1)) for keyframe in self.keyframes]
             self.background = torch.stack(means).mean(0)
         count = len(self.keyframes)
         if self.uncertainty.is_learnt:
             self._weighted_from = FIRST_VIEWS * count
-        for keyframe in self.keyframes:
-            self._insert(keyframe)
+        for position in range(count):
+            self._insert(position)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
         most = count * self.config.keyframe_iterations if online else self.config.init_iterations
         iterations = max(min(self.config.init_iterations, most), self._weighted_from)
@@ -64,7 +60,7 @@ class Mapper(JointOptimisation):
     def integrate(self, keyframe: Keyframe) -> None:
         """Add one keyframe: window, insertion, then optimisation of map and MLP."""
         assert self.keyframes, "call initialise first"
-        self.keyframes.append(MappedKeyframe.from_record(keyframe))
+        self.keyframes.append(keyframe)
         new = len(self.keyframes) - 1
         poses = torch.stack([k.T_camera_world for k in self.keyframes])
         seen = {
@@ -74,7 +70,7 @@ class Mapper(JointOptimisation):
         self.window = update_window(self.window, new, seen, poses, self.config.window_size)
         turn = range(new * RECHECKED, (new + 1) * RECHECKED)  # a constant number per keyframe
         self._remove_dynamic_gaussians({*self.window, *(number % new for number in turn)})
-        self._insert(self.keyframes[new])
+        self._insert(new)
         if new % self.config.keyframe_stride != 0:
             return  # Fast mode: this keyframe waits for the next optimisation.
         probabilities = sampling_probabilities(
@@ -92,8 +88,8 @@ class Mapper(JointOptimisation):
         new = T_camera_world.double()
         anchors = self.gaussians.anchor_keyframe
         self._optimizer.replace(deform_rigidly(self.gaussians, anchors, old, new))
-        for keyframe, pose in zip(self.keyframes, new, strict=True):
-            keyframe.T_camera_world = pose
+        rows = zip(self.keyframes, new, strict=True)
+        self.keyframes = [replace(keyframe, T_camera_world=pose) for keyframe, pose in rows]
 
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size.
@@ -128,17 +124,18 @@ class Mapper(JointOptimisation):
         return self._workers.map(refine_pose, calls)
 
     @torch.no_grad()
-    def _insert(self, keyframe: MappedKeyframe) -> None:
+    def _insert(self, position: int) -> None:
         """Add Gaussians for what a keyframe sees and the map does not show."""
+        keyframe = self.keyframes[position]
         rendering = self.render(keyframe.T_camera_world) if len(self.gaussians) else None
         weight = self.static_weight(self.beta_of(keyframe), self.camera)
         scene = self.camera, rendering, weight, self.median_depth
         insertion = replace(self.config.insertion, cell=self.cell)
-        new = gaussians_of_keyframe(keyframe, *scene, insertion, self._generator)
+        new = gaussians_of_keyframe(keyframe, position, *scene, insertion, self._generator)
         self._optimizer.append(new)
         self._reset_gradients()
 
-    def _shown_fraction(self, keyframe: MappedKeyframe) -> float:
+    def _shown_fraction(self, keyframe: Keyframe) -> float:
         """Return the fraction of a keyframe's static pixels where the map is opaque [-]."""
         static = self.static_weight(self.beta_of(keyframe), self.camera) > 0
         shown = self.render(keyframe.T_camera_world).opacity[static] > OPAQUE
@@ -186,5 +183,5 @@ class Mapper(JointOptimisation):
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""
         self._remove_dynamic_gaussians(range(len(self.keyframes)))
-        for keyframe in self.keyframes:
-            self._insert(keyframe)
+        for position in range(len(self.keyframes)):
+            self._insert(position)

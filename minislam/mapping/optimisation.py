@@ -12,12 +12,12 @@ from minislam.mapping.density import densify, useful_rows
 from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
 from minislam.mapping.view_gradients import ViewGradients, view_gradients
-from minislam.mapping.views import Comparison, MappedKeyframe
+from minislam.mapping.views import Comparison, view_of
 from minislam.mapping.window import in_turn
-from minislam.records import MappingHistory, Progress
+from minislam.records import Keyframe, MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.stateful import Stateful
-from minislam.uncertainty import RenderingError, UncertaintyConfig, UncertaintyMLP
+from minislam.uncertainty import RenderingError, UncertaintyConfig, UncertaintyMLP, beta_of_mask
 from minislam.uncertainty.training import UncertaintyTrainer
 from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
 from minislam.workers import Workers
@@ -30,7 +30,7 @@ class JointOptimisation(Stateful):
     """
 
     camera: Camera  # of the keyframe images; the tracker may refine its focal length
-    keyframes: list[MappedKeyframe]
+    keyframes: list[Keyframe]
     window: list[int]  # positions in `keyframes`, newest first
     median_depth: float = 1.0  # world units; set by the first keyframes, then fixed
     cell: int  # px, side of the square that gets one Gaussian
@@ -101,10 +101,10 @@ class JointOptimisation(Stateful):
         """Return the raw beta (h', w') of features (h', w', C)."""
         return self._trainer.predict(features)
 
-    def beta_of(self, keyframe: MappedKeyframe) -> Tensor:
+    def beta_of(self, keyframe: Keyframe) -> Tensor:
         """Return the raw beta (h', w') of a keyframe: from its mask or from the MLP."""
-        if keyframe.given_beta is not None:
-            return keyframe.given_beta
+        if keyframe.moving_mask is not None:
+            return beta_of_mask(keyframe.moving_mask)
         return confirmed_beta(self.predict_beta(keyframe.features), keyframe.confirmation)
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
@@ -164,13 +164,13 @@ class JointOptimisation(Stateful):
             self.history.add(share.losses, loss, len(self._optimizer.gaussians))
         self._iteration += len(shares)
 
-    def _call(self, keyframe: MappedKeyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
+    def _call(self, keyframe: Keyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
         """Return the arguments of `view_gradients`."""
         (rows, columns, _), unit = keyframe.features.shape, metre(self.median_depth)
-        small = keyframe.view(self._online_camera)
+        small = view_of(keyframe, self._online_camera)
         grid = small, (rows, columns), keyframe.confirmation, unit, self.uncertainty
         pose, weight = keyframe.T_camera_world, self.static_weight(self.beta_of(keyframe), camera)
-        view = camera, pose.float(), self.background, keyframe.view(camera), weight
+        view = camera, pose.float(), self.background, view_of(keyframe, camera), weight
         comparison = Comparison(*grid) if trains else None
         return self.gaussians, *view, self.median_depth, self.config, comparison
 

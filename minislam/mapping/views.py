@@ -1,7 +1,7 @@
-"""Keyframes as the mapper stores them: one pose, and the image at several sizes."""
+"""Keyframes at the size of a rendering, and how one is compared with it."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,10 +10,9 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.images import shrink_depth, shrink_image
 from minislam.mapping.safeguards import doubted_error
-from minislam.records import Keyframe, Pictured
+from minislam.records import Keyframe
 from minislam.splatting import Rendering
-from minislam.state.stateful import FrameOf, Tree
-from minislam.uncertainty import RenderingError, UncertaintyConfig, beta_of_mask, rendering_error
+from minislam.uncertainty import RenderingError, UncertaintyConfig, rendering_error
 
 MOST_DEPTHS = 100  # keyframes whose depths are sorted together: those of 500 fill 300 MB
 
@@ -27,48 +26,11 @@ class View:
     exposure: Tensor | None = None  # (3,) of its keyframe
 
 
-@dataclass
-class MappedKeyframe(Pictured):
-    """A keyframe in the map. Bundle adjustment changes its pose."""
-
-    keyframe_index: int
-    frame_index: int
-    features: Tensor  # (h', w', C)
-    pixels: Tensor  # (H, W, 3) as of a `Keyframe`
-    depth: Tensor  # (H, W) world units, 0 where unknown
-    T_camera_world: Tensor  # (4, 4) float64
-    given_beta: Tensor | None = None  # (h, w) instead of the MLP's
-    confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
-    exposure: Tensor | None = None  # (3,) as of all that has an image
-    _small: dict[tuple[int, int], tuple[Tensor, Tensor]] = field(default_factory=dict)
-
-    @classmethod
-    def from_record(cls, keyframe: Keyframe) -> "MappedKeyframe":
-        """Return the keyframe for a record of the tracker."""
-        mask, depth, pose = keyframe.moving_mask, keyframe.depth, keyframe.T_camera_world.double()
-        return cls(
-            keyframe.keyframe_index, keyframe.frame_index, keyframe.features, keyframe.pixels,
-            depth, pose, None if mask is None else beta_of_mask(mask), keyframe.confirmation,
-        )  # fmt: skip
-
-    def saved_state(self) -> Tree:
-        """Return all attributes but the image, which is read again, and its copies."""
-        images = ("pixels", "_small")
-        return {name: value for name, value in vars(self).items() if name not in images}
-
-    @classmethod
-    def from_state(cls, state: Tree, frame_of: FrameOf) -> "MappedKeyframe":
-        """Return the keyframe of a saved state; its image is read again."""
-        return cls(**state, pixels=frame_of(state["frame_index"]).pixels)
-
-    def view(self, camera: Camera) -> View:
-        """Return the keyframe at the size of `camera`; a smaller one is computed once."""
-        size = (camera.height, camera.width)
-        if size == self.depth.shape:
-            return View(self.image, self.depth, self.exposure)
-        if size not in self._small:
-            self._small[size] = shrink_image(self.image, *size), shrink_depth(self.depth, *size)
-        return View(*self._small[size], self.exposure)
+def view_of(keyframe: Keyframe, camera: Camera) -> View:
+    """Return a keyframe at the size of a camera."""
+    size = camera.height, camera.width
+    image, depth = shrink_image(keyframe.image, *size), shrink_depth(keyframe.depth, *size)
+    return View(image, depth, keyframe.exposure)
 
 
 def median_depth(keyframes: list[Keyframe]) -> float:  # world units

@@ -22,7 +22,7 @@ WIDTH = 160  # px of the images that are swept for the map
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
-BETWEEN = 2  # frames between two keyframes that are swept as well, to vote
+BETWEEN = 2  # frames between two keyframes that are swept as well
 AT_ONCE = 8  # frames whose sweeps are given to the workers together
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
@@ -35,7 +35,7 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 def with_swept_depth(
     camera: Camera,  # of the images
     keyframes: list[Keyframe],
-    swept: Iterable[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
+    swept: Iterable[tuple[Tensor, Tensor]],  # of each, depth (H, W) and confirmation (H, W)
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth, where nothing was swept with their own, and confirmed.
 
@@ -84,22 +84,22 @@ def dense_depths(
     read: Callable[[int], Frame],  # a frame by its index
     camera: Camera,  # of its images
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
-    keyframes: list[int],  # K frame indices, increasing
-    disparities: list[np.ndarray],  # K x (n,) 1/world unit, known; they place the nearest plane
+    disparities: dict[int, np.ndarray],  # (n,) 1/world unit, of some frames: of the nearest plane
+    frames: list[int],  # that are swept, increasing; all of them vote
+    wanted: list[int],  # of these, whose depths are returned
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
     width: int = WIDTH,  # px of the images that are swept, at most
-    chosen: list[int] | None = None,  # frames that are swept, keyframes and others; None: usual
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of every keyframe in turn."""
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
-    frames = swept_frames(keyframes, list(poses)) if chosen is None else chosen
+    told, near = list(disparities), list(disparities.values())
     swept: list[votes.SweptView] = []
     for first in range(0, len(frames), AT_ONCE):
         sweeps = []
         for frame in frames[first : first + AT_ONCE]:
-            nearest = int(np.argmin([abs(frame - keyframe) for keyframe in keyframes]))
-            known = np.concatenate(disparities[max(0, nearest - 1) : nearest + 2])
+            nearest = int(np.argmin([abs(frame - index) for index in told]))
+            known = np.concatenate(near[max(0, nearest - 1) : nearest + 2])
             sweeps.append(planner.plan(frame, known))
         swept += workers.map(swept_view, sweeps)
         if progress:
@@ -108,13 +108,13 @@ def dense_depths(
     for at, view in enumerate(swept):
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
         depths.append(votes.confirm(planner.camera, view, others))
-    wanted = [frames.index(keyframe) for keyframe in keyframes]
-    kept = votes.keep_what_stays(planner.camera, swept, depths, wanted)
+    positions = [frames.index(frame) for frame in wanted]
+    kept = votes.keep_what_stays(planner.camera, swept, depths, positions)
     return (full_size(depth, camera) for depth in kept)
 
 
 def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
-    """Return the keyframes and some followed frames between each pair, which vote as well."""
+    """Return the keyframes and some followed frames between each pair."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
         there = [frame for frame in followed if first < frame < last]

@@ -10,13 +10,14 @@ A common factor is free: the median is 1. Not in the paper; MonoGS optimises suc
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import TypeVar
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.records import Frame
+from minislam.records import Frame, Keyframe
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.robust import weighted_median
 
@@ -26,10 +27,11 @@ KEPT = 20  # blurred images: most links are among neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
 LEAST_WEIGHT = 0.015  # of the heaviest link: with less, a few chance matches would tell [-]
 STEADY = 1e-6  # weight of "as bright as the keyframe before", where no link tells more
+Shot = TypeVar("Shot", Frame, Keyframe)
 
 
-def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
-    """Return how bright the keyframes are (K, 3), their median being 1; None if all are alike."""
+def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
+    """Return how bright keyframes are (3,), by frame index, the median being 1; {}: all alike."""
     links, cells, frames = graph.links, graph.keyframes.cell_weights, graph.keyframes.frames
     ratios: list[list[float | None]] = []
     weights: list[float] = []
@@ -61,11 +63,12 @@ def keyframe_exposures(graph: KeyframeGraph) -> Tensor | None:
     levels = np.linalg.lstsq(root * steps, root * np.array(values, float), rcond=None)[0]
     levels -= np.median(levels, 0)
     if np.abs(levels).max() < LEAST_CHANGE:
-        return None
-    return torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)
+        return {}
+    exposures = torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)
+    return {frame.frame_index: exposure for frame, exposure in zip(frames, exposures, strict=True)}
 
 
-def with_exposure(frame: Frame, exposures: dict[int, Tensor]) -> Frame:
+def with_exposure(frame: Shot, exposures: dict[int, Tensor]) -> Shot:
     """Return a frame exposed as between the nearest frames whose exposures are known."""
     if not exposures:
         return frame

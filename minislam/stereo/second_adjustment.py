@@ -6,12 +6,13 @@ multiplies the static weight of each cell, and swept depth is the start, of one 
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from minislam.records import Progress, Sequence
-from minislam.stereo.dense_structure import WIDTH, dense_depths, swept_frames
+from minislam.stereo.dense_structure import dense_depths, swept_frames
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import final_global_ba
 from minislam.tracking.reprojection import reproject
@@ -45,25 +46,24 @@ def adjust_again(
     poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))
     tracker.tracked = tracked
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
-    how = on_sweep, workers, COARSE_WIDTH, sorted(poses)
-    swept = sweep_keyframes(tracker.graph, sequence, poses, *how)
+    frames = sorted(poses), keyframes
+    swept = sweep(tracker.graph, sequence, poses, *frames, on_sweep, workers, COARSE_WIDTH)
     adjust_confirmed(tracker.graph, swept, on_round)
     tracker.watch.conclude()
 
 
-def sweep_keyframes(
+def sweep(
     graph: KeyframeGraph,
     sequence: Sequence,
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
-    progress: Progress | None = None,
-    workers: Workers | None = None,  # sweep side by side
-    width: int = WIDTH,  # px of the images that are swept, at most
-    chosen: list[int] | None = None,  # frames that are swept, keyframes and others; None: usual
+    frames: list[int],  # that are swept
+    wanted: list[int],  # of these, whose depths are returned
+    *how: Any,  # progress, workers and width, as `dense_depths` takes them
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each keyframe in turn."""
-    frames = [frame.frame_index for frame in graph.keyframes.frames]
-    known = [agreed_disparities(graph, index).cpu().numpy() for index in range(len(frames))]
-    inputs = graph.grid.camera, poses, frames, known, progress, workers, width, chosen
+    """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
+    keyframes = enumerate(graph.keyframes.frames)
+    known = {f.frame_index: agreed_disparities(graph, k).cpu().numpy() for k, f in keyframes}
+    inputs = graph.grid.camera, poses, known, frames, wanted, *how
     swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return ((depth.to(device), confirmation.to(device)) for depth, confirmation in swept)

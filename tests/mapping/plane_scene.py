@@ -54,4 +54,4 @@ def wall_keyframe(index: int, mover_column: int | None = None) -> Keyframe:
         depth[square] = 1.0
         first = mover_column // 4
         features[2:4, first : first + 2] = torch.tensor([0.0, 1.0, 0.0])
-    return Keyframe(index, 5 * index, 0.1 * index, image, features, depth, pose(shift))
+    return Keyframe(5 * index, image, features, depth, pose(shift))

@@ -5,6 +5,7 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import se3_exp
+from minislam.mapping.views import view_of
 from minislam.splatting.constants import MIN_ALPHA
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe
@@ -35,8 +36,8 @@ def test_a_wall_that_was_exposed_darker_has_its_colour_in_the_map():
     for known in (exposure, None):
         mapper, dark = make_mapper(), wall_keyframe(1)
         dark = replace(dark, pixels=dark.image * exposure)
-        known = None if known is None else torch.stack([torch.ones(3), known])
-        mapper.initialise([wall_keyframe(0), dark], exposures=known)
+        first = replace(wall_keyframe(0), exposure=None if known is None else torch.ones(3))
+        mapper.initialise([first, replace(dark, exposure=known)])
         shown = mapper.render(wall_keyframe(2).T_camera_world).color
         errors.append(float((shown - wall_keyframe(2).image).square().mean()))
         assert len(mapper.exposures) == (0 if known is None else 2)
@@ -59,10 +60,10 @@ def test_the_fraction_that_is_shown_counts_holes_but_not_where_something_moves()
 
 def test_exposures_are_those_of_the_views():
     mapper = make_mapper()
-    told = torch.tensor([[1.0, 1.0, 1.0], [0.5, 0.6, 0.7]])
-    mapper.initialise([wall_keyframe(0), wall_keyframe(1)], exposures=told)
-    assert list(mapper.exposures) == [0, 5]
-    assert mapper.keyframes[1].view(CAMERA).exposure is mapper.exposures[5]
+    told = torch.tensor([0.5, 0.6, 0.7])
+    mapper.initialise([wall_keyframe(0), replace(wall_keyframe(1), exposure=told)])
+    assert list(mapper.exposures) == [5]
+    assert view_of(mapper.keyframes[1], CAMERA).exposure is mapper.exposures[5]
 
 
 def test_a_mover_becomes_uncertain_and_fades_from_the_map():

@@ -132,8 +132,7 @@ def test_what_only_moving_pixels_show_leaves_the_map_at_the_end():
     before = len(mapper.gaussians)
     mapper.refine(0)
     assert len(mapper.gaussians) >= 0.98 * before
-    for keyframe in mapper.keyframes:
-        keyframe.given_beta = torch.where(on_the_right, 4.0, 0.1)
+    mapper.keyframes = [replace(k, moving_mask=on_the_right) for k in mapper.keyframes]
     mapper.refine(0)
     pose = mapper.keyframes[0].T_camera_world
     seen = [mapper.render(pose).opacity[:, columns] for columns in (slice(2, 16), slice(27, None))]
@@ -145,7 +144,7 @@ def test_where_nothing_is_static_the_map_stays():
     mapper = make_mapper()
     mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
     before = len(mapper.gaussians)
-    for keyframe in mapper.keyframes:
-        keyframe.given_beta = torch.full((CAMERA.height, CAMERA.width), 4.0)
+    everywhere = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    mapper.keyframes = [replace(k, moving_mask=everywhere) for k in mapper.keyframes]
     mapper.refine(0)
     assert len(mapper.gaussians) == before > 0

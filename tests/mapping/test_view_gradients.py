@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
 from minislam.mapping.losses import render_loss
 from minislam.mapping.view_gradients import view_gradients
+from minislam.mapping.views import view_of
 from minislam.splatting import render
 from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 
@@ -12,13 +15,12 @@ from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 @pytest.mark.parametrize("exposure", [None, torch.tensor([0.5, 1.0, 1.6])])
 def test_the_gradients_are_those_of_the_loss_of_one_keyframe(exposure):
     mapper = make_mapper()
-    mapper.initialise([wall_keyframe(0)])
-    mapper.keyframes[0].exposure = exposure
+    mapper.initialise([replace(wall_keyframe(0), exposure=exposure)])
     keyframe, gaussians = mapper.keyframes[0], mapper._optimizer.gaussians
     share = view_gradients(*mapper._call(keyframe, CAMERA, trains=False))
     assert all(parameter.grad is None for parameter in gaussians.parameters.values())
 
-    pose, view = keyframe.T_camera_world.float(), keyframe.view(CAMERA)
+    pose, view = keyframe.T_camera_world.float(), view_of(keyframe, CAMERA)
     rendering = render(gaussians, CAMERA, pose, mapper.background)
     if exposure is not None:
         rendering = rendering._replace(color=(rendering.color * exposure).clamp_max(1))

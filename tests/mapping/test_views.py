@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from minislam.errors import InputError
-from minislam.mapping.views import MOST_DEPTHS, MappedKeyframe, median_depth
+from minislam.mapping.views import MOST_DEPTHS, median_depth, view_of
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
 
 HALF = CAMERA.resized(16, 12)
@@ -15,43 +15,34 @@ HALF = CAMERA.resized(16, 12)
 
 
 def test_a_half_size_image_has_half_the_pixels_and_the_same_means():
-    view = MappedKeyframe.from_record(wall_keyframe(0)).view(HALF)
+    view = view_of(wall_keyframe(0), HALF)
     assert view.image.shape == (12, 16, 3) and view.depth.shape == (12, 16)
     torch.testing.assert_close(view.image[0, 0], wall_keyframe(0).image[:2, :2].mean((0, 1)))
 
 
 def test_shrinking_depth_averages_known_pixels_only():
-    record = wall_keyframe(0)
-    record.depth[0, 0] = 0
-    record.depth[:2, 2:4] = 0
-    depth = MappedKeyframe.from_record(record).view(HALF).depth
+    keyframe = wall_keyframe(0)
+    keyframe.depth[0, 0] = 0
+    keyframe.depth[:2, 2:4] = 0
+    depth = view_of(keyframe, HALF).depth
     assert float(depth[0, 0]) == pytest.approx(2.0) and depth[0, 1] == 0
 
 
 # Identities
 
 
-def test_the_full_size_is_the_keyframe_itself_and_is_kept_as_bytes_only():
-    record = wall_keyframe(0)
-    record = replace(record, pixels=(255 * record.image).round().byte())
-    keyframe = MappedKeyframe.from_record(record)
-    assert torch.equal(keyframe.view(CAMERA).image, record.pixels.float() / 255)
-    assert keyframe.view(CAMERA).depth is keyframe.depth
-    assert keyframe.pixels is record.pixels and not keyframe._small
+def test_the_full_size_is_the_keyframe_itself():
+    keyframe = wall_keyframe(0)
+    keyframe = replace(keyframe, pixels=(255 * keyframe.image).round().byte())
+    view = view_of(keyframe, CAMERA)
+    assert torch.equal(view.image, keyframe.pixels.float() / 255) and view.depth is keyframe.depth
 
 
-def test_a_smaller_size_is_computed_once():
-    keyframe = MappedKeyframe.from_record(wall_keyframe(0))
-    assert keyframe.view(HALF).image is keyframe.view(HALF).image
-
-
-def test_a_view_has_the_newest_exposure():
-    keyframe = MappedKeyframe.from_record(wall_keyframe(0))
+def test_a_view_has_the_exposure_of_its_keyframe():
+    keyframe = replace(wall_keyframe(0), exposure=torch.ones(3))
     for camera in (CAMERA, HALF):
-        keyframe.exposure = None
-        assert keyframe.view(camera).exposure is None
-        keyframe.exposure = torch.ones(3)
-        assert keyframe.view(camera).exposure is keyframe.exposure
+        assert view_of(wall_keyframe(0), camera).exposure is None
+        assert view_of(keyframe, camera).exposure is keyframe.exposure
 
 
 # Errors

@@ -17,7 +17,7 @@ from minislam.stereo.second_adjustment import (
     UNCONFIRMED_WEIGHT,
     adjust_again,
     adjust_confirmed,
-    sweep_keyframes,
+    sweep,
 )
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -104,16 +104,16 @@ def test_where_nothing_is_confirmed_all_cells_count_alike():
 def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
     told = {}
 
-    def dense_depths(read, camera, poses, keyframes, disparities, *how):
-        told.update(camera=camera, poses=poses, keyframes=keyframes, disparities=disparities)
+    def dense_depths(read, camera, poses, disparities, *how):
+        told.update(camera=camera, poses=poses, disparities=disparities, how=how)
         return []
 
     monkeypatch.setattr(second_adjustment, "dense_depths", dense_depths)
     graph, poses = true_graph(NUMBERS), {0: torch.eye(4)}
-    sweep_keyframes(graph, SimpleNamespace(), poses)
+    sweep(graph, SimpleNamespace(), poses, [0, 1], [1], None)
     assert told["camera"] == graph.grid.camera and told["poses"] is poses
-    assert told["keyframes"] == NUMBERS
-    nearest = [float(np.max(d)) for d in told["disparities"]]
+    assert list(told["disparities"]) == NUMBERS and told["how"] == ([0, 1], [1], None)
+    nearest = [float(np.max(d)) for d in told["disparities"].values()]
     assert nearest == pytest.approx(graph.keyframes.disparities.amax(1).tolist(), rel=0.2)
 
 
@@ -133,12 +133,15 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
         tracker.tracked[0] = lost
         return {0: torch.eye(4)}
 
-    def sweep(graph, sequence, poses, progress, workers, width, chosen):
-        done.append((sorted(poses), width, chosen))
+    def sweep(graph, sequence, poses, frames, wanted, progress, workers, width):
+        done.append((sorted(poses), width, frames, wanted))
         return swept(graph)
 
     monkeypatch.setattr(second_adjustment, "pose_all_frames", pose_all_frames)
-    monkeypatch.setattr(second_adjustment, "sweep_keyframes", sweep)
+    monkeypatch.setattr(second_adjustment, "sweep", sweep)
     adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
-    assert done == [([0], COARSE_WIDTH, [0]), ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end
+    assert done == [
+        ([0], COARSE_WIDTH, [0], NUMBERS),
+        ("judged", UNCONFIRMED_WEIGHT),
+    ]  # judged at the end
