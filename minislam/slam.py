@@ -28,7 +28,7 @@ from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import swept_frames, with_swept_depth
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
-from minislam.stereo.second_adjustment import adjust_again, sweep
+from minislam.stereo.second_adjustment import adjust_again, sweep_frames
 from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,
@@ -174,9 +174,9 @@ class Slam(Stateful):
         """Build map and MLP anew on swept depth, from the tracker's keyframes and some between."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         known = [frame.frame_index for frame in graph.keyframes.frames]
-        frames = swept_frames(known, list(self._poses))
+        frames = swept_frames(known, list(self._poses), least=1)
         parts = graph, self.sequence, self._poses, frames, frames
-        swept, exposures = sweep(*parts, progress, self.workers), keyframe_exposures(graph)
+        swept, exposures = sweep_frames(*parts, progress, self.workers), keyframe_exposures(graph)
         keyframes = self._keyframes(others=sorted({*frames} - {*known}))
         keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
         self.mapper = self._new_mapper(self.config.mapping.insertion.cell)

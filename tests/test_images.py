@@ -3,8 +3,9 @@
 import pytest
 import torch
 from scipy import ndimage
+from torch.nn import functional
 
-from minislam.images import SSIM_SIGMA, gaussian_blur, local_moments, resample
+from minislam.images import SSIM_SIGMA, gaussian_blur, local_moments, resample, shrink_image
 from tests.helpers import generator
 
 
@@ -35,6 +36,13 @@ def test_a_single_pixel_becomes_the_window():
 
 
 # Identities
+
+
+@pytest.mark.parametrize("size", [(12, 20), (4, 10), (9, 7), (24, 20)])
+def test_a_smaller_image_holds_the_means_of_the_areas(size: tuple[int, int]):
+    image = random_images(3, 24, 20, 3)
+    expected = functional.adaptive_avg_pool2d(image.permute(2, 0, 1)[None], size)[0]
+    torch.testing.assert_close(shrink_image(image, *size), expected.permute(1, 2, 0))
 
 
 def test_moments_are_the_blurred_powers():

@@ -113,12 +113,12 @@ def dense_depths(
     return (full_size(depth, camera) for depth in kept)
 
 
-def swept_frames(keyframes: list[int], followed: list[int]) -> list[int]:
-    """Return the keyframes and some followed frames between each pair."""
+def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
+    """Return the keyframes and some followed frames between each pair, at least so many."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
         there = [frame for frame in followed if first < frame < last]
-        number = min(BETWEEN, len(there) // 3)
+        number = min(len(there), max(least, min(BETWEEN, len(there) // 3)))
         frames |= {there[len(there) * (k + 1) // (number + 1)] for k in range(number)}
     return sorted(frames)
 

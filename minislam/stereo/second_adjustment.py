@@ -47,12 +47,12 @@ def adjust_again(
     tracker.tracked = tracked
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
     frames = sorted(poses), keyframes
-    swept = sweep(tracker.graph, sequence, poses, *frames, on_sweep, workers, COARSE_WIDTH)
+    swept = sweep_frames(tracker.graph, sequence, poses, *frames, on_sweep, workers, COARSE_WIDTH)
     adjust_confirmed(tracker.graph, swept, on_round)
     tracker.watch.conclude()
 
 
-def sweep(
+def sweep_frames(
     graph: KeyframeGraph,
     sequence: Sequence,
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index

@@ -6,6 +6,7 @@ import torch
 from minislam.errors import InputError
 from minislam.geometry import se3_exp
 from minislam.mapping.views import view_of
+from minislam.records import Frame
 from minislam.splatting.constants import MIN_ALPHA
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe
@@ -141,6 +142,19 @@ def test_two_runs_with_one_seed_are_equal_to_the_bit():
     assert torch.equal(first.gaussians.means, second.gaussians.means)
     assert torch.equal(first.mlp.weights[0], second.mlp.weights[0])
     assert first.history.render == second.history.render
+
+
+def test_a_restored_mapper_has_the_images_that_it_was_given():
+    # They may differ from the frames of the sequence: a rolling shutter is undone in them.
+    def never(index: int) -> Frame:
+        raise AssertionError(index)
+
+    mapper, restored = make_mapper(replace(CONFIG, init_iterations=10)), make_mapper()
+    mapper.initialise([wall_keyframe(0), replace(wall_keyframe(1), exposure=torch.ones(3))])
+    restored.restore_state(mapper.saved_state(), never)
+    for found, known in zip(restored.keyframes, mapper.keyframes, strict=True):
+        assert torch.equal(found.pixels, known.pixels) and found.frame_index == known.frame_index
+    assert list(restored.exposures) == [5]
 
 
 def test_a_rigid_motion_of_all_keyframes_moves_the_map_with_them():

@@ -51,7 +51,8 @@ def test_what_stands_still_is_confirmed(index: int):
 def test_every_third_frame_of_a_gap_at_most_is_swept():
     assert swept_frames([0, 1, 4, 20], list(range(24))) == [0, 1, 4, 10, 15, 20]
     assert swept_frames([0, 4], list(range(5))) == [0, 2, 4]
-    assert swept_frames([0, 4], [0, 4]) == [0, 4]
+    assert swept_frames([0, 4], [0, 4]) == [0, 4] == swept_frames([0, 4], [0, 4], least=1)
+    assert swept_frames([0, 1, 3, 20], list(range(24)), least=1) == [0, 1, 2, 3, 9, 14, 20]
 
 
 def test_views_of_much_parallax_are_not_used():

@@ -17,7 +17,7 @@ from minislam.stereo.second_adjustment import (
     UNCONFIRMED_WEIGHT,
     adjust_again,
     adjust_confirmed,
-    sweep,
+    sweep_frames,
 )
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -110,7 +110,7 @@ def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
 
     monkeypatch.setattr(second_adjustment, "dense_depths", dense_depths)
     graph, poses = true_graph(NUMBERS), {0: torch.eye(4)}
-    sweep(graph, SimpleNamespace(), poses, [0, 1], [1], None)
+    sweep_frames(graph, SimpleNamespace(), poses, [0, 1], [1], None)
     assert told["camera"] == graph.grid.camera and told["poses"] is poses
     assert list(told["disparities"]) == NUMBERS and told["how"] == ([0, 1], [1], None)
     nearest = [float(np.max(d)) for d in told["disparities"].values()]
@@ -138,7 +138,7 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
         return swept(graph)
 
     monkeypatch.setattr(second_adjustment, "pose_all_frames", pose_all_frames)
-    monkeypatch.setattr(second_adjustment, "sweep", sweep)
+    monkeypatch.setattr(second_adjustment, "sweep_frames", sweep)
     adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
     assert done == [
