@@ -60,7 +60,7 @@ class Slam(Stateful):
     steps: Steps
     first_frame: FirstFrame
     focal_length: FocalLengthFit | None = None  # where it was not refined, the best one at the end
-    _poses: dict[int, Tensor]  # T_camera_world of every frame, once known
+    poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Slam(Stateful):
         self.tracker.graph.seeks_focal = sequence.refines_focal
         self.mapper = self._new_mapper(config.mapping.insertion.online_cell)
         self._stride = priors.flow.stride
-        self._poses, self.first_frame = {}, FirstFrame()
+        self.poses, self.first_frame = {}, FirstFrame()
 
     def run(self) -> None:
         """Process the sequence to the final map, from its start or from a restored state."""
@@ -140,7 +140,7 @@ class Slam(Stateful):
         mapped, store = len(self.mapper.keyframes), self.tracker.keyframes
         if not store.has_prior or mapped == len(store):
             return
-        new_keyframes = self._keyframes(first=mapped)
+        new_keyframes = self.keyframes(first=mapped)
         with self.steps.timed("mapping"):
             if mapped:
                 self._move_map()
@@ -174,10 +174,10 @@ class Slam(Stateful):
         """Build map and MLP anew on swept depth, from the tracker's keyframes and some between."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         known = [frame.frame_index for frame in graph.keyframes.frames]
-        frames = swept_frames(known, list(self._poses), least=1)
-        parts = graph, self.sequence, self._poses, frames, frames
+        frames = swept_frames(known, list(self.poses), least=1)
+        parts = graph, self.sequence, self.poses, frames, frames
         swept, exposures = sweep_frames(*parts, progress, self.workers), keyframe_exposures(graph)
-        keyframes = self._keyframes(others=sorted({*frames} - {*known}))
+        keyframes = self.keyframes(others=sorted({*frames} - {*known}))
         keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
         self.mapper = self._new_mapper(self.config.mapping.insertion.cell)
         progress = self.steps.on_progress("first map")
@@ -191,22 +191,22 @@ class Slam(Stateful):
     def _pose_all_frames(self) -> None:
         self.focal_length = check_focal_length(self.tracker.graph, self.workers)
         progress = self.steps.on_progress("posing all frames")
-        self._poses = pose_all_frames(self.tracker, self.sequence, progress)
+        self.poses = pose_all_frames(self.tracker, self.sequence, progress)
 
     def _refine_other_poses(self) -> None:
         """Refine the poses between the keyframes until the rendered map matches the images."""
         stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
-        others = [index for index in self._poses if index not in keyframes]
+        others = [index for index in self.poses if index not in keyframes]
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
             read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
             undone = [self.tracker.graph.shutter.undone(frame) for frame in read]
             frames = [with_exposure(frame, self.mapper.exposures) for frame in undone]
-            start = [self._poses[frame.frame_index] for frame in frames]
+            start = [self.poses[frame.frame_index] for frame in frames]
             images = [frame.levelled for frame in frames]
             betas = [self._beta(frame, None) for frame in frames]
             poses = self.mapper.refine_poses(start, images, betas)
-            self._poses |= {f.frame_index: pose for f, pose in zip(frames, poses, strict=True)}
+            self.poses |= {f.frame_index: pose for f, pose in zip(frames, poses, strict=True)}
             self.steps.finish(stage, first + len(frames), len(others))
 
     def _static_weight(self, index: int) -> Tensor:
@@ -242,13 +242,13 @@ class Slam(Stateful):
             )
         return torch.from_numpy(mask).to(self.device)
 
-    def _keyframes(self, first: int = 0, others: Iterable[int] = ()) -> list[Keyframe]:
+    def keyframes(self, first: int = 0, others: Iterable[int] = ()) -> list[Keyframe]:
         """Return the tracker's keyframes from `first` on, and other frames, for the mapper."""
         store, shutter = self.tracker.keyframes, self.tracker.graph.shutter
         columns = store.frames, store.features, store.metric_depths, store.T_camera_world
         rows = list(zip(*(column[first:] for column in columns), strict=True))
         for frame in map(self.frame, others):
-            rows.append((frame, self._features(frame), None, self._poses[frame.frame_index]))
+            rows.append((frame, self._features(frame), None, self.poses[frame.frame_index]))
         result = []
         for frame, features, depth, pose in rows:
             pixels, mask = shutter.undone(frame).pixels, self._given_mask(frame.frame_index)
@@ -259,10 +259,10 @@ class Slam(Stateful):
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames that were not lost; before the end, those of keyframes."""
-        if not self._poses:
+        if not self.poses:
             return self.keyframe_trajectory()
         stamps = {t.frame_index: t.timestamp for t in self.tracker.tracked}
-        return _trajectory([stamps[index] for index in self._poses], list(self._poses.values()))
+        return _trajectory([stamps[index] for index in self.poses], list(self.poses.values()))
 
     def keyframe_trajectory(self) -> Trajectory:
         """Return the poses of the keyframes."""

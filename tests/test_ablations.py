@@ -133,8 +133,8 @@ def test_only_the_poses_between_the_keyframes_are_refined(sequence: Sequence, us
     keyframes = {frame.frame_index for frame in usual.tracker.keyframes.frames}
     different = {
         index
-        for index, pose in usual._poses.items()
-        if not np.array_equal(pose.numpy(), refined._poses[index].numpy())
+        for index, pose in usual.poses.items()
+        if not np.array_equal(pose.numpy(), refined.poses[index].numpy())
     }
     assert different and not different & keyframes
 

@@ -24,6 +24,7 @@ from minislam.mapping.safeguards import (
 from minislam.mapping.views import median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
+from minislam.splatting import Rendering
 
 RECHECKED = 10  # keyframes beside the window whose Gaussians are looked at with every new one
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
@@ -185,3 +186,9 @@ class Mapper(JointOptimisation):
         self._remove_dynamic_gaussians(range(len(self.keyframes)))
         for position in range(len(self.keyframes)):
             self._insert(position)
+
+
+def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
+    """Return the depth of the visible surface [world units], 0 where the map is transparent."""
+    depth = rendering.depth / rendering.opacity.clamp_min(OPAQUE)
+    return torch.where(rendering.opacity > OPAQUE, depth, 0)

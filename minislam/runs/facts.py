@@ -1,5 +1,6 @@
 """What a run reports: run.json with its warnings, and metrics.json."""
 
+import math
 import platform
 import sys
 from collections.abc import Iterator
@@ -11,19 +12,19 @@ import cv2
 import numpy as np
 import scipy
 import torch
-from torch import Tensor
 
 import minislam
 from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MAX_DIFFERENCE, MappedView, ate_cm, measure_run
 from minislam.evaluation.trajectory import associate
-from minislam.mapping.mapper import OPAQUE
+from minislam.mapping.mapper import Mapper, surface_depth
 from minislam.priors.choice import PriorChoice
-from minislam.records import Trajectory
+from minislam.records import Keyframe, Trajectory
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Slam
 from minislam.splatting import Rendering
+from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
 
 # Of the static pixels, in the mean of the keyframes [-]: 78 good runs show .94 to 1, a trajectory
@@ -31,6 +32,7 @@ from minislam.tracking.optimisation import bundle_problem, typical_residual
 LEAST_SHOWN = 0.75
 # px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
 LEAST_BEYOND_TURNS = 0.45
+MOST_UNSEEN = 20  # frames, evenly spread, that the map is compared with
 
 
 def run_facts(
@@ -100,6 +102,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     return {
         **errors,
         **_segment_errors(slam),
+        "psnr_unseen_db": unseen_psnr(slam),
         "focal_length_px": slam.tracker.grid.camera.fx,
         "seconds_total": seconds,
         "frames_per_second": len(slam.tracker.tracked) / seconds,
@@ -116,15 +119,32 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
         rendering = mapper.render(keyframe.T_camera_world)
         color, depth = rendering.color.clamp(0, 1), surface_depth(rendering)
         beta = slam.beta_image(index) if slam.config.uncertainty.is_learnt else None
-        static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
-        pictures = keyframe.exposed(rendering.color), keyframe.image, static
         yield MappedView(
             keyframe.frame_index,
             color=color.cpu().numpy(),
             depth=depth.cpu().numpy(),
             beta=beta,
-            static_psnr=psnr(*(p.cpu() for p in pictures)) if static.any() else None,
+            static_psnr=_static_psnr(mapper, keyframe, rendering),
         )
+
+
+def unseen_psnr(slam: Slam) -> float | None:
+    """Return the PSNR [dB] where other frames stand still that the map was not built from."""
+    mapper, seen = slam.mapper, {keyframe.frame_index for keyframe in slam.mapper.keyframes}
+    others = [index for index in slam.poses if index not in seen]
+    some = others[:: math.ceil(len(others) / MOST_UNSEEN) or 1]
+    keyframes = slam.keyframes(first=len(slam.tracker.keyframes), others=some)
+    views = [with_exposure(keyframe, mapper.exposures) for keyframe in keyframes]
+    found = [_static_psnr(mapper, view, mapper.render(view.T_camera_world)) for view in views]
+    known = [value for value in found if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _static_psnr(mapper: Mapper, keyframe: Keyframe, rendering: Rendering) -> float | None:
+    """Compare the map, as it is exposed there, with a keyframe where beta finds it static."""
+    static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
+    pictures = keyframe.exposed(rendering.color), keyframe.image, static
+    return psnr(*(picture.cpu() for picture in pictures)) if static.any() else None
 
 
 def shown_static(slam: Slam) -> float | None:
@@ -170,12 +190,6 @@ def _segment_errors(slam: Slam) -> dict[str, float | None]:
         piece = Trajectory(times[inside], trajectory.T_world_camera[inside])
         errors[f"ate_{first}_to_{last}_cm"] = ate_cm(piece, truth.trajectory)
     return errors
-
-
-def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
-    """Return the depth of the visible surface [world units], 0 where the map is transparent."""
-    depth = rendering.depth / rendering.opacity.clamp_min(OPAQUE)
-    return torch.where(rendering.opacity > OPAQUE, depth, 0)
 
 
 def peak_memory_mb() -> float | None:

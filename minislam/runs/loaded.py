@@ -20,12 +20,13 @@ from minislam.data.sequence import RecordedSequence, open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera, se3_inverse
 from minislam.images import resample
+from minislam.mapping.mapper import surface_depth
 from minislam.parameters import with_values
 from minislam.priors.choice import PriorChoice, choose_features
 from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
-from minislam.runs.facts import surface_depth, unit_of
+from minislam.runs.facts import unit_of
 from minislam.runs.resume import way_on
 from minislam.runs.summary import Line, summarise
 from minislam.slam import Slam

@@ -16,7 +16,7 @@ from minislam.data.images import encode_jpeg, encode_png
 from minislam.data.run_folder import KEYFRAMES, PLOTS, REPORT, VIEWER, RunFolder
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
-from minislam.runs.facts import surface_depth
+from minislam.mapping.mapper import surface_depth
 from minislam.runs.loaded import Run
 from minislam.runs.summary import summarise
 from minislam.slam import Slam
@@ -156,24 +156,29 @@ def _pictures(slam: Slam, index: int) -> dict[str, np.ndarray]:
 def _write_keyframes(
     folder: RunFolder, slam: Slam
 ) -> tuple[dict[int, list[bytes]], tuple[float, float], tuple[float, float]]:
-    """Write the pictures of all keyframes.
+    """Write the pictures of the tracker's keyframes.
 
     Return small ones for report and viewer, frame_index: JPEG of input, depth, beta, render; and
     between which depths [world units] and betas all are coloured.
     """
-    keyframes, jpegs = slam.mapper.keyframes, dict[int, list[bytes]]()
-    sampled = [_pictures(slam, index) for index in _spread(len(keyframes), COLOUR_SAMPLES)]
+    tracked, jpegs = (
+        {f.frame_index for f in slam.tracker.keyframes.frames},
+        dict[int, list[bytes]](),
+    )
+    views = [view.frame_index for view in slam.mapper.keyframes]
+    keyframes = [index for index, frame_index in enumerate(views) if frame_index in tracked]
+    sampled = [_pictures(slam, keyframes[k]) for k in _spread(len(keyframes), COLOUR_SAMPLES)]
     of_depth = viz.depth_limits(np.array([pictures["depth"] for pictures in sampled]))
     of_beta = viz.beta_limits(np.array([pictures["beta"] for pictures in sampled]))
     shown = set(_spread(len(keyframes), MAX_SHOWN))
-    for index, keyframe in enumerate(keyframes):
-        pictures = _pictures(slam, index)
+    for number, index in enumerate(keyframes):
+        pictures, frame_index = _pictures(slam, index), views[index]
         pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
         pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
         for kind, picture in pictures.items():
-            name = f"{KEYFRAMES}/{keyframe.frame_index:06d}_{kind}.png"
+            name = f"{KEYFRAMES}/{frame_index:06d}_{kind}.png"
             folder.write_picture(name, encode_png(picture))
-        if index in shown:
+        if number in shown:
             small = [encode_jpeg(picture, LONGEST_SIDE) for picture in pictures.values()]
-            jpegs[keyframe.frame_index] = small
+            jpegs[frame_index] = small
     return jpegs, of_depth, of_beta

@@ -52,7 +52,8 @@ def _counted(facts: Mapping[str, Any]) -> Iterator[Line]:
     if facts["breaks"]:
         where = ", ".join(f"{b['first_frame']} to {b['last_frame']}" for b in facts["breaks"])
         yield Line("broken at frames", where, "poor", "before and after do not belong together")
-    yield Line("keyframes", f"{facts['keyframes']:,}", "", "the frames that the map is made from")
+    meaning = "frames that the tracker keeps; the map is built from them and from some between"
+    yield Line("keyframes", f"{facts['keyframes']:,}", "", meaning)
     yield Line("Gaussians in the map", f"{facts['gaussians']:,}")
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.records import Pictured, Trajectory
+from minislam.records import Keyframe, Pictured, Trajectory
 from minislam.runs import facts
 from minislam.splatting import Rendering
 from minislam.tracking.safeguards.diagnostics import Break
@@ -94,6 +94,7 @@ def test_without_an_ate_there_is_no_straight_walk(monkeypatch: pytest.MonkeyPatc
     run.trajectory = run.keyframe_trajectory = lambda: path
     run.tracker.grid, run.render = run.tracker.graph.grid, None
     monkeypatch.setattr(facts, "_ties", lambda run: {})
+    monkeypatch.setattr(facts, "unseen_psnr", lambda run: None)
     for ate, line in ((None, None), (0.0, 86.0)):
         errors = {"ate_all_cm": ate, "ate_straight_line_cm": 86.0}
         monkeypatch.setattr(facts, "measure_run", lambda *_, found=errors: found)
@@ -199,3 +200,35 @@ def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
     assert (first.beta, second.beta) == (0.5, 1.5)
     uncertainty.is_learnt = False
     assert all(view.beta is None for view in facts.mapped_views(run))
+
+
+def test_the_map_is_compared_with_some_frames_that_it_was_not_built_from():
+    asked: list[int] = []
+
+    def keyframes(first: int, others: list[int]) -> list[Keyframe]:
+        assert first == 3  # none of the tracker
+        asked[:] = others
+        image, none = torch.full((4, 6, 3), 0.5), torch.zeros(4, 6)
+        return [Keyframe(index, image, none, none, torch.tensor(index)) for index in others]
+
+    def render(pose: torch.Tensor) -> Rendering:
+        opacity = torch.ones(4, 6)
+        return Rendering(torch.full((4, 6, 3), 0.2), opacity, opacity, torch.ones(1))
+
+    mapper = SimpleNamespace(
+        keyframes=[SimpleNamespace(frame_index=0)],
+        exposures={0: torch.full((3,), 2.0)},  # so .4 is seen
+        camera=CAMERA,
+        render=render,
+        beta_of=lambda keyframe: (torch.arange(6) < keyframe.frame_index).expand(4, 6),
+        static_weight=lambda beta, camera: beta,
+    )
+    tracker = SimpleNamespace(keyframes=[None] * 3)
+    run = SimpleNamespace(mapper=mapper, tracker=tracker, keyframes=keyframes)
+    run.poses = dict.fromkeys(range(101))
+    assert facts.unseen_psnr(run) == pytest.approx(20, abs=1e-3)
+    assert len(asked) == facts.MOST_UNSEEN and asked[0] == 1 and asked[-1] == 96
+    run.poses = dict.fromkeys(range(9))
+    assert facts.unseen_psnr(run) is not None and asked == [1, 2, 3, 4, 5, 6, 7, 8]
+    run.poses = {0: None}
+    assert facts.unseen_psnr(run) is None
