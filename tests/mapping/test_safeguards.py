@@ -94,8 +94,8 @@ def test_without_confirmation_the_usual_cut_stays():
     assert mapper.least_weight == MAPPING_CUT
 
 
-def test_before_a_keyframe_was_rendered_four_times_the_usual_cut_stays():
-    mapper, _ = moving_square(20)  # the half are 10 renderings of 3 keyframes
+def test_before_a_keyframe_was_rendered_twice_the_usual_cut_stays():
+    mapper, _ = moving_square(8)  # the half are 4 renderings of 3 keyframes
     assert mapper.least_weight == MAPPING_CUT
 
 
