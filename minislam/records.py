@@ -62,6 +62,7 @@ class Keyframe(Pictured):
     moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
     exposure: Tensor | None = None  # (3,) as of all that has an image
+    inserts: bool = True  # Gaussians; else the map is only compared with it
 
 
 @dataclass(frozen=True)

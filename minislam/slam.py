@@ -243,18 +243,18 @@ class Slam(Stateful):
         return torch.from_numpy(mask).to(self.device)
 
     def keyframes(self, first: int = 0, others: Iterable[int] = ()) -> list[Keyframe]:
-        """Return the tracker's keyframes from `first` on, and other frames, for the mapper."""
+        """Return keyframes of the tracker from `first` on, and others, which insert nothing."""
         store, shutter = self.tracker.keyframes, self.tracker.graph.shutter
         columns = store.frames, store.features, store.metric_depths, store.T_camera_world
         rows = list(zip(*(column[first:] for column in columns), strict=True))
         for frame in map(self.frame, others):
             rows.append((frame, self._features(frame), None, self.poses[frame.frame_index]))
         result = []
-        for frame, features, depth, pose in rows:
+        for position, (frame, features, depth, pose) in enumerate(rows, first):
             pixels, mask = shutter.undone(frame).pixels, self._given_mask(frame.frame_index)
             unknown = torch.zeros((), device=self.device).expand(pixels.shape[:2])
             seen = pixels, features, unknown if depth is None else depth, pose, mask
-            result.append(Keyframe(frame.frame_index, *seen))
+            result.append(Keyframe(frame.frame_index, *seen, inserts=position < len(store)))
         return sorted(result, key=lambda keyframe: keyframe.frame_index)
 
     def trajectory(self) -> Trajectory:

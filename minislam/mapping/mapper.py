@@ -128,6 +128,8 @@ class Mapper(JointOptimisation):
     def _insert(self, position: int) -> None:
         """Add Gaussians for what a keyframe sees and the map does not show."""
         keyframe = self.keyframes[position]
+        if not keyframe.inserts:
+            return
         rendering = self.render(keyframe.T_camera_world) if len(self.gaussians) else None
         weight = self.static_weight(self.beta_of(keyframe), self.camera)
         scene = self.camera, rendering, weight, self.median_depth
@@ -138,8 +140,8 @@ class Mapper(JointOptimisation):
 
     def _shown_fraction(self, keyframe: Keyframe) -> float:
         """Return the fraction of a keyframe's static pixels where the map is opaque [-]."""
-        static = self.static_weight(self.beta_of(keyframe), self.camera) > 0
-        shown = self.render(keyframe.T_camera_world).opacity[static] > OPAQUE
+        static = self.static_weight(self.beta_of(keyframe), self._online_camera) > 0
+        shown = self.render(keyframe.T_camera_world, self._online_camera).opacity[static] > OPAQUE
         return float(shown.float().mean()) if len(shown) else 1.0
 
     def _remove_dynamic_gaussians(self, positions: Iterable[int]) -> None:

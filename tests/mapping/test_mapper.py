@@ -178,6 +178,15 @@ def test_covered_pixels_are_not_inserted_again():
     assert len(mapper.gaussians) - count < 0.25 * count
 
 
+def test_a_frame_between_keyframes_is_compared_with_the_map_and_inserts_nothing():
+    mapper, between = make_mapper(), replace(wall_keyframe(3, mover_column=20), inserts=False)
+    mapper.initialise([wall_keyframe(0), between])
+    assert set(mapper.gaussians.anchor_keyframe.tolist()) == {0}
+    alone = make_mapper()
+    alone.initialise([wall_keyframe(0)])
+    assert mapper.history.render != alone.history.render
+
+
 def test_in_fast_mode_most_keyframes_wait_for_their_optimisation():
     mapper = make_mapper(replace(CONFIG, init_iterations=4, keyframe_stride=3))
     mapper.initialise([wall_keyframe(0)])
