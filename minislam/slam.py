@@ -171,7 +171,7 @@ class Slam(Stateful):
         self._move_map()
 
     def _rebuild_map(self) -> None:
-        """Build map and MLP anew on swept depth, from the tracker's keyframes and some between."""
+        """Build map and MLP anew on swept depth, of keyframes and of frames in the gaps."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         known = [frame.frame_index for frame in graph.keyframes.frames]
         frames = swept_frames(known, list(self.poses), least=1)

@@ -129,7 +129,7 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
 
 
 def unseen_psnr(slam: Slam) -> float | None:
-    """Return the PSNR [dB] where other frames stand still that the map was not built from."""
+    """Return the PSNR [dB] where other frames stand still that the map was not fitted to."""
     mapper, seen = slam.mapper, {keyframe.frame_index for keyframe in slam.mapper.keyframes}
     others = [index for index in slam.poses if index not in seen]
     some = others[:: math.ceil(len(others) / MOST_UNSEEN) or 1]

@@ -52,7 +52,7 @@ def _counted(facts: Mapping[str, Any]) -> Iterator[Line]:
     if facts["breaks"]:
         where = ", ".join(f"{b['first_frame']} to {b['last_frame']}" for b in facts["breaks"])
         yield Line("broken at frames", where, "poor", "before and after do not belong together")
-    meaning = "frames that the tracker keeps; the map is built from them and from some between"
+    meaning = "frames that the tracker keeps; the map is fitted to them and to some between"
     yield Line("keyframes", f"{facts['keyframes']:,}", "", meaning)
     yield Line("Gaussians in the map", f"{facts['gaussians']:,}")
 
