@@ -57,11 +57,13 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("(scales - scales.mean(-1, keepdim=True))", "scales"),
     ],
     ("mapping/mapper.py", "mapping/test_mapper.py"): [
-        ("self.camera) > 0\n        shown", "self.camera) > -1\n        shown"),
+        ("self._online_camera) > 0\n        shown", "self._online_camera) > -1\n        shown"),
+        ("if not keyframe.inserts", "if False"),
         ("opacity[static] > OPAQUE", "opacity[static] < OPAQUE"),
     ],
     ("runs/facts.py", "runs/test_facts.py runs/test_run_ending.py"): [
         ("shown is not None and shown < LEAST_SHOWN", "bool(shown) and shown < LEAST_SHOWN"),
+        ("if index not in seen", "if index in seen"),
         ("np.argmin(slam.mapper.shown)", "np.argmax(slam.mapper.shown)"),
     ],
     ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
