@@ -161,18 +161,14 @@ def _write_keyframes(
     Return small ones for report and viewer, frame_index: JPEG of input, depth, beta, render; and
     between which depths [world units] and betas all are coloured.
     """
-    tracked, jpegs = (
-        {f.frame_index for f in slam.tracker.keyframes.frames},
-        dict[int, list[bytes]](),
-    )
-    views = [view.frame_index for view in slam.mapper.keyframes]
-    keyframes = [index for index, frame_index in enumerate(views) if frame_index in tracked]
+    views, jpegs = slam.mapper.keyframes, dict[int, list[bytes]]()
+    keyframes = [index for index, view in enumerate(views) if view.inserts]
     sampled = [_pictures(slam, keyframes[k]) for k in _spread(len(keyframes), COLOUR_SAMPLES)]
     of_depth = viz.depth_limits(np.array([pictures["depth"] for pictures in sampled]))
     of_beta = viz.beta_limits(np.array([pictures["beta"] for pictures in sampled]))
     shown = set(_spread(len(keyframes), MAX_SHOWN))
     for number, index in enumerate(keyframes):
-        pictures, frame_index = _pictures(slam, index), views[index]
+        pictures, frame_index = _pictures(slam, index), views[index].frame_index
         pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
         pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
         for kind, picture in pictures.items():

@@ -84,7 +84,7 @@ def dense_depths(
     read: Callable[[int], Frame],  # a frame by its index
     camera: Camera,  # of its images
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
-    disparities: dict[int, np.ndarray],  # (n,) 1/world unit, of some frames: of the nearest plane
+    disparities: dict[int, np.ndarray],  # (n,) 1/world unit, by frame: place the nearest plane
     frames: list[int],  # that are swept, increasing; all of them vote
     wanted: list[int],  # of these, whose depths are returned
     progress: Progress | None = None,

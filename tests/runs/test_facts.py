@@ -202,7 +202,7 @@ def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
     assert all(view.beta is None for view in facts.mapped_views(run))
 
 
-def test_the_map_is_compared_with_some_frames_that_it_was_not_built_from():
+def test_the_map_is_compared_with_some_frames_that_it_was_not_fitted_to():
     asked: list[int] = []
 
     def keyframes(first: int, others: list[int]) -> list[Keyframe]:

@@ -141,7 +141,5 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
     monkeypatch.setattr(second_adjustment, "sweep_frames", sweep)
     adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
-    assert done == [
-        ([0], COARSE_WIDTH, [0], NUMBERS),
-        ("judged", UNCONFIRMED_WEIGHT),
-    ]  # judged at the end
+    swept_first = [0], COARSE_WIDTH, [0], NUMBERS
+    assert done == [swept_first, ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end
