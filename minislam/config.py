@@ -56,6 +56,7 @@ _PAPER: dict[str, Any] = {
     "mapping.init_iterations": 1050,
     "mapping.keyframe_iterations": 450,
     "mapping.refine_iterations": 20000,
+    "mapping.refine_images": 0,
     "mapping.refine_full_fraction": 1.0,
     "mapping.freeze_iterations": 20,
     "mapping.color_weight": 0.5,

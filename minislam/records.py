@@ -52,7 +52,7 @@ class Frame(Pictured):
 
 @dataclass(frozen=True)
 class Keyframe(Pictured):
-    """A frame that the map is fitted to. Bundle adjustment changes its pose."""
+    """An image that the map is fitted to: a keyframe, or at the end a frame between two."""
 
     frame_index: int  # position among the frames
     pixels: Tensor  # (H, W, 3) uint8 RGB

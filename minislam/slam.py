@@ -5,8 +5,8 @@
                 |  beta: what the MLP has learnt        |
                 +---------------------------------------+
 
-The two arrows that go back are two calls. The tracker calls `_static_weight` to turn the MLP's
-beta into the weight of each cell. `_move_map` deforms the map when an adjustment moves keyframes.
+The arrow that goes back is a call: the tracker asks `_static_weight` for the weight of each cell,
+by the MLP's beta. `_move_map` deforms the map when an adjustment has moved keyframes.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -59,7 +59,7 @@ class Slam(Stateful):
     mapper: Mapper
     steps: Steps
     first_frame: FirstFrame
-    focal_length: FocalLengthFit | None = None  # where it was not refined, the best one at the end
+    focal_length: FocalLengthFit | None = None  # what the check at the end has found
     poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
@@ -128,7 +128,7 @@ class Slam(Stateful):
             yield frame
 
     def _initialise(self) -> None:
-        """Start in two stages (paper Sec. 3.3): first without beta, then with beta."""
+        """Start in two stages (paper supplement): first without beta, then with beta."""
         with self.steps.timed("initialisation"):
             self.tracker.initialise(self.workers)
         self._map_new_keyframes()
@@ -185,7 +185,7 @@ class Slam(Stateful):
 
     def _refine_map(self) -> None:
         stage = "refining the map"
-        iterations = self.config.mapping.refine_iterations
+        iterations = self.config.mapping.refinement(len(self.mapper.keyframes))
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
@@ -275,12 +275,12 @@ class Slam(Stateful):
         pose = se3_inverse(torch.from_numpy(T_world_camera))
         return self.mapper.render(pose).color.clamp(0, 1).cpu().numpy()
 
-    def beta_image(self, keyframe_index: int) -> np.ndarray:
-        """Return beta (H, W) of a keyframe; without uncertainty it is 1 everywhere."""
+    def beta_image(self, position: int) -> np.ndarray:
+        """Return beta (H, W) of an image of the map; without uncertainty it is 1 everywhere."""
         camera = self.sequence.camera
         if not self.config.uncertainty.enabled:
             return np.ones((camera.height, camera.width), np.float32)
-        beta = self.mapper.beta_of(self.mapper.keyframes[keyframe_index])
+        beta = self.mapper.beta_of(self.mapper.keyframes[position])
         return resample(beta, camera.height, camera.width).cpu().numpy()
 
     def lost_frames(self) -> list[tuple[int, float, str]]:

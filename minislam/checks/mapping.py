@@ -231,7 +231,7 @@ def check_followed_pose(student: Function) -> Verdict:
     def case(
         turn: float, start: Tensor, mover: bool, description: str, last: float = 99.0
     ) -> tuple[Case, Tensor]:
-        """Return a case whose map holds the columns up to the last one [px], and its answer."""
+        """Return a case, whose map shows what lies left of `last` [px], and the true pose."""
         true, weight = se3_exp(doubles(0.1, 0, 0.1, 0, turn, 0)), torch.ones(24, 32)
         world = transform_points(se3_inverse(true), means).float()
         gaussians = GaussianMap(world, *rows, *looks, torch.zeros(count, dtype=torch.int64))

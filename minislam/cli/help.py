@@ -18,7 +18,8 @@ constants, each of them an option:                minislam settings [PATTERN]
 """
 RUN_EPILOG = """\
 files of a run folder:
-  report.html, plots/, keyframes/          pictures; open report.html first
+  report.html, viewer.html, clip.webp      open report.html first
+  plots/, keyframes/                       its pictures
   map.ply                                  Gaussians for any 3DGS viewer; y points down
   trajectory.txt, keyframe_trajectory.txt  poses in TUM format, timestamps of the source
   lost_frames.txt                          frames without a pose, and why

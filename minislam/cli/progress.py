@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
+IMAGES_PER_FRAME = 0.4  # of the map: every fifth frame is a keyframe, and one more of every gap
 REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
 TRUST = 0.1  # fraction of the plan by which it resists the first measurements
 
@@ -76,7 +77,7 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
         again if config.uncertainty.enabled else {},
         {"posing all frames": 0.12 * per_frame},
         {"dense depth": 0.25 * per_frame} | first_map,
-        {"refining the map": iteration * mapping.refine_iterations},
+        {"refining the map": iteration * mapping.refinement(IMAGES_PER_FRAME * frames)},
         {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
     ]
     stages[-1 if stages[-1] else -2][""] = 0.1 * per_frame

@@ -27,7 +27,7 @@ CENTIMETRES = 100.0  # per world unit of the truth, which is metric
 
 @dataclass(frozen=True)
 class MappedView:
-    """The map at the end of a run, seen from a keyframe."""
+    """The map at the end of a run, seen from the pose of one of its images."""
 
     frame_index: int
     color: np.ndarray  # (H, W, 3) rendered, in [0, 1]
@@ -122,7 +122,7 @@ def _keyframe_errors(
     scale: float | None,  # of the truth per unit of the map, None: unknown
     lpips: ImageDistance | None,
 ) -> Iterator[tuple[str, float]]:
-    """Compare the map, seen from a keyframe, with image and depth of the static scene.
+    """Compare the map, seen from one of its images, with image and depth of the static scene.
 
     `psnr_masked_db` counts only pixels that a dynamic object covered: its ghost would be there.
     """
@@ -142,7 +142,7 @@ def _keyframe_errors(
 
 
 def _beta_auroc(betas: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
-    """Return how well beta separates moving from static pixels, over all keyframes together."""
+    """Return how well beta separates moving from static pixels, over all images of the map."""
     if not any(moving.any() for _, moving in betas):
         return None
     beta, moving = zip(*betas, strict=True)

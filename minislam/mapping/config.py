@@ -1,5 +1,6 @@
 """The settings of mapping. "official" names the constants of the authors' code."""
 
+import math
 from dataclasses import dataclass, field
 
 from minislam.parameters import parameter
@@ -32,7 +33,7 @@ class DensityConfig:
     )
     max_gaussians: int = parameter(
         0,
-        "no cloning or splitting beyond this size of the map, 0 switches both off; paper: no limit."
+        "no cloning or splitting beyond this size of the map, 0 switches both off; official: any."
         " Over a dense insertion they gain nothing in novel views (tests/benchmarks/RESULTS.md)",
     )
 
@@ -54,10 +55,13 @@ class PoseRefinementConfig:
 class MappingConfig:
     """Iterations, window, losses and step lengths.
 
-    The world has no fixed unit, so lengths are given in median depths of the first keyframes.
+    The world has no fixed unit, so lengths are given in median depths of the images that a map is
+    begun with: online the first keyframes, at the end all.
     """
 
-    image_scale: float = parameter(0.5, "size of the images used online, of the full one", 0.01, 1)
+    image_scale: float = parameter(
+        0.5, "size of the images, of the full one, until the last part of the refinement", 0.01, 1
+    )
     views_per_step: int = parameter(
         2,
         "keyframes rendered per step, side by side if there are --workers; an iteration is one"
@@ -65,13 +69,18 @@ class MappingConfig:
         1,
     )
     init_iterations: int = parameter(
-        150, "on the first keyframes, at least 4 each, online no more than others; official 1050"
+        150,
+        "on the images that a map is begun with, at least 4 each if beta is learnt, online at most"
+        " keyframe_iterations each; official 1050",
     )
     keyframe_iterations: int = parameter(12, "iterations per keyframe, online; official 450")
     keyframe_stride: int = parameter(
         1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode", 1
     )
     refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
+    refine_images: int = parameter(
+        80, "images of the map for which these are enough; more get more in proportion, 0: never"
+    )
     refine_full_fraction: float = parameter(
         0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1
     )
@@ -91,7 +100,7 @@ class MappingConfig:
     lambda_isotropic: float = parameter(10.0, "lambda_7: weight of L_iso [1 per m], official")
     mean_background: bool = parameter(
         True,
-        "what no keyframe sees is rendered in the mean colour of the first ones; off: black,"
+        "what no image shows has the mean colour of those that the map is begun with; off: black,"
         " official",
     )
 
@@ -114,6 +123,11 @@ class MappingConfig:
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     pose_refinement: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
+
+    def refinement(self, images: float) -> int:
+        """Return the iterations at the end, for a map of so many images."""
+        share = images / self.refine_images if self.refine_images else 0.0
+        return math.ceil(self.refine_iterations * max(1.0, share))
 
     def rates_at(
         self,

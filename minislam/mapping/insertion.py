@@ -63,7 +63,7 @@ def draw_pixels(
 ) -> Tensor:  # (M, 2) int64, column and row
     """Draw one random known pixel in each cell x cell square of the image that has any.
 
-    The paper's random subset of the image leaves clumps, holes and less where depth is sparse.
+    The official random subset of the image leaves clumps, holes and less where depth is sparse.
     """
     height, width = known.shape
     priority = torch.rand(height, width, generator=generator).to(known.device)

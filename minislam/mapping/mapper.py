@@ -40,7 +40,7 @@ class Mapper(JointOptimisation):
         progress: Progress | None = None,
         online: bool = False,  # more keyframes will come
     ) -> None:
-        """Build the map of the first keyframes and train the MLP on it (two-stage start)."""
+        """Begin a map with keyframes, online the first, at the end all; train the MLP on it."""
         assert keyframes, "a map starts from at least one keyframe"
         self.median_depth = median_depth(keyframes)
         self.keyframes = list(keyframes)
@@ -59,7 +59,10 @@ class Mapper(JointOptimisation):
         self._replace_dynamic_gaussians()
 
     def integrate(self, keyframe: Keyframe) -> None:
-        """Add one keyframe: window, insertion, then optimisation of map and MLP."""
+        """Add one keyframe: window, removal on dynamic objects, insertion, then optimisation.
+
+        With a `keyframe_stride` of n, map and MLP are optimised at every n-th keyframe only.
+        """
         assert self.keyframes, "call initialise first"
         self.keyframes.append(keyframe)
         new = len(self.keyframes) - 1
@@ -159,7 +162,7 @@ class Mapper(JointOptimisation):
         self._reset_gradients()
 
     def _exclude_upper_mode(self) -> None:
-        """Exclude all that the betas tell to move, where confirmation holds what stands still."""
+        """Exclude the upper mode of all betas, if there is one; only confirmed images are asked."""
         betas = [self.beta_of(k).flatten() for k in self.keyframes if k.confirmation is not None]
         least = least_weight(torch.cat(betas)) if betas else self.least_weight
         if least > self.least_weight and self.uncertainty.enabled:
@@ -184,7 +187,7 @@ class Mapper(JointOptimisation):
             self._reset_gradients()
 
     def _replace_dynamic_gaussians(self) -> None:
-        """Remove Gaussians on dynamic objects; let every keyframe fill the holes that it sees."""
+        """Remove Gaussians on dynamic objects; let keyframes fill the holes that they see."""
         self._remove_dynamic_gaussians(range(len(self.keyframes)))
         for position in range(len(self.keyframes)):
             self._insert(position)

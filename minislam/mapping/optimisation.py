@@ -32,12 +32,12 @@ class JointOptimisation(Stateful):
     camera: Camera  # of the keyframe images; the tracker may refine its focal length
     keyframes: list[Keyframe]
     window: list[int]  # positions in `keyframes`, newest first
-    median_depth: float = 1.0  # world units; set by the first keyframes, then fixed
+    median_depth: float = 1.0  # world units, of the images that the map is begun with
     cell: int  # px, side of the square that gets one Gaussian
     least_weight: float = MAPPING_CUT  # a pixel with less is excluded
     background: Tensor  # RGB of what no keyframe sees
     history: MappingHistory
-    shown: list[float]  # by keyframe, fraction of the static pixels that the refined map shows [-]
+    shown: list[float]  # by image of the map, the fraction of its static pixels that is shown [-]
     _trainer: UncertaintyTrainer
     _generator: torch.Generator
     _optimizer: MapOptimizer
@@ -83,7 +83,7 @@ class JointOptimisation(Stateful):
 
     @property
     def exposures(self) -> dict[int, Tensor]:
-        """Return the exposures (3,) of keyframes, by frame index; without differences, none."""
+        """Return the exposures (3,) of the images, by frame index; without differences, none."""
         return {k.frame_index: k.exposure for k in self.keyframes if k.exposure is not None}
 
     @property

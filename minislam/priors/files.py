@@ -71,7 +71,7 @@ class FileFeatures:
         path = self._files.of(frame)
         if path is None:
             raise InputError(
-                f"expected features of every keyframe in {self._files.folder}, found none for "
+                f"expected features of every frame in {self._files.folder}, found none for "
                 f"frame {frame.frame_index}; make them from this sequence with minislam priors"
             )
         features = read_array(path, FEATURES).astype(np.float32)

@@ -27,7 +27,7 @@ from minislam.splatting import Rendering
 from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
 
-# Of the static pixels, in the mean of the keyframes [-]: 78 good runs show .94 to 1, a trajectory
+# Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
 # that hangs together badly .65, a camera on a tripod .03 to .17.
 LEAST_SHOWN = 0.75
 # px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
@@ -113,7 +113,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
 
 
 def mapped_views(slam: Slam) -> Iterator[MappedView]:
-    """Yield what the map shows of every keyframe, and how well it fits what stands still there."""
+    """Yield what the map shows of each of its images, and how well it fits what stands still."""
     mapper = slam.mapper
     for index, keyframe in enumerate(mapper.keyframes):
         rendering = mapper.render(keyframe.T_camera_world)
@@ -129,7 +129,7 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
 
 
 def unseen_psnr(slam: Slam) -> float | None:
-    """Return the PSNR [dB] where other frames stand still that the map was not fitted to."""
+    """Return the PSNR [dB] of up to 20 frames beside the map's, where beta finds them static."""
     mapper, seen = slam.mapper, {keyframe.frame_index for keyframe in slam.mapper.keyframes}
     others = [index for index in slam.poses if index not in seen]
     some = others[:: math.ceil(len(others) / MOST_UNSEEN) or 1]

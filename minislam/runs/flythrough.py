@@ -23,7 +23,7 @@ _SHOWN_BETAS = 8  # frames from whose beta one range of colours is chosen
 
 
 def frame_rate(run: Run) -> float:
-    """Return how many frames per second the run's source has, between 5 and 30."""
+    """Return how many of the run's frames there are per second, between 5 and 30."""
     steps = np.diff([frame.timestamp for frame in run.frames])
     return float(np.clip(1 / np.median(steps), *_RATES)) if len(steps) else _RATES[0]
 

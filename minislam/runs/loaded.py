@@ -46,7 +46,7 @@ class SourceFrame:
     timestamp: float  # second
     source: str  # name of its image file, or of its video with the number in it
     keyframe: bool
-    exposure: list[float] | None = None  # of a keyframe, how many times as bright as the map
+    exposure: list[float] | None = None  # of an image of the map, how many times as bright
 
 
 def scene_of(slam: Slam) -> dict[str, Any]:

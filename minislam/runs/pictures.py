@@ -142,7 +142,7 @@ def _spread(count: int, most: int) -> list[int]:
 
 
 def _pictures(slam: Slam, index: int) -> dict[str, np.ndarray]:
-    """Return what a keyframe shows, and depth and beta as numbers."""
+    """Return what an image of the map shows, and depth and beta as numbers."""
     keyframe = slam.mapper.keyframes[index]
     rendering = slam.mapper.render(keyframe.T_camera_world)
     return {

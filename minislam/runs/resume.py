@@ -80,7 +80,7 @@ class Checkpoints:
         self.seconds += self._cost
 
     def restore(self, slam: Slam) -> None:
-        """Restore the state in the folder, if it belongs to the same run.
+        """Restore the state in the folder; refuse that of another run or of other images.
 
         What a GPU began may go on without one, no longer to the same bytes.
         """

@@ -22,7 +22,7 @@ WIDTH = 160  # px of the images that are swept for the map
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
-BETWEEN = 2  # frames between two keyframes that are swept as well
+BETWEEN = 2  # most frames between two keyframes that are swept as well
 AT_ONCE = 8  # frames whose sweeps are given to the workers together
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
@@ -37,10 +37,10 @@ def with_swept_depth(
     keyframes: list[Keyframe],
     swept: Iterable[tuple[Tensor, Tensor]],  # of each, depth (H, W) and confirmation (H, W)
 ) -> list[Keyframe]:
-    """Return the keyframes with swept depth, where nothing was swept with their own, and confirmed.
+    """Return the keyframes with swept depth and confirmation.
 
-    The depth of each keyframe is scaled to what was swept there, because a network errs image by
-    image. Where other keyframes look through it, it is of something that moves, and left out.
+    Where nothing was swept their own depth fills in, scaled to what was swept in the same image,
+    because a network errs image by image. What other views look through moves, and stays empty.
     """
     small, views, result = _small(camera, WIDTH), [], []
     for keyframe, (depth, confirmation) in zip(keyframes, swept, strict=True):
@@ -114,7 +114,7 @@ def dense_depths(
 
 
 def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
-    """Return the keyframes and some followed frames between each pair, at least so many."""
+    """Return keyframes and a third of the frames between two: at least so many, at most two."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
         there = [frame for frame in followed if first < frame < last]

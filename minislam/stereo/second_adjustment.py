@@ -36,7 +36,10 @@ def adjust_again(
     on_progress: Callable[[str], Progress | None] = lambda stage: None,
     workers: Workers | None = None,  # sweep side by side
 ) -> None:
-    """Sweep the keyframes, adjust them on what is confirmed, and judge them; lose no frame yet."""
+    """Adjust the keyframes on what sweeps confirm, and judge them; no frame is lost yet.
+
+    Frames between keyframes are posed and swept as well, to vote.
+    """
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
     followed = [frame.frame_index for frame in tracked if frame.status.is_followed]

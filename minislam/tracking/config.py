@@ -14,7 +14,7 @@ class LearnedFlowConfig:
     """
 
     keyframe_flow: float = parameter(10.0, "as tracking.keyframe_flow [px]")
-    keyframe_flow_without_prior: float = parameter(18.0, "without prior, in the start [px]")
+    keyframe_flow_without_prior: float = parameter(18.0, "without prior, or in the start [px]")
     warmup_rounds: int = parameter(4, "turns before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "turns once beta is known")
     warmup_iterations: int = parameter(2, "Gauss-Newton steps per turn of the warm-up", 1)
@@ -43,7 +43,7 @@ class TrackingConfig:
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up", 1)
     window: int = parameter(10, "newest keyframes that the local BA moves", 1)
-    active_edges: int = parameter(0, "edges measured again with a new keyframe's, at most in all")
+    active_edges: int = parameter(0, "edges measured per keyframe, old ones included; 0: its own")
     min_link_ratio: float = parameter(0.1, "least matched ratio of a far link [-]", most=1)
     rounds: int = parameter(2, "rounds of flow and BA per keyframe", 1)
     iterations: int = parameter(3, "Gauss-Newton steps per round", 1)
@@ -68,7 +68,7 @@ class TrackingConfig:
     mask_min_corresponding: int = parameter(2, "views that must see a cell, paper supplement")
     mask_min_consistent: int = parameter(2, "of which this many must agree, official code")
     min_parallax: float = parameter(2.0, "with less on all links, disparities are kept [px]")
-    global_interval: int = parameter(20, "keyframes between global BAs; 0: none, paper supplement")
+    global_interval: int = parameter(20, "fewest keyframes between global BAs; 0: none, paper 3.3")
     loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
     loop_min_gap: int = parameter(20, "keyframes between the ends of a loop, official code", 1)
     loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")

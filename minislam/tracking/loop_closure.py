@@ -37,7 +37,7 @@ def loop_pairs(
 
 
 def close_loops(graph: KeyframeGraph) -> bool:
-    """Link the loops that end at the newest keyframe; adjust all unless they fit, and tell it."""
+    """Link loops that end at the newest keyframe; return whether all keyframes were adjusted."""
     config, newest = graph.config, len(graph.keyframes) - 1
     if newest < config.loop_min_gap:
         return False

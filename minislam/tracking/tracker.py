@@ -118,7 +118,7 @@ class Tracker(Stateful):
         return len(self.keyframes) > count
 
     def end(self) -> None:
-        """Make the last frame a keyframe, so that the frames before it lie between two."""
+        """Make the last frame a keyframe, unless it follows one closely: poses lie between two."""
         if self.last_non_keyframe is not None:
             last = self.last_non_keyframe[0].frame_index
             if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:

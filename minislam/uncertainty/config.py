@@ -55,7 +55,7 @@ class UncertaintyConfig:
         350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes"
     )
     neighbour_keyframes: int = parameter(
-        2, "keyframes before and after that L_reg_V looks at [keyframes], official"
+        2, "images of the map before and after that L_reg_V looks at, official"
     )
 
     @property

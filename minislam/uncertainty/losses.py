@@ -91,7 +91,8 @@ def variance_regulariser(
 ) -> Tensor:  # ()
     """Return L_reg_V, the mean variance of beta among cells of similar features.
 
-    Each cell is compared with its most similar cells of cosine > 0.75, itself included.
+    Each cell is compared with at most `neighbours` cells whose cosine exceeds `similarity`, with
+    itself among them.
     """
     unit = functional.normalize(features.detach(), dim=-1)
     cosine = unit @ unit.T

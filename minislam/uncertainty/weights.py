@@ -22,7 +22,7 @@ TRAIN_FRACTION = 0.3  # x: position in NeRF On-the-go's schedule, fixed in the o
 SCHLICK_SLOPE = 0.8  # s: slope of that schedule at its end, official
 WEIGHT_SCALE = 0.5  # numerator of the weight, official
 TRACKING_CAP = 1.0  # beta may lower the weight that the flow confidence gives, not raise it
-BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: the largest that L_uncer gives
+BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: what the capped SSIM alone gives
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
 BETA_CUT = 1.41  # the beta_raw of that weight

@@ -1,4 +1,4 @@
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 
@@ -22,6 +22,13 @@ def test_the_common_factor_reaches_every_parameter():
     whole, half = config.rates_at(7, 1.0, 1.0), config.rates_at(7, 1.0, 0.5)
     for rate in fields(whole):
         assert getattr(half, rate.name) == pytest.approx(0.5 * getattr(whole, rate.name))
+
+
+def test_each_image_of_a_long_sequence_has_its_share_of_the_refinement():
+    config = MappingConfig(refine_iterations=400, refine_images=80)
+    assert [config.refinement(images) for images in (8, 80, 81, 240)] == [400, 400, 405, 1200]
+    assert replace(config, refine_images=0).refinement(240) == 400
+    assert replace(config, refine_iterations=0).refinement(240) == 0
 
 
 def test_every_constant_says_what_it_means():

@@ -47,11 +47,11 @@ def minima(
     states: list[BundleState],
     workers: Workers | None = None,  # adjust side by side
 ) -> list[Found]:
-    """Adjust every hypothesis on the same measurements and return where they end, each place once.
+    """Adjust every hypothesis on the same measurements; return where they end, of equals the first.
 
     A wide robust weight lets a bad guess leave its wrong minimum, but under the widest one a large
-    dynamic object may outvote the room. So every hypothesis starts from the two widest. Costs are
-    compared under a narrow one, which a compromise between room and dynamic object does not fit.
+    dynamic object may outvote the room. So each is adjusted from the widest and from the second.
+    Costs are compared under a narrow one, which a compromise of room and mover does not fit.
     """
     starts = [WIDENINGS, WIDENINGS[1:]] if problem.robust else [[1.0]]
     calls = [(problem, *pair, ITERATIONS) for pair in itertools.product(states, starts)]
@@ -104,9 +104,9 @@ def lowest_minimum(
 ) -> Found:
     """Return the geometry of the warm-up that is most plausible, adjusted with its camera.
 
-    The focal length stays as guessed if the motion does not tell it, and the readout at zero if it
-    saves too little: a global shutter would follow noise and dynamic objects. Of few keyframes both
-    stay.
+    The focal length stays as guessed if the motion does not tell it and it saves little, the
+    readout at zero if it saves too little: a global shutter would follow noise and dynamic objects.
+    Of few keyframes both stay.
     """
     tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
     seeks_focal = graph.seeks_focal and tells_camera
