@@ -227,6 +227,10 @@ def check_prior_mask(student: Function) -> Verdict:
         (lambda *a: 1 - reference(*a), "M is 1 where the prior counts, 0 where views contradict."),
         (lambda d, o, *a: reference(d, [(x, se3_inverse(T)) for x, T in o], *a), back),
         (lambda *a: reference(*a, agree=1), "Two views must agree, not one."),
+        (
+            lambda d, *a: reference(d, *a) * (d > 0)[::stride, ::stride],
+            "Without a depth, M stays 1.",
+        ),
         # Where all depths are near 3 m, an absolute error is a third of it, relatively.
         (lambda *a: reference(*a[:2], a[-1] / 3), relative),
         # An error relative to the own depth, where that is the larger of the two.

@@ -225,14 +225,15 @@ def check_followed_pose(student: Function) -> Verdict:
     depth, places, colors = (random(source, count, n) for n in (1, 2, 3))
     z, pixels = 1 + 3 * depth, places * doubles(40, 32) - 4
     means = camera.backproject(pixels, z[:, 0])
-    rows = torch.tensor([1.0, 0, 0, 0]).expand(count, 4), (0.13 * z).log().expand(-1, 3).float()
-    looks = torch.full((count,), 2.0), colors.round().float()
+    quats = doubles(1, 0, 0, 0).float().expand(count, 4)
+    rows = quats, (0.13 * z).log().expand(-1, 3).float()
+    looks = torch.full((count,), 2.0).float(), colors.round().float()
 
     def case(
         turn: float, start: Tensor, mover: bool, description: str, last: float = 99.0
     ) -> tuple[Case, Tensor]:
         """Return a case, whose map shows what lies left of `last` [px], and the true pose."""
-        true, weight = se3_exp(doubles(0.1, 0, 0.1, 0, turn, 0)), torch.ones(24, 32)
+        true, weight = se3_exp(doubles(0.1, 0, 0.1, 0, turn, 0)), torch.ones(24, 32).float()
         world = transform_points(se3_inverse(true), means).float()
         gaussians = GaussianMap(world, *rows, *looks, torch.zeros(count, dtype=torch.int64))
         image = render(gaussians, camera, true.float()).color
@@ -247,6 +248,7 @@ def check_followed_pose(student: Function) -> Verdict:
         case(0.8, doubles(0.12, 0, 0, 0, 0, 0.09), False, "a camera that has turned"),
         case(0.2, doubles(-0.03, 0.03, 0, 0, 0, 0), True, "an object that moves in the image"),
         case(0.2, doubles(0.04, -0.03, 0.03, 0, 0, 0), False, "a map of half of the image", 14.0),
+        case(2.5, doubles(0.12, -0.09, 0.09, 0, 0, 0), False, "a camera that looks back"),
     ]
 
     def true_pose(*a: Any) -> Tensor:
@@ -254,17 +256,21 @@ def check_followed_pose(student: Function) -> Verdict:
 
     def pixels_of(follow: Function, *a: Any) -> Any:
         pose = follow(*a)
-        if pose is None or torch.as_tensor(pose).shape != (4, 4):
-            return pose
+        if pose is None:
+            return None
+        if torch.as_tensor(pose).shape != (4, 4):
+            raise ValueError(
+                f"a pose (4, 4) is asked for, found {tuple(torch.as_tensor(pose).shape)}"
+            )
         points = transform_points(torch.as_tensor(pose).double(), a[0].means.double())
-        return camera.project(points)
+        return (camera.project(points),)
 
     def motion(*a: Any) -> Tensor:
         return true_pose(*a) @ se3_inverse(a[2])
 
     def refined(*a: Any, steps: int) -> Tensor:
         gaussians, camera, start, image, weight, *_ = a
-        view, black = (start, image, weight), torch.zeros(3)
+        view, black = (start, image, weight), torch.zeros(3).to(image)
         settings = PoseRefinementConfig(iterations=steps, tolerance=0.0)
         return pose_refinement.refine_pose(gaussians, camera, *view, black, settings)
 
@@ -285,4 +291,5 @@ def check_followed_pose(student: Function) -> Verdict:
     mistakes = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
     cases = [case for case, _ in pairs]
     answered, right = partial(pixels_of, student), partial(pixels_of, true_pose)
-    return check_function(answered, right, cases, 0.02, mistakes)
+    returns = ("the Gaussians' pixels",)
+    return check_function(answered, right, cases, 0.02, mistakes, returns)

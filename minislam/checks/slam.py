@@ -143,7 +143,7 @@ def check_sign_test(student: Function) -> Verdict:
 
     of_clips = {
         "three clips that all get better": [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]],
-        "four clips, one gets worse": [[0.4, 0.9, 0.3, 0.8], [0.5, 0.6, 0.7, 2.8]],
+        "four clips, two get worse": [[0.6, 0.9, 0.3, 0.8], [0.5, 0.6, 0.7, 2.8]],
         "a single clip": [[2.0], [1.0]],
         "no difference at all": [[1.0, 2.0, 1.5], [1.0, 2.0, 1.5]],
     }
@@ -152,6 +152,7 @@ def check_sign_test(student: Function) -> Verdict:
         (lambda a, b: reference(a, b, sided=1), "A difference the other way is as surprising."),
         (lambda a, b: reference(a, b, -1e-12), "At least as far: the measured one counts as well."),
         (lambda a, b: 1 - reference(a, b), "This is the fraction of the others."),
+        (lambda a, b: reference(np.sign(a - b), 0 * b), "This counts signs: compare the means."),
         (lambda a, b: reference(a, b) * 2 ** len(a), "Divide by the number of choices, 2^N."),
     ]
     return check_function(student, reference, cases, 1e-9, mistakes)

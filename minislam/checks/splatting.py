@@ -2,11 +2,12 @@
 
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
-from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normals
+from minislam.checks.cases import CAMERA, Case, doubles, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.splatting import projection
@@ -99,13 +100,14 @@ def check_rendered_image(student: Function) -> Verdict:
         points = transform_points(pose, means)
         nearest = {"behind": -torch.inf, "near": 0.0}.get(flaw, NEAR_DEPTH)
         kept = (points[:, 2] > nearest).nonzero()[:, 0]
-        far = points.norm(dim=-1) if flaw == "distance" else points[:, 2]
+        far = {"distance": points.norm(dim=-1), "world": means[:, 2]}.get(flaw, points[:, 2])
         if flaw != "unsorted":
             kept = kept[far[kept].argsort(descending=flaw == "far first")]
         wide = project_covariances(covariances[kept], points[kept], pose, camera)
         wide = wide - (flaw == "sharp") * LOW_PASS_VARIANCE * torch.eye(2, dtype=wide.dtype)
         wide = wide / 2 if flaw == "whole" else wide
         alphas = gaussian_alphas(camera.project(points[kept]), wide, opacities[kept], camera)
+        alphas = alphas.clamp(max=0.99) if flaw == "alpha" else alphas
         if flaw == "added":
             return torch.einsum("nhw,nc->hwc", alphas, colors[kept])
         return composite(alphas, colors[kept], torch.zeros_like(colors[0]))[0]
@@ -114,20 +116,32 @@ def check_rendered_image(student: Function) -> Verdict:
         return Case((*(x[:count] for x in values), pose, camera), description)
 
     camera = Camera(18.0, 22.0, 9.3, 6.8, 21, 13)
+
+    def draw(seed: int) -> Case:
+        pose = se3_exp(0.1 * normals(seed, 6).clamp(-1, 1))  # not so far that J would be limited
+        return case(5, pose, f"five Gaussians and pose {seed}")
+
     turned = se3_exp(doubles(0.1, -0.1, 0.2, 0.1, -0.2, 0.3))
+    back = torch.diag(doubles(-1, 1, -1, 1))
+    back[2, 3] = 6
     cases = [
         case(1, torch.eye(4).double(), "one Gaussian"),
         case(3, turned, "three Gaussians in any order"),
         case(5, turned, "five Gaussians, one behind the camera"),
         case(7, torch.eye(4).double(), "seven Gaussians, one nearer than 0.05 m"),
-        *drawn(lambda seed: case(5, any_pose(seed), f"five Gaussians and pose {seed}")),
+        case(5, back, "a camera that looks back"),
+        *drawn(draw),
     ]
+    uncapped = patch("minislam.splatting.reference.MAX_OPACITY", 1.0)(rendered)
     mistakes = [
         ("unsorted", "Sort by the depth in the camera frame: the list has no order."),
         ("far first", "This is sorted the wrong way: the nearest Gaussian comes first."),
         ("behind", "A Gaussian behind the camera (z < 0.05) is not seen: leave it out."),
         ("near", "What is nearer than 0.05 m is not seen: leave it out."),
         ("distance", "Sort by the depth z, not by the distance."),
+        ("world", "Sort by the depth in the camera frame, not by z in the world."),
+        (uncapped, "No opacity is more than 0.99."),
+        (partial(uncapped, flaw="alpha"), "The opacity is capped at 0.99, not alpha."),
         ("sharp", "The low-pass filter is missing: add 0.3 I to Sigma'."),
         ("whole", "The exponent is -1/2 of the squared distance."),
         ("added", "Light is used up on its way: multiply T by 1 - alpha after each Gaussian."),

@@ -173,6 +173,7 @@ def check_keyframes(student: Function) -> Verdict:
         Case((shown(slide[:6], blinking=True), 6.9, 20), "a screen that blinks"),
         Case(([*closer, leap[-1]], 500.0, 20), "a camera that comes closer, then leaps"),
         Case((closer[:3], 9.2, 20), "cells that leave the image"),
+        Case((shown([0.0, 12.0, 24.0, *[36.0] * 4]), 30.0, 20), "a camera that stops"),
         *drawn(draw),
     ]
     one_way = patch.object(grid_flow, "sample", lambda flow, _: flow[::8, ::8])(choice)

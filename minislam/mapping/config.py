@@ -79,7 +79,7 @@ class MappingConfig:
     )
     refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
     refine_images: int = parameter(
-        80, "images of the map for which these are enough; more get more in proportion, 0: never"
+        100, "images of the map for which these are enough; more get more in proportion, 0: never"
     )
     refine_full_fraction: float = parameter(
         0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1

@@ -136,6 +136,7 @@ def test_prior_mask():
         "always": lambda *a: voted(*a) | True,
         "unknown depth as well": lambda *a: voted(*a, known=False),
         "behind the camera": lambda *a: voted(*a, before=False),
+        "no prior without a depth": lambda d, o, c, n, e: voted(d, o, c, n, e) & (d[::n, ::n] > 0),
         "relative to the own depth": lambda *a: voted(*a, by_own=True),
     }
     assert_variants(check_prior_mask, right, wrong, named=0.7)

@@ -139,6 +139,7 @@ def test_simple_relations_are_named():
     assert "reversed" in relation(RIGHT.flip(0), RIGHT, 1e-9)
     assert "sign" in relation(-RIGHT, RIGHT, 1e-9)
     assert "2 times" in relation(2 * RIGHT, RIGHT, 1e-9)
+    assert relation(torch.tensor([2.0, 0]), torch.tensor([1.0, 0]), 1e-9) == ""  # one number
     assert "NaN" in relation(RIGHT * torch.nan, RIGHT, 1e-9)
     assert relation(RIGHT + 1, RIGHT, 1e-9) == relation("3", RIGHT, 1e-9) == ""
     assert relation(RIGHT[0], RIGHT, 1e-9) == relation(0 * RIGHT, RIGHT, 1e-9) == ""

@@ -125,7 +125,7 @@ def followed(gaussians, camera, T, image, weight, steps, rate=0.025, shrink=0.96
     return results[how.get("result", "left")]
 
 
-def newton(gaussians, camera, T, image, weight, steps, transparent=True):
+def newton(gaussians, camera, T, image, weight, steps, transparent=True, left=True):
     """Divide the gradient by the curvature."""
     for _ in range(steps):
         twist = torch.zeros(6, requires_grad=True)
@@ -135,7 +135,7 @@ def newton(gaussians, camera, T, image, weight, steps, transparent=True):
         (weight * seen * error).mean().backward()
         H = curvature(view, image, weight, camera)
         step = torch.linalg.solve(H + 0.1 * H.diagonal().diag(), twist.grad.double())
-        T = se3_exp(-step) @ T
+        T = se3_exp(-step) @ T if left else T @ se3_exp(-step)
     return T
 
 
@@ -148,5 +148,7 @@ def test_followed_pose():
     wrong["uphill"] = lambda *a: followed(*a, sign=-1, rate=0.006)
     wrong["equal weights"] = lambda *a: followed(*a, equal=True)
     wrong["one step"] = lambda *a: newton(*a[:-1], 1)
+    wrong["each step on the right"] = lambda *a: newton(*a, left=False)
+    wrong["a twist"] = lambda *a: torch.zeros(6)
     wrong["holes of the map count"] = lambda *a: newton(*a, transparent=False)
-    assert_variants(check_followed_pose, right, wrong)
+    assert_variants(check_followed_pose, right, wrong, 0.6)

@@ -138,6 +138,7 @@ def test_sign_test():
         "the others": lambda a, b: 1 - chance(a, b),
         "a count": lambda a, b: chance(a, b) * 2 ** len(a),
         "mean difference": lambda a, b: float(np.mean(a - b)),
+        "the classical sign test": lambda a, b: chance(np.sign(a - b), 0 * a),
         "which are better": lambda a, b: float(np.mean(a < b)),
     }
     assert_variants(check_sign_test, {"vectors": chance, "loop": chance_in_a_loop}, wrong, 0.6)

@@ -3,10 +3,12 @@
 from functools import partial
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
 from minislam.checks import (
+    PASSED,
     check_conic_vjp,
     check_pixel_color,
     check_projected_covariance,
@@ -78,7 +80,8 @@ def test_known_mistakes_of_gradients_are_named():
 
 def rendered(means, covariances, opacities, colors, pose, camera, flaw: str = "") -> Tensor:
     points = means @ pose[:3, :3].T + pose[:3, 3]
-    order = (points.norm(dim=1) if flaw == "distance" else points[:, 2]).argsort()
+    far = {"distance": points.norm(dim=1), "world": means[:, 2]}.get(flaw, points[:, 2])
+    order = far.argsort()
     order = order.sort().values if flaw == "unsorted" else order
     image = torch.zeros(camera.height, camera.width, 3, dtype=means.dtype)
     light = torch.ones(camera.height, camera.width, 1, dtype=means.dtype)
@@ -90,8 +93,9 @@ def rendered(means, covariances, opacities, colors, pose, camera, flaw: str = ""
         offsets = camera.pixel_grid(dtype=wide.dtype) - camera.project(points[n])
         offsets = offsets.flip(-1) if flaw == "exchanged" else offsets
         distances = ((offsets @ wide.inverse()) * offsets).sum(-1, keepdim=True)
-        alpha = opacities[n].clamp_max(1.0 if flaw == "opaque" else 0.99)
+        alpha = opacities[n].clamp_max(1.0 if flaw in ("opaque", "of alpha") else 0.99)
         alpha = alpha * torch.exp(-distances * (1.0 if flaw == "whole" else 0.5))
+        alpha = alpha.clamp_max(0.99) if flaw == "of alpha" else alpha
         alpha = torch.where(alpha > 1 / 255, alpha, 0)
         image = image + light * alpha * colors[n]
         light = light if flaw == "added" else light * (1 - alpha)
@@ -127,5 +131,13 @@ def test_a_rendered_image_is_told_from_a_wrong_one():
         "u and v": partial(rendered, flaw="exchanged"),
         "nearer than 0.05 m": partial(rendered, flaw="near"),
         "by distance": partial(rendered, flaw="distance"),
+        "by z in the world": partial(rendered, flaw="world"),
+        "alpha is capped": partial(rendered, flaw="of alpha"),
     }
     assert_variants(check_rendered_image, {"one": rendered, "other": rendered_by_pixels}, wrong)
+
+
+@pytest.mark.parametrize("seed", [106, 125, 132])
+def test_no_drawn_pose_is_so_far_that_the_package_limits_the_jacobian(seed: int, monkeypatch):
+    monkeypatch.setenv("MINISLAM_SEED", str(seed))
+    assert check_rendered_image(rendered).status == PASSED

@@ -15,7 +15,7 @@ from tests.helpers import assert_variants
 def kept(
     images, max_flow, interval,
     weighted=True, restart=True, matched=0.2, forced=True, stride=8, by_remap=False,
-    warped=True, half=0.5, masked=True,
+    warped=True, half=0.5, masked=True, zero=True,
 ):  # fmt: skip
     height, width = images[0].shape
     u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -39,7 +39,7 @@ def kept(
         if mean > max_flow or sure.mean() < matched or (forced and n - chosen[-1] >= interval):
             chosen.append(n)
             if restart:
-                start, flow = image, np.zeros_like(flow)
+                start, flow = image, np.zeros_like(flow) if zero else flow
     return chosen
 
 
@@ -53,6 +53,7 @@ def test_keyframes():
     wrong = {
         "not weighted": lambda *a: kept(*a, weighted=False),
         "never starts anew": lambda *a: kept(*a, restart=False),
+        "the old flow from a new frame": lambda *a: kept(*a, zero=False),
         "matched or not": lambda *a: kept(*a, matched=-1),
         "never forced": lambda *a: kept(*a, forced=False),
         "without the first": lambda *a: kept(*a)[1:],
