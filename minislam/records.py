@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from minislam.errors import InputError
 from minislam.geometry import Camera
 
 Progress = Callable[[int, int], None]  # called with the steps done and their number
@@ -150,6 +151,17 @@ class Sequence(Protocol):
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) [m], 0 where unknown; None without a sensor."""
+
+
+def required_mask(sequence: Sequence, frame_index: int) -> np.ndarray:  # (H, W) bool
+    """Return the mask of dynamic objects that a frame must have, where masks are used."""
+    mask = sequence.given_mask(frame_index)
+    if mask is None:
+        raise InputError(
+            f"expected a mask of movers for every frame of {sequence.name}, found none for "
+            f"{frame_index}; give --masks files:FOLDER, or set uncertainty.given_masks to off"
+        )
+    return mask
 
 
 @dataclass

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 
 from minislam.config import SlamConfig
-from minislam.errors import InputError, MinislamError, TrackingLost
+from minislam.errors import MinislamError, TrackingLost
 from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
 from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.records import Frame, Keyframe, Sequence, Trajectory
+from minislam.records import Frame, Keyframe, Sequence, Trajectory, required_mask
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import swept_frames, with_swept_depth
@@ -232,15 +232,9 @@ class Slam(Stateful):
 
     def _given_mask(self, frame_index: int) -> Tensor | None:
         """Return the mask of dynamic objects (H, W), if given masks are used."""
-        if not self.config.uncertainty.given_masks:
+        if not self.config.uncertainty.takes_masks:
             return None
-        mask = self.sequence.given_mask(frame_index)
-        if mask is None:
-            raise InputError(
-                f"expected a mask of movers for every frame of {self.sequence.name}, found none for"
-                f" {frame_index}; give --masks files:FOLDER, or set uncertainty.given_masks to off"
-            )
-        return torch.from_numpy(mask).to(self.device)
+        return torch.from_numpy(required_mask(self.sequence, frame_index)).to(self.device)
 
     def keyframes(self, first: int = 0, others: Iterable[int] = ()) -> list[Keyframe]:
         """Return keyframes of the tracker from `first` on, and others, which insert nothing."""

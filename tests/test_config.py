@@ -188,7 +188,8 @@ def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):
         ("tracking.window", 10**22), ("tracking.learned.window", 0),
         ("mapping.init_iterations", -1), ("mapping.color_weight", 1.1), ("flow.stride", 0),
         ("networks.metric3d.size", "28,0"),
-        ("uncertainty.dropout", 1), ("uncertainty.grid_factor", 0),
+        ("uncertainty.dropout", 1), ("uncertainty.grid_factor", 0), ("uncertainty.neighbours", 0),
+        ("mapping.insertion.footprint", 0.0), ("tracking.warmup_keyframes", 1),
     ],
 )  # fmt: skip
 def test_a_value_that_means_nothing_is_refused_with_its_bounds(name: str, value: object):

@@ -16,7 +16,7 @@ class InsertionConfig:
         4, "the same in the map that is learnt online, which the final one replaces", 1
     )
     footprint: float = parameter(
-        0.45, "first scale over the side of a cell seen at its depth [1]; official 0.22"
+        0.45, "first scale over the side of a cell seen at its depth [1]; official 0.22", 0.01
     )
     opacity: float = parameter(0.9, "first opacity; official 0.5", 0.01, 0.99)
 

@@ -13,7 +13,7 @@ from minislam.splatting import GaussianMap, Rendering
 from minislam.uncertainty.losses import FAR_FACTOR
 
 EXPLAINED_OPACITY = 0.8  # a pixel of the map that is at least so opaque gets no new Gaussian
-_SMALLEST_SCALE = 1e-12  # world units; a scale must be positive, because its logarithm is stored
+_SMALLEST_SCALE = 1e-8  # world units; a scale must be positive, because its logarithm is stored
 
 
 def gaussians_of_keyframe(

@@ -142,10 +142,13 @@ class Mapper(JointOptimisation):
         self._reset_gradients()
 
     def _shown_fraction(self, keyframe: Keyframe) -> float:
-        """Return the fraction of a keyframe's static pixels where the map is opaque [-]."""
+        """Return the fraction of a keyframe's static pixels where the map is opaque [-].
+
+        Without static pixels nothing is missing, unless the map is empty.
+        """
         static = self.static_weight(self.beta_of(keyframe), self._online_camera) > 0
         shown = self.render(keyframe.T_camera_world, self._online_camera).opacity[static] > OPAQUE
-        return float(shown.float().mean()) if len(shown) else 1.0
+        return float(shown.float().mean()) if len(shown) else float(len(self.gaussians) > 0)
 
     def _remove_dynamic_gaussians(self, positions: Iterable[int]) -> None:
         """Remove Gaussians that keyframes inserted on an object before the MLP knew it moves."""

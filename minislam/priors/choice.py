@@ -42,12 +42,12 @@ def choose_flow(
 
 
 def choose_features(
-    choice: PriorChoice, camera: Camera, networks: NetworksConfig
+    choice: PriorChoice, camera: Camera, networks: NetworksConfig, frames: int = 0
 ) -> FeatureExtractor:
-    """Return the features: classical, a network, a plugin, or files:FOLDER."""
+    """Return the features: classical, a network, a plugin, or files:FOLDER of so many frames."""
     makers: dict[str, Callable[[], Any]] = {
         "classical": ClassicalFeatures,
-        FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera),
+        FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera, frames),
     }
     return _choose("features", choice, networks, makers)
 

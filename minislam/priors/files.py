@@ -45,6 +45,9 @@ class FrameFiles:
         index = self.folder / INDEX
         self._number_of = _read_index(index) if index.is_file() else None
 
+    def __len__(self) -> int:
+        return len(self._files)
+
     def of(self, frame: Frame) -> Path | None:
         """Return the file of a frame, or None if the folder has none for it."""
         if self._number_of is None:
@@ -61,8 +64,14 @@ class FrameFiles:
 class FileFeatures:
     """Features made elsewhere, from .npy files (h', w', C): a `FeatureExtractor`."""
 
-    def __init__(self, folder: Path | str, camera: Camera) -> None:
+    def __init__(self, folder: Path | str, camera: Camera, frames: int = 0) -> None:
+        """Open a folder; raises InputError where it has fewer files than there are `frames`."""
         self._files = FrameFiles(folder, "features", (".npy",))
+        if len(self._files) < frames:
+            raise InputError(
+                f"expected features of every frame in {folder}, {frames} files, found "
+                f"{len(self._files)}; make them from this sequence with minislam priors"
+            )
         rows, _, self.dimension = read_array(self._files.first, FEATURES).shape
         self.stride = max(1, round(camera.height / rows))
 

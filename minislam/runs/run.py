@@ -22,7 +22,7 @@ from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, InputError
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
-from minislam.records import Sequence
+from minislam.records import Sequence, required_mask
 from minislam.runs.alarms import alarms
 from minislam.runs.facts import has_large_holes, measure, run_facts
 from minislam.runs.flythrough import write_clip
@@ -44,7 +44,7 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
         )
     return Priors(
         choose_flow(choice, config.flow, networks),
-        choose_features(choice, sequence.camera, networks),
+        choose_features(choice, sequence.camera, networks, len(sequence)),
         choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
 
@@ -71,7 +71,10 @@ def run_in_folder(
     they were.
     """
     for index in range(len(sequence)):
-        sequence.given_mask(index)
+        if config.uncertainty.takes_masks:
+            required_mask(sequence, index)
+        else:
+            sequence.given_mask(index)
     priors = choose_priors(choice, sequence, config)
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
     threads = torch.get_num_threads()

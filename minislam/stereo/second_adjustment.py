@@ -46,8 +46,10 @@ def adjust_again(
     # To pose all frames took two to five times as long, for the same accuracy (RESULTS.md).
     wanted = {*swept_frames(keyframes, followed)}
     tracker.tracked = [frame for frame in tracked if frame.frame_index in wanted]
-    poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))
-    tracker.tracked = tracked
+    try:
+        poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))
+    finally:
+        tracker.tracked = tracked
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
     frames = sorted(poses), keyframes
     swept = sweep_frames(tracker.graph, sequence, poses, *frames, on_sweep, workers, COARSE_WIDTH)

@@ -38,7 +38,7 @@ class TrackingConfig:
     keyframe_flow: float = parameter(10.0, "mean flow since the last keyframe that makes one [px]")
     keyframe_flow_without_prior: float = parameter(18.0, "without prior, and in the start [px]")
     keyframe_interval: int = parameter(8, "most frames to the next keyframe, paper supplement", 1)
-    warmup_keyframes: int = parameter(6, "keyframes of the start; the paper takes 12", 1)
+    warmup_keyframes: int = parameter(6, "keyframes of the start; the paper takes 12", 2)
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known", 1)
     warmup_rounds_with_beta: int = parameter(2, "rounds of flow and BA once beta is known")
     warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up", 1)

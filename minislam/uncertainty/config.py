@@ -50,7 +50,7 @@ class UncertaintyConfig:
     similarity: float = parameter(
         0.75, "cosine above which features are similar [1], official", most=1
     )
-    neighbours: int = parameter(128, "most similar cells that enter L_reg_V [cells], official")
+    neighbours: int = parameter(128, "most similar cells that enter L_reg_V [cells], official", 1)
     variance_samples: int = parameter(
         350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes"
     )
@@ -62,6 +62,11 @@ class UncertaintyConfig:
     def is_learnt(self) -> bool:
         """Tell whether beta comes from the MLP."""
         return self.enabled and not self.given_masks
+
+    @property
+    def takes_masks(self) -> bool:
+        """Tell whether beta comes from masks that are given."""
+        return self.enabled and self.given_masks
 
     def __post_init__(self) -> None:
         if self.median_size < 1 or self.median_size % 2 == 0:

@@ -97,7 +97,7 @@ def variance_regulariser(
     unit = functional.normalize(features.detach(), dim=-1)
     cosine = unit @ unit.T
     # A cell is always similar to itself, even when its feature vector is zero.
-    cosine.fill_diagonal_(1)
+    cosine.fill_diagonal_(torch.inf)
     similar = cosine > config.similarity
     crowded = similar.sum(-1) > config.neighbours
     if crowded.any():

@@ -59,6 +59,14 @@ def test_the_fraction_that_is_shown_counts_holes_but_not_where_something_moves()
     assert shown[1] == pytest.approx(0.5, abs=0.1)  # a Gaussian reaches over the border
 
 
+def test_an_empty_map_shows_nothing():
+    mapper = make_mapper()
+    mask = torch.ones(24, 32, dtype=torch.bool)
+    mapper.initialise([replace(wall_keyframe(0), moving_mask=mask)])
+    mapper.refine(0)
+    assert len(mapper.gaussians) == 0 and mapper.shown == [0]
+
+
 def test_exposures_are_those_of_the_views():
     mapper = make_mapper()
     told = torch.tensor([0.5, 0.6, 0.7])

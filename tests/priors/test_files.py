@@ -131,7 +131,9 @@ def test_bad_folders_of_features_are_one_sentence(tmp_path: Path, write, words: 
 
 def test_a_missing_file_and_another_network_are_refused(tmp_path: Path):
     files = {"0.npy": grid(1), "1.npy": grid(1, channels=7)}
-    features = FileFeatures(folder_with(tmp_path, files), CAMERA)
+    with pytest.raises(InputError, match=r"of every frame in .*, 3 files, found 2"):
+        FileFeatures(folder_with(tmp_path, files), CAMERA, frames=3)
+    features = FileFeatures(tmp_path, CAMERA, frames=2)
     with pytest.raises(InputError, match="found none for frame 2"):
         features(frame_of(IMAGE, 2))
     with pytest.raises(InputError, match=r"of 6 channels in .*1\.npy, found 7"):

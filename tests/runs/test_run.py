@@ -9,6 +9,7 @@ import pytest
 from minislam import slam
 from minislam.cli.main import main
 from minislam.data.run_folder import RunFolder
+from minislam.data.sequence import RecordedSequence
 from minislam.errors import InputError
 from minislam.runs import pictures
 from minislam.state.steps import Steps
@@ -39,6 +40,18 @@ def test_config_json_alone_gives_the_same_bytes_again(root: Path, monkeypatch):
     assert "data:image/jpeg" in running[0] and "location.reload" in running[0]
     facts = RunFolder(root / "again").read_run()
     assert facts["failed_adjustments"] == 0 < facts["adjustments"]
+
+
+def test_a_mask_that_is_missing_is_said_before_anything_is_done(root: Path, monkeypatch, capsys):
+    original = RecordedSequence.given_mask
+    monkeypatch.setattr(
+        RecordedSequence, "given_mask", lambda self, k: None if k == 2 else original(self, k)
+    )
+    assert main([*COMMAND, "-o", str(root / "masks")]) == 1
+    said = capsys.readouterr().err
+    assert "a mask of movers for every frame" in said and "found none for 2" in said
+    assert not (root / "masks").exists()
+    assert main([*COMMAND, "--no-uncertainty", "-o", str(root / "masks")]) in (0, 3)
 
 
 def test_a_run_whose_every_adjustment_fails_says_so(root: Path, monkeypatch, capsys):

@@ -133,6 +133,9 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
         tracker.tracked[0] = lost
         return {0: torch.eye(4)}
 
+    def interrupted(tracker, sequence, progress):
+        raise KeyboardInterrupt
+
     def sweep(graph, sequence, poses, frames, wanted, progress, workers, width):
         done.append((sorted(poses), width, frames, wanted))
         return swept(graph)
@@ -140,6 +143,10 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
     monkeypatch.setattr(second_adjustment, "pose_all_frames", pose_all_frames)
     monkeypatch.setattr(second_adjustment, "sweep_frames", sweep)
     adjust_again(tracker, SimpleNamespace())
+    assert tracker.tracked == [followed[0], lost, *followed[2:]]
+    monkeypatch.setattr(second_adjustment, "pose_all_frames", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
     swept_first = [0], COARSE_WIDTH, [0], NUMBERS
     assert done == [swept_first, ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end

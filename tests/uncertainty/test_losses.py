@@ -71,6 +71,12 @@ def test_variance_of_two_groups_by_hand():
     )
 
 
+def test_a_cell_is_similar_to_itself_whatever_the_least_similarity():
+    features = torch.randn(5, 3, generator=generator(12))
+    strict = UncertaintyConfig(similarity=1.0)
+    assert variance_regulariser(torch.arange(5.0), features, strict) == 0
+
+
 def test_only_the_128_most_similar_cells_enter_the_variance():
     # All are similar, cosine > 0.87, but each more to some than to others.
     angle = 0.5 * torch.rand(200, generator=generator(10), dtype=torch.float64)  # radian

@@ -66,6 +66,6 @@ def weighted_median(values: Tensor, weights: Tensor) -> float | None:
     """Return the value below which half of the weight lies; None without weight."""
     order = values.flatten().argsort()
     below = weights.flatten()[order].cumsum(0)
-    if below[-1] <= 0:
+    if not below[-1] > 0:  # or NaN
         return None
     return float(values.flatten()[order][torch.searchsorted(below, below[-1] / 2)])

@@ -49,3 +49,4 @@ def test_the_weighted_median_splits_the_weight():
     values, weights = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([0.1, 1.0, 0.5])
     assert weighted_median(values, weights) == 1  # of 1.6 in all, 0.8 lies below: within the first
     assert weighted_median(values, 0 * weights) is None
+    assert weighted_median(values, torch.nan * weights) is None
