@@ -241,10 +241,10 @@ class KeyframeGraph(Stateful):
         near = self.neighbour_edges(keyframe)
         return self._covisible_edges(start, newest, near, PROXIMITY_DISTANCE, PROXIMITY_EDGES)
 
-    def global_edges(self, first: int = 0) -> list[Edge]:
-        """Return further edges from the keyframes from `first` on to all others before them."""
-        newer = range(first, len(self.keyframes))
-        return self._covisible_edges(0, newer, [], GLOBAL_DISTANCE, GLOBAL_EDGES)
+    def global_edges(self) -> list[Edge]:
+        """Return further edges among all keyframes, over many baselines."""
+        all_keyframes = range(len(self.keyframes))
+        return self._covisible_edges(0, all_keyframes, [], GLOBAL_DISTANCE, GLOBAL_EDGES)
 
     def _covisible_edges(
         self,

@@ -45,9 +45,9 @@ def local_ba(graph: KeyframeGraph) -> None:
         adjust(graph, first_free, config.iterations)
 
 
-def online_global_ba(graph: KeyframeGraph, first_new: int) -> None:
-    """Adjust all keyframes while the sequence goes on; the new ones get further links before."""
-    edges = graph.global_edges(first_new)
+def online_global_ba(graph: KeyframeGraph) -> None:
+    """Adjust all keyframes while the sequence goes on; only the flow of new links is measured."""
+    edges = graph.global_edges()
     if edges:
         graph.match(edges)
     adjust(graph, 0, graph.config.global_iterations, free_camera=True)

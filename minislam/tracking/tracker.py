@@ -202,7 +202,7 @@ class Tracker(Stateful):
         is_due = 0 < config.global_interval <= count - self._last_global >= count // LEAST_GROWTH
         if is_due and not closed:
             seek_readouts(self.graph)
-            online_global_ba(self.graph, self._last_global)
+            online_global_ba(self.graph)
         if is_due or closed:
             self._last_global = count
 

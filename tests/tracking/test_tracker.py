@@ -129,7 +129,7 @@ def global_adjustments(monkeypatch, keyframes: int, interval: int, loops: Sequen
     tracker.config = replace(CONFIG, global_interval=interval)
     monkeypatch.setattr(
         "minislam.tracking.tracker.online_global_ba",
-        lambda graph, first: adjusted.append(len(graph.keyframes)),
+        lambda graph: adjusted.append(len(graph.keyframes)),
     )
     monkeypatch.setattr(
         "minislam.tracking.tracker.close_loops", lambda graph: len(graph.keyframes) in loops
