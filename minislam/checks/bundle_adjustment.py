@@ -62,9 +62,9 @@ def check_schur_step(student: Function) -> Verdict:
     def solved(H: Tensor, E: Tensor, C: Tensor, g: Tensor, s: Tensor, flaw: str = "") -> Any:
         by = C**0 if flaw == "unscaled" else C
         left = {"alone": 0, "added": -1}.get(flaw, 1) * (E / by @ E.T)
-        right = (flaw not in ("alone", "old")) * (E @ (s / by))
+        right = {"alone": 0, "old": 0, "plus": -1}.get(flaw, 1) * (E @ (s / by))
         xi = torch.linalg.solve(H - left, g - right)
-        delta = s - (flaw != "still") * (E.T @ xi)
+        delta = s - {"still": 0, "ahead": -1}.get(flaw, 1) * (E.T @ xi)
         return xi, delta if flaw == "undivided" else delta / C
 
     def case(poses: int, cells: int, description: str, seed: int = 1) -> Case:
@@ -83,7 +83,9 @@ def check_schur_step(student: Function) -> Verdict:
     mistakes = [
         ("alone", "The disparities do not stand still: subtract E C^-1 E^T from H."),
         ("old", "The right-hand side changes too: g - E C^-1 s."),
+        ("plus", "The right-hand side is g minus E C^-1 s, not plus."),
         ("still", "The disparities must follow the poses: s - E^T xi."),
+        ("ahead", "The disparities follow the poses with a minus: s - E^T xi."),
         ("added", "E C^-1 E^T is subtracted from H, not added."),
         ("unscaled", "C^-1 is missing between E and E^T, and between E and s."),
         ("undivided", "The steps of the disparities are divided by C, one by one."),
@@ -104,7 +106,10 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         problem = replace(problem, weights=weights, free_poses=free)
         for _ in range(min(steps, 1) if flaw == "one" else steps):
             equations = dense_normal_equations(problem, state)
-            diagonal = (1e-9 if flaw == "damping" else damping) * torch.ones(len(equations.vector))
+            diagonal = damping * torch.ones(len(equations.vector))
+            poses = 6 * int(problem.free_poses.sum())
+            undamped = {"damping": slice(None), "of H": slice(poses, None), "of C": slice(poses)}
+            diagonal[undamped.get(flaw, slice(0))] = 1e-9
             step = torch.linalg.solve(equations.matrix + diagonal.diag(), equations.vector)
             before = state.T_camera_world
             state = moved(problem, state, -step if flaw == "uphill" else step)
@@ -147,6 +152,8 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         ("uphill", "The step points uphill: with r = p~ - p it is added."),
         ("right", "The step stands on the left: exp(xi) T_camera_world."),
         ("damping", "Add the damping to the diagonals of H and of C."),
+        ("of H", "The diagonal of C is damped as well, not H's alone."),
+        ("of C", "The diagonal of H is damped as well, not C's alone."),
         ("one", "Repeat the step: each one linearises at the state the last one left."),
         (lambda *a: (loop(*a)[0], a[1].disparities), "The disparities move as well: + delta."),
         (lambda *a: (a[1].T_camera_world, loop(*a)[1]), "The poses move as well: exp(xi) T."),

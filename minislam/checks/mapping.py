@@ -174,7 +174,8 @@ def check_map_loss(student: Function) -> Verdict:
         depth_loss = loss.depth / (1 - unknown.mean()) if flaw == "of known" else loss.depth
         if flaw == "with unknown":
             depth_loss = depth_loss + (weight * unknown * depth).mean()
-        return shares[0] * loss.color + shares[1] * depth_loss + shares[2] * loss.isotropic
+        spread = (scales - scales.mean()).abs().mean() if flaw == "one mean" else loss.isotropic
+        return shares[0] * loss.color + shares[1] * depth_loss + shares[2] * spread
 
     def outcome(loss: Function, color: Tensor, *rest: Tensor) -> Any:
         """Return the loss and its derivative by the colour, 0 if it has none."""
@@ -204,6 +205,7 @@ def check_map_loss(student: Function) -> Verdict:
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 1)), "L_iso is multiplied by 10."),
         (lambda *a: reference(*a, shares=(0.2, 0.8, 10)), "0.8 is for colour, 0.2 for depth."),
+        (partial(reference, flaw="one mean"), "Each Gaussian has its own mean scale."),
         (partial(reference, flaw="of known"), "The mean is over all pixels: unknown ones count 0."),
         (partial(reference, flaw="with unknown"), "Depth 0 is unknown and costs nothing."),
         (lambda *a: reference(*a).detach(), "Return a tensor that autograd can differentiate."),

@@ -233,6 +233,11 @@ def check_picture_gradient(student: Function) -> Verdict:
         image = torch.einsum("khw,kc->hwc", light * alphas, leaf[:, 6:])
         return image.detach(), torch.autograd.grad((image - target).square().sum(), leaf)[0]
 
+    def of_opacity(gaussians: Tensor, target: Tensor) -> tuple:
+        image, gradient = reference(gaussians, target)
+        gradient[:, 5] /= gaussians[:, 5].exp()
+        return image, gradient
+
     def scaled(factor: float, columns: slice = slice(9)) -> Function:
         scale = torch.ones(9, dtype=torch.float64)
         scale[columns] = factor
@@ -257,6 +262,7 @@ def check_picture_gradient(student: Function) -> Verdict:
         (scaled(-1), "The sign is flipped: v = 2 (image - target)."),
         (scaled(0.5), "A factor 2 is missing: L is the sum of the squares."),
         (scaled(1 / target.numel()), "L is a sum over the pixels, not a mean."),
+        (of_opacity, "The sixth column is ln o, not o: dL/d ln o = o dL/do."),
         (scaled(-1, slice(2)), "The sign of v_mu' is flipped: d = x' - mu' falls as mu' grows."),
         (scaled(0.5, slice(3, 4)), "b stands twice in the quadratic form: v_b = -sum g du dv."),
         (partial(reference, fixed_light=True), "A Gaussian also hides what is behind it: A_{k+1}."),

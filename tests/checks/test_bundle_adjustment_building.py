@@ -35,6 +35,7 @@ def equations(problem, state, weights, source_sign):
 def adjusted(
     problem, state, steps, damping,
     weighted=True, held=True, sign=1, on_left=True, most=99, source_sign=-1, schur=False,
+    of_poses=1, of_cells=1,
 ):  # fmt: skip
     """Return the state after Gauss-Newton steps, all unknowns at once or by `schur`."""
     K = len(problem.free_poses)
@@ -44,7 +45,9 @@ def adjusted(
         free[: 6 * K] = problem.free_poses.repeat_interleave(6)
     for _ in range(min(steps, most)):
         N, b = equations(problem, state, weights, source_sign)
-        N = (N + damping * torch.eye(len(N)))[free][:, free]
+        added = torch.full((len(N),), damping * of_cells).double()
+        added[: 6 * K] = damping * of_poses
+        N = (N + added.diag())[free][:, free]
         step = torch.zeros_like(b)
         if schur:
             P = int(free[: 6 * K].sum())
@@ -76,6 +79,8 @@ def test_bundle_adjustment():
         "step on the right": with_change(on_left=False),
         "one step": with_change(most=1),
         "source as target": with_change(source_sign=1),
+        "H alone is damped": with_change(of_cells=1e-10),
+        "C alone is damped": with_change(of_poses=1e-10),
         "no damping": lambda p, s, n, damping: adjusted(p, s, n, 1e-9),
         "poses alone": lambda p, s, n, m: BundleState(
             adjusted(p, s, n, m).T_camera_world, s.disparities

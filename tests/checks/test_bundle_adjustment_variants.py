@@ -78,6 +78,16 @@ def old_right_side(H, E, C, g, s):
     return xi, (s - E.T @ xi) / C
 
 
+def plus_on_the_right(H, E, C, g, s):
+    xi = torch.linalg.solve(H - E / C @ E.T, g + E @ (s / C))
+    return xi, (s - E.T @ xi) / C
+
+
+def ahead(H, E, C, g, s):
+    xi, _ = step(H, E, C, g, s)
+    return xi, (s + E.T @ xi) / C
+
+
 def added(H, E, C, g, s):
     xi = torch.linalg.solve(H + E / C @ E.T, g - E @ (s / C))
     return xi, (s - E.T @ xi) / C
@@ -95,6 +105,8 @@ def test_schur_step():
         "poses alone": poses_alone,
         "old right-hand side": old_right_side,
         "added": added,
+        "plus on the right": plus_on_the_right,
+        "disparities ahead of the poses": ahead,
         "without C": without_C,
         "not substituted": lambda *a: (step(*a)[0], a[4] / a[2]),
         "delta first": lambda *a: step(*a)[::-1],
@@ -106,6 +118,8 @@ def test_schur_step():
         "the other sign": lambda *a: tuple(-part for part in step(*a)),
     }
     assert_variants(check_schur_step, right, wrong)
+    assert "not plus" in check_schur_step(plus_on_the_right).hint
+    assert "with a minus" in check_schur_step(ahead).hint
     assert (
         "it returns 1 value, expected 2: xi, delta" in check_schur_step(wrong["xi alone"]).sentence
     )

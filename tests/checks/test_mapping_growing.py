@@ -62,9 +62,9 @@ def test_insertion():
     assert_variants(check_insertion, {"vectors": inserted, "loop": in_a_loop}, variants)
 
 
-def of_parts(c, d, i, r, w, s, shares=(0.8, 0.2, 10.0), mask=True):
+def of_parts(c, d, i, r, w, s, shares=(0.8, 0.2, 10.0), mask=True, own_mean=True):
     known = (r > 0) if mask else torch.ones_like(r)
-    isotropic = (s - s.mean(-1, keepdim=True)).abs().mean()
+    isotropic = (s - (s.mean(-1, keepdim=True) if own_mean else s.mean())).abs().mean()
     depth = (w * known * (d - r).abs()).mean()
     return (
         shares[0] * (w * (c - i).abs().mean(-1)).mean() + shares[1] * depth + shares[2] * isotropic
@@ -90,6 +90,7 @@ def test_map_loss():
         "isotropic part once": lambda *a: of_parts(*a, shares=(0.8, 0.2, 1.0)),
         "shares exchanged": lambda *a: of_parts(*a, shares=(0.2, 0.8, 10.0)),
         "unknown depth too": lambda *a: of_parts(*a, mask=False),
+        "one mean of all scales": lambda *a: of_parts(*a, own_mean=False),
         "squares": lambda c, d, i, r, w, s: of_parts(c**2, d, i**2, r, w, s),
         "a float": lambda *a: of_parts(*a).item(),
         "detached": lambda *a: of_parts(*a).detach(),

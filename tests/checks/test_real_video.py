@@ -25,7 +25,13 @@ def within(first, second, lowest, highest):
     return torch.where(both, second / first, torch.nan).nanquantile(0.5, dim=0)
 
 
+def lower_median(first, second):
+    bad = (first <= 0.05) | (first >= 0.95) | (second <= 0.05) | (second >= 0.95)
+    return torch.where(bad, torch.nan, second / first).nanmedian(0).values
+
+
 WRONG_GAINS = [
+    (lower_median, "lower of two"),
     (lambda a, b: (b / a).quantile(0.5, dim=0), "Saturated"),
     (lambda a, b: gains_of_nan(b, a), "from the second frame to the first"),
     (lambda a, b: (b / a).mean(0), "take the median"),

@@ -50,8 +50,15 @@ def test_the_gradient_of_a_picture_is_told_from_a_wrong_one():
         scale[list(columns)] = factor
         return lambda *a: (picture_gradient(*a)[0], scale * picture_gradient(*a)[1])
 
+    def by_opacity(gaussians: Tensor, target: Tensor):
+        image, gradient = picture_gradient(gaussians, target)
+        return image, torch.cat(
+            [gradient[:, :5], gradient[:, 5:6] / gaussians[:, 5:6].exp(), gradient[:, 6:]], 1
+        )
+
     wrong = {
         "sign is flipped": scaled(-1, *range(9)),
+        "by o, not by ln o": by_opacity,
         "factor 2": scaled(0.5, *range(9)),
         "not a mean": scaled(1 / 189, *range(9)),
         "falls as mu' grows": scaled(-1, 0, 1),
@@ -62,3 +69,4 @@ def test_the_gradient_of_a_picture_is_told_from_a_wrong_one():
     }
     right = {"by hand": picture_gradient, "autograd": gradient_by_autograd}
     assert_variants(check_picture_gradient, right, wrong)
+    assert "not o" in check_picture_gradient(by_opacity).hint
