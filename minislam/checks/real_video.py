@@ -16,7 +16,7 @@ def check_gains(student: Function) -> Verdict:
         both = (torch.minimum(first, second) > low) & (torch.maximum(first, second) < high)
         return torch.where(both, second / first, torch.nan)
 
-    def reference(*a: Any, **bounds: float) -> Tensor:
+    def reference(*a: Any, **bounds: Any) -> Tensor:
         return ratios(*a, **bounds).nanquantile(0.5, dim=0)
 
     def case(seed: int, gain: float, what: str) -> Case:
