@@ -70,7 +70,7 @@ def measure_run(
         if truth is None:
             continue
         moving = truth.moving_mask(view.frame_index)
-        for name, value in _keyframe_errors(view, truth, moving, scale, lpips):
+        for name, value in _view_errors(view, truth, moving, scale, lpips):
             values[name].append(value)
         if view.beta is not None and moving is not None:
             betas.append((view.beta, moving))
@@ -115,7 +115,7 @@ def _novel_errors(
         yield "psnr_novel_oriented_db", psnr(rendered, image)
 
 
-def _keyframe_errors(
+def _view_errors(
     view: MappedView,
     truth: GroundTruth,
     moving: np.ndarray | None,  # (H, W) true mask of the view
