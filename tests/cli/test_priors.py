@@ -258,7 +258,10 @@ def test_priors_without_anything_to_write_and_files_of_another_sequence(
     short = ["synth:ball", "--max-frames", "3", "--size", SIZE, "--preset", "test"]
     assert main(["priors", *short, "--features", "classical", "--out", made]) == 0
     capsys.readouterr()
-    assert main(["run", *CLIP, "--features", f"files:{made}", "-o", str(tmp_path / "out")]) == 1
+    taken = ["--features", f"files:{made}", "-o", str(tmp_path / "out")]
+    assert main(["run", *CLIP, *taken]) == 1
+    assert "8 files, found 3" in the_sentence(capsys) and not (tmp_path / "out").exists()
+    assert main(["run", *short, "--stride", "2", *taken]) == 1
     assert "found no such frame in" in the_sentence(capsys)
 
 
