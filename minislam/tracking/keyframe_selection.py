@@ -30,10 +30,18 @@ def needs_keyframe(
     graph: KeyframeGraph,
     frame: Frame,
     matches: FlowMatches,  # E = 1, newest keyframe to this frame
+    before: FlowMatches | None,  # to the frame before it; None: that is the keyframe
     is_initialised: bool,
 ) -> bool:
-    """Tell whether a frame moved far, is hardly matched, or is `keyframe_interval` frames away."""
+    """Tell whether a frame moved far, is hardly matched, or is `keyframe_interval` frames away.
+
+    Without a depth prior each keyframe takes its scale from the one before, and drifts over wide
+    steps. So no frame is waited for that would lie farther beyond the flow than this one before it.
+    """
     flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
+    if not graph.keyframes.has_prior:
+        step = flow - mean_flow(graph, before) if before else flow
+        enough -= max(0.0, step / 2)
     if flow > enough or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
     # Without a depth prior the first keyframes need parallax, so a camera at rest makes none.

@@ -147,8 +147,9 @@ class Tracker(Stateful):
             return
         self._chain = chain
         self._log_followed(frame, ratio)
-        self.last_non_keyframe = (frame, matches)
-        if needs_keyframe(self.graph, frame, matches, self.initialised):
+        before, self.last_non_keyframe = self.last_non_keyframe, (frame, matches)
+        last_matches = before[1] if before else None
+        if needs_keyframe(self.graph, frame, matches, last_matches, self.initialised):
             self._insert(frame, matches)
 
     def _advance(self, frame: Frame) -> tuple[FlowChain, FlowMatches]:

@@ -20,8 +20,15 @@ def shifted(pixels: float, ratio: float = 1.0) -> FlowMatches:
     return FlowMatches(targets, torch.ones_like(targets), torch.tensor([ratio]))
 
 
-def needs(graph: KeyframeGraph, frame: int, matches: FlowMatches, initialised: bool = True) -> bool:
-    return needs_keyframe(graph, wall_frame(frame), matches, initialised)
+def needs(
+    graph: KeyframeGraph,
+    frame: int,
+    matches: FlowMatches,
+    before: FlowMatches | None = None,
+    initialised: bool = True,
+) -> bool:
+    """Tell it; without a flow before, the camera has hardly moved since the frame before."""
+    return needs_keyframe(graph, wall_frame(frame), matches, before or matches, initialised)
 
 
 def test_a_prior_asks_for_less_flow_once_the_start_is_over():
@@ -37,6 +44,24 @@ def test_much_flow_makes_a_keyframe():
     graph = true_graph([0])
     enough = keyframe_flow(graph, True)
     assert needs(graph, 1, shifted(1.01 * enough)) and not needs(graph, 1, shifted(0.99 * enough))
+
+
+def test_without_a_prior_the_frame_nearest_to_the_flow_is_the_keyframe():
+    graph = true_graph([0])
+    enough = keyframe_flow(graph, True)
+    near, next_one = shifted(0.79 * enough), shifted(1.19 * enough)  # .21 before it, .19 beyond
+    assert not needs(graph, 2, near, before=shifted(0.39 * enough))
+    assert needs(graph, 2, shifted(0.81 * enough), before=shifted(0.41 * enough))
+    assert needs(graph, 3, next_one, before=near)
+    back = shifted(0.99 * enough)  # the camera turns back: the next frame will not be beyond
+    assert not needs(graph, 3, back, before=next_one)
+    # The first frame after a keyframe is one whole step away from it.
+    frame = wall_frame(1)
+    assert needs_keyframe(graph, frame, shifted(0.67 * enough), None, True)
+    assert not needs_keyframe(graph, frame, shifted(0.66 * enough), None, True)
+    graph.keyframes.prior_disparities[0, 3] = 1.0
+    enough = keyframe_flow(graph, True)
+    assert not needs_keyframe(graph, frame, shifted(0.99 * enough), None, True)
 
 
 def test_few_matches_make_a_keyframe():

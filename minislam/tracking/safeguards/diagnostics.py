@@ -34,7 +34,7 @@ MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
 LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .1, broken .5
-MIN_CONTINUITY = 0.0065  # of the view; healthy .007 to .5, broken 0 to .006
+MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MIN_EVIDENCE = 0.005  # of the view, for an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
@@ -51,7 +51,7 @@ class KeyframeDiagnostics:
     parallax: float  # px, the largest mean flow by translation alone among its links
     explained: float | None  # of the matched flow from its predecessors; None: no link
     depth_error: float | None  # median relative difference from them; None: they see other things
-    continuity: float | None  # of the view: known before, and holds it still; None: no such links
+    continuity: float | None  # of the match: known before, holds it still [-]; None: no such links
     agreement: float | None  # of what was known before, in the link that agrees least
 
 
@@ -141,9 +141,10 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
     A cell of a keyframe before this one is known if its flow to the next keyframe fits. Of the
     keyframe just before, the cells are known to which known ones flow: what comes into view is not.
 
-    First the part of the view [-] that is known, matched and fits this keyframe, in the best link
-    into it, weighed by motion, too: all that holds the pose. Then how much of what is known and
-    matched fits [-], in the worst link, moving or not. None: a link is missing, or the camera was.
+    First what is known, matched and fits this keyframe, in the best link into it, weighed by
+    motion, too: all that holds the pose, over all that the keyframe just before matches [-]. In a
+    fast turn both are small. Then how much of what is known and matched fits [-], in the worst
+    link, moving or not. None: a link is missing, or the camera was.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
@@ -163,7 +164,8 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
         holding.append(float((fitted * graph.keyframes.motion_weights[i]).mean()))
         if matched.mean() > MIN_EVIDENCE:
             agreeing.append(float(fitted.sum() / matched.sum()))
-    return max(holding), min(agreeing, default=None)
+    matched = float(graph.links.confidences[links[keyframe - 1, keyframe]][0].mean())
+    return max(holding) / max(matched, 1e-6), min(agreeing, default=None)
 
 
 def fitting(graph: KeyframeGraph, residual: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) bool
