@@ -27,14 +27,10 @@ class DensityConfig:
 
     interval: int = parameter(100, "iterations between two rounds, official in initialisation", 1)
     gradient: float = parameter(
-        2e-4,
-        "Gaussians of a larger mean screen gradient are cloned or split [1 per half image],"
-        " official",
+        2e-4, "mean screen gradient that clones or splits a Gaussian, official [1 per half image]"
     )
     max_gaussians: int = parameter(
-        0,
-        "no cloning or splitting beyond this size of the map, 0 switches both off; official: any."
-        " Over a dense insertion they gain nothing in novel views (tests/benchmarks/RESULTS.md)",
+        0, "size of the map above which none is cloned or split; 0: never any, official: always"
     )
 
 
@@ -63,10 +59,7 @@ class MappingConfig:
         0.5, "size of the images, of the full one, until the last part of the refinement", 0.01, 1
     )
     views_per_step: int = parameter(
-        2,
-        "keyframes rendered per step, side by side if there are --workers; an iteration is one"
-        " rendered keyframe; paper 1",
-        1,
+        2, "images rendered per step, each an iteration; --workers share them; paper 1", 1
     )
     init_iterations: int = parameter(
         150,
@@ -74,9 +67,7 @@ class MappingConfig:
         " keyframe_iterations each; official 1050",
     )
     keyframe_iterations: int = parameter(12, "iterations per keyframe, online; official 450")
-    keyframe_stride: int = parameter(
-        1, "map and MLP are optimised at every n-th keyframe only; 5 in the paper's fast mode", 1
-    )
+    keyframe_stride: int = parameter(1, "optimise at every n-th keyframe only; fast mode 5", 1)
     refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
     refine_images: int = parameter(
         100, "images of the map for which these are enough; more get more in proportion, 0: never"
@@ -99,9 +90,7 @@ class MappingConfig:
     lambda_ssim: float = parameter(0.2, "weight of SSIM in L_color, Eq. (7), official", most=1)
     lambda_isotropic: float = parameter(10.0, "lambda_7: weight of L_iso [1 per m], official")
     mean_background: bool = parameter(
-        True,
-        "what no image shows has the mean colour of those that the map is begun with; off: black,"
-        " official",
+        True, "what no image shows has the mean colour of all images; off: black, official"
     )
 
     means_rate: float = parameter(

@@ -36,9 +36,7 @@ class TrackingConfig:
     """Settings of the tracker. Lengths in px hold for 320x240 and grow with the image diagonal."""
 
     keyframe_flow: float = parameter(10.0, "mean flow since the last keyframe that makes one [px]")
-    keyframe_flow_without_prior: float = parameter(
-        18.0, "the same without prior, where the nearest frame is taken, and in the start [px]"
-    )
+    keyframe_flow_without_prior: float = parameter(18.0, "without prior, and in the start [px]")
     keyframe_interval: int = parameter(8, "most frames to the next keyframe, paper supplement", 1)
     warmup_keyframes: int = parameter(6, "keyframes of the start; the paper takes 12", 2)
     warmup_rounds: int = parameter(3, "rounds of flow and BA before beta is known", 1)

@@ -30,7 +30,7 @@ def needs_keyframe(
     graph: KeyframeGraph,
     frame: Frame,
     matches: FlowMatches,  # E = 1, newest keyframe to this frame
-    before: FlowMatches | None,  # to the frame before it; None: that is the keyframe
+    before: tuple[Frame, FlowMatches] | None,  # the same of the frame before; None: the keyframe
     is_initialised: bool,
 ) -> bool:
     """Tell whether a frame moved far, is hardly matched, or is `keyframe_interval` frames away.
@@ -40,12 +40,11 @@ def needs_keyframe(
     """
     flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
     if not graph.keyframes.has_prior:
-        step = flow - mean_flow(graph, before) if before else flow
-        enough -= max(0.0, step / 2)
+        step = flow - mean_flow(graph, before[1]) if before else flow
+        enough -= step / 2
     if flow > enough or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
     # Without a depth prior the first keyframes need parallax, so a camera at rest makes none.
     may_rest = is_initialised or graph.keyframes.has_prior
-    elapsed = frame.frame_index - graph.keyframes.frames[-1].frame_index
-    is_due = elapsed >= graph.config.keyframe_interval
-    return is_due and (may_rest or flow > graph.least_parallax)
+    due = graph.keyframes.frames[-1].frame_index + graph.config.keyframe_interval
+    return frame.frame_index >= due and (may_rest or flow > graph.least_parallax)

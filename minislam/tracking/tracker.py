@@ -148,8 +148,7 @@ class Tracker(Stateful):
         self._chain = chain
         self._log_followed(frame, ratio)
         before, self.last_non_keyframe = self.last_non_keyframe, (frame, matches)
-        last_matches = before[1] if before else None
-        if needs_keyframe(self.graph, frame, matches, last_matches, self.initialised):
+        if needs_keyframe(self.graph, frame, matches, before, self.initialised):
             self._insert(frame, matches)
 
     def _advance(self, frame: Frame) -> tuple[FlowChain, FlowMatches]:

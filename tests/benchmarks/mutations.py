@@ -156,14 +156,15 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("tracking/keyframe_selection.py", "tracking/test_keyframe_selection.py"): [
         ("if not graph.keyframes.has_prior", "if True"),
         ("if before else flow", "if before else 0.0"),
-        ("max(0.0, step / 2)", "step / 2"),
-        ("max(0.0, step / 2)", "max(0.0, step)"),
-        ("flow - mean_flow(graph, before)", "flow"),
+        ("enough -= step / 2", "enough -= step"),
+        ("flow - mean_flow(graph, before[1])", "flow"),
     ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
         ("free_focal=graph.seeks_focal and", "free_focal=False and"),
         ("graph.seeks_focal and not graph.focal_is_free", "graph.seeks_focal"),
         ("weak >= LONG or _is", "_is"),
+        ("[] if rests else find_breaks", "find_breaks"),
+        ("rests = all(", "rests = any("),
         ("or held < MIN_CONTINUITY", ""),
         ("max(holding) / max(matched, 1e-6)", "max(holding)"),
         ("or agreement < MIN_AGREEMENT", ""),

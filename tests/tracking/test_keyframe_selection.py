@@ -28,7 +28,8 @@ def needs(
     initialised: bool = True,
 ) -> bool:
     """Tell it; without a flow before, the camera has hardly moved since the frame before."""
-    return needs_keyframe(graph, wall_frame(frame), matches, before or matches, initialised)
+    last = wall_frame(frame - 1), before or matches
+    return needs_keyframe(graph, wall_frame(frame), matches, last, initialised)
 
 
 def test_a_prior_asks_for_less_flow_once_the_start_is_over():

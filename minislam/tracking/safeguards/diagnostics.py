@@ -82,7 +82,9 @@ class Watch(Stateful):
     def conclude(self) -> None:
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
-        self.breaks = find_breaks(self.diagnostics)
+        # A camera at rest measures no depth, so two views that see other depths contradict nothing.
+        rests = all(k.parallax < self._graph.least_parallax for k in self.diagnostics)
+        self.breaks = [] if rests else find_breaks(self.diagnostics)
         self.beyond_turns = flow_beyond_turns(self._graph)
 
     @property

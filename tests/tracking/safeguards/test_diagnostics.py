@@ -136,6 +136,17 @@ def test_a_keyframe_of_another_scale_sees_other_depths():
     assert found.depth_error == pytest.approx(math.log(1.5), rel=1e-3)
 
 
+def test_only_a_camera_at_rest_may_see_other_depths():
+    for places, breaks in (([0, 0], []), ([0, 1, 1], [Break(1, 1)])):
+        graph = true_graph(places)
+        last = len(places) - 1
+        graph.match(neighbourhood_edges(0, len(places), 1))
+        graph.keyframes.disparities[last] *= 1.5
+        watch = Watch(graph)
+        watch.conclude()
+        assert watch.diagnostics[last].depth_error > 0.3 and watch.breaks == breaks
+
+
 def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
     graph = true_graph([0, 1, 2], TrackingConfig(robust_scale=0))
     poses = graph.keyframes.T_camera_world
