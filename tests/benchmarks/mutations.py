@@ -167,6 +167,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("rests = all(", "rests = any("),
         ("or held < MIN_CONTINUITY", ""),
         ("max(holding) / max(matched, 1e-6)", "max(holding)"),
+        ("max(LEAST_CELLS, MIN_EVIDENCE * len(matched))", "MIN_EVIDENCE * len(matched)"),
         ("or agreement < MIN_AGREEMENT", ""),
         ("matched * fits[i, keyframe]", "matched"),
         ("known[i] * graph.links.conf", "graph.links.conf"),

@@ -36,7 +36,7 @@ MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .1, broken .5
 MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
-MIN_EVIDENCE = 0.005  # of the view, for an agreement
+MIN_EVIDENCE, LEAST_CELLS = 0.005, 2  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
 TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
 MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
@@ -164,7 +164,7 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
         matched = matched * graph.keyframes.static_weights[i]
         fitted = matched * fits[i, keyframe]
         holding.append(float((fitted * graph.keyframes.motion_weights[i]).mean()))
-        if matched.mean() > MIN_EVIDENCE:
+        if matched.sum() > max(LEAST_CELLS, MIN_EVIDENCE * len(matched)):
             agreeing.append(float(fitted.sum() / matched.sum()))
     matched = float(graph.links.confidences[links[keyframe - 1, keyframe]][0].mean())
     return max(holding) / max(matched, 1e-6), min(agreeing, default=None)

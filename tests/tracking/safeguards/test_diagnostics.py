@@ -109,6 +109,18 @@ def test_what_holds_a_keyframe_is_known_from_those_before():
     assert continuity(graph, 2) == continuity(graph, 3) == (None, None)
 
 
+@pytest.mark.parametrize(("cells", "agreement"), [(1, 1), (3, 0)])
+def test_one_cell_does_not_tell_what_a_keyframe_agrees_with(cells: int, agreement: int):
+    graph = true_graph([0, 1, 2, 3])
+    graph.match(neighbourhood_edges(0, 4, 3))
+    link = graph.links.edges.index((0, 3))
+    certain = graph.links.confidences[link][0].topk(cells).indices
+    graph.links.confidences[link][:] = 0
+    graph.links.confidences[link][:, certain] = 1
+    graph.links.targets[link][0, certain] += 9  # px
+    assert continuity(graph, 3)[1] == agreement
+
+
 def test_a_dynamic_object_in_place_of_the_scene_is_new():
     graph = true_graph([0, 1, 2, 3])
     graph.match(neighbourhood_edges(0, 4, 3))
