@@ -82,9 +82,10 @@ class Watch(Stateful):
     def conclude(self) -> None:
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
-        # A camera at rest measures no depth, so two views that see other depths contradict nothing.
-        rests = all(k.parallax < self._graph.least_parallax for k in self.diagnostics)
-        self.breaks = [] if rests else find_breaks(self.diagnostics)
+        judged, least = self.diagnostics, self._graph.least_parallax
+        if all(keyframe.parallax < least for keyframe in judged):  # at rest: no depth is measured
+            judged = [replace(keyframe, depth_error=None) for keyframe in judged]
+        self.breaks = find_breaks(judged)
         self.beyond_turns = flow_beyond_turns(self._graph)
 
     @property

@@ -157,6 +157,13 @@ def test_only_a_camera_at_rest_may_see_other_depths():
         watch = Watch(graph)
         watch.conclude()
         assert watch.diagnostics[last].depth_error > 0.3 and watch.breaks == breaks
+    graph = true_graph([0, 0])
+    graph.match(neighbourhood_edges(0, 2, 1))
+    turn = se3_exp(torch.tensor([0, 0, 0, 0.05, 0.1, 0], dtype=torch.float64))
+    graph.keyframes.T_camera_world[1] = turn @ graph.keyframes.T_camera_world[1]
+    watch = Watch(graph)
+    watch.conclude()  # but its flow must fit
+    assert watch.diagnostics[1].parallax == 0 and watch.breaks == [Break(0, 0)]
 
 
 def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
