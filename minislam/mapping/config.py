@@ -90,7 +90,7 @@ class MappingConfig:
     lambda_ssim: float = parameter(0.2, "weight of SSIM in L_color, Eq. (7), official", most=1)
     lambda_isotropic: float = parameter(10.0, "lambda_7: weight of L_iso [1 per m], official")
     mean_background: bool = parameter(
-        True, "what no image shows has the mean colour of all images; off: black, official"
+        True, "what no image shows has the mean colour of those it begins with; off: official black"
     )
 
     means_rate: float = parameter(
