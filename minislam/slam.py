@@ -26,7 +26,7 @@ from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimat
 from minislam.records import Frame, Keyframe, Sequence, Trajectory, required_mask
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.stereo.dense_structure import swept_frames, with_swept_depth
+from minislam.stereo.dense_structure import on_backdrop, swept_frames, with_swept_depth
 from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.stereo.second_adjustment import adjust_again, sweep_frames
 from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
@@ -97,7 +97,7 @@ class Slam(Stateful):
             self._initialise()
 
         self.steps.once("final adjustment", self._adjust_all)
-        if self.config.uncertainty.enabled:
+        if self.config.uncertainty.enabled and self.tracker.knows_depth:
             self.steps.once("second adjustment", self._adjust_again)
         self.steps.once("all frames", self._pose_all_frames)
         self.steps.once("dense structure", self._rebuild_map)
@@ -175,10 +175,14 @@ class Slam(Stateful):
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         known = [frame.frame_index for frame in graph.keyframes.frames]
         frames = swept_frames(known, list(self.poses), least=1)
-        parts = graph, self.sequence, self.poses, frames, frames
-        swept, exposures = sweep_frames(*parts, progress, self.workers), keyframe_exposures(graph)
         keyframes = self.keyframes(others=sorted({*frames} - {*known}))
-        keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
+        if self.tracker.knows_depth:
+            parts = graph, self.sequence, self.poses, frames, frames
+            swept = sweep_frames(*parts, progress, self.workers)
+            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
+        else:
+            keyframes = on_backdrop(keyframes)
+        exposures = keyframe_exposures(graph)
         self.mapper = self._new_mapper(self.config.mapping.insertion.cell)
         progress = self.steps.on_progress("first map")
         self.mapper.initialise([with_exposure(k, exposures) for k in keyframes], progress)
@@ -189,7 +193,8 @@ class Slam(Stateful):
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
-        self.focal_length = check_focal_length(self.tracker.graph, self.workers)
+        if self.tracker.knows_depth:
+            self.focal_length = check_focal_length(self.tracker.graph, self.workers)
         progress = self.steps.on_progress("posing all frames")
         self.poses = pose_all_frames(self.tracker, self.sequence, progress)
 

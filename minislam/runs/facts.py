@@ -28,7 +28,7 @@ from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
-# that hangs together badly .65, a camera on a tripod .03 to .17.
+# that hangs together badly .65.
 LEAST_SHOWN = 0.75
 # px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
 LEAST_BEYOND_TURNS = 0.45
@@ -254,6 +254,7 @@ def _warnings(slam: Slam) -> Iterator[str]:
         yield (
             f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera "
             "turned or stood still, so the distances it moved are not determined"
+            + ("" if slam.tracker.knows_depth else ", and all that the map shows is at one depth")
         )
     elif is_hardly_more_than_a_turn(slam):
         yield (
@@ -274,7 +275,7 @@ def _warnings(slam: Slam) -> Iterator[str]:
 
 def _focal_length_warnings(slam: Slam) -> Iterator[str]:
     fit, graph = slam.focal_length, slam.tracker.graph
-    if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
+    if graph.guesses_focal and graph.adjustments:
         yield (
             "the focal length is unknown and the motion does not tell it: trajectory and map may "
             "be bent; give --fx or a calibration file"

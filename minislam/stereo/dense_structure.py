@@ -22,7 +22,8 @@ WIDTH = 160  # px of the images that are swept for the map
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
-BETWEEN = 2  # most frames between two keyframes that are swept as well
+BETWEEN = 2  # frames between two keyframes that are swept as well, at most; if many lie there,
+RESTING = 8  # one of so many: a camera at rest makes no keyframes
 AT_ONCE = 8  # frames whose sweeps are given to the workers together
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
@@ -61,6 +62,14 @@ def with_swept_depth(
             depth = torch.where((depth > 0) | moves, depth, guess)
             result[index] = replace(found, depth=depth)
     return result
+
+
+def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:
+    """Return the keyframes of a camera that only turned, with all they see one world unit away.
+
+    Without parallax every depth explains the images as well, and no other view confirms any.
+    """
+    return [replace(k, depth=k.depth.new_ones(()).expand(k.depth.shape)) for k in keyframes]
 
 
 def _nearest(image: Tensor, camera: Camera) -> np.ndarray:
@@ -114,11 +123,12 @@ def dense_depths(
 
 
 def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
-    """Return keyframes and a third of the frames between two: at least so many, at most two."""
+    """Return keyframes and a third of the frames between two: at least so many, and few."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
         there = [frame for frame in followed if first < frame < last]
-        number = min(len(there), max(least, min(BETWEEN, len(there) // 3)))
+        few = max(min(BETWEEN, len(there) // 3), len(there) // RESTING)
+        number = min(len(there), max(least, few))
         frames |= {there[len(there) * (k + 1) // (number + 1)] for k in range(number)}
     return sorted(frames)
 

@@ -54,7 +54,7 @@ def adjust_again(
     frames = sorted(poses), keyframes
     swept = sweep_frames(tracker.graph, sequence, poses, *frames, on_sweep, workers, COARSE_WIDTH)
     adjust_confirmed(tracker.graph, swept, on_round)
-    tracker.watch.conclude()
+    tracker.conclude()
 
 
 def sweep_frames(

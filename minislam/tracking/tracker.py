@@ -24,7 +24,13 @@ from minislam.tracking.initialisation import first_geometry
 from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
-from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
+from minislam.tracking.optimisation import (
+    adjust_turns,
+    final_global_ba,
+    local_ba,
+    online_global_ba,
+    warm_up_ba,
+)
 from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.focal_length import seek_readouts
@@ -106,6 +112,11 @@ class Tracker(Stateful):
     def initialised(self) -> bool:
         """Tell whether the warm-up is over: there are poses to start from."""
         return self.mode in (Mode.TRACKING, Mode.LOST)
+
+    @property
+    def knows_depth(self) -> bool:
+        """Tell whether a prior or parallax tells depth, once all keyframes have been judged."""
+        return self.keyframes.has_prior or not self.watch.only_turned
 
     def track(self, frame: Frame) -> bool:
         """Follow the camera into the next frame; tell whether there are new keyframes."""
@@ -264,7 +275,14 @@ class Tracker(Stateful):
         if not self.config.lambda_disparity_prior:  # else the prior holds the scale itself
             undo_scale_drift(self.keyframes)
         final_global_ba(self.graph, progress)
+        self.conclude()
+
+    def conclude(self) -> None:
+        """Judge all keyframes, once all are adjusted; if nothing tells depth, they only turn."""
         self.watch.conclude()
+        if not self.knows_depth:
+            adjust_turns(self.graph)
+            self.watch.conclude()
 
     def _update_static_weights(self, first: int = 0) -> None:
         """Predict the static weights of the keyframes from `first` on, by the present beta."""

@@ -24,14 +24,16 @@ def slam(**parts: object) -> SimpleNamespace:
         adjustments=2 + failed,
         failed_adjustments=failed,
         least_parallax=1.0,
-        seeks_focal=parts.pop("seeks_focal", False),
-        focal_is_free=parts.pop("focal_is_free", False),
+        seeks_focal=parts.get("seeks_focal", False),
+        focal_is_free=parts.get("focal_is_free", False),
+        guesses_focal=parts.pop("seeks_focal", False) and not parts.pop("focal_is_free", False),
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
     tracker = SimpleNamespace(
         tracked=[SimpleNamespace(timestamp=k / 30) for k in range(4)],
         graph=graph,
+        knows_depth=parts.pop("knows_depth", True),
         watch=SimpleNamespace(
             diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
             beyond_turns=parts.pop("beyond_turns", 3.0),
@@ -72,6 +74,7 @@ WARNINGS = [
     ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
     ({"seeks_focal": True}, "the motion does not tell it"),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
+    ({"parallax": [0.1], "knows_depth": False}, "and all that the map shows is at one depth"),
     ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),
     ({"overlay": torch.tensor([0.0, 1, 1, 1])}, "25% of the image stand still while the rest mov"),
     ({"has_prior": False}, "the unit of length is arbitrary"),

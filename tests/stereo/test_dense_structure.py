@@ -11,6 +11,7 @@ from minislam.stereo.dense_structure import (
     SweepPlanner,
     dense_depths,
     full_size,
+    on_backdrop,
     swept_frames,
     with_swept_depth,
 )
@@ -53,6 +54,11 @@ def test_every_third_frame_of_a_gap_at_most_is_swept():
     assert swept_frames([0, 4], list(range(5))) == [0, 2, 4]
     assert swept_frames([0, 4], [0, 4]) == [0, 4] == swept_frames([0, 4], [0, 4], least=1)
     assert swept_frames([0, 1, 3, 20], list(range(24)), least=1) == [0, 1, 2, 3, 9, 14, 20]
+
+
+def test_of_a_long_gap_every_eighth_frame_is_swept():
+    assert swept_frames([0, 40], list(range(41))) == [0, 8, 16, 24, 32, 40]
+    assert swept_frames([0, 23], list(range(24))) == [0, 8, 15, 23]
 
 
 def test_views_of_much_parallax_are_not_used():
@@ -136,6 +142,12 @@ def test_the_swept_camera_sees_what_the_camera_sees():
 
 
 # Keyframes
+
+
+def test_a_backdrop_is_one_unit_away_and_nothing_confirms_it():
+    seen = keyframe(8, torch.zeros(()).expand(SIZE[::-1]))
+    [flat] = on_backdrop([seen])
+    assert torch.equal(flat.depth, torch.ones(SIZE[::-1])) and flat.confirmation is None
 
 
 def keyframe(index: int, depth: torch.Tensor) -> Keyframe:

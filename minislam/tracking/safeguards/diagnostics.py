@@ -39,6 +39,8 @@ MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
 TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
+# px of a 320x240 image beyond turns: cameras on tripods have .08 to .16, others .19 and more.
+ONLY_TURNED = 0.17
 MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
 
 
@@ -82,11 +84,19 @@ class Watch(Stateful):
     def conclude(self) -> None:
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
-        judged, least = self.diagnostics, self._graph.least_parallax
-        if all(keyframe.parallax < least for keyframe in judged):  # at rest: no depth is measured
+        self.beyond_turns = flow_beyond_turns(self._graph)
+        judged = self.diagnostics
+        if self.only_turned:
             judged = [replace(keyframe, depth_error=None) for keyframe in judged]
         self.breaks = find_breaks(judged)
-        self.beyond_turns = flow_beyond_turns(self._graph)
+
+    @property
+    def only_turned(self) -> bool:
+        """Tell whether the camera stood still or only turned, so that nothing measures depth."""
+        graph, seen = self._graph, self.beyond_turns
+        is_rest = all(keyframe.parallax < graph.least_parallax for keyframe in self.diagnostics)
+        is_turn = seen is not None and seen < ONLY_TURNED and not graph.guesses_focal
+        return is_rest or is_turn
 
     @property
     def segments(self) -> list[tuple[int, int]]:
@@ -220,7 +230,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
     measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
     problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
-    problem = replace(problem, free_focal=graph.seeks_focal and not graph.focal_is_free)
+    problem = replace(problem, free_focal=graph.guesses_focal)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
     turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
     kernels = [graph.robust.widened(width) for width in TURN_WIDENING] if graph.robust else []

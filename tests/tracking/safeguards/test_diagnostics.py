@@ -203,6 +203,18 @@ def test_under_a_wrong_focal_length_a_turn_is_no_parallax_either():
     assert flow_beyond_turns(graph) > 1
 
 
+def test_a_camera_that_only_turned_measured_no_depth_unless_its_focal_length_is_a_guess():
+    turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
+    watch = Watch(seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T)))
+    watch.conclude()
+    assert watch.diagnostics[1].parallax > 3 and watch.only_turned
+    watch._graph.seeks_focal = True  # under a wrong one, steps may look like turns
+    assert not watch.only_turned
+    watch = Watch(seen_moving(1.05 * GRID.pixels))
+    watch.conclude()
+    assert not watch.only_turned
+
+
 @pytest.mark.parametrize("moving", [0.1, 0.2])
 def test_what_moves_in_front_of_a_turning_camera_is_no_sign_of_depth(moving: float):
     turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
