@@ -16,7 +16,6 @@ from minislam.tracking.bundle_adjustment import (
 )
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.keyframe_graph import AT_ONCE, Edge, KeyframeGraph
-from minislam.tracking.pose_from_flow import POSE_ITERATIONS, ROBUST_WIDENING
 from minislam.tracking.reprojection import lengths
 from minislam.tracking.safeguards.parts import of_cells, of_rows
 from minislam.tracking.safeguards.robust import weighted_median
@@ -65,19 +64,6 @@ def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> N
         adjust(graph, 0, config.global_iterations, lambda_prior, free_camera=True, settled=is_last)
         if progress:
             progress(done + 1, config.final_rounds)
-
-
-def adjust_turns(graph: KeyframeGraph) -> None:
-    """Adjust the turns of the keyframes alone: all that they see is infinitely far away."""
-    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.links)), 0, 0.0)
-    problem = replace(problem, free_disparities=torch.zeros_like(problem.free_disparities))
-    poses = keyframes.T_camera_world.clone()
-    poses[:, :3, 3] = 0
-    state = replace(graph.state, T_camera_world=poses, disparities=0 * keyframes.disparities)
-    state, report = adjust_narrowing(problem, state, [*ROBUST_WIDENING], POSE_ITERATIONS)
-    graph.count_adjustment(report)
-    if report.converged:
-        keyframes.set_geometry(state.T_camera_world, state.disparities)
 
 
 def warm_up_ba(graph: KeyframeGraph, edges: list[Edge], rounds: int) -> None:

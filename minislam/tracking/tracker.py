@@ -24,13 +24,7 @@ from minislam.tracking.initialisation import first_geometry
 from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
-from minislam.tracking.optimisation import (
-    adjust_turns,
-    final_global_ba,
-    local_ba,
-    online_global_ba,
-    warm_up_ba,
-)
+from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.focal_length import seek_readouts
@@ -38,6 +32,7 @@ from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.scale_drift import undo_scale_drift
 from minislam.tracking.safeguards.settling import SETTLED, Settling
+from minislam.tracking.safeguards.turns import adjust_turns
 from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]

@@ -14,7 +14,6 @@ from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import (
     adjust,
-    adjust_turns,
     bundle_problem,
     final_global_ba,
     local_ba,
@@ -26,7 +25,6 @@ from tests.tracking.wall import true_graph, true_poses
 
 # As a network errs: a scale of its own in each of four keyframes.
 WRONG = torch.tensor([[1.3], [0.8], [1.2], [0.7]])
-TURNS = [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01), (0.03, 0.05, -0.02)]  # rad
 XI = torch.tensor([0.03, -0.02, 0.02, 0.01, -0.01, 0.015], dtype=torch.float64)
 
 
@@ -207,26 +205,6 @@ def test_adjustments_that_all_fail_are_counted_and_keep_the_state(monkeypatch: p
 
     monkeypatch.setattr(torch.linalg, "cholesky_ex", singular)
     adjust(graph, first_free=2, iterations=3)
-    adjust_turns(graph)
     final_global_ba(graph)
-    assert graph.failed_adjustments == 2 + graph.config.final_rounds
+    assert graph.failed_adjustments == 1 + graph.config.final_rounds
     assert_same_bits(graph.state, before)
-
-
-# Turns alone
-
-
-def test_turns_are_found_whatever_depth_and_place_were_thought_to_be():
-    graph = matched(3)
-    turns = [se3_exp(torch.tensor([0, 0, 0, *r], dtype=torch.float64)) for r in TURNS]
-    for (source, target), positions in zip(graph.links.edges, graph.links.targets, strict=True):
-        rays = graph.grid.rays.double() @ (turns[target] @ se3_inverse(turns[source]))[:3, :3].T
-        positions.copy_(CAMERA.project(rays).T)
-    adjustments = graph.adjustments
-    adjust_turns(graph)
-    poses = graph.keyframes.T_camera_world
-    pairs = zip(poses, turns, strict=True)
-    assert max(float(se3_log(pose @ se3_inverse(T)).norm()) for pose, T in pairs) < 1e-5
-    assert not poses[:, :3, 3].any()
-    assert not graph.keyframes.disparities.any()
-    assert graph.adjustments == adjustments + 1 and graph.failed_adjustments == 0

@@ -9,6 +9,7 @@ pose_support     tries other starts for poses between keyframes that little of t
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
 first_camera     which minimum the start takes, with an unknown focal length and readout
 diagnostics      how well each keyframe is tied to the others
+turns            tells a camera that stands or only turns, and adjusts its turns alone
 focal_length     estimates an unknown focal length, tells whether a given one was wrong; the readout
 focal_column     the focal length as one more unknown of the bundle adjustment
 scale_drift      undoes a drift of the scale that a depth prior tells

@@ -8,23 +8,21 @@ large dynamic object takes the place of the scene, hardly anything that held the
 holds this one, or what is left of it does not fit.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from statistics import median
 
 import torch
 from torch import Tensor
 
 from minislam.state.stateful import Stateful
-from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, residuals
+from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.pose_from_flow import POSE_ITERATIONS, motion_only_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
+from minislam.tracking.safeguards.turns import ONLY_TURNED, flow_beyond_turns
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -38,10 +36,6 @@ MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 t
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
-TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
-# px of a 320x240 image beyond turns: cameras on tripods have .08 to .16, others .19 and more.
-ONLY_TURNED = 0.17
-MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
 
 
 @dataclass(frozen=True)
@@ -210,36 +204,6 @@ def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
         before = keyframes.motion_weights[keyframe - 1]
         weight = weight * inherit_motion_weight(graph.grid, matches, before)
     return weight if keyframes.overlay is None else weight * keyframes.overlay
-
-
-def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 image
-    """Return the flow between neighbouring keyframes that no turn of the camera explains.
-
-    A turn moves all points as if they were infinitely far away. The best one, under a wide robust
-    weight, takes the place of any translation that looks like it, so that what is left, in the
-    median, tells depth, whatever parallax the poses claim. Under a wrong focal length a turn looks
-    like parallax, so one that is sought and not told is free. None: no link has any weight.
-    """
-    grid, links, keyframes = graph.grid, graph.links, graph.keyframes
-    pairs = [p for p, (source, target) in enumerate(links.edges) if target == source + 1]
-    pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)] if pairs else []
-    if not pairs:
-        return None
-    weights = [links.confidences[p] * keyframes.cell_weights[links.edges[p][0]] for p in pairs]
-    numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
-    ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
-    measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
-    problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
-    problem = replace(problem, free_focal=graph.guesses_focal)
-    poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
-    turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
-    kernels = [graph.robust.widened(width) for width in TURN_WIDENING] if graph.robust else []
-    for kernel in (None, *kernels):
-        turned, _ = bundle_adjust(replace(problem, robust=kernel), turned, POSE_ITERATIONS)
-    left = lengths(residuals(problem, turned)[0])
-    medians = [weighted_median(*pair) for pair in zip(left, problem.weights[:, 0], strict=True)]
-    known = [found for found in medians if found is not None]
-    return median(known) / graph.pixel_scale if known else None
 
 
 def is_unexplained(newest: KeyframeDiagnostics) -> bool:

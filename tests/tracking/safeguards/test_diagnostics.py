@@ -9,7 +9,6 @@ import torch
 from minislam.geometry import se3_exp
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
-from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust
 from minislam.tracking.safeguards.diagnostics import (
     Break,
@@ -18,7 +17,6 @@ from minislam.tracking.safeguards.diagnostics import (
     continuity,
     diagnose,
     find_breaks,
-    flow_beyond_turns,
     is_unexplained,
     weight_so_far,
 )
@@ -175,73 +173,6 @@ def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
     before = graph.keyframes.disparities.clone()
     adjust(graph, first_free=2, iterations=3)
     assert torch.equal(graph.keyframes.disparities, before)
-
-
-def seen_moving(positions: torch.Tensor) -> KeyframeGraph:
-    """Return two keyframes between which the cells move to positions (N, 2)."""
-    graph = true_graph([0, 1])
-    graph.match([(0, 1), (1, 0)])
-    graph.links.targets[0] = positions.T.float()
-    graph.links.confidences[0] = torch.ones_like(graph.links.targets[0])
-    return graph
-
-
-def test_a_turn_is_no_parallax_whatever_the_poses_claim():
-    turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
-    graph = seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
-    assert flow_beyond_turns(graph) < 1e-3 < 3 < diagnose(graph, 1).parallax
-
-
-def test_under_a_wrong_focal_length_a_turn_is_no_parallax_either():
-    turn = se3_exp(torch.tensor([0, 0, 0, 0.1, 0.15, 0.3], dtype=torch.float64))
-    graph = seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
-    graph.grid.zoom(math.log(1.5))
-    assert flow_beyond_turns(graph) > 1  # px: the focal length is given
-    graph.seeks_focal = True
-    assert flow_beyond_turns(graph) < 0.01
-    graph.focal_is_free = True  # the motion has told it
-    assert flow_beyond_turns(graph) > 1
-
-
-def test_a_camera_that_only_turned_measured_no_depth_unless_its_focal_length_is_a_guess():
-    turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
-    watch = Watch(seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T)))
-    watch.conclude()
-    assert watch.diagnostics[1].parallax > 3 and watch.only_turned
-    watch._graph.seeks_focal = True  # under a wrong one, steps may look like turns
-    assert not watch.only_turned
-    watch = Watch(seen_moving(1.05 * GRID.pixels))
-    watch.conclude()
-    assert not watch.only_turned
-
-
-@pytest.mark.parametrize("moving", [0.1, 0.2])
-def test_what_moves_in_front_of_a_turning_camera_is_no_sign_of_depth(moving: float):
-    turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
-    positions = CAMERA.project(GRID.rays.double() @ turn[:3, :3].T)
-    positions[GRID.pixels[:, 0] < moving * CAMERA.width] += 20  # px
-    assert flow_beyond_turns(seen_moving(positions)) < 0.3  # 15 and 28 by least squares
-
-
-def test_walking_ahead_is_more_than_any_turn():
-    from_centre = GRID.pixels - GRID.pixels.new_tensor([CAMERA.cx, CAMERA.cy])
-    graph = seen_moving(GRID.pixels + 0.05 * from_centre)
-    expected = 0.05 * float(from_centre.norm(dim=1).median()) / graph.pixel_scale
-    assert flow_beyond_turns(graph) == pytest.approx(expected, rel=0.05)
-
-
-def test_sliding_along_a_far_wall_looks_like_a_turn():
-    slid = GRID.pixels + GRID.pixels.new_tensor([5.0, 0.0])
-    graph = seen_moving(slid)
-    assert flow_beyond_turns(graph) < 0.2 * 5 / graph.pixel_scale
-
-
-def test_without_links_or_weight_there_is_no_parallax():
-    assert flow_beyond_turns(true_graph([0, 1])) is None
-    graph = true_graph([0, 1])
-    graph.match([(0, 1), (1, 0)])
-    graph.keyframes.static_weights.zero_()
-    assert flow_beyond_turns(graph) is None
 
 
 def test_a_keyframe_without_links_is_reported_as_such():

@@ -1,0 +1,66 @@
+"""A camera that stands, or only turns: nothing measures depth, so its poses are turns alone."""
+
+import math
+from dataclasses import replace
+from statistics import median
+
+import torch
+
+from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, residuals
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
+from minislam.tracking.pose_from_flow import (
+    POSE_ITERATIONS,
+    ROBUST_WIDENING,
+    motion_only_problem,
+)
+from minislam.tracking.reprojection import lengths
+from minislam.tracking.safeguards.robust import weighted_median
+
+# px of a 320x240 image beyond turns: cameras on tripods have .08 to .16, others .19 and more.
+ONLY_TURNED = 0.17
+TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
+MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
+
+
+def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 image
+    """Return the flow between neighbouring keyframes that no turn of the camera explains.
+
+    A turn moves all points as if they were infinitely far away. The best one, under a wide robust
+    weight, takes the place of any translation that looks like it, so that what is left, in the
+    median, tells depth, whatever parallax the poses claim. Under a wrong focal length a turn looks
+    like parallax, so one that is sought and not told is free. None: no link has any weight.
+    """
+    grid, links, keyframes = graph.grid, graph.links, graph.keyframes
+    pairs = [p for p, (source, target) in enumerate(links.edges) if target == source + 1]
+    pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)] if pairs else []
+    if not pairs:
+        return None
+    weights = [links.confidences[p] * keyframes.cell_weights[links.edges[p][0]] for p in pairs]
+    numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
+    ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
+    measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
+    problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
+    problem = replace(problem, free_focal=graph.guesses_focal)
+    poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
+    turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
+    kernels = [graph.robust.widened(width) for width in TURN_WIDENING] if graph.robust else []
+    for kernel in (None, *kernels):
+        turned, _ = bundle_adjust(replace(problem, robust=kernel), turned, POSE_ITERATIONS)
+    left = lengths(residuals(problem, turned)[0])
+    medians = [weighted_median(*pair) for pair in zip(left, problem.weights[:, 0], strict=True)]
+    known = [found for found in medians if found is not None]
+    return median(known) / graph.pixel_scale if known else None
+
+
+def adjust_turns(graph: KeyframeGraph) -> None:
+    """Adjust the turns of the keyframes alone: all that they see is infinitely far away."""
+    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.links)), 0, 0.0)
+    problem = replace(problem, free_disparities=torch.zeros_like(problem.free_disparities))
+    poses = keyframes.T_camera_world.clone()
+    poses[:, :3, 3] = 0
+    state = replace(graph.state, T_camera_world=poses, disparities=0 * keyframes.disparities)
+    state, report = adjust_narrowing(problem, state, [*ROBUST_WIDENING], POSE_ITERATIONS)
+    graph.count_adjustment(report)
+    if report.converged:
+        keyframes.set_geometry(state.T_camera_world, state.disparities)
