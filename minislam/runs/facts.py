@@ -26,12 +26,11 @@ from minislam.slam import Slam
 from minislam.splatting import Rendering
 from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
+from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
 # that hangs together badly .65.
 LEAST_SHOWN = 0.75
-# px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
-LEAST_BEYOND_TURNS = 0.45
 MOST_UNSEEN = 20  # frames, evenly spread, that the map is compared with
 
 

@@ -277,6 +277,7 @@ class Tracker(Stateful):
         self.watch.conclude()
         if not self.knows_depth:
             adjust_turns(self.graph)
+            motion_memory.judge_all(self.graph)
             self.watch.conclude()
 
     def _update_static_weights(self, first: int = 0) -> None:

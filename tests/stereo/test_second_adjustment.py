@@ -123,10 +123,8 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
     followed = [TrackedFrame(index, float(index), ok, 1.0) for index in range(count)]
     lost = replace(followed[1], status=TrackingStatus.LOST)
     tracked = [followed[0], lost, *followed[2:]]
-    watch = SimpleNamespace()
-    watch.conclude = lambda: done.append(("judged", graph.keyframes.static_weights.min()))
-    keyframes = graph.keyframes
-    tracker = SimpleNamespace(graph=graph, keyframes=keyframes, tracked=tracked, watch=watch)
+    tracker = SimpleNamespace(graph=graph, keyframes=graph.keyframes, tracked=tracked)
+    tracker.conclude = lambda: done.append(("judged", graph.keyframes.static_weights.min()))
 
     def pose_all_frames(tracker, sequence, progress):
         assert [frame.frame_index for frame in tracker.tracked] == NUMBERS

@@ -10,6 +10,7 @@ holds this one, or what is left of it does not fit.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
-from minislam.tracking.safeguards.turns import ONLY_TURNED, flow_beyond_turns
+from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS, flow_beyond_turns
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -86,11 +87,16 @@ class Watch(Stateful):
 
     @property
     def only_turned(self) -> bool:
-        """Tell whether the camera stood still or only turned, so that nothing measures depth."""
-        graph, seen = self._graph, self.beyond_turns
-        is_rest = all(keyframe.parallax < graph.least_parallax for keyframe in self.diagnostics)
-        is_turn = seen is not None and seen < ONLY_TURNED and not graph.guesses_focal
-        return is_rest or is_turn
+        """Tell whether the camera stood still or only turned, so that nothing measures depth.
+
+        Then no pose claims any parallax, or hardly any flow is beyond turns and keyframes see each
+        other's depths as other ones.
+        """
+        if all(k.parallax < self._graph.least_parallax for k in self.diagnostics):
+            return True
+        errors = [k.depth_error for k in self.diagnostics if k.depth_error is not None]
+        is_weak = self.beyond_turns is not None and self.beyond_turns < LEAST_BEYOND_TURNS
+        return is_weak and bool(errors) and median(errors) > MAX_DEPTH_ERROR
 
     @property
     def segments(self) -> list[tuple[int, int]]:

@@ -27,6 +27,14 @@ def seen_moving(positions: torch.Tensor) -> KeyframeGraph:
     return graph
 
 
+def watched(positions: Tensor) -> tuple[KeyframeGraph, Watch]:
+    """Return two keyframes between which the cells move to positions (N, 2), judged."""
+    graph = seen_moving(positions)
+    watch = Watch(graph)
+    watch.conclude()
+    return graph, watch
+
+
 def test_a_turn_is_no_parallax_whatever_the_poses_claim():
     turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
     graph = seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
@@ -44,16 +52,17 @@ def test_under_a_wrong_focal_length_a_turn_is_no_parallax_either():
     assert flow_beyond_turns(graph) > 1
 
 
-def test_a_camera_that_only_turned_measured_no_depth_unless_its_focal_length_is_a_guess():
+def test_of_a_turning_camera_the_keyframes_see_other_depths():
     turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
-    watch = Watch(seen_moving(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T)))
+    graph, watch = watched(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
+    assert watch.diagnostics[1].parallax > 3 and not watch.only_turned  # of one depth all the same
+    graph.keyframes.disparities[1] *= 1.5
     watch.conclude()
-    assert watch.diagnostics[1].parallax > 3 and watch.only_turned
-    watch._graph.seeks_focal = True  # under a wrong one, steps may look like turns
-    assert not watch.only_turned
-    watch = Watch(seen_moving(1.05 * GRID.pixels))
+    assert watch.only_turned
+    graph, watch = watched(1.05 * GRID.pixels)  # it walks, and its depths are wrong
+    graph.keyframes.disparities[1] *= 1.5
     watch.conclude()
-    assert not watch.only_turned
+    assert watch.diagnostics[1].depth_error > 0.3 and not watch.only_turned
 
 
 @pytest.mark.parametrize("moving", [0.1, 0.2])
