@@ -164,7 +164,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("find_breaks(judged)", "find_breaks(self.diagnostics)"),
         ("if all(k.parallax <", "if any(k.parallax <"),
         ("return is_weak and bool(errors) and", "return bool(errors) and"),
-        ("median(errors) > MAX_DEPTH_ERROR", "True"),
+        ("median(errors) > UNMEASURED", "True"),
         ("keyframe, depth_error=None)", "keyframe, depth_error=None, explained=None)"),
         ("or held < MIN_CONTINUITY", ""),
         ("max(holding) / max(matched, 1e-6)", "max(holding)"),

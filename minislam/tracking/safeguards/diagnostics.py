@@ -23,7 +23,7 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
-from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS, flow_beyond_turns
+from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS, UNMEASURED, flow_beyond_turns
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -96,7 +96,7 @@ class Watch(Stateful):
             return True
         errors = [k.depth_error for k in self.diagnostics if k.depth_error is not None]
         is_weak = self.beyond_turns is not None and self.beyond_turns < LEAST_BEYOND_TURNS
-        return is_weak and bool(errors) and median(errors) > MAX_DEPTH_ERROR
+        return is_weak and bool(errors) and median(errors) > UNMEASURED
 
     @property
     def segments(self) -> list[tuple[int, int]]:
