@@ -18,7 +18,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import cache
 from threading import Lock, Thread
 from typing import Any, get_type_hints
@@ -47,7 +47,7 @@ def idle_cores() -> int:
     return max(1, min(MOST_WORKERS, math.ceil(cores - busy)))
 
 
-class Workers:
+class Workers(AbstractContextManager["Workers"]):
     """This process and its helpers; one worker is this process alone."""
 
     def __init__(
@@ -67,9 +67,6 @@ class Workers:
                 self._helpers.append(_Helper(threads))
         except OSError as error:
             warn(f"a worker could not be started ({error}); the run goes on with fewer")
-
-    def __enter__(self) -> "Workers":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
