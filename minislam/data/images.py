@@ -131,18 +131,23 @@ def _bgr(image: np.ndarray) -> np.ndarray:
 
 
 def _decode(path: Path, mode: int) -> np.ndarray:
-    content = read_bytes(path)
-    decoded, said = _decoded(content, mode) if _is_complete(content) else (None, b"")
+    content, decoded = read_bytes(path), None
+    with _standard_error() as lines, suppress(cv2.error):  # of a header that claims 10^10 px
+        if _is_complete(content):
+            decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
+    # Only here libjpeg tells of damage. What libpng only warns of, such as a broken colour profile,
+    # does not touch the pixels.
+    said = b"".join(line for line in lines if not line.startswith(b"libpng warning"))
     if b"extraneous" in said:  # cameras pad some files so, and damage looks like it, too
         warnings.warn(f"{path} may be damaged: {said.decode().strip()}", stacklevel=1)
     elif said:
         decoded = None  # libjpeg has filled the rest with grey
-    if decoded is not None:
-        return decoded
-    raise InputError(
-        f"expected a whole PNG or JPEG image, but {path} ({len(content)} bytes) is damaged, cut "
-        "short or of another kind; replace or remove it"
-    )
+    if decoded is None:
+        raise InputError(
+            f"expected a whole PNG or JPEG image, but {path} ({len(content)} bytes) is damaged, "
+            "cut short or of another kind; replace or remove it"
+        )
+    return decoded
 
 
 def _is_complete(content: bytes) -> bool:
@@ -153,15 +158,6 @@ def _is_complete(content: bytes) -> bool:
         # A thumbnail in the header has its own end marker, so the LAST scan must be closed.
         return content.rfind(_JPEG_END_OF_IMAGE) > content.rfind(_JPEG_START_OF_SCAN) > 0
     return False
-
-
-def _decoded(content: bytes, mode: int) -> tuple[np.ndarray | None, bytes]:
-    """Decode, and catch what libjpeg writes to standard error: only there it tells of damage."""
-    image = None
-    with _standard_error() as said, suppress(cv2.error):  # of a header that claims 10^10 px
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
-    # What libpng only warns of, such as a broken colour profile, does not touch the pixels.
-    return image, b"".join(line for line in said if not line.startswith(b"libpng warning"))
 
 
 @contextmanager
