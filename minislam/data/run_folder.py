@@ -113,11 +113,6 @@ class RunFolder:
 
     def read_checkpoint(self, gpu: str = "cpu") -> dict[str, Any]:
         """Return the state from which an interrupted run can continue, see `read_checkpoint`."""
-        if not (self.path / CHECKPOINT).exists():
-            raise InputError(
-                f"expected {CHECKPOINT} of an interrupted run in {self.path}, found none; give the "
-                "folder of such a run, or leave out --resume to start anew"
-            )
         return read_checkpoint(self.path / CHECKPOINT, gpu)
 
     def remove_checkpoint(self) -> None:
