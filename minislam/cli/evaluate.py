@@ -10,7 +10,7 @@ from minislam.data.files import atomic_write, require_new, write_json
 from minislam.errors import InputError
 
 if TYPE_CHECKING:
-    from minislam.evaluation import Alignment, TrajectoryError
+    from minislam.evaluation.trajectory import Alignment, TrajectoryError
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:

@@ -1,9 +1,4 @@
 """Compare a run with the ground truth: trajectory, images, depth, separation by beta."""
 
 from minislam.evaluation.images import auroc, depth_l1, psnr
-from minislam.evaluation.trajectory import (
-    Alignment,
-    TrajectoryError,
-    absolute_trajectory_error,
-    straight_line_error,
-)
+from minislam.evaluation.trajectory import absolute_trajectory_error, straight_line_error
