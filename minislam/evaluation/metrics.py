@@ -75,7 +75,9 @@ def measure_run(
         if view.beta is not None and moving is not None:
             betas.append((view.beta, moving))
     metrics |= {name: float(np.mean(found)) for name, found in values.items()}
-    metrics["beta_auroc"] = _beta_auroc(betas)
+    if any(mask.any() for _, mask in betas):  # over all images of the map
+        beta, masks = zip(*betas, strict=True)
+        metrics["beta_auroc"] = auroc(np.stack(beta), np.stack(masks))
     return metrics
 
 
@@ -139,11 +141,3 @@ def _view_errors(
     error = None if depth is None else depth_l1(view.depth, depth, scale, moving)
     if error is not None:
         yield "depth_l1_cm", CENTIMETRES * error
-
-
-def _beta_auroc(betas: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
-    """Return how well beta separates moving from static pixels, over all images of the map."""
-    if not any(moving.any() for _, moving in betas):
-        return None
-    beta, moving = zip(*betas, strict=True)
-    return auroc(np.stack(beta), np.stack(moving))
