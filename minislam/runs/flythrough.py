@@ -1,6 +1,7 @@
 """Images of a finished run in motion: along its trajectory, in a circle, or beside the input."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -72,13 +73,10 @@ def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:
     return side_by_side(run, camera, every), frame_rate(run) / every
 
 
-def write_clip(folder: str) -> bool:
-    """Write the clip of a run into its folder; tell whether this OpenCV can."""
-    try:
+def write_clip(folder: str) -> None:
+    """Write the clip of a run into its folder, if this OpenCV can."""
+    with suppress(InputError):
         write_animation(Path(folder) / CLIP, *clip(Run(folder)))
-    except InputError:
-        return False
-    return True
 
 
 def _labelled(panels: list[np.ndarray]) -> np.ndarray:
