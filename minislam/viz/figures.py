@@ -98,11 +98,9 @@ def keyframe_health(
 ) -> Figure:
     """Draw how well poses and depths explain the flow, and where the run is broken or lost."""
     figure, axes = _one_panel("frame", "explained flow", height=2.2)
-    shown = [
-        [np.nan if part is None else part for part in parts] for parts in (explained, agreement)
-    ]
-    axes.plot(frames, shown[0], marker=".", label="of all flow", **ESTIMATE_STYLE)
-    axes.plot(frames, shown[1], "--", color="tab:purple", label="of what held the camera before")
+    of_all, of_held = np.array([explained, agreement], dtype=np.float64)  # None becomes NaN
+    axes.plot(frames, of_all, marker=".", label="of all flow", **ESTIMATE_STYLE)
+    axes.plot(frames, of_held, "--", color="tab:purple", label="of what held the camera before")
     axes.axhline(least, color="gray", linestyle=":", label="least of a healthy keyframe")
     for position, (first, last) in enumerate(broken):
         label = "broken" if position == 0 else None
