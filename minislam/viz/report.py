@@ -51,7 +51,11 @@ def build_report(report: Report) -> str:
         keyframes=json.dumps(pages),
         depth_scale=_scale(depth_to_rgb(depths[None], report.depth_limits), depths, report.unit),
         beta_scale=_scale(beta_to_rgb(betas[None], report.beta_limits), betas, ""),
-        figures="\n".join(_figure(caption, png) for caption, png in report.figures),
+        figures="\n".join(
+            f'<figure><img src="{picture_url(png)}" alt="{escape(caption)}">'
+            f"<figcaption>{escape(caption)}</figcaption></figure>"
+            for caption, png in report.figures
+        ),
     )
 
 
@@ -90,9 +94,3 @@ def _scale(colors: np.ndarray, values: np.ndarray, unit: str) -> str:
         f'<div class="bar" style="background:linear-gradient(to right, {stops})"></div>'
         f'<div class="numbers">{numbers}</div>'
     )
-
-
-def _figure(caption: str, png: bytes) -> str:
-    text = escape(caption)
-    image = f'<img src="{picture_url(png)}" alt="{text}">'
-    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
