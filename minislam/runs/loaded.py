@@ -53,10 +53,9 @@ def scene_of(slam: Slam) -> dict[str, Any]:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
     exposures = {index: e.tolist() for index, e in slam.mapper.exposures.items()}
-    origins = [(t.timestamp, sequence.source_name(i)) for i, t in enumerate(slam.tracker.tracked)]
     frames = [
-        asdict(SourceFrame(index, *origin, index in keyframes, exposures.get(index)))
-        for index, origin in enumerate(origins)
+        SourceFrame(i, t.timestamp, sequence.source_name(i), i in keyframes, exposures.get(i))
+        for i, t in enumerate(slam.tracker.tracked)
     ]
     return {
         "sequence": {"name": sequence.name, "description": sequence.description},
@@ -65,7 +64,7 @@ def scene_of(slam: Slam) -> dict[str, Any]:
         "background": slam.mapper.background.tolist(),
         "least_weight": slam.mapper.least_weight,
         "preparation": sequence.preparation,
-        "frames": frames,
+        "frames": [asdict(frame) for frame in frames],
     }
 
 

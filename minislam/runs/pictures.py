@@ -175,6 +175,5 @@ def _write_keyframes(
             name = f"{KEYFRAMES}/{frame_index:06d}_{kind}.png"
             folder.write_picture(name, encode_png(picture))
         if number in shown:
-            small = [encode_jpeg(picture, LONGEST_SIDE) for picture in pictures.values()]
-            jpegs[frame_index] = small
+            jpegs[frame_index] = [encode_jpeg(p, LONGEST_SIDE) for p in pictures.values()]
     return jpegs, of_depth, of_beta
