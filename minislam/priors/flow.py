@@ -5,6 +5,7 @@ Every flow starts from an expected one: the prediction of the geometry, or the l
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,19 +19,16 @@ from minislam.priors.grid_flow import (
     texture_confidence,
 )
 from minislam.priors.interfaces import FlowMatches
-from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree, to_tree
+from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
 _THREADS = ThreadPoolExecutor(2)  # compute flows side by side, without effect on the result
 
 
-@dataclass(frozen=True)
-class MeasuredEdge:
+class MeasuredEdge(NamedTuple):
     """The flow measured along an edge, and the start it was measured from."""
 
-    source: int  # keyframe index
-    target: int  # keyframe index
     start: np.ndarray  # (2, N) px
     targets: np.ndarray  # (h, w, 2) px
     confidence: np.ndarray  # (h, w) in [0, 1)
@@ -56,12 +54,11 @@ class ClassicalFlow(Stateful):
 
     def saved_state(self) -> Tree:
         """Return what was measured; the images are given again."""
-        return {"measured": to_tree(list(self._measured.values()))}
+        return {"measured": [[*edge, *measured] for edge, measured in self._measured.items()]}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
-        measured = from_tree(list[MeasuredEdge], state["measured"], frame_of)
-        self._measured = {(edge.source, edge.target): edge for edge in measured}
+        self._measured = {(i, j): MeasuredEdge(*parts) for i, j, *parts in state["measured"]}
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
@@ -117,7 +114,7 @@ class ClassicalFlow(Stateful):
                 backward = reverse_flow(*images, flow)
             matches = measure_on_grid(*images, flow, backward, self._textures[i], self.stride)
             # A copy: a view would keep the starts of all edges of this call.
-            measured[i, j] = MeasuredEdge(i, j, starts[i, j].copy(), *matches)
+            measured[i, j] = MeasuredEdge(starts[i, j].copy(), *matches)
         return measured
 
     def start_chain(self, image: Tensor) -> "FlowChain":
