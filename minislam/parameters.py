@@ -49,29 +49,26 @@ def kind_of(entry: Field[Any]) -> Any:
 
 def with_values(tree: Tree, values: Mapping[str, Any]) -> Tree:
     """Return a tree with values replaced; they are given by name, as in JSON or as text."""
-    known = {name: (value, entry) for name, value, entry in leaves(tree)}
-    converted = {}
+    known = [name for name, *_ in leaves(tree)]
     for name, value in values.items():
-        if value == {} and any(other.startswith(f"{name}.") for other in known):
-            continue  # a part of which nothing is given
-        if name not in known:
+        is_empty_part = value == {} and any(other.startswith(f"{name}.") for other in known)
+        if name not in known and not is_empty_part:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
             raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
-        present, entry = known[name]
-        converted[name] = _converted(name, value, present, entry)
-        bounds = entry.metadata.get("least", 0), entry.metadata.get("most", MOST)
-        require_bounds(name, converted[name], *bounds)
-    return _replaced(tree, converted)
+    return _replaced(tree, values)
 
 
 def _replaced(tree: Any, values: Mapping[str, Any], prefix: str = "") -> Any:
     changed = {}
     for entry in fields(tree):
-        name, value = prefix + entry.name, getattr(tree, entry.name)
-        if is_dataclass(value):
-            changed[entry.name] = _replaced(value, values, f"{name}.")
+        name, present = prefix + entry.name, getattr(tree, entry.name)
+        if is_dataclass(present):
+            changed[entry.name] = _replaced(present, values, f"{name}.")
         elif name in values:
-            changed[entry.name] = values[name]
+            value = _converted(name, values[name], present, entry)
+            bounds = entry.metadata.get("least", 0), entry.metadata.get("most", MOST)
+            require_bounds(name, value, *bounds)
+            changed[entry.name] = value
     return replace(tree, **changed)
 
 
