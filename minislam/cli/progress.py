@@ -63,20 +63,18 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
     mapping, has_prior, frames = config.mapping, choice.depth != "none", len(sequence)
     scale = sequence.camera.width * sequence.camera.height / REFERENCE_PIXELS
     per_frame, iteration = frames * scale, 0.24 * mapping.image_scale * scale
-    first_map = {"first map": iteration * mapping.init_iterations}
     online_iterations = mapping.keyframe_iterations * config.tracking.warmup_keyframes
     first_online = iteration * min(mapping.init_iterations, online_iterations)
     late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
     online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
     coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}
-    again = {**coarse, "second adjustment": 0.06 * per_frame}
     stages = [
         {"tracking and mapping": 0.25 * per_frame + online}
         | ({"first map": first_online} if has_prior else {}),
         {"final adjustment": 0.05 * per_frame},
-        again if config.uncertainty.enabled else {},
+        coarse | {"second adjustment": 0.06 * per_frame} if config.uncertainty.enabled else {},
         {"posing all frames": 0.12 * per_frame},
-        {"dense depth": 0.25 * per_frame} | first_map,
+        {"dense depth": 0.25 * per_frame, "first map": iteration * mapping.init_iterations},
         {"refining the map": iteration * mapping.refinement(IMAGES_PER_FRAME * frames)},
         {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
     ]
