@@ -16,7 +16,7 @@ from minislam.data.files import read_json
 from minislam.data.options import InputOptions
 from minislam.errors import InputError
 from minislam.parameters import flattened, kind_of, with_values
-from minislam.priors.names import PriorChoice, find_weights, require_priors
+from minislam.priors.names import BUILT_IN, PriorChoice, find_weights, require_prior
 
 if TYPE_CHECKING:
     from minislam.config import SlamConfig
@@ -160,7 +160,8 @@ def input_options(args: argparse.Namespace) -> InputOptions:
 def prior_choice(args: argparse.Namespace, default_depth: str) -> PriorChoice:
     """Return the priors, which exist: those of the file of --config, replaced by what is given."""
     choice = _with_given(PriorChoice(depth=default_depth), args, "priors")
-    require_priors(choice)
+    for kind in BUILT_IN:
+        require_prior(kind, getattr(choice, kind), getattr(choice, f"{kind}_weights"))
     return choice
 
 

@@ -133,9 +133,3 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
             f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
         )
     return None
-
-
-def require_priors(choice: PriorChoice) -> None:
-    """Refuse a choice with a name that is unknown or with weights that are missing."""
-    for kind in BUILT_IN:
-        require_prior(kind, getattr(choice, kind), getattr(choice, f"{kind}_weights"))
