@@ -34,19 +34,16 @@ class SimulatedDepthConfig:
     gross_errors: int = parameter(2, "places per frame with an error of 30 %")
 
 
+@dataclass(frozen=True)
 class SimulatedDepth:
     """The true depth of a synthetic scene with the errors of a monocular metric network.
 
     The errors of a frame depend on the seed and the frame index alone, not on the order of calls.
     """
 
-    def __init__(
-        self,
-        truth: DepthReader,
-        seed: int,
-        config: SimulatedDepthConfig = SimulatedDepthConfig(),
-    ) -> None:
-        self.truth, self.seed, self.config = truth, seed, config
+    truth: DepthReader
+    seed: int
+    config: SimulatedDepthConfig = SimulatedDepthConfig()
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return the disturbed truth of a frame."""
