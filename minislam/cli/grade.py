@@ -52,12 +52,16 @@ def _grade(args: argparse.Namespace) -> int:
     graded = []
     for name in args.notebooks:
         try:
-            graded.append(_graded(Path(name), args.seed, args.no_package))
+            result = _graded(Path(name), args.seed, args.no_package)
         except InputError as error:
-            graded.append(
-                {"file": name, "error": str(error), "points": 0, "of": 0, "exercises": []}
-            )
-        _show(graded[-1])
+            result = {"file": name, "error": str(error), "points": 0, "of": 0, "exercises": []}
+        graded.append(result)
+        print(result["file"])
+        for row in result["exercises"]:
+            verdict = f"{row['status']:7}  {row['sentence']}"
+            print(f"  {row['key']:7} {row['points']}/{row['of']}  {verdict}")
+        total = f"{result['points']} of {result['of']} points"
+        print(f"  {result.get('error', total)}")
     points, of = sum(g["points"] for g in graded), sum(g["of"] for g in graded)
     if len(graded) > 1:
         print(f"all {len(graded)} notebooks: {points} of {of} points")
@@ -73,14 +77,6 @@ def _grade(args: argparse.Namespace) -> int:
         write_text(args.csv, table.getvalue())
     failed = any("error" in notebook for notebook in graded)
     return int(failed or (args.strict and points < of))
-
-
-def _show(graded: dict[str, Any]) -> None:
-    print(graded["file"])
-    for row in graded["exercises"]:
-        print(f"  {row['key']:7} {row['points']}/{row['of']}  {row['status']:7}  {row['sentence']}")
-    total = f"{graded['points']} of {graded['of']} points"
-    print(f"  {graded.get('error', total)}")
 
 
 def _graded(path: Path, seed: int | None, without_package: bool) -> dict[str, Any]:
