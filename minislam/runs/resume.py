@@ -35,6 +35,7 @@ class Checkpoints:
         self._folder = folder
         self._fraction = config.checkpoint_fraction
         origin = {
+            "input": sequence.opened_as["input"],  # an option says more than a description
             "version": minislam.__version__,
             "sequence": {
                 "name": sequence.name,
@@ -87,10 +88,8 @@ class Checkpoints:
         device, where = self._origin["priors"]["device"], self._folder.path
         found = self._folder.read_checkpoint(device)
         try:
-            inputs = {"input": json.loads(json.dumps(slam.sequence.opened_as["input"]))}
-            present = flattened(inputs | self._origin)  # an option says more than a description
-            then = flattened(inputs | {name: found.get(name) for name in self._origin})
-            then |= flattened({"input": self._folder.read_config().get("input")})
+            present = flattened(self._origin)
+            then = flattened({name: found.get(name) for name in self._origin})
             if device == "cpu" and then.get("priors.device") != "cpu":
                 for name in ("device", "precision"):
                     then[f"priors.{name}"] = self._origin["priors"][name]
