@@ -76,8 +76,9 @@ def make_folder(path: Path) -> None:
     require_no_file(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        text = f"expected to make the folder {path}, but the system says: {error.strerror}"
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        text = f"expected to make the folder {str(path)[:300]}, but the system says: {reason}"
         raise InputError(f"{text}; choose another name, or change its permissions") from error
 
 

@@ -12,7 +12,14 @@ import torch
 from torch import Tensor
 
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
-from minislam.data.files import atomic_write, read_bytes, read_json, require_free, write_text
+from minislam.data.files import (
+    atomic_write,
+    make_folder,
+    read_bytes,
+    read_json,
+    require_free,
+    write_text,
+)
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
@@ -80,15 +87,8 @@ class RunFolder:
         require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():
             file.unlink()
-        try:
-            for folder in (KEYFRAMES, PLOTS):
-                (path / folder).mkdir(parents=True, exist_ok=True)
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(
-                f"expected to make the output folder {str(path)[:300]}, but the system says: "
-                f"{reason}; choose another --output"
-            ) from error
+        for folder in (KEYFRAMES, PLOTS):
+            make_folder(path / folder)
         return cls(path)
 
     def write_lost_frames(self, lost: list[tuple[int, float, str]]) -> None:

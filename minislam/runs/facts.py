@@ -274,7 +274,7 @@ def _warnings(slam: Slam) -> Iterator[str]:
 
 def _focal_length_warnings(slam: Slam) -> Iterator[str]:
     fit, graph = slam.focal_length, slam.tracker.graph
-    if graph.guesses_focal and graph.adjustments:
+    if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
         yield (
             "the focal length is unknown and the motion does not tell it: trajectory and map may "
             "be bent; give --fx or a calibration file"

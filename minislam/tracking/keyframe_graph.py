@@ -93,11 +93,6 @@ class KeyframeGraph(Stateful):
         """Return poses and disparities of all keyframes."""
         return BundleState(self.keyframes.T_camera_world, self.keyframes.disparities)
 
-    @property
-    def guesses_focal(self) -> bool:
-        """Tell whether the focal length is still the first guess."""
-        return self.seeks_focal and not self.focal_is_free
-
     def count_adjustment(self, report: BundleReport) -> None:
         """Count an adjustment; a run warns at its end of those that failed."""
         self.adjustments += 1

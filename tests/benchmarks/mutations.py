@@ -179,7 +179,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("index - last <= HEALED_AFTER", "False"),
     ],
     ("tracking/safeguards/turns.py", "tracking/safeguards/test_turns.py"): [
-        ("free_focal=graph.guesses_focal", "free_focal=False"),
+        ("free_focal=graph.seeks_focal and", "free_focal=False and"),
+        ("graph.seeks_focal and not graph.focal_is_free", "graph.seeks_focal"),
         ("if target == source + 1", "if target == source - 9"),
         ("turned, POSE_ITERATIONS", "turned, 0"),
         ("for kernel in (None, *kernels)", "for kernel in (None,)"),

@@ -195,8 +195,8 @@ def test_damaged_weights_are_one_sentence(content: bytes, tmp_path: Path):
     ("name", "words"),
     [
         ("mine/a", "mine is a file; choose"),
-        ("a" * 300, "make the output folder (?s:.*)says: .*too long.*; choose"),
-        ("a\0", "make the output folder (?s:.*)says: .*null byte.*; choose"),
+        ("a" * 300, "make the folder (?s:.*)says: .*too long.*; choose"),
+        ("a\0", "make the folder (?s:.*)says: .*null byte.*; choose"),
     ],
 )
 def test_a_folder_that_cannot_be_made_is_one_sentence(name: str, words: str, tmp_path: Path):

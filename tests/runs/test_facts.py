@@ -24,9 +24,8 @@ def slam(**parts: object) -> SimpleNamespace:
         adjustments=2 + failed,
         failed_adjustments=failed,
         least_parallax=1.0,
-        seeks_focal=parts.get("seeks_focal", False),
-        focal_is_free=parts.get("focal_is_free", False),
-        guesses_focal=parts.pop("seeks_focal", False) and not parts.pop("focal_is_free", False),
+        seeks_focal=parts.pop("seeks_focal", False),
+        focal_is_free=parts.pop("focal_is_free", False),
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )

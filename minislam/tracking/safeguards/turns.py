@@ -42,7 +42,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
     measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
     problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
-    problem = replace(problem, free_focal=graph.guesses_focal)
+    problem = replace(problem, free_focal=graph.seeks_focal and not graph.focal_is_free)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
     turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
     kernels = [graph.robust.widened(width) for width in TURN_WIDENING] if graph.robust else []
