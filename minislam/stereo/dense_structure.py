@@ -22,8 +22,8 @@ WIDTH = 160  # px of the images that are swept for the map
 VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
-BETWEEN = 2  # frames between two keyframes that are swept as well, at most; if many lie there,
-RESTING = 8  # one of so many: a camera at rest makes no keyframes
+BETWEEN = 2  # most frames between two keyframes that are swept as well
+RESTING = 8  # yet one of so many: a camera at rest makes no keyframes
 AT_ONCE = 8  # frames whose sweeps are given to the workers together
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
@@ -123,7 +123,7 @@ def dense_depths(
 
 
 def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
-    """Return keyframes and a third of the frames between two: at least so many, and few."""
+    """Return keyframes and a third of the frames between two: at least so many, at most a few."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
         there = [frame for frame in followed if first < frame < last]
