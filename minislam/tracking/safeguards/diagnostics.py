@@ -81,8 +81,8 @@ class Watch(Stateful):
         self.judge()
         self.beyond_turns = flow_beyond_turns(self._graph)
         judged = self.diagnostics
-        if self.only_turned:
-            judged = [replace(keyframe, depth_error=None) for keyframe in judged]
+        if self.only_turned:  # it may see other depths, and be held by something new
+            judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         self.breaks = find_breaks(judged)
 
     @property

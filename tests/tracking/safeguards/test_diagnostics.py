@@ -10,6 +10,7 @@ from minislam.geometry import se3_exp
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.optimisation import adjust
+from minislam.tracking.safeguards import diagnostics
 from minislam.tracking.safeguards.diagnostics import (
     Break,
     KeyframeDiagnostics,
@@ -162,6 +163,15 @@ def test_only_a_camera_at_rest_may_see_other_depths():
     watch = Watch(graph)
     watch.conclude()  # but its flow must fit
     assert watch.diagnostics[1].parallax == 0 and watch.breaks == [Break(0, 0)]
+
+
+@pytest.mark.parametrize(("parallax", "breaks"), [(0.1, []), (30.0, [Break(10, 10)])])
+def test_what_holds_a_camera_at_rest_may_change(monkeypatch, parallax: float, breaks: list):
+    told = [replace(k, parallax=parallax) for k in keyframes(HEALTHY, UNTIED)]
+    monkeypatch.setattr(diagnostics, "diagnose", lambda graph, keyframe: told[keyframe])
+    watch = Watch(true_graph([0, 0]))
+    watch.conclude()
+    assert watch.breaks == breaks
 
 
 def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
