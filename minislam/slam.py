@@ -193,7 +193,7 @@ class Slam(Stateful):
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
-        if self.tracker.knows_depth:
+        if not self.tracker.watch.only_turned:
             self.focal_length = check_focal_length(self.tracker.graph, self.workers)
         progress = self.steps.on_progress("posing all frames")
         self.poses = pose_all_frames(self.tracker, self.sequence, progress)

@@ -192,7 +192,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if report.converged", "if True"),
     ],
     ("slam.py", "test_slam_at_rest.py"): [
-        ("if self.tracker.knows_depth:\n            self.f", "if True:\n            self.f"),
+        ("if not self.tracker.watch.only_turned", "if True"),
         ("enabled and self.tracker.knows_depth", "enabled"),
     ],
     ("tracking/tracker.py", "test_slam_at_rest.py"): [
