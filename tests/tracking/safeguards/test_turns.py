@@ -18,7 +18,7 @@ from tests.tracking.wall import CAMERA, GRID, true_graph
 TURNS = [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01), (0.03, 0.05, -0.02)]  # rad
 
 
-def seen_moving(positions: torch.Tensor) -> KeyframeGraph:
+def seen_moving(positions: Tensor) -> KeyframeGraph:
     """Return two keyframes between which the cells move to positions (N, 2)."""
     graph = true_graph([0, 1])
     graph.match([(0, 1), (1, 0)])
