@@ -17,9 +17,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from functools import cache
+from itertools import islice
 from threading import Lock, Thread
 from typing import Any, get_type_hints
 
@@ -32,6 +33,7 @@ from minislam.records import Frame
 from minislam.state.stateful import Tree, from_tree, to_tree
 
 MOST_WORKERS = 4  # by default
+AT_ONCE = 8  # calls of a stream
 _TENSOR = "tensor"  # key of what stands for a tensor in the JSON of a message
 _START = "import sys; sys.path[:] = sys.argv[2:]; from minislam.workers import serve; serve()"
 
@@ -110,6 +112,14 @@ class Workers(AbstractContextManager["Workers"]):
             self._warn(f"a worker process has ended; the run goes on with {len(alive) + 1}")
         self._helpers = alive
         return [_result(function, answers[number]) for number in range(len(calls))]
+
+    def stream(
+        self, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
+    ) -> Iterator[Any]:
+        """Yield what `map` returns. Calls are asked for, and results are kept, a few at a time."""
+        left = iter(calls)
+        while some := list(islice(left, AT_ONCE)):
+            yield from self.map(function, some)
 
     def start(self, function: Callable[..., Any], *call: Any) -> Callable[[], Any]:
         """Begin function(*call) in a helper, as for `map`; return what waits for the result.

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from minislam.errors import InputError
-from minislam.workers import MOST_WORKERS, Workers, idle_cores
+from minislam.workers import AT_ONCE, MOST_WORKERS, Workers, idle_cores
 from tests.mapping.plane_scene import CONFIG, make_mapper, wall_keyframe
 from tests.worker_calls import Pair, dies_in_a_helper, fails, prints, process_of, swapped
 
@@ -44,6 +44,20 @@ def test_calls_are_shared_and_answered_in_their_order(two):
     assert os.getpid() in pids and len(set(pids)) == 2
     assert two.map(prints, [(number,) for number in range(9)]) == list(range(9))
     assert two.map(prints, []) == []
+
+
+def test_a_stream_asks_for_few_calls_at_a_time():
+    asked = []
+
+    def calls():
+        for number in range(2 * AT_ONCE + 1):
+            asked.append(number)
+            yield (number,)
+
+    answers = Workers().stream(prints, calls())
+    assert next(answers) == 0 and len(asked) == AT_ONCE
+    assert list(answers) == asked[1:] and len(asked) == 2 * AT_ONCE + 1
+    assert list(Workers().stream(prints, [])) == []
 
 
 @pytest.mark.slow

@@ -34,7 +34,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add("--rpe", action="store_true", help="relative pose error: the drift over --delta")
     add("--delta", type=float, default=1.0, help="length of each motion for --rpe, 1")
     add("--delta_unit", choices=("s", "f"), default="s", help="of --delta: seconds or frames, s")
-    add("-p", "--plot", action="store_true", help="show the trajectories")
     add("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
     add("--save_results", metavar="FILE.json", help="write the numbers to a file")
     add("--overwrite", action="store_true", help="replace files of these names")
@@ -85,14 +84,11 @@ def run_eval(args: argparse.Namespace) -> None:
             "errors": result.errors.tolist(),
         }
         write_json(args.save_results, numbers)
-    if args.plot or args.save_plot:
-        from minislam.viz import figure_png, show_figure, trajectory_plot
+    if plot:
+        from minislam.viz import figure_png, trajectory_plot
 
         figure = trajectory_plot(result.estimate, result.truth, unit="m")
-        if args.save_plot:
-            atomic_write(plot, figure_png(figure))
-        if args.plot:
-            show_figure(figure)
+        atomic_write(plot, figure_png(figure))
 
 
 def _alignment(args: argparse.Namespace) -> Alignment:

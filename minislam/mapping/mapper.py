@@ -181,9 +181,12 @@ class Mapper(JointOptimisation):
         """
         sums = self.gaussians.means.new_zeros(2, len(self.gaussians))
         camera = self._online_camera
-        for keyframe in self.keyframes:
-            weight = self.static_weight(self.beta_of(keyframe), camera)
-            sums += blending_weights(self.gaussians, camera, keyframe.T_camera_world, weight)
+        calls = (
+            (self.gaussians, camera, k.T_camera_world, self.static_weight(self.beta_of(k), camera))
+            for k in self.keyframes
+        )
+        for of_view in self._workers.stream(blending_weights, calls):
+            sums += of_view
         static, whole = sums
         if static.any():
             self._optimizer.prune(static >= LEAST_STATIC * whole)

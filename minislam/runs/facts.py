@@ -221,9 +221,12 @@ def _warnings(slam: Slam) -> Iterator[str]:
             "its times"
         )
     if lost:
+        tracked = slam.tracker.tracked
+        since = 1 + max((t.frame_index for t in tracked if t.status.is_followed), default=-1)
+        rest = f". If the film is cut at frame {since}, run the rest by itself (--start)"
         yield (
-            f"{lost} of {len(slam.tracker.tracked)} frames could not be tracked and have no "
-            "pose; lost_frames.txt lists them"
+            f"{lost} of {len(tracked)} frames could not be tracked and have no pose; "
+            f"lost_frames.txt lists them{rest if since < len(tracked) else ''}"
         )
     if watch.breaks:
         where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)

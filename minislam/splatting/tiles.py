@@ -161,7 +161,9 @@ def stable_argsort(keys: Tensor) -> Tensor:  # (N,) integers in [0, 2^31) -> (N,
     """Return the stable sorting order of integers."""
     if keys.device.type != "cpu":
         return keys.argsort(stable=True)
-    # With its place in the lower half of each key any sort is stable. That of numpy is ten times
-    # as fast as a stable one.
-    keys = keys.long() << 32 | torch.arange(len(keys), device=keys.device)
-    return torch.from_numpy(np.sort(keys.numpy())) & 0xFFFFFFFF
+    # numpy sorts numbers of 16 bits digit by digit, ten times as fast as longer ones.
+    low, high = (half.numpy().astype(np.uint16) for half in (keys & 0xFFFF, keys >> 16))
+    order = low.argsort(kind="stable")
+    if high.any():
+        order = order[high[order].argsort(kind="stable")]
+    return torch.from_numpy(order)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,6 @@ REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
 BETWEEN = 2  # most frames between two keyframes that are swept as well
 RESTING = 8  # yet one of so many: a camera at rest makes no keyframes
-AT_ONCE = 8  # frames whose sweeps are given to the workers together
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
 LARGEST_QUANTILE = 0.98
@@ -104,13 +104,14 @@ def dense_depths(
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     told, near = list(disparities), list(disparities.values())
     swept: list[votes.SweptView] = []
-    for first in range(0, len(frames), AT_ONCE):
-        sweeps = []
-        for frame in frames[first : first + AT_ONCE]:
+
+    def plans() -> Iterator[tuple[Any, ...]]:
+        for frame in frames:
             nearest = int(np.argmin([abs(frame - index) for index in told]))
-            known = np.concatenate(near[max(0, nearest - 1) : nearest + 2])
-            sweeps.append(planner.plan(frame, known))
-        swept += workers.map(swept_view, sweeps)
+            yield planner.plan(frame, np.concatenate(near[max(0, nearest - 1) : nearest + 2]))
+
+    for view in workers.stream(swept_view, plans()):
+        swept.append(view)
         if progress:
             progress(len(swept), len(frames))
     depths = []

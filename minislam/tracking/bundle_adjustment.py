@@ -20,7 +20,7 @@ from torch import Tensor
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
 from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal, within_reach
-from minislam.tracking.safeguards.parts import in_parts, joined
+from minislam.tracking.safeguards.parts import CELLS_KEPT, in_parts, joined
 from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
 from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
 
@@ -162,11 +162,12 @@ def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) fl
 
 
 def _cost(problem: BundleProblem, state: BundleState) -> tuple[float, list[_Linearised]]:
-    """Return the whole cost in px^2, Eq. (5), and the linearised edges if they are one part."""
+    """Return the whole cost in px^2, Eq. (5), and the linearised edges if they are not too many."""
     difference = state.disparities - problem.prior_disparities
     prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
-    costs = [(at := found).costs for found in _linearised(problem, state)]
-    return float(torch.cat(costs).sum() + prior_cost), [at] if len(costs) == 1 else []
+    edges = _linearised(problem, state)
+    known = list(edges) if problem.weights[:, 0].numel() <= CELLS_KEPT else []
+    return float(torch.cat([at.costs for at in known or edges]).sum() + prior_cost), known
 
 
 def _normal_equations(
@@ -246,11 +247,11 @@ def _source_blocks(
     blocks, is_free = [], problem.free_disparities.tolist()
     for source in sorted(source for source in edges_of if is_free[source]):
         edges = edges_of[source]
-        ends = [slots[source], *(slots[targets[edge]] for edge in edges)]
-        free = [position for position, end in enumerate(ends) if end >= 0]
-        parts = torch.cat([E_source[edges].sum(0)[None], E_target[edges, :6]])
-        rows = [6 * ends[position] + row for position in free for row in range(6)] + common
-        E = torch.cat([parts[free].flatten(0, 1), E_target[edges, 6:].sum(0)])
+        free = [edge for edge in edges if slots[targets[edge]] >= 0]
+        own = [E_source[edges].sum(0)] if slots[source] >= 0 else []
+        ends = [slots[source]] * len(own) + [slots[targets[edge]] for edge in free]
+        rows = [6 * end + row for end in ends for row in range(6)] + common
+        E = torch.cat([*own, E_target[free, :6].flatten(0, 1), E_target[edges, 6:].sum(0)])
         blocks.append((source, torch.tensor(rows, dtype=torch.long, device=E.device), E))
     return blocks
 

@@ -21,7 +21,6 @@ from minislam.viz.style import (
     figure_png,
     new_figure,
     set_notebook_style,
-    show_figure,
     show_image,
     show_map,
 )

@@ -12,8 +12,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from minislam.errors import InputError
-
 WIDE = 9.0, 3.0  # inch
 
 # The truth is drawn on top of the estimate.
@@ -51,23 +49,6 @@ def figure_picture(figure: Figure) -> np.ndarray:  # (H, W, 3) uint8
     """Turn a figure into a picture; one of `new_figure` is shown nowhere else."""
     png = np.frombuffer(figure_png(figure, figure.dpi), np.uint8)
     return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR_RGB))
-
-
-def show_figure(figure: Figure) -> None:
-    """Open a window with a figure and wait until it is closed."""
-    from matplotlib import pyplot  # only here: pyplot looks for a screen when it is imported
-    from matplotlib.backends import backend_registry
-    from matplotlib.backends.registry import BackendFilter
-
-    backend = pyplot.get_backend().lower()
-    if backend not in backend_registry.list_builtin(BackendFilter.INTERACTIVE):
-        raise InputError(
-            "expected a display to plot on, found none; write the plot to a file with "
-            "--save_plot FILE"
-        )
-    window = pyplot.figure(figsize=figure.get_size_inches(), dpi=figure.dpi)
-    window.figimage(figure_picture(figure))
-    pyplot.show()
 
 
 def show_image(

@@ -29,8 +29,14 @@ def slam(**parts: object) -> SimpleNamespace:
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
+    lost, ends_lost = parts.pop("lost", 0), parts.pop("ends_lost", False)
+    follows = [k < 4 - lost if ends_lost else k > lost for k in range(4)]
+    frames = [
+        SimpleNamespace(frame_index=k, timestamp=k / 30, status=SimpleNamespace(is_followed=there))
+        for k, there in enumerate(follows)
+    ]
     tracker = SimpleNamespace(
-        tracked=[SimpleNamespace(timestamp=k / 30) for k in range(4)],
+        tracked=frames,
         graph=graph,
         knows_depth=parts.pop("knows_depth", True),
         watch=SimpleNamespace(
@@ -47,7 +53,7 @@ def slam(**parts: object) -> SimpleNamespace:
     if truth is not None:
         poses = np.tile(np.eye(4), (len(truth), 1, 1))
         truth = SimpleNamespace(trajectory=Trajectory(np.array(truth), poses))
-    lost, shown = parts.pop("lost", 0), parts.pop("shown", [1.0])
+    shown = parts.pop("shown", [1.0])
     keyframes = [SimpleNamespace(frame_index=8 * k) for k in range(len(shown))]
     return SimpleNamespace(
         mapper=SimpleNamespace(shown=shown, keyframes=keyframes),
@@ -62,7 +68,11 @@ CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
 DOUBTFUL = FocalLengthFit(272.0, 1.1, 0.25)
 ZOOMED = FocalLengthFit(272.0, 1.4, 0.52, half=(8, 15))
 WARNINGS = [
-    ({"lost": 1}, "1 of 4 frames could not be tracked"),
+    (
+        {"lost": 1},
+        "1 of 4 frames could not be tracked and have no pose; lost_frames.txt lists them",
+    ),
+    ({"lost": 2, "ends_lost": True}, "If the film is cut at frame 2, run the rest by itself"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
     ({"breaks": [Break(2, 2)]}, "look at each piece (frames 0 to 1, 3 to 3) by itself"),
     ({"truth": [9.0, 9.5]}, "no frame has a true pose within 0.02 s, so there is no ATE"),
@@ -234,3 +244,8 @@ def test_the_map_is_compared_with_some_frames_that_it_was_not_fitted_to():
     assert facts.unseen_psnr(run) is not None and asked == [1, 2, 3, 4, 5, 6, 7, 8]
     run.poses = {0: None}
     assert facts.unseen_psnr(run) is None
+
+
+def test_a_film_that_goes_on_after_a_loss_is_not_called_cut():
+    (warning,) = facts._warnings(slam(lost=1))
+    assert "cut" not in warning

@@ -5,7 +5,7 @@ import torch
 
 from minislam.splatting import tiles
 from minislam.splatting.reference import gaussian_alphas
-from minislam.splatting.tiles import TILE, TileGroup, build_tile_lists, tile_grid
+from minislam.splatting.tiles import TILE, TileGroup, build_tile_lists, stable_argsort, tile_grid
 from minislam.splatting.visible import project_gaussians
 from tests.splatting.scenes import KINDS, random_camera, random_map, random_pose
 
@@ -76,3 +76,11 @@ def test_lists_run_from_front_to_back(seed: int):
 def test_no_gaussian_gives_no_group():
     empty = torch.zeros(3, 0)
     assert build_tile_lists(empty[:2], empty, empty, empty[0], random_camera(0)) == []
+
+
+@pytest.mark.parametrize("most", [1, 300, 65_536, 65_537, 2**31 - 1])
+def test_integers_are_sorted_and_equal_ones_keep_their_order(most: int):
+    keys = torch.randint(0, most, (2_000,), dtype=torch.int32)
+    keys[::3] = most - 1
+    assert torch.equal(stable_argsort(keys), keys.argsort(stable=True))
+    assert stable_argsort(keys[:0]).shape == (0,)

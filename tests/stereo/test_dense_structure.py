@@ -107,7 +107,7 @@ def test_progress_counts_the_swept_frames():
     for frames in ([0, 2], [0, 1, 2]):
         found = dense_depths(*inputs, frames, [2], lambda *step: told.append(step))
         assert len(list(found)) == 1  # of the frame that is wanted
-    assert told == [(2, 2), (3, 3)]
+    assert told == [(1, 2), (2, 2), (1, 3), (2, 3), (3, 3)]
 
 
 def test_a_helper_sweeps_to_the_same_bits():

@@ -1,10 +1,9 @@
-"""Colours of depth and uncertainty, bytes that do not change, and windows on a screen."""
+"""Colours of depth and uncertainty, and bytes that do not change."""
 
 import numpy as np
 import pytest
 from matplotlib import colormaps, pyplot, rc_context
 
-from minislam.errors import InputError
 from minislam.viz import (
     beta_to_rgb,
     colour_bar,
@@ -13,7 +12,6 @@ from minislam.viz import (
     figure_png,
     new_figure,
     set_notebook_style,
-    show_figure,
     show_image,
     show_map,
 )
@@ -94,21 +92,3 @@ def test_constant_maps_can_be_coloured(value: float):
     assert np.isfinite(depth_to_rgb(np.full((3, 4), value))).all()
     if np.isfinite(value):
         assert np.isfinite(beta_to_rgb(np.full((3, 4), value))).all()
-
-
-# Windows
-
-
-def test_without_a_display_the_user_is_told_what_to_do(monkeypatch):
-    monkeypatch.setattr(pyplot, "get_backend", lambda: "agg")
-    with pytest.raises(InputError, match="--save_plot"):
-        show_figure(new_figure((2, 2)))
-
-
-def test_with_a_display_the_figure_is_shown(monkeypatch):
-    shown = []
-    monkeypatch.setattr(pyplot, "get_backend", lambda: "QtAgg")
-    monkeypatch.setattr(pyplot, "show", lambda: shown.extend(pyplot.get_fignums()))
-    show_figure(new_figure((2, 2)))
-    assert len(shown) == 1
-    pyplot.close("all")

@@ -1,6 +1,7 @@
 """A bundle problem of some edges, keyframes or cells alone.
 
-Edges in parts, because the derivatives of thousands of edges at once would take gigabytes.
+Edges in parts, because the derivatives of thousands of edges at once would take gigabytes, and
+because arrays of few megabytes are taken from memory that was used before.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,7 +14,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 
-CELLS_AT_ONCE = 300_000  # of all edges of a part: 200 bytes a cell
+CELLS_AT_ONCE = 50_000  # of all edges of a part: 200 bytes a cell
+CELLS_KEPT = 300_000  # of all edges of a problem whose derivatives are kept from cost to step
 _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
 _OF_CELLS = "targets weights shutter prior_disparities prior_weights disparity_damping"
