@@ -29,6 +29,7 @@ VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
 LARGEST_QUANTILE = 0.98
 PLANES = (48, 96)  # fewest and most
+FARTHEST = 0.25  # plane of all that lies between the first, at infinity, and this one [-]
 LEAST_COMMON = 100  # px, with two depths of which the ratio of their scales is told
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
 
@@ -147,7 +148,7 @@ def swept_view(
         return votes.SweptView(nothing, nothing + 1, step, pose)
     cost = sweep(camera, reference, others, planes)
     best, fraction = refined_minimum(aggregate(cost, reference.gray))
-    found = ((best + fraction) * step).clip(0).astype(np.float32)
+    found = ((best + fraction) * step).clip(FARTHEST * step).astype(np.float32)
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
     at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
     return votes.SweptView(found, at_best, step, pose)

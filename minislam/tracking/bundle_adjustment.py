@@ -251,7 +251,7 @@ def _source_blocks(
         own = [E_source[edges].sum(0)] if slots[source] >= 0 else []
         ends = [slots[source]] * len(own) + [slots[targets[edge]] for edge in free]
         rows = [6 * end + row for end in ends for row in range(6)] + common
-        E = torch.cat([*own, E_target[free, :6].flatten(0, 1), E_target[edges, 6:].sum(0)])
+        E = torch.cat([*own, *(E_target[edge, :6] for edge in free), E_target[edges, 6:].sum(0)])
         blocks.append((source, torch.tensor(rows, dtype=torch.long, device=E.device), E))
     return blocks
 
