@@ -106,12 +106,11 @@ def dense_depths(
     told, near = list(disparities), list(disparities.values())
     swept: list[votes.SweptView] = []
 
-    def plans() -> Iterator[tuple[Any, ...]]:
-        for frame in frames:
-            nearest = int(np.argmin([abs(frame - index) for index in told]))
-            yield planner.plan(frame, np.concatenate(near[max(0, nearest - 1) : nearest + 2]))
+    def plan(frame: int) -> tuple[Any, ...]:
+        nearest = int(np.argmin([abs(frame - index) for index in told]))
+        return planner.plan(frame, np.concatenate(near[max(0, nearest - 1) : nearest + 2]))
 
-    for view in workers.stream(swept_view, plans()):
+    for view in workers.stream(swept_view, map(plan, frames)):
         swept.append(view)
         if progress:
             progress(len(swept), len(frames))

@@ -53,7 +53,7 @@ def adjust_again(
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
     frames = sorted(poses), keyframes
     swept = sweep_frames(tracker.graph, sequence, poses, *frames, on_sweep, workers, COARSE_WIDTH)
-    adjust_confirmed(tracker.graph, swept, on_round)
+    tracker.watch.confirmed = adjust_confirmed(tracker.graph, swept, on_round)
     tracker.conclude()
 
 
@@ -100,8 +100,11 @@ def adjust_confirmed(
     graph: KeyframeGraph,
     swept: Iterable[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
     progress: Progress | None = None,
-) -> None:
-    """Adjust all keyframes on fresh flow. Each cell counts as far as it is confirmed."""
+) -> float:
+    """Adjust all keyframes on fresh flow. Each cell counts as far as it is confirmed.
+
+    Return the fraction of the cells whose swept depth is known.
+    """
     keyframes, stride = graph.keyframes, graph.grid.stride
     cells = [torch.stack(images)[:, ::stride, ::stride].flatten(1) for images in swept]
     depth, confirmation = torch.stack(cells, 1)
@@ -111,3 +114,4 @@ def adjust_confirmed(
     disparities = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), keyframes.disparities)
     keyframes.set_geometry(keyframes.T_camera_world, disparities)
     final_global_ba(graph, progress)
+    return float((depth > 0).float().mean())

@@ -185,13 +185,16 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("for kernel in (None, *kernels)", "for kernel in (None,)"),
         ("BundleState(poses, grid.rays.new_zeros(", "BundleState(poses, grid.rays.new_ones("),
         ("/ graph.pixel_scale if known", "if known"),
+        ("beyond_turns is None or", "beyond_turns is not None and"),
+        ("confirmed < LEAST_CONFIRMED or", ""),
+        ("> UNMEASURED", "> 0"),
         ("poses[:, :3, 3] = 0", "pass"),
         ("0 * keyframes.disparities", "keyframes.disparities"),
         ("if report.converged", "if True"),
     ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_turns.py"): [
-        ("return is_weak and bool(errors) and", "return bool(errors) and"),
-        ("median(errors) > UNMEASURED", "True"),
+        ("no_parallax or tells_no_depth", "tells_no_depth"),
+        ("errors, self.confirmed)", "errors, 1.0)"),
     ],
     ("slam.py", "test_slam_at_rest.py"): [
         ("if not self.tracker.watch.only_turned", "if True"),

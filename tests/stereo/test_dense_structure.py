@@ -1,5 +1,6 @@
 """Dense depth of keyframes, against the truth of the ray-caster, and which frames are swept."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -8,14 +9,17 @@ from minislam.geometry import Camera
 from minislam.records import Keyframe
 from minislam.stereo import dense_structure
 from minislam.stereo.dense_structure import (
+    FARTHEST,
     SweepPlanner,
     dense_depths,
     full_size,
     on_backdrop,
     swept_frames,
+    swept_view,
     with_swept_depth,
 )
-from minislam.stereo.votes import ConfirmedDepth
+from minislam.stereo.sweep import PosedImage
+from minislam.stereo.votes import ConfirmedDepth, confirm
 from minislam.workers import Workers
 from tests.stereo.clip import KEYFRAMES, SIZE, camera, clip, found, pose, sequence
 
@@ -44,6 +48,21 @@ def test_what_stands_still_is_confirmed(index: int):
     assert seen.confirmation[~seen.moving].mean() > 0.7
     assert seen.confirmation[seen.moving].mean() < 0.2
     assert 0 <= seen.confirmation.min() and seen.confirmation.max() <= 1 + 1e-6
+
+
+def test_what_lies_at_infinity_is_known_to_be_far():
+    noise = np.random.default_rng(0).uniform(0, 1, (30, 40)).astype(np.float32)
+    gray = cv2.blur(noise, (3, 3))  # all views show the same, however far apart they are
+    poses = [np.eye(4) for _ in range(5)]
+    for index, posed in enumerate(poses):
+        posed[0, 3] = 0.1 * index
+    images, planes = [PosedImage(gray, posed) for posed in poses], np.linspace(0, 2, 48)
+    far = Camera(40.0, 40.0, 20.0, 15.0, 40, 30)
+    views = [
+        swept_view(far, image, [i for i in images if i is not image], planes) for image in images
+    ]
+    depth = confirm(far, views[2], views[:2] + views[3:]).inverse_depth
+    assert (depth > 0).mean() > 0.9 and np.median(depth) == np.float32(FARTHEST * planes[1])
 
 
 # Which frames
@@ -168,6 +187,8 @@ def test_swept_depth_comes_first_and_a_prior_of_another_scale_fills_the_rest():
         assert 0 < float(known.float().mean()) < 1
         assert torch.equal(found_there.depth[known], depth[known])
         rest = found_there.depth[~known]
+        assert float((rest == 0).float().mean()) < 0.01  # others seem to look through a few
+        rest = rest[rest > 0]
         torch.testing.assert_close(rest, torch.full_like(rest, 7 / 1.3))
         assert found_there.confirmation is not None
         assert found_there.confirmation.shape == (15, 20)

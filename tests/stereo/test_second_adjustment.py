@@ -84,7 +84,7 @@ def test_confirmation_becomes_the_weight_and_swept_depth_the_start(monkeypatch):
     right = GRID.pixels[:, 0] >= HALF
     graph.keyframes.set_geometry(graph.keyframes.T_camera_world, 3 * expected)
     monkeypatch.setattr(second_adjustment, "final_global_ba", lambda graph, progress: None)
-    adjust_confirmed(graph, images)
+    assert adjust_confirmed(graph, images) == pytest.approx(float(right.float().mean()))
     weights, disparities = graph.keyframes.static_weights, graph.keyframes.disparities
     assert torch.allclose(disparities[:, right], expected[:, right])
     assert torch.equal(disparities[:, ~right], 3 * expected[:, ~right])  # the sweep found nothing
@@ -96,7 +96,7 @@ def test_where_nothing_is_confirmed_all_cells_count_alike():
     first, second = linked_graph(), linked_graph()
     final_global_ba(first)
     nothing = [(torch.zeros_like(c), torch.zeros_like(c)) for _, c in swept(second)]
-    adjust_confirmed(second, nothing)
+    assert adjust_confirmed(second, nothing) == 0
     poses = first.keyframes.T_camera_world
     assert torch.allclose(poses, second.keyframes.T_camera_world, atol=1e-3)
 
@@ -123,7 +123,8 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
     followed = [TrackedFrame(index, float(index), ok, 1.0) for index in range(count)]
     lost = replace(followed[1], status=TrackingStatus.LOST)
     tracked = [followed[0], lost, *followed[2:]]
-    tracker = SimpleNamespace(graph=graph, keyframes=graph.keyframes, tracked=tracked)
+    watch = SimpleNamespace()
+    tracker = SimpleNamespace(graph=graph, keyframes=graph.keyframes, tracked=tracked, watch=watch)
     tracker.conclude = lambda: done.append(("judged", graph.keyframes.static_weights.min()))
 
     def pose_all_frames(tracker, sequence, progress):

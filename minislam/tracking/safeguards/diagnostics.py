@@ -10,7 +10,6 @@ holds this one, or what is left of it does not fit.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from statistics import median
 
 import torch
 from torch import Tensor
@@ -23,7 +22,7 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
-from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS, UNMEASURED, flow_beyond_turns
+from minislam.tracking.safeguards.turns import flow_beyond_turns, tells_no_depth
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -66,6 +65,7 @@ class Watch(Stateful):
     diagnostics: list[KeyframeDiagnostics]
     breaks: list[Break]  # known at the end, because the newest depths are rough
     beyond_turns: float | None = None  # px of a 320x240 image, at the end: `flow_beyond_turns`
+    confirmed: float = 1.0  # fraction of all cells that sweeps confirm, once they have swept [-]
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._graph = graph
@@ -87,16 +87,10 @@ class Watch(Stateful):
 
     @property
     def only_turned(self) -> bool:
-        """Tell whether the camera stood still or only turned, so that nothing measures depth.
-
-        Then no pose claims any parallax, or hardly any flow is beyond turns and keyframes see each
-        other's depths as other ones.
-        """
-        if all(k.parallax < self._graph.least_parallax for k in self.diagnostics):
-            return True
+        """Tell whether the camera stood still or only turned, so that nothing measures depth."""
         errors = [k.depth_error for k in self.diagnostics if k.depth_error is not None]
-        is_weak = self.beyond_turns is not None and self.beyond_turns < LEAST_BEYOND_TURNS
-        return is_weak and bool(errors) and median(errors) > UNMEASURED
+        no_parallax = all(k.parallax < self._graph.least_parallax for k in self.diagnostics)
+        return no_parallax or tells_no_depth(self.beyond_turns, errors, self.confirmed)
 
     @property
     def segments(self) -> list[tuple[int, int]]:

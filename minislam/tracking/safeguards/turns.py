@@ -20,6 +20,7 @@ from minislam.tracking.safeguards.robust import weighted_median
 # px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
 LEAST_BEYOND_TURNS = 0.45
 UNMEASURED = 0.13  # relative error of depths that claim parallax: turns .16 to .95, pans to .10
+LEAST_CONFIRMED = 0.25  # fraction of the cells: cameras that stand 0 to .19, pans .35 and more [-]
 TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
 MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
 
@@ -52,6 +53,17 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     medians = [weighted_median(*pair) for pair in zip(left, problem.weights[:, 0], strict=True)]
     known = [found for found in medians if found is not None]
     return median(known) / graph.pixel_scale if known else None
+
+
+def tells_no_depth(
+    beyond_turns: float | None,  # px, see `flow_beyond_turns`
+    depth_errors: list[float],  # relative, of keyframes that see each other's depths
+    confirmed: float,  # fraction of the cells that sweeps confirm [-]
+) -> bool:
+    """Tell whether hardly any flow is beyond turns, and what looks like depth agrees nowhere."""
+    if beyond_turns is None or beyond_turns >= LEAST_BEYOND_TURNS:
+        return False
+    return confirmed < LEAST_CONFIRMED or median([0.0, *depth_errors]) > UNMEASURED
 
 
 def adjust_turns(graph: KeyframeGraph) -> None:

@@ -11,7 +11,14 @@ from minislam.tracking.bundle_adjustment import BundleState
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.diagnostics import Watch, diagnose
-from minislam.tracking.safeguards.turns import adjust_turns, flow_beyond_turns
+from minislam.tracking.safeguards.turns import (
+    LEAST_BEYOND_TURNS,
+    LEAST_CONFIRMED,
+    UNMEASURED,
+    adjust_turns,
+    flow_beyond_turns,
+    tells_no_depth,
+)
 from tests.tracking.scene import assert_same_bits
 from tests.tracking.wall import CAMERA, GRID, true_graph
 
@@ -63,6 +70,21 @@ def test_of_a_turning_camera_the_keyframes_see_other_depths():
     graph.keyframes.disparities[1] *= 1.5
     watch.conclude()
     assert watch.diagnostics[1].depth_error > 0.3 and not watch.only_turned
+    graph, watch = watched(GRID.pixels + GRID.pixels.new_tensor([0.5, 0.0]))
+    graph.least_parallax = 0.0  # the poses claim parallax, of which hardly any flow is left
+    assert not watch.only_turned
+    watch.confirmed = 0.5 * LEAST_CONFIRMED
+    assert watch.only_turned
+
+
+def test_weak_parallax_is_depth_only_if_keyframes_and_sweeps_agree_on_it():
+    weak, right, confirmed = 0.5 * LEAST_BEYOND_TURNS, [0.02, 0.05], 2 * LEAST_CONFIRMED
+    assert not tells_no_depth(weak, right, confirmed)
+    assert tells_no_depth(weak, [0.02, 2 * UNMEASURED, 3 * UNMEASURED], confirmed)
+    assert tells_no_depth(weak, right, 0.5 * LEAST_CONFIRMED) and tells_no_depth(weak, [], 0.0)
+    assert not tells_no_depth(weak, [], 1.0)
+    for strong in (LEAST_BEYOND_TURNS, None):
+        assert not tells_no_depth(strong, [2 * UNMEASURED], 0.0)
 
 
 @pytest.mark.parametrize("moving", [0.1, 0.2])
