@@ -29,7 +29,7 @@ VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
 LARGEST_QUANTILE = 0.98
 PLANES = (48, 96)  # fewest and most
-FARTHEST = 0.25  # plane of all that lies between the first, at infinity, and this one [-]
+FARTHEST = 0.5  # plane of all that lies between the first, at infinity, and this one [-]
 LEAST_COMMON = 100  # px, with two depths of which the ratio of their scales is told
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
 
@@ -150,6 +150,7 @@ def swept_view(
     found = ((best + fraction) * step).clip(FARTHEST * step).astype(np.float32)
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
     at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
+    found[(best == 0) & (at_best >= votes.CONFIRMING_COST)] = np.nan  # every plane costs as much
     return votes.SweptView(found, at_best, step, pose)
 
 

@@ -62,7 +62,11 @@ def test_what_lies_at_infinity_is_known_to_be_far():
         swept_view(far, image, [i for i in images if i is not image], planes) for image in images
     ]
     depth = confirm(far, views[2], views[:2] + views[3:]).inverse_depth
-    assert (depth > 0).mean() > 0.9 and np.median(depth) == np.float32(FARTHEST * planes[1])
+    infinity = np.float32(FARTHEST * planes[1])
+    assert (depth > 0).mean() > 0.9 and np.median(depth) == infinity
+    blank = [PosedImage(np.full_like(gray, 0.5), posed) for posed in poses]  # as far as near
+    alike = swept_view(far, blank[2], blank[:2] + blank[3:], planes).inverse_depth
+    assert not (alike == infinity).any() and np.isnan(alike).mean() > 0.5
 
 
 # Which frames
