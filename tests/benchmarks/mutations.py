@@ -162,7 +162,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
         ("weak >= LONG or _is", "_is"),
         ("find_breaks(judged)", "find_breaks(self.diagnostics)"),
-        ("if all(k.parallax <", "if any(k.parallax <"),
+        ("= all(k.parallax <", "= any(k.parallax <"),
         ("(k, depth_error=None, ", "(k, explained=None, depth_error=None, "),
         ("depth_error=None, continuity=None", "depth_error=None"),
         ("or held < MIN_CONTINUITY", ""),
@@ -217,6 +217,23 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("before[:, :-1] + STEP_COST", "before[:, :-1]"),
         ("0.5 * (left - right)", "0.5 * (right - left)"),
     ],
+    ("stereo/dense_structure.py", "stereo/test_dense_structure.py"): [
+        (".clip(FARTHEST * step)", ".clip(0)"),
+        ("(best == 0) & (at_best >= votes.CONFIRMING_COST)", "best < 0"),
+    ],
+    ("stereo/second_adjustment.py", "stereo/test_second_adjustment.py"): [
+        ("(depth > 0).float().mean()", "(depth >= 0).float().mean()"),
+    ],
+    ("workers.py", "test_workers.py"): [("islice(left, AT_ONCE)", "islice(left, None)")],
+    ("splatting/tiles.py", "splatting/test_tiles.py"): [
+        ("if high.any()", "if False"),
+        ("keys & 0xFFFF", "keys & 0x7FFF"),
+        ('high[order].argsort(kind="stable")', "high[order].argsort()"),
+    ],
+    ("tracking/bundle_adjustment.py", "tracking/safeguards/test_parts.py"): [
+        ("known or edges", "known"),
+        ("if slots[source] >= 0 else []", "if True else []"),
+    ],
     ("stereo/votes.py", "stereo/test_votes.py"): [
         ("expected - 2 * tolerance", "expected"),
         ("& (other.cost.take(place) < WELL_MATCHED)", ""),
@@ -245,6 +262,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if slam.tracker.watch.breaks:", "if False:"),
     ],
     ("runs/facts.py", "runs/test_facts.py"): [
+        ("if since < len(tracked)", "if True"),
+        ("since = 1 + max", "since = max"),
         ("keyframe.exposed(rendering.color), keyframe", "rendering.color, keyframe"),
         ("keyframe.image, static\n", "keyframe.image, None\n"),
         ("if static.any() else None", "if True else None"),

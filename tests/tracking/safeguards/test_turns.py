@@ -75,6 +75,9 @@ def test_of_a_turning_camera_the_keyframes_see_other_depths():
     assert not watch.only_turned
     watch.confirmed = 0.5 * LEAST_CONFIRMED
     assert watch.only_turned
+    watch = Watch(true_graph([0, 1]))  # without links no pose claims parallax
+    watch.conclude()
+    assert watch.beyond_turns is None and watch.only_turned
 
 
 def test_weak_parallax_is_depth_only_if_keyframes_and_sweeps_agree_on_it():
