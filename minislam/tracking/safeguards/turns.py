@@ -63,7 +63,7 @@ def tells_no_depth(
     """Tell whether hardly any flow is beyond turns, and what looks like depth agrees nowhere."""
     if beyond_turns is None or beyond_turns >= LEAST_BEYOND_TURNS:
         return False
-    return confirmed < LEAST_CONFIRMED or median([0.0, *depth_errors]) > UNMEASURED
+    return confirmed < LEAST_CONFIRMED or median(depth_errors or [0.0]) > UNMEASURED
 
 
 def adjust_turns(graph: KeyframeGraph) -> None:

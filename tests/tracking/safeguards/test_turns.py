@@ -84,6 +84,7 @@ def test_weak_parallax_is_depth_only_if_keyframes_and_sweeps_agree_on_it():
     weak, right, confirmed = 0.5 * LEAST_BEYOND_TURNS, [0.02, 0.05], 2 * LEAST_CONFIRMED
     assert not tells_no_depth(weak, right, confirmed)
     assert tells_no_depth(weak, [0.02, 2 * UNMEASURED, 3 * UNMEASURED], confirmed)
+    assert tells_no_depth(weak, [1.5 * UNMEASURED], confirmed)  # of two keyframes one has an error
     assert tells_no_depth(weak, right, 0.5 * LEAST_CONFIRMED) and tells_no_depth(weak, [], 0.0)
     assert not tells_no_depth(weak, [], 1.0)
     for strong in (LEAST_BEYOND_TURNS, None):
