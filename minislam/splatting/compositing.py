@@ -1,7 +1,7 @@
 """Eq. (1) and Eq. (2) for a group of tiles: colour and depth of each pixel, front to back.
 
-A group of B tiles with P pixels each and K slots per tile is one dense block; a slot holds one
-Gaussian. With the channels f_k = (red, green, blue, z) of slot k, per pixel
+A group has B tiles with P pixels each, a tile has K slots, and a slot holds one Gaussian. With the
+channels f_k = (red, green, blue, z) of slot k, per pixel
 
     T_0 = 1,   T_{k+1} = T_k (1 - alpha_k),   out = sum_k T_k alpha_k f_k + T_K f_background.
 
@@ -10,9 +10,10 @@ Three rewritings make it fast without compiled code:
   coefficients per slot with six monomials per pixel gives all of them.
 * Since T_k alpha_k = T_k - T_{k+1}, summation by parts gives out = sum_k T_k (f_k - f_{k-1}) with
   f_{-1} = 0 and f_K = f_background: a matrix product with T itself, without blending weights.
-* The slots are processed in chunks that stay in the cache. Only T at the start of each chunk is
-  kept; the backward computes the rest anew, which is as fast as reading it back and needs a tenth
-  of the memory. All large arrays are reused: fresh memory costs more than the arithmetic in it.
+* The slots are processed in chunks that stay in the cache, each without the tiles whose lists have
+  ended. Only T at the start of a chunk is kept; the backward computes the rest anew, which is as
+  fast as reading it back and needs a tenth of the memory. All large arrays are reused: fresh
+  memory costs more than the arithmetic in it.
 """
 
 import math
@@ -22,9 +23,8 @@ import torch
 from torch import Tensor
 
 from minislam.splatting.constants import MIN_ALPHA
-from minislam.splatting.tiles import PIXELS, TILE
+from minislam.splatting.tiles import CHUNK, PIXELS, TILE, Chunk
 
-CHUNK = 12  # slots per step: longer steps leave a 2 MB cache, shorter ones cost more calls
 _T, _ALPHAS, _V_WEIGHTS = range(3)  # the buffers of a workspace
 
 
@@ -65,8 +65,8 @@ class GroupOutput(NamedTuple):
 
     channels: Tensor  # (B, 4, P)
     transmittance: Tensor  # (B, P), T_K
-    weight_sums: Tensor  # (K, B), blending weight T_k alpha_k summed over the pixels of a tile
-    checkpoints: Tensor  # (ceil(K / CHUNK), B, P), T at the start of each chunk
+    weight_sums: Tensor  # (S,), blending weight T_k alpha_k summed over the pixels of a tile
+    checkpoints: list[Tensor]  # (b, P), T at the start of each chunk, of its b tiles
 
 
 def monomials(like: Tensor) -> Tensor:
@@ -134,8 +134,9 @@ def moments_vjp(
 
 
 def composite(
-    coefficients: Tensor,  # (6, K * B) from `log_alpha_coefficients`, slot-major
-    channels: Tensor,  # (K, B, 4)
+    chunks: list[Chunk],  # S slots in all
+    coefficients: Tensor,  # (6, S) from `log_alpha_coefficients`
+    channels: Tensor,  # (S, 4)
     background: Tensor,  # (4,)
     inside: Tensor,  # (B, P) 1 on the image, 0 on pixels beyond its border
     workspace: Workspace,
@@ -144,38 +145,41 @@ def composite(
 
     Slow twin: reference.composite. Eq. (2).
     """
-    slots, tiles, _ = channels.shape
-    checkpoints = inside.new_empty(-(-slots // CHUNK), tiles, PIXELS)
-    checkpoints[0] = inside  # T = 0 beyond the border: nothing is shown or counted there
-    out = inside.new_zeros(tiles, 4, PIXELS)
-    T_sums = inside.new_empty(slots + 1, tiles)  # T_k summed over the pixels of a tile
-    steps = channels.diff(dim=0, prepend=torch.zeros_like(channels[:1]))  # f_k - f_{k-1}
+    transmittance = inside.clone()  # T = 0 beyond the border: nothing is shown or counted there
+    out = inside.new_zeros(len(inside), 4, PIXELS)
+    f_before = channels.new_zeros(len(inside), 4)  # f_{k-1}
+    checkpoints, weight_sums = [], []
 
-    for chunk, first in enumerate(range(0, slots, CHUNK)):
-        last = min(first + CHUNK, slots)
-        T = workspace.block(_T, last - first + 1, tiles)
-        T.slots[0].copy_(checkpoints[chunk])
+    sizes = [slots * tiles for slots, tiles in chunks]
+    parts = zip(chunks, coefficients.split(sizes, 1), channels.split(sizes), strict=True)
+    for (slots, tiles), chunk_coefficients, f in parts:
+        f = f.view(slots, tiles, 4)
+        T, T_before = workspace.block(_T, slots + 1, tiles), transmittance[-tiles:]
+        checkpoints.append(T_before.clone())
+        T.slots[0].copy_(T_before)
         # alpha_k is stored in the place of T_{k+1}: half the memory, so more stays in the cache.
-        _gaussian_alphas(coefficients[:, first * tiles : last * tiles], workspace, out=T.all[1:])
+        _gaussian_alphas(chunk_coefficients, workspace, out=T.all[1:])
         _transmittances(T, T.slots[1:])
-        out.baddbmm_(steps[first:last].permute(1, 2, 0), T.all[:-1].transpose(0, 1))
-        torch.sum(T.all, 2, out=T_sums[first : last + 1])
-        if last < slots:
-            checkpoints[chunk + 1] = T.slots[-1]
-    transmittance = T.slots[-1].clone()
-    out.addcmul_((background - channels[-1])[:, :, None], transmittance[:, None])
-    return GroupOutput(out, transmittance, T_sums[:-1] - T_sums[1:], checkpoints)
+        steps = f.diff(dim=0, prepend=f_before[None, -tiles:])  # f_k - f_{k-1}
+        out[-tiles:].baddbmm_(steps.permute(1, 2, 0), T.all[:-1].transpose(0, 1))
+        T_sums = T.all.sum(2)
+        weight_sums.append((T_sums[:-1] - T_sums[1:]).view(-1))
+        T_before.copy_(T.slots[-1])
+        f_before[-tiles:] = f[-1]
+    out.addcmul_((background - f_before)[:, :, None], transmittance[:, None])
+    return GroupOutput(out, transmittance, torch.cat(weight_sums), checkpoints)
 
 
 def composite_vjp(
-    coefficients: Tensor,  # (6, K * B)
-    channels: Tensor,  # (K, B, 4)
+    chunks: list[Chunk],
+    coefficients: Tensor,  # (6, S)
+    channels: Tensor,  # (S, 4)
     background: Tensor,  # (4,)
-    checkpoints: Tensor,  # (ceil(K / CHUNK), B, P)
+    checkpoints: list[Tensor],  # (b, P) of each chunk
     v_out: Tensor,  # (B, 4, P)
     v_transmittance: Tensor,  # (B, P)  dL/dT_K
     workspace: Workspace,
-) -> tuple[Tensor, Tensor]:  # (6, K * B), (K, B, 4)
+) -> tuple[Tensor, Tensor]:  # (6, S), (S, 4)
     """Pull gradients of a group's pixels back to coefficients and channels. Eq. (2).
 
     From back to front, let A_k be v_out . (what slot k and all slots behind it would show if
@@ -188,32 +192,37 @@ def composite_vjp(
 
     Nothing is divided by 1 - alpha, which may be tiny.
     """
-    slots, tiles, _ = channels.shape
-    v_coefficients = torch.empty_like(coefficients)
+    v_coefficients, v_channels = torch.empty_like(coefficients), torch.empty_like(channels)
     v_out_t = v_out.transpose(1, 2).contiguous()
-    T_v_sums = channels.new_empty(slots + 1, tiles, 4)  # T_k v_out summed over a tile's pixels
     A = (background[:, None] * v_out).sum(1).add_(v_transmittance)
-    gain = torch.empty_like(A)  # f_k . v_out - A_{k+1}: slot k instead of what it hides
+    gains = torch.empty_like(A)
 
-    for chunk in reversed(range(len(checkpoints))):
-        first, last = chunk * CHUNK, min((chunk + 1) * CHUNK, slots)
-        span = slice(first * tiles, last * tiles)
-        T = workspace.block(_T, last - first + 1, tiles)
-        alphas = workspace.block(_ALPHAS, last - first, tiles)
-        v_weights = workspace.block(_V_WEIGHTS, last - first, tiles, tile_major=True)
+    sizes = [slots * tiles for slots, tiles in chunks]
+    parts = (
+        chunks, coefficients.split(sizes, 1), channels.split(sizes), checkpoints,
+        v_coefficients.split(sizes, 1), v_channels.split(sizes),
+    )  # fmt: skip
+    for part in list(zip(*parts, strict=True))[::-1]:
+        (slots, tiles), chunk_coefficients, f, T_before, v_chunk_coefficients, v_f = part
+        f, v_f = f.view(slots, tiles, 4), v_f.view(slots, tiles, 4)
+        T = workspace.block(_T, slots + 1, tiles)
+        alphas = workspace.block(_ALPHAS, slots, tiles)
+        v_weights = workspace.block(_V_WEIGHTS, slots, tiles, tile_major=True)
 
-        T.slots[0].copy_(checkpoints[chunk])
-        _gaussian_alphas(coefficients[:, span], workspace, out=alphas.all)
+        T.slots[0].copy_(T_before)
+        _gaussian_alphas(chunk_coefficients, workspace, out=alphas.all)
         _transmittances(T, alphas.slots)
-        T_v_sums[first : last + 1] = torch.bmm(T.all.transpose(0, 1), v_out_t).transpose(0, 1)
+        T_v_sums = torch.bmm(T.all.transpose(0, 1), v_out_t[-tiles:])  # summed over pixels
+        torch.sub(T_v_sums[:, :-1], T_v_sums[:, 1:], out=v_f.transpose(0, 1))
         # f_k . v_out, in memory tile by tile because bmm fills no other order.
-        torch.bmm(channels[first:last].transpose(0, 1), v_out, out=v_weights.all.transpose(0, 1))
+        torch.bmm(f.transpose(0, 1), v_out[-tiles:], out=v_weights.all.transpose(0, 1))
+        A_k, gain = A[-tiles:], gains[-tiles:]  # gain: slot k instead of what it hides
         for v_weight, alpha in zip(v_weights.slots[::-1], alphas.slots[::-1], strict=True):
-            torch.sub(v_weight, A, out=gain)
-            A.add_(alpha.mul_(gain))  # alpha_k is not needed again: g_k takes its place
-        v_log_alphas = alphas.all.mul_(T.all[:-1]).view(-1, PIXELS)
-        torch.mm(workspace.monomials, v_log_alphas.T, out=v_coefficients[:, span])
-    return v_coefficients, T_v_sums[:-1] - T_v_sums[1:]
+            torch.sub(v_weight, A_k, out=gain)
+            A_k.add_(alpha.mul_(gain))  # alpha_k is not needed again: g_k takes its place
+        T_g = alphas.all.mul_(T.all[:-1]).view(-1, PIXELS)
+        torch.mm(workspace.monomials, T_g.T, out=v_chunk_coefficients)
+    return v_coefficients, v_channels
 
 
 def _gaussian_alphas(

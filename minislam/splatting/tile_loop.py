@@ -12,7 +12,14 @@ from torch.nn.functional import pad
 
 from minislam.geometry import Camera
 from minislam.splatting import compositing
-from minislam.splatting.tiles import PIXELS, build_tile_lists, from_tiles, tile_centres, to_tiles
+from minislam.splatting.tiles import (
+    PIXELS,
+    Chunk,
+    build_tile_lists,
+    from_tiles,
+    tile_centres,
+    to_tiles,
+)
 from minislam.splatting.visible import VisibleGaussians
 
 # ln of the opacity of a padding slot. Finite, because 0 * inf would be NaN in a matrix product.
@@ -23,11 +30,12 @@ class CompositedGroup(NamedTuple):
     """What the backward needs of a group of tiles."""
 
     tiles: Tensor  # (B,) int64
-    gaussians: Tensor  # (K * B,) int64
-    offsets: Tensor  # (2, K * B) px, mean minus tile centre
-    coefficients: Tensor  # (6, K * B)
-    channels: Tensor  # (K, B, 4)
-    checkpoints: Tensor  # (chunks, B, P)
+    gaussians: Tensor  # (S,) int64
+    chunks: list[Chunk]
+    offsets: Tensor  # (2, S) px, mean minus tile centre
+    coefficients: Tensor  # (6, S)
+    channels: Tensor  # (S, 4)
+    checkpoints: list[Tensor]  # (b, P)
 
 
 class CompositedImage(NamedTuple):
@@ -59,23 +67,22 @@ def composite_image(
     canvas = background[:, None].repeat(len(inside), 1, PIXELS)  # (tiles, 4, P)
     opacities = torch.zeros_like(inside)
     weight_sums = channels.new_zeros(len(channels))
-    largest_group = max((len(tiles) for tiles, _ in lists), default=0)
+    largest_group = max((len(group.tiles) for group in lists), default=0)
     workspace = compositing.Workspace(largest_group, channels)
     groups = []
-    for tiles, slot_gaussians in lists:
-        gaussians = slot_gaussians.view(-1)
+    for tiles, gaussians, chunks in lists:
         slots = table.index_select(1, gaussians)
-        offsets = slots[:2].view(2, *slot_gaussians.shape) - centres[:, None, tiles]
-        offsets = offsets.view(2, -1)
+        tile_of_slot = torch.cat([tiles[-b:].repeat(k) for k, b in chunks])
+        offsets = slots[:2] - centres.index_select(1, tile_of_slot)
         coefficients = compositing.log_alpha_coefficients(offsets, slots[2:5], slots[5])
-        group_channels = channels.index_select(0, gaussians).view(*slot_gaussians.shape, 4)
+        group_channels = channels.index_select(0, gaussians)
         out = compositing.composite(
-            coefficients, group_channels, background, inside[tiles], workspace
+            chunks, coefficients, group_channels, background, inside[tiles], workspace
         )
         canvas[tiles] = out.channels
         opacities[tiles] = 1 - out.transmittance
-        weight_sums.index_add_(0, gaussians, out.weight_sums.view(-1))
-        kept = tiles, gaussians, offsets, coefficients, group_channels, out.checkpoints
+        weight_sums.index_add_(0, gaussians, out.weight_sums)
+        kept = tiles, gaussians, chunks, offsets, coefficients, group_channels, out.checkpoints
         groups.append(CompositedGroup(*kept))
     opacity = from_tiles(opacities, camera)[0].clone()
     image = from_tiles(canvas, camera)
@@ -97,10 +104,10 @@ def composite_image_vjp(
     sums = v_channels.new_zeros(10, count + 1)  # the last column collects the padding
     for group in groups:
         v_coefficients, v_group = compositing.composite_vjp(
-            group.coefficients, group.channels, background, group.checkpoints,
+            group.chunks, group.coefficients, group.channels, background, group.checkpoints,
             v_canvas[group.tiles], v_transmittances[group.tiles], workspace,
         )  # fmt: skip
         moments = compositing.log_alpha_coefficients_vjp(group.offsets, v_coefficients)
         sums[:6].index_add_(1, group.gaussians, moments)
-        sums[6:].index_add_(1, group.gaussians, v_group.view(-1, 4).T)
+        sums[6:].index_add_(1, group.gaussians, v_group.T)
     return sums[:6, :-1], sums[6:, :-1]

@@ -229,6 +229,16 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if high.any()", "if False"),
         ("keys & 0xFFFF", "keys & 0x7FFF"),
         ('high[order].argsort(kind="stable")', "high[order].argsort()"),
+        ("bisect_right(lengths, first)", "bisect_right(lengths, first + CHUNK)"),
+        ("bisect_right(lengths, first)", "0"),
+        ("-(-active // ACTIVE) * ACTIVE", "active // ACTIVE * ACTIVE"),
+    ],
+    ("splatting/compositing.py", "splatting/test_compositing.py"): [
+        ("f_before[-tiles:] = f[-1]", "f_before[-tiles:] = 0"),
+        ("T_before.copy_(T.slots[-1])", "T_before.copy_(T.slots[0])"),
+        ("strict=True))[::-1]", "strict=True))"),
+        ("v_out_t[-tiles:]", "v_out_t[:tiles]"),
+        ("A[-tiles:], gains", "A[:tiles], gains"),
     ],
     ("tracking/bundle_adjustment.py", "tracking/safeguards/test_parts.py"): [
         ("known or edges", "known"),

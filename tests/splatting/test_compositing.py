@@ -5,7 +5,6 @@ import torch
 from torch import Tensor
 
 from minislam.splatting.compositing import (
-    CHUNK,
     Workspace,
     composite,
     composite_vjp,
@@ -15,7 +14,7 @@ from minislam.splatting.compositing import (
     monomials,
 )
 from minislam.splatting.constants import MIN_ALPHA
-from minislam.splatting.tiles import PIXELS
+from minislam.splatting.tiles import CHUNK, PIXELS, Chunk
 from tests.helpers import assert_gradients_close, generator, numerical_gradient
 
 pytestmark = pytest.mark.slow
@@ -32,31 +31,48 @@ def conics_of(seed: int, count: int) -> Tensor:
     return torch.stack([0.05 + a.abs(), 0.1 * b, 0.05 + c.abs()])
 
 
-def block(seed: int, slots: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return coefficients (6, K * B), channels (K, B, 4) and background (4,)."""
-    count = slots * TILES
+def chunks_of(slots: int) -> list[Chunk]:
+    """Return chunks of so many slots: from the second on only the last tile has any."""
+    first = range(0, slots, CHUNK)
+    return [Chunk(min(CHUNK, slots - k), TILES if k == 0 else 1) for k in first]
+
+
+def block(seed: int, slots: int) -> tuple[list[Chunk], Tensor, Tensor, Tensor]:
+    """Return chunks, coefficients (6, S), channels (S, 4) and background (4,)."""
+    chunks = chunks_of(slots)
+    count = sum(chunk.slots * chunk.tiles for chunk in chunks)
     offsets, log_opacities = 4 * normal(seed, 2, count), -normal(seed + 1, count).abs() - 0.02
     coefficients = log_alpha_coefficients(offsets, 0.1 * conics_of(seed + 2, count), log_opacities)
-    return coefficients, normal(seed + 3, slots, TILES, 4), normal(seed + 4, 4)
+    return chunks, coefficients, normal(seed + 3, count, 4), normal(seed + 4, 4)
 
 
-def composite_plainly(coefficients: Tensor, channels: Tensor, background: Tensor) -> Tensor:
+def composite_plainly(
+    chunks: list[Chunk], coefficients: Tensor, channels: Tensor, background: Tensor
+) -> Tensor:
     """Return what the tiles show (B, 5, P): channels and opacity, as Eq. (2) is written."""
-    alphas = (coefficients.T @ monomials(channels)).exp().view(-1, TILES, PIXELS)
+    alphas = (coefficients.T @ monomials(channels)).exp()
     alphas = alphas * (alphas > MIN_ALPHA)
-    transmittance = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    shown = torch.zeros(TILES, 4, PIXELS, dtype=torch.float64)
-    for k, alpha in enumerate(alphas):
-        shown = shown + channels[k, :, :, None] * (transmittance * alpha)[:, None]
-        transmittance = transmittance * (1 - alpha)
-    shown = shown + background[:, None] * transmittance[:, None]
-    return torch.cat([shown, 1 - transmittance[:, None]], 1)
+    columns = [torch.arange(TILES - tiles, TILES).repeat(slots) for slots, tiles in chunks]
+    tile_of_slot = torch.cat(columns)
+    images = []
+    for tile in range(TILES):
+        transmittance = torch.ones(PIXELS, dtype=torch.float64)
+        shown = torch.zeros(4, PIXELS, dtype=torch.float64)
+        mine = tile_of_slot == tile
+        for alpha, channel in zip(alphas[mine], channels[mine], strict=True):
+            shown = shown + channel[:, None] * (transmittance * alpha)
+            transmittance = transmittance * (1 - alpha)
+        shown = shown + background[:, None] * transmittance
+        images.append(torch.cat([shown, 1 - transmittance[None]]))
+    return torch.stack(images)
 
 
-def composite_block(coefficients: Tensor, channels: Tensor, background: Tensor) -> Tensor:
+def composite_block(
+    chunks: list[Chunk], coefficients: Tensor, channels: Tensor, background: Tensor
+) -> Tensor:
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
     workspace = Workspace(TILES, channels)
-    out = composite(coefficients, channels, background, inside, workspace)
+    out = composite(chunks, coefficients, channels, background, inside, workspace)
     return torch.cat([out.channels, 1 - out.transmittance[:, None]], 1)
 
 
@@ -74,13 +90,13 @@ def test_exponent_at_the_mean_is_the_log_opacity():
 
 
 def test_weight_sums_add_up_the_blending_weight_of_each_slot():
-    coefficients, channels, background = block(1, slots=2)
+    chunks, coefficients, channels, background = block(1, slots=2)
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    out = composite(coefficients, channels, background, inside, Workspace(TILES, channels))
+    out = composite(chunks, coefficients, channels, background, inside, Workspace(TILES, channels))
     alphas = (coefficients.T @ monomials(channels)).exp().view(2, TILES, PIXELS)
     alphas = alphas * (alphas > MIN_ALPHA)
-    torch.testing.assert_close(out.weight_sums[0], alphas[0].sum(1))
-    torch.testing.assert_close(out.weight_sums[1], (alphas[1] * (1 - alphas[0])).sum(1))
+    expected = torch.cat([alphas[0], alphas[1] * (1 - alphas[0])])
+    torch.testing.assert_close(out.weight_sums, expected.sum(1))
 
 
 # Identities
@@ -95,9 +111,9 @@ def test_chunks_give_the_plain_sum(slots: int):
 
 
 def test_pixels_beyond_the_border_show_and_count_nothing():
-    coefficients, channels, background = block(3, slots=5)
+    *inputs, background = block(3, slots=5)
     inside = torch.zeros(TILES, PIXELS, dtype=torch.float64)
-    out = composite(coefficients, channels, background, inside, Workspace(TILES, channels))
+    out = composite(*inputs, background, inside, Workspace(TILES, background))
     assert out.channels.abs().max() == 0
     assert out.weight_sums.abs().max() == 0
 
@@ -123,24 +139,23 @@ def test_log_alpha_coefficients_and_moments_vjp(seed: int):
 @pytest.mark.parametrize("slots", [1, CHUNK, 2 * CHUNK + 3])
 @pytest.mark.parametrize("seed", range(7))
 def test_composite_vjp(slots: int, seed: int):
-    coefficients, channels, background = block(seed, slots)
+    chunks, coefficients, channels, background = block(seed, slots)
     cotangent = normal(seed + 7, TILES, 5, PIXELS)
     leaves = [coefficients.clone().requires_grad_(), channels.clone().requires_grad_()]
-    (composite_plainly(*leaves, background) * cotangent).sum().backward()
+    (composite_plainly(chunks, *leaves, background) * cotangent).sum().backward()
 
-    inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    workspace = Workspace(TILES, channels)
-    checkpoints = composite(coefficients, channels, background, inside, workspace).checkpoints
+    inside, workspace = cotangent.new_ones(TILES, PIXELS), Workspace(TILES, channels)
+    inputs = chunks, coefficients, channels, background
+    checkpoints = composite(*inputs, inside, workspace).checkpoints
     actual = composite_vjp(
-        coefficients, channels, background, checkpoints,
-        cotangent[:, :4].contiguous(), -cotangent[:, 4], workspace,
-    )  # fmt: skip
+        *inputs, checkpoints, cotangent[:, :4].contiguous(), -cotangent[:, 4], workspace
+    )
     for ours, leaf in zip(actual, leaves, strict=True):
         assert_gradients_close(ours, leaf.grad, relative=1e-10)
         assert (ours != 0).double().mean() > 0.5  # the test would pass on zeros otherwise
 
     def varied(value: Tensor) -> Tensor:
-        return (composite_plainly(coefficients, value, background) * cotangent).sum()
+        return (composite_plainly(chunks, coefficients, value, background) * cotangent).sum()
 
     assert_gradients_close(actual[1], numerical_gradient(varied, channels), relative=1e-7)
 
@@ -149,16 +164,15 @@ def test_composite_vjp(slots: int, seed: int):
 
 
 def test_many_opaque_slots_give_finite_gradients():
-    slots = 40
-    coefficients = torch.zeros(6, slots * TILES, dtype=torch.float32)
+    chunks = chunks_of(40)
+    count = sum(chunk.slots * chunk.tiles for chunk in chunks)
+    coefficients = torch.zeros(6, count)
     coefficients[0] = -0.01  # alpha 0.99 everywhere: T falls to 1e-80, below any float32
-    channels = torch.ones(slots, TILES, 4)
-    workspace = Workspace(TILES, channels)
-    background, inside = torch.zeros(4), torch.ones(TILES, PIXELS)
-    out = composite(coefficients, channels, background, inside, workspace)
+    inputs = chunks, coefficients, torch.ones(count, 4), torch.zeros(4)
+    inside, workspace = torch.ones(TILES, PIXELS), Workspace(TILES, coefficients)
+    out = composite(*inputs, inside, workspace)
     v_coefficients, v_channels = composite_vjp(
-        coefficients, channels, background, out.checkpoints,
-        torch.ones(TILES, 4, PIXELS), torch.zeros(TILES, PIXELS), workspace,
-    )  # fmt: skip
+        *inputs, out.checkpoints, torch.ones(TILES, 4, PIXELS), torch.zeros_like(inside), workspace
+    )
     torch.testing.assert_close(out.channels, torch.ones(TILES, 4, PIXELS))
     assert v_coefficients.isfinite().all() and v_channels.isfinite().all()
