@@ -79,7 +79,8 @@ def followed(sequence: Sequence, with_prior: bool) -> Tracker:
         tracker.refine_initialisation()
     tracker.end()
     tracker.finish()
-    adjust_again(tracker, sequence)
+    if tracker.knows_depth:
+        adjust_again(tracker, sequence)
     return tracker
 
 

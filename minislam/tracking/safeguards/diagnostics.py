@@ -22,7 +22,7 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
-from minislam.tracking.safeguards.turns import flow_beyond_turns, tells_no_depth
+from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_rest, tells_no_depth
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -31,7 +31,7 @@ EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the ge
 MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
 LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
-MAX_DEPTH_ERROR = 0.2  # relative; healthy .004 to .1, broken .5
+MAX_DEPTH_ERROR = 0.2  # relative; healthy .003 to .15, broken .5
 MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
@@ -65,6 +65,7 @@ class Watch(Stateful):
     diagnostics: list[KeyframeDiagnostics]
     breaks: list[Break]  # known at the end, because the newest depths are rough
     beyond_turns: float | None = None  # px of a 320x240 image, at the end: `flow_beyond_turns`
+    resting: float = 0.0  # fraction of the keyframes, at the end: `fraction_at_rest` [-]
     confirmed: float = 1.0  # fraction of all cells that sweeps confirm, once they have swept [-]
 
     def __init__(self, graph: KeyframeGraph) -> None:
@@ -80,6 +81,7 @@ class Watch(Stateful):
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
         self.beyond_turns = flow_beyond_turns(self._graph)
+        self.resting = fraction_at_rest(self._graph)
         judged = self.diagnostics
         if self.only_turned:  # it may see other depths, and be held by something new
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
@@ -88,9 +90,9 @@ class Watch(Stateful):
     @property
     def only_turned(self) -> bool:
         """Tell whether the camera stood still or only turned, so that nothing measures depth."""
-        errors = [k.depth_error for k in self.diagnostics if k.depth_error is not None]
         no_parallax = all(k.parallax < self._graph.least_parallax for k in self.diagnostics)
-        return no_parallax or tells_no_depth(self.beyond_turns, errors, self.confirmed)
+        told = self.beyond_turns, self.resting, self.confirmed
+        return no_parallax or tells_no_depth(*told)
 
     @property
     def segments(self) -> list[tuple[int, int]]:
@@ -121,7 +123,8 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 
     First the part of the flow from there, of what was static so far, that the geometry explains
     [-]. Then the median relative difference of the depths that the two ends of a link see, over the
-    cells that count in the adjustment. None: no link.
+    cells that count in the adjustment, near ones more: hardly anything tells how far the sky is.
+    None: no link.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
     edges = graph.links.edges
@@ -139,7 +142,7 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     positions_seen = (problem.targets - residual).mT
     seen, expected = seen_and_expected(graph, sources, targets, positions_seen)
     counted = robust_weights[:, 0] * graph.grid.camera.contains(positions_seen)
-    return explained, weighted_median((seen / expected).log().abs(), counted)
+    return explained, weighted_median((seen / expected).log().abs(), counted * expected)
 
 
 def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:

@@ -14,12 +14,12 @@ from minislam.tracking.pose_from_flow import (
     ROBUST_WIDENING,
     motion_only_problem,
 )
-from minislam.tracking.reprojection import lengths
+from minislam.tracking.reprojection import lengths, reproject
 from minislam.tracking.safeguards.robust import weighted_median
 
 # px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
 LEAST_BEYOND_TURNS = 0.45
-UNMEASURED = 0.13  # relative error of depths that claim parallax: turns .16 to .95, pans to .10
+MOST_RESTING = 0.75  # fraction of the keyframes: cameras that stand .88 to 1, pans 0 to .16 [-]
 LEAST_CONFIRMED = 0.15  # fraction of the cells: a hand-held camera .05, pans .24 and more [-]
 TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
 MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
@@ -55,15 +55,35 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     return median(known) / graph.pixel_scale if known else None
 
 
+def fraction_at_rest(graph: KeyframeGraph) -> float:
+    """Return the fraction of the keyframes whose poses claim hardly any parallax [-]."""
+    resting = [_rests(graph, keyframe) for keyframe in range(len(graph.keyframes))]
+    return sum(resting) / max(len(resting), 1)
+
+
+def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
+    """Tell whether translation moves most cells too little, in all links that still see them."""
+    targets = [target for source, target in graph.links.edges if source == keyframe]
+    if not targets:
+        return True
+    geometry = graph.geometry([keyframe] * len(targets), targets)
+    transforms, disparities, rays, camera = geometry
+    turned, _ = reproject(transforms, torch.zeros_like(disparities), rays, camera)
+    positions, valid = reproject(*geometry)
+    parallax = lengths(positions - turned) * (valid & camera.contains(positions.mT))
+    most = weighted_median(parallax.amax(0), graph.keyframes.cell_weights[keyframe])
+    return most is None or most < graph.least_parallax
+
+
 def tells_no_depth(
     beyond_turns: float | None,  # px, see `flow_beyond_turns`
-    depth_errors: list[float],  # relative, of keyframes that see each other's depths
+    resting: float,  # see `fraction_at_rest` [-]
     confirmed: float,  # fraction of the cells that sweeps confirm [-]
 ) -> bool:
-    """Tell whether hardly any flow is beyond turns, and what looks like depth agrees nowhere."""
+    """Tell whether hardly any flow is beyond turns, and poses or sweeps make no depth of it."""
     if beyond_turns is None or beyond_turns >= LEAST_BEYOND_TURNS:
         return False
-    return confirmed < LEAST_CONFIRMED or median(depth_errors or [0.0]) > UNMEASURED
+    return confirmed < LEAST_CONFIRMED or resting > MOST_RESTING
 
 
 def adjust_turns(graph: KeyframeGraph) -> None:

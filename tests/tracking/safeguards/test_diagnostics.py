@@ -147,6 +147,14 @@ def test_a_keyframe_of_another_scale_sees_other_depths():
     assert found.depth_error == pytest.approx(math.log(1.5), rel=1e-3)
 
 
+def test_how_far_the_sky_is_breaks_nothing():
+    graph = true_graph([0, 0])
+    graph.match(neighbourhood_edges(0, 2, 1))
+    sky = GRID.pixels[:, 1] < 0.6 * CAMERA.height
+    graph.keyframes.disparities[:, sky] = torch.tensor([[0.001], [0.003]])
+    assert diagnose(graph, 1).depth_error < 1e-3
+
+
 def test_only_a_camera_at_rest_may_see_other_depths():
     for places, breaks in (([0, 0], []), ([0, 1, 1], [Break(1, 1)])):
         graph = true_graph(places)
@@ -199,7 +207,7 @@ def test_a_keyframe_without_links_is_reported_as_such():
         ([HEALTHY, HEALTHY, UNEXPLAINED, HEALTHY], [Break(20, 20)]),
         ([HEALTHY, DEEP, HEALTHY, UNEXPLAINED, HEALTHY], [Break(10, 30)]),
         ([UNEXPLAINED, *[HEALTHY] * 4, DEEP], [Break(0, 0), Break(50, 50)]),
-        ([HEALTHY, (None, None, None, None), HEALTHY], []),
+        ([HEALTHY, (None,) * 4, HEALTHY], []),
         ([HEALTHY, UNTIED, HEALTHY, NEW, HEALTHY], [Break(10, 30)]),
         ([HEALTHY, WEAK, WEAK, HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),

@@ -14,9 +14,10 @@ from minislam.tracking.safeguards.diagnostics import Watch, diagnose
 from minislam.tracking.safeguards.turns import (
     LEAST_BEYOND_TURNS,
     LEAST_CONFIRMED,
-    UNMEASURED,
+    MOST_RESTING,
     adjust_turns,
     flow_beyond_turns,
+    fraction_at_rest,
     tells_no_depth,
 )
 from tests.tracking.scene import assert_same_bits
@@ -59,17 +60,29 @@ def test_under_a_wrong_focal_length_a_turn_is_no_parallax_either():
     assert flow_beyond_turns(graph) > 1
 
 
-def test_of_a_turning_camera_the_keyframes_see_other_depths():
+def test_a_turn_whose_poses_claim_parallax_may_show_a_flat_scene():
     turn = se3_exp(torch.tensor([0, 0, 0, 0.03, 0.05, 0.1], dtype=torch.float64))
     graph, watch = watched(CAMERA.project(GRID.rays.double() @ turn[:3, :3].T))
-    assert watch.diagnostics[1].parallax > 3 and not watch.only_turned  # of one depth all the same
-    graph.keyframes.disparities[1] *= 1.5
+    assert watch.diagnostics[1].parallax > 3 and watch.resting == 0 and not watch.only_turned
+    near = GRID.pixels[:, 1] > 0.7 * CAMERA.height
+    graph.keyframes.disparities[:, ~near] *= 0.01  # the nearest cells alone tell parallax
     watch.conclude()
-    assert watch.only_turned
-    graph, watch = watched(1.05 * GRID.pixels)  # it walks, and its depths are wrong
-    graph.keyframes.disparities[1] *= 1.5
-    watch.conclude()
-    assert watch.diagnostics[1].depth_error > 0.3 and not watch.only_turned
+    assert watch.diagnostics[1].parallax > graph.least_parallax
+    assert watch.resting == 1 and watch.only_turned
+    watch.beyond_turns = LEAST_BEYOND_TURNS
+    assert not watch.only_turned
+
+
+def test_a_keyframe_rests_unless_some_link_that_sees_its_cells_shows_parallax():
+    graph = true_graph([0, 0, 2, 2])
+    assert fraction_at_rest(graph) == 1  # without links
+    graph.match([(0, 1), (1, 0), (2, 3), (3, 2)])
+    assert fraction_at_rest(graph) == 1
+    graph.match([(1, 2)])
+    assert fraction_at_rest(graph) == 0.75
+    graph.keyframes.T_camera_world[2, 0, 3] += 50.0  # there no cell of the others is seen
+    assert fraction_at_rest(graph) == 1
+
     graph, watch = watched(GRID.pixels + GRID.pixels.new_tensor([0.5, 0.0]))
     graph.least_parallax = 0.0  # the poses claim parallax, of which hardly any flow is left
     assert not watch.only_turned
@@ -80,15 +93,13 @@ def test_of_a_turning_camera_the_keyframes_see_other_depths():
     assert watch.beyond_turns is None and watch.only_turned
 
 
-def test_weak_parallax_is_depth_only_if_keyframes_and_sweeps_agree_on_it():
-    weak, right, confirmed = 0.5 * LEAST_BEYOND_TURNS, [0.02, 0.05], 2 * LEAST_CONFIRMED
-    assert not tells_no_depth(weak, right, confirmed)
-    assert tells_no_depth(weak, [0.02, 2 * UNMEASURED, 3 * UNMEASURED], confirmed)
-    assert tells_no_depth(weak, [1.5 * UNMEASURED], confirmed)  # of two keyframes one has an error
-    assert tells_no_depth(weak, right, 0.5 * LEAST_CONFIRMED) and tells_no_depth(weak, [], 0.0)
-    assert not tells_no_depth(weak, [], 1.0)
+def test_weak_parallax_is_depth_only_if_poses_and_sweeps_make_depth_of_it():
+    weak, few, many = 0.5 * LEAST_BEYOND_TURNS, 0.9 * MOST_RESTING, 1.1 * MOST_RESTING
+    assert not tells_no_depth(weak, few, 2 * LEAST_CONFIRMED)
+    assert tells_no_depth(weak, many, 2 * LEAST_CONFIRMED)
+    assert tells_no_depth(weak, few, 0.5 * LEAST_CONFIRMED)
     for strong in (LEAST_BEYOND_TURNS, None):
-        assert not tells_no_depth(strong, [2 * UNMEASURED], 0.0)
+        assert not tells_no_depth(strong, many, 0.0)
 
 
 @pytest.mark.parametrize("moving", [0.1, 0.2])
