@@ -4,12 +4,13 @@ Read `initialise`, `integrate` and `refine` first: they are the three moments at
 built. `update_keyframes` moves it when the tracker has corrected poses.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from minislam.geometry import Camera
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
@@ -18,17 +19,18 @@ from minislam.mapping.safeguards import (
     FIRST_VIEWS,
     LEAST_STATIC,
     LEAST_VIEWS,
+    OPAQUE,
     blending_weights,
     least_weight,
+    shown_fraction,
 )
 from minislam.mapping.views import median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
-from minislam.splatting import Rendering
+from minislam.splatting import GaussianMap, Rendering
 
 RECHECKED = 10  # keyframes beside the window whose Gaussians are looked at with every new one
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
-OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 
 class Mapper(JointOptimisation):
@@ -112,7 +114,7 @@ class Mapper(JointOptimisation):
         self._optimise(*how, range(max(done, half), iterations))
         if self.uncertainty.enabled:
             self._remove_unsupported()
-        self.shown = [self._shown_fraction(keyframe) for keyframe in self.keyframes]
+        self.shown = [*self._workers.stream(shown_fraction, self._small_views())]
 
     def refine_poses(
         self,
@@ -140,15 +142,6 @@ class Mapper(JointOptimisation):
         new = gaussians_of_keyframe(keyframe, position, *scene, insertion, self._generator)
         self._optimizer.append(new)
         self._reset_gradients()
-
-    def _shown_fraction(self, keyframe: Keyframe) -> float:
-        """Return the fraction of a keyframe's static pixels where the map is opaque [-].
-
-        Without static pixels nothing is missing, unless the map is empty.
-        """
-        static = self.static_weight(self.beta_of(keyframe), self._online_camera) > 0
-        shown = self.render(keyframe.T_camera_world, self._online_camera).opacity[static] > OPAQUE
-        return float(shown.float().mean()) if len(shown) else float(len(self.gaussians) > 0)
 
     def _remove_dynamic_gaussians(self, positions: Iterable[int]) -> None:
         """Remove Gaussians that keyframes inserted on an object before the MLP knew it moves."""
@@ -180,17 +173,19 @@ class Mapper(JointOptimisation):
         those that no keyframe shows.
         """
         sums = self.gaussians.means.new_zeros(2, len(self.gaussians))
-        camera = self._online_camera
-        calls = (
-            (self.gaussians, camera, k.T_camera_world, self.static_weight(self.beta_of(k), camera))
-            for k in self.keyframes
-        )
-        for of_view in self._workers.stream(blending_weights, calls):
+        for of_view in self._workers.stream(blending_weights, self._small_views()):
             sums += of_view
         static, whole = sums
         if static.any():
             self._optimizer.prune(static >= LEAST_STATIC * whole)
             self._reset_gradients()
+
+    def _small_views(self) -> Iterator[tuple[GaussianMap, Camera, Tensor, Tensor]]:
+        """Yield map, camera, pose and static weight of each image at the size it has online."""
+        camera = self._online_camera
+        for keyframe in self.keyframes:
+            weight = self.static_weight(self.beta_of(keyframe), camera)
+            yield self.gaussians, camera, keyframe.T_camera_world, weight
 
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let keyframes fill the holes that they see."""

@@ -29,6 +29,7 @@ LEAST_VIEWS = 2  # renderings of each keyframe, before which most of a static ro
 # Of the pixels that show a Gaussian, by blending weight, that must be static [-]: 0.01 to 0.1 take
 # a carried table out of the map; from 0.05 on, they also take a wall that beta doubts.
 LEAST_STATIC = 0.02
+OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 
 def confirmed_beta(beta: Tensor, confirmation: Tensor | None) -> Tensor:
@@ -75,3 +76,18 @@ def blending_weights(
     rendering = render(replace(gaussians, colors=colors), camera, T_camera_world.float())
     (static,) = torch.autograd.grad(rendering.color[..., 0][weight > 0].sum(), colors)
     return torch.stack([static[:, 0], rendering.weight_sums])
+
+
+@torch.no_grad()
+def shown_fraction(
+    gaussians: GaussianMap,
+    camera: Camera,
+    T_camera_world: Tensor,  # (4, 4)
+    weight: Tensor,  # (H, W) static weight
+) -> float:
+    """Return the fraction of a view's static pixels where the map is opaque [-].
+
+    Without static pixels nothing is missing, unless the map is empty.
+    """
+    shown = render(gaussians, camera, T_camera_world.float()).opacity[weight > 0] > OPAQUE
+    return float(shown.float().mean()) if len(shown) else float(len(gaussians) > 0)

@@ -12,14 +12,7 @@ from torch.nn.functional import pad
 
 from minislam.geometry import Camera
 from minislam.splatting import compositing
-from minislam.splatting.tiles import (
-    PIXELS,
-    Chunk,
-    build_tile_lists,
-    from_tiles,
-    tile_centres,
-    to_tiles,
-)
+from minislam.splatting.tiles import PIXELS, build_tile_lists, from_tiles, tile_centres, to_tiles
 from minislam.splatting.visible import VisibleGaussians
 
 # ln of the opacity of a padding slot. Finite, because 0 * inf would be NaN in a matrix product.
@@ -31,7 +24,7 @@ class CompositedGroup(NamedTuple):
 
     tiles: Tensor  # (B,) int64
     gaussians: Tensor  # (S,) int64
-    chunks: list[Chunk]
+    chunks: list[compositing.Chunk]
     offsets: Tensor  # (2, S) px, mean minus tile centre
     coefficients: Tensor  # (6, S)
     channels: Tensor  # (S, 4)
