@@ -13,8 +13,8 @@ from minislam.splatting.constants import MIN_ALPHA
 
 TILE = 8  # px, side of a tile; 4 and 16 are 20 % slower (measured)
 PIXELS = TILE * TILE
-# Tiles composited together, and the slots of a chunk. Their blocks stay in a cache of 2 MB; smaller
-# ones cost more calls.
+# Tiles composited together, and slots of a chunk: larger blocks leave the cache, smaller ones cost
+# more calls.
 GROUP, CHUNK = 512, 12
 ACTIVE = 16  # tiles of a chunk are a multiple of it: few sizes, so that blocks are used again
 GROUP_ON_GPU = 4096  # there a call costs more than its arithmetic
@@ -82,7 +82,8 @@ def build_tile_lists(
     counts = torch.bincount(tile, minlength=rows * columns)
     starts = counts.cumsum(0) - counts
 
-    # Sorted by length, neighbouring tiles have lists of similar length and need little padding.
+    # Sorted by length: of a group, the lists that end first come first, so each chunk can leave
+    # them out.
     by_length = counts.argsort(stable=True)
     by_length = by_length[counts[by_length] > 0]
     gaussian_or_padding = pad(gaussian, (0, 1), value=means2d.shape[1])
@@ -90,9 +91,10 @@ def build_tile_lists(
     group = GROUP_ON_GPU if tile.is_cuda else GROUP
     for tiles in by_length.split(group) if len(by_length) else ():
         lengths = counts[tiles]
-        position = torch.arange(int(lengths[-1]), device=tile.device)[:, None]
-        entry = torch.where(position < lengths, starts[tiles] + position, len(gaussian))
         chunks = _chunks(lengths.tolist())
+        slots = sum(chunk.slots for chunk in chunks)
+        position = torch.arange(slots, device=tile.device)[:, None]
+        entry = torch.where(position < lengths, starts[tiles] + position, len(gaussian))
         parts = zip(entry.split(CHUNK), chunks, strict=True)
         listed = torch.cat([part[:, -chunk.tiles :].reshape(-1) for part, chunk in parts])
         groups.append(TileGroup(tiles, gaussian_or_padding.index_select(0, listed), chunks))
