@@ -57,9 +57,12 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("(scales - scales.mean(-1, keepdim=True))", "scales"),
     ],
     ("mapping/mapper.py", "mapping/test_mapper.py"): [
-        ("self._online_camera) > 0\n        shown", "self._online_camera) > -1\n        shown"),
         ("if not keyframe.inserts", "if False"),
-        ("opacity[static] > OPAQUE", "opacity[static] < OPAQUE"),
+    ],
+    ("mapping/safeguards.py", "mapping/test_mapper.py"): [
+        ("opacity[weight > 0] > OPAQUE", "opacity[weight > -1] > OPAQUE"),
+        ("opacity[weight > 0] > OPAQUE", "opacity[weight > 0] < OPAQUE"),
+        ("float(len(gaussians) > 0)", "1.0"),
     ],
     ("runs/facts.py", "runs/test_facts.py runs/test_run_ending.py"): [
         ("shown is not None and shown < LEAST_SHOWN", "bool(shown) and shown < LEAST_SHOWN"),
