@@ -75,21 +75,31 @@ def lengths(vectors: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) px
     return torch.hypot(vectors[:, 0], vectors[:, 1])
 
 
+def parallax(
+    T_target_source: Tensor,  # (E, 4, 4)
+    disparities: Tensor,  # (E, N)
+    rays: Tensor,  # (N, 3)
+    camera: Camera,
+) -> tuple[Tensor, Tensor, Tensor]:  # (E, N) px, (E, 2, N) px, (E, N) bool
+    """Return the parallax of all cells, their positions in the target, and whether both are valid.
+
+    Parallax is the flow that translation causes: all flow minus that of the rotation alone.
+    """
+    turned, still_seen = reproject(T_target_source, torch.zeros_like(disparities), rays, camera)
+    positions, valid = reproject(T_target_source, disparities, rays, camera)
+    return lengths(positions - turned), positions, valid & still_seen
+
+
 def mean_parallax(
     T_target_source: Tensor,  # (E, 4, 4)
     disparities: Tensor,  # (E, N)
     rays: Tensor,  # (N, 3)
     camera: Camera,
 ) -> Tensor:  # (E,) px
-    """Return the mean parallax of each edge: the flow that its translation causes.
-
-    It is the flow minus the flow of the rotation alone.
-    """
-    turned, still_seen = reproject(T_target_source, torch.zeros_like(disparities), rays, camera)
-    positions, valid = reproject(T_target_source, disparities, rays, camera)
-    both = (valid & still_seen).to(positions.dtype)
-    shift = lengths(positions - turned)
-    return (shift * both).sum(1) / both.sum(1).clamp_min(1)
+    """Return the mean parallax of each edge."""
+    shift, _, valid = parallax(T_target_source, disparities, rays, camera)
+    counted = valid.to(shift.dtype)
+    return (shift * counted).sum(1) / counted.sum(1).clamp_min(1)
 
 
 def reproject_with_jacobians(

@@ -192,9 +192,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("beyond_turns is None or", "beyond_turns is not None and"),
         ("confirmed < LEAST_CONFIRMED or", ""),
         (" or resting > MOST_RESTING", ""),
-        ("torch.zeros_like(disparities), rays", "disparities, rays"),
-        ("parallax.amax(0)", "parallax.amin(0)"),
-        ("(valid & camera.contains(positions.mT))", "valid"),
+        (".contains(positions.mT))).amax(0)", ".contains(positions.mT))).amin(0)"),
+        ("(valid & graph.grid.camera.contains(positions.mT))", "valid"),
         ("if source == keyframe]\n    if not", "if target == keyframe]\n    if not"),
         ("poses[:, :3, 3] = 0", "pass"),
         ("0 * keyframes.disparities", "keyframes.disparities"),
@@ -221,6 +220,9 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("ratio >= KEPT_FRACTION *", "ratio >= 0 *"),
         ("(without_rotation, 1 - rotation_weight)", "(without_rotation, rotation_weight)"),
         ("min(abs(i - j) - 2, suppression)", "suppression"),
+    ],
+    ("tracking/reprojection.py", "tracking/safeguards/test_turns.py"): [
+        ("torch.zeros_like(disparities), rays, camera)", "disparities, rays, camera)"),
     ],
     ("stereo/aggregation.py", "stereo/test_aggregation.py"): [
         ("before[:, :-1] + STEP_COST", "before[:, :-1]"),

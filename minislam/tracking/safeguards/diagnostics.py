@@ -91,8 +91,7 @@ class Watch(Stateful):
     def only_turned(self) -> bool:
         """Tell whether the camera stood still or only turned, so that nothing measures depth."""
         no_parallax = all(k.parallax < self._graph.least_parallax for k in self.diagnostics)
-        told = self.beyond_turns, self.resting, self.confirmed
-        return no_parallax or tells_no_depth(*told)
+        return no_parallax or tells_no_depth(self.beyond_turns, self.resting, self.confirmed)
 
     @property
     def segments(self) -> list[tuple[int, int]]:

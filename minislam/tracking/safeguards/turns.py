@@ -14,7 +14,7 @@ from minislam.tracking.pose_from_flow import (
     ROBUST_WIDENING,
     motion_only_problem,
 )
-from minislam.tracking.reprojection import lengths, reproject
+from minislam.tracking.reprojection import lengths, parallax
 from minislam.tracking.safeguards.robust import weighted_median
 
 # px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
@@ -66,12 +66,9 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
     targets = [target for source, target in graph.links.edges if source == keyframe]
     if not targets:
         return True
-    geometry = graph.geometry([keyframe] * len(targets), targets)
-    transforms, disparities, rays, camera = geometry
-    turned, _ = reproject(transforms, torch.zeros_like(disparities), rays, camera)
-    positions, valid = reproject(*geometry)
-    parallax = lengths(positions - turned) * (valid & camera.contains(positions.mT))
-    most = weighted_median(parallax.amax(0), graph.keyframes.cell_weights[keyframe])
+    shift, positions, valid = parallax(*graph.geometry([keyframe] * len(targets), targets))
+    largest = (shift * (valid & graph.grid.camera.contains(positions.mT))).amax(0)
+    most = weighted_median(largest, graph.keyframes.cell_weights[keyframe])
     return most is None or most < graph.least_parallax
 
 

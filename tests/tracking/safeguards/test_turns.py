@@ -83,6 +83,8 @@ def test_a_keyframe_rests_unless_some_link_that_sees_its_cells_shows_parallax():
     graph.keyframes.T_camera_world[2, 0, 3] += 50.0  # there no cell of the others is seen
     assert fraction_at_rest(graph) == 1
 
+
+def test_parallax_that_no_sweep_confirms_is_none():
     graph, watch = watched(GRID.pixels + GRID.pixels.new_tensor([0.5, 0.0]))
     graph.least_parallax = 0.0  # the poses claim parallax, of which hardly any flow is left
     assert not watch.only_turned
