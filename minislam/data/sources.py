@@ -53,7 +53,6 @@ class VideoImages:
         self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self.promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less if unknown
         stamps: list[float] = []
         last = 0  # A failed call is the end of the file, or damage with more frames behind it.
         while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
@@ -62,6 +61,9 @@ class VideoImages:
                 last = self._grabbed
                 self._calls.append(self._grabbed)
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+        # Of as many frames as were read, 0 or less if unknown: the container tells it of all.
+        promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.promised = 0 if len(stamps) == limit else promised
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
         self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
         self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]
@@ -182,7 +184,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
             rate = _ASSUMED_FRAME_RATE
         stamps, lost = np.arange(len(images)) / rate, lost[:0]
         warnings.append(f"{path.name} has no timestamps: {rate:g} frames per second assumed")
-    if len(images) < images.promised and len(images) != limit:
+    if len(images) < images.promised:
         warnings.append(
             f"{path.name} promises {images.promised} frames, but only {len(images)} can be decoded"
         )

@@ -17,13 +17,14 @@ Three rewritings make it fast without compiled code:
 """
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from minislam.splatting.constants import MIN_ALPHA
-from minislam.splatting.tiles import CHUNK, PIXELS, TILE, Chunk
+from minislam.splatting.tiles import PIXELS, TILE, Chunk
 
 _T, _ALPHAS, _V_WEIGHTS = range(3)  # the buffers of a workspace
 
@@ -38,11 +39,12 @@ class Block(NamedTuple):
 class Workspace:
     """Shared by all groups of an image: the monomials, and buffers for the largest block."""
 
-    def __init__(self, tiles: int, like: Tensor) -> None:
+    def __init__(self, chunks: Iterable[Chunk], like: Tensor) -> None:
         self.monomials = monomials(like)  # (6, P)
         # 2^(x log2 e), because exp is forty times slower than exp2 where its result underflows.
         self.monomials_log2 = self.monomials * math.log2(math.e)
-        self._buffers = like.new_empty(3, (CHUNK + 1) * tiles * PIXELS)
+        largest = max(((slots + 1) * tiles for slots, tiles in chunks), default=0)
+        self._buffers = like.new_empty(3, largest * PIXELS)
         self._blocks: dict[tuple[int, ...], Block] = {}
 
     def block(self, number: int, slots: int, tiles: int, tile_major: bool = False) -> Block:

@@ -60,8 +60,7 @@ def composite_image(
     canvas = background[:, None].repeat(len(inside), 1, PIXELS)  # (tiles, 4, P)
     opacities = torch.zeros_like(inside)
     weight_sums = channels.new_zeros(len(channels))
-    largest_group = max((len(group.tiles) for group in lists), default=0)
-    workspace = compositing.Workspace(largest_group, channels)
+    workspace = compositing.Workspace([c for group in lists for c in group.chunks], channels)
     groups = []
     for tiles, gaussians, chunks in lists:
         slots = table.index_select(1, gaussians)

@@ -14,10 +14,10 @@ from minislam.splatting.constants import MIN_ALPHA
 TILE = 8  # px, side of a tile; 4 and 16 are 20 % slower (measured)
 PIXELS = TILE * TILE
 # Tiles composited together, and slots of a chunk: larger blocks leave the cache, smaller ones cost
-# more calls.
+# more calls. On a GPU a call costs more than its arithmetic.
 GROUP, CHUNK = 512, 12
+GROUP_ON_GPU, CHUNK_ON_GPU = 4096, 64
 ACTIVE = 16  # tiles of a chunk are a multiple of it: few sizes, so that blocks are used again
-GROUP_ON_GPU = 4096  # there a call costs more than its arithmetic
 
 
 class Chunk(NamedTuple):
@@ -88,26 +88,26 @@ def build_tile_lists(
     by_length = by_length[counts[by_length] > 0]
     gaussian_or_padding = pad(gaussian, (0, 1), value=means2d.shape[1])
     groups = []
-    group = GROUP_ON_GPU if tile.is_cuda else GROUP
+    group, chunk = (GROUP_ON_GPU, CHUNK_ON_GPU) if tile.is_cuda else (GROUP, CHUNK)
     for tiles in by_length.split(group) if len(by_length) else ():
         lengths = counts[tiles]
-        chunks = _chunks(lengths.tolist())
-        slots = sum(chunk.slots for chunk in chunks)
+        chunks = _chunks(lengths.tolist(), chunk)
+        slots = sum(k for k, _ in chunks)
         position = torch.arange(slots, device=tile.device)[:, None]
         entry = torch.where(position < lengths, starts[tiles] + position, len(gaussian))
-        parts = zip(entry.split(CHUNK), chunks, strict=True)
-        listed = torch.cat([part[:, -chunk.tiles :].reshape(-1) for part, chunk in parts])
+        parts = zip(entry.split(chunk), chunks, strict=True)
+        listed = torch.cat([part[:, -b:].reshape(-1) for part, (_, b) in parts])
         groups.append(TileGroup(tiles, gaussian_or_padding.index_select(0, listed), chunks))
     return groups
 
 
-def _chunks(lengths: list[int]) -> list[Chunk]:
-    """Cut lists of ascending lengths into chunks."""
+def _chunks(lengths: list[int], slots: int) -> list[Chunk]:
+    """Cut lists of ascending lengths into chunks of so many slots."""
     chunks = []
-    for first in range(0, lengths[-1], CHUNK):
+    for first in range(0, lengths[-1], slots):
         active = len(lengths) - bisect_right(lengths, first)
         active = min(len(lengths), -(-active // ACTIVE) * ACTIVE)
-        chunks.append(Chunk(min(CHUNK, lengths[-1] - first), active))
+        chunks.append(Chunk(min(slots, lengths[-1] - first), active))
     return chunks
 
 

@@ -240,7 +240,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if high.any()", "if False"),
         ("keys & 0xFFFF", "keys & 0x7FFF"),
         ('high[order].argsort(kind="stable")', "high[order].argsort()"),
-        ("bisect_right(lengths, first)", "bisect_right(lengths, first + CHUNK)"),
+        ("bisect_right(lengths, first)", "bisect_right(lengths, first + slots)"),
         ("bisect_right(lengths, first)", "0"),
         ("-(-active // ACTIVE) * ACTIVE", "active // ACTIVE * ACTIVE"),
     ],

@@ -71,7 +71,7 @@ def composite_block(
     chunks: list[Chunk], coefficients: Tensor, channels: Tensor, background: Tensor
 ) -> Tensor:
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    workspace = Workspace(TILES, channels)
+    workspace = Workspace(chunks, channels)
     out = composite(chunks, coefficients, channels, background, inside, workspace)
     return torch.cat([out.channels, 1 - out.transmittance[:, None]], 1)
 
@@ -92,7 +92,7 @@ def test_exponent_at_the_mean_is_the_log_opacity():
 def test_weight_sums_add_up_the_blending_weight_of_each_slot():
     chunks, coefficients, channels, background = block(1, slots=2)
     inside = torch.ones(TILES, PIXELS, dtype=torch.float64)
-    out = composite(chunks, coefficients, channels, background, inside, Workspace(TILES, channels))
+    out = composite(chunks, coefficients, channels, background, inside, Workspace(chunks, channels))
     alphas = (coefficients.T @ monomials(channels)).exp().view(2, TILES, PIXELS)
     alphas = alphas * (alphas > MIN_ALPHA)
     expected = torch.cat([alphas[0], alphas[1] * (1 - alphas[0])])
@@ -111,9 +111,9 @@ def test_chunks_give_the_plain_sum(slots: int):
 
 
 def test_pixels_beyond_the_border_show_and_count_nothing():
-    *inputs, background = block(3, slots=5)
+    chunks, *inputs = block(3, slots=5)
     inside = torch.zeros(TILES, PIXELS, dtype=torch.float64)
-    out = composite(*inputs, background, inside, Workspace(TILES, background))
+    out = composite(chunks, *inputs, inside, Workspace(chunks, inside))
     assert out.channels.abs().max() == 0
     assert out.weight_sums.abs().max() == 0
 
@@ -144,7 +144,7 @@ def test_composite_vjp(slots: int, seed: int):
     leaves = [coefficients.clone().requires_grad_(), channels.clone().requires_grad_()]
     (composite_plainly(chunks, *leaves, background) * cotangent).sum().backward()
 
-    inside, workspace = cotangent.new_ones(TILES, PIXELS), Workspace(TILES, channels)
+    inside, workspace = cotangent.new_ones(TILES, PIXELS), Workspace(chunks, channels)
     inputs = chunks, coefficients, channels, background
     checkpoints = composite(*inputs, inside, workspace).checkpoints
     actual = composite_vjp(
@@ -169,7 +169,7 @@ def test_many_opaque_slots_give_finite_gradients():
     coefficients = torch.zeros(6, count)
     coefficients[0] = -0.01  # alpha 0.99 everywhere: T falls to 1e-80, below any float32
     inputs = chunks, coefficients, torch.ones(count, 4), torch.zeros(4)
-    inside, workspace = torch.ones(TILES, PIXELS), Workspace(TILES, coefficients)
+    inside, workspace = torch.ones(TILES, PIXELS), Workspace(chunks, coefficients)
     out = composite(*inputs, inside, workspace)
     v_coefficients, v_channels = composite_vjp(
         *inputs, out.checkpoints, torch.ones(TILES, 4, PIXELS), torch.zeros_like(inside), workspace

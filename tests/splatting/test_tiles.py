@@ -53,13 +53,17 @@ def slots_in_use(lists: list[TileGroup], count: int) -> int:
     return sum(int((group.gaussians < count).sum()) for group in lists)
 
 
-@pytest.mark.parametrize("group", [1, 7, tiles.GROUP, tiles.GROUP_ON_GPU])
+ON_CPU, ON_GPU = (tiles.GROUP, tiles.CHUNK), (tiles.GROUP_ON_GPU, tiles.CHUNK_ON_GPU)
+
+
+@pytest.mark.parametrize(("group", "chunk"), [(1, 12), (7, 1), ON_CPU, ON_GPU])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(6))
 def test_every_pair_that_shows_is_listed_once(
-    kind: str, seed: int, group: int, monkeypatch: pytest.MonkeyPatch
+    kind: str, seed: int, group: int, chunk: int, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(tiles, "GROUP", group)
+    monkeypatch.setattr(tiles, "CHUNK", chunk)
     lists, overlaps, count = lists_and_truth(kind, seed)
     pairs = listed_pairs(lists, overlaps.shape, count)
     assert not (overlaps & ~pairs).any()
