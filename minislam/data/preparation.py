@@ -13,8 +13,13 @@ from minislam.data.options import MINIMUM_SIDE
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
 
+Window = tuple[int, int, int, int]  # left, top, width, height px
+
 # Trackers, networks and feature grids work on cells of 8 px, so both sides are multiples of it.
 SIZE_MULTIPLE = 8  # px
+BLACK = 24  # of 255: the brightest that a codec leaves in a black bar
+BLURRED = 2  # px of the picture, beside a bar, that a codec mixes with it
+LEAST_PICTURE = 0.5  # fraction of each side; a scene that leaves less is dark, not barred [-]
 
 
 class ImagePreparation:
@@ -30,6 +35,7 @@ class ImagePreparation:
         distortion: BrownDistortion,
         size: tuple[int, int] | None,  # (width, height) px of the working image, None: choose
         pixels: int,  # about width * height of the working image when it is chosen
+        picture: Window | None = None,  # of the raw image, see `picture_window`; None: all
     ) -> None:
         self._raw_size = (raw_camera.width, raw_camera.height)
         if min(self._raw_size) < MINIMUM_SIDE:
@@ -38,10 +44,10 @@ class ImagePreparation:
                 f"{raw_camera.width}x{raw_camera.height}; use larger images"
             )
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
-        self._window = (0, 0, *self._raw_size)
+        self._window = picture or (0, 0, *self._raw_size)
         if np.any(distortion.coefficients):
             self._maps = distortion.undistortion_maps(raw_camera)
-            self._window = seen_window(*self._maps)
+            self._window = seen_window(*self._maps, self._window)
         seen_width, seen_height = self._window[2:]
         width, height = size or working_size(seen_width, seen_height, pixels)
         # The smallest scale at which the image covers the wanted size; the rest is cropped.
@@ -122,17 +128,37 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
     return side(width), side(height)
 
 
+def picture_window(brightest: np.ndarray) -> Window:
+    """Return the window of the images that no black bar covers; films have such bars.
+
+    `brightest` (H, W) uint8 is the largest value of each pixel in several images. A bar would be
+    taken for a part of the scene that moves with the camera, and what is black in the scene for a
+    part of the bar.
+    """
+    window = []
+    for axis, side in ((0, brightest.shape[1]), (1, brightest.shape[0])):
+        (shown,) = np.nonzero(brightest.max(axis) > BLACK)
+        first, last = (int(shown[0]), int(shown[-1])) if len(shown) else (0, side - 1)
+        first, last = first + BLURRED * (first > 0), last - BLURRED * (last < side - 1)
+        is_picture = last + 1 - first >= max(LEAST_PICTURE * side, MINIMUM_SIDE)
+        window.append((first, last + 1 - first) if is_picture else (0, side))
+    (left, width), (top, height) = window
+    return left, top, width, height
+
+
 def seen_window(
     map_x: np.ndarray,  # (H, W) px, where each undistorted pixel is taken from
     map_y: np.ndarray,  # (H, W) px
-) -> tuple[int, int, int, int]:  # left, top, width, height px
+    picture: Window,  # of the raw image
+) -> Window:
     """Return a window of the undistorted image without pixels that no camera saw.
 
     Such pixels would be a black frame that stands still while the camera moves. The side with
     the largest fraction of such pixels loses one row or column until none is left.
     """
     height, width = map_x.shape
-    unseen = (map_x < 0) | (map_x > width - 1) | (map_y < 0) | (map_y > height - 1)
+    left, top, right, bottom = *picture[:2], picture[0] + picture[2], picture[1] + picture[3]
+    unseen = (map_x < left) | (map_x > right - 1) | (map_y < top) | (map_y > bottom - 1)
     left, top, right, bottom = 0, 0, width, height
     while right - left >= MINIMUM_SIDE and bottom - top >= MINIMUM_SIDE:
         inside = unseen[top:bottom, left:right]

@@ -12,7 +12,7 @@ import torch
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
-from minislam.data.preparation import ImagePreparation, KeptImages
+from minislam.data.preparation import ImagePreparation, KeptImages, picture_window
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
@@ -71,7 +71,9 @@ class RecordedSequence:
         height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
         calibration = _calibration(recording, options, width, height)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
-        self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels)
+        picture = picture_window(recording.images.brightest())
+        how = options.size, options.pixels, picture
+        self.prepare = ImagePreparation(camera, distortion, *how)
         self.name = recording.name
         self.camera = self.prepare.camera
         self.preparation = self.prepare.steps
@@ -88,6 +90,8 @@ class RecordedSequence:
             )
         size = f"{width}x{height} -> {self.camera.width}x{self.camera.height} px"
         counts = f"{len(self)} of {len(recording.images)} images"
+        if picture[2:] != (width, height):
+            size = f"black bars cut to {picture[2]}x{picture[3]}, {size}"
         parts = [counts, *recording.notes, size, calibration.origin]
         if options.masks is not None:
             parts.append(f"masks from {options.masks}")

@@ -2,6 +2,7 @@
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from minislam.data.calibration import Calibration, read_calibration
 from minislam.data.images import is_image, list_images, read_color
 from minislam.data.metadata import noted_focal_length
-from minislam.errors import InputError
+from minislam.errors import InputError, MinislamError
 from minislam.records import Trajectory
 
 FILES = "files:"  # before the name of a folder
@@ -39,6 +40,17 @@ class FileImages:
         """Return a raw image (H, W, 3) uint8 RGB."""
         return read_color(self.paths[index])
 
+    def brightest(self) -> np.ndarray:  # (H, W) uint8
+        """Return the largest value of each pixel in some of the images, as large as the first."""
+        found = self.read(0).max(2)
+        for path in (
+            self.paths[index] for index in range(1, len(self.paths)) if _is_looked_at(index)
+        ):
+            with suppress(MinislamError):  # told when it is that frame's turn
+                image = read_color(path).max(2)
+                found = np.maximum(found, image) if image.shape == found.shape else found
+        return found
+
 
 class VideoImages:
     """Images that are frames of a video. OpenCV applies the rotation that phones note in it.
@@ -53,6 +65,7 @@ class VideoImages:
         self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
+        self._brightest: np.ndarray | None = None
         stamps: list[float] = []
         last = 0  # A failed call is the end of the file, or damage with more frames behind it.
         while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
@@ -60,6 +73,8 @@ class VideoImages:
             if self._capture.grab():
                 last = self._grabbed
                 self._calls.append(self._grabbed)
+                if _is_looked_at(len(stamps)):
+                    self._look()
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         # Of as many frames as were read, 0 or less if unknown: the container tells it of all.
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -85,6 +100,18 @@ class VideoImages:
         _, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
+    def brightest(self) -> np.ndarray:  # (H, W) uint8
+        """Return the largest value of each pixel in some of the images."""
+        assert self._brightest is not None, "the first image was read"
+        return self._brightest
+
+    def _look(self) -> None:
+        decoded, image = self._capture.retrieve()
+        if decoded:
+            image = image.max(2)
+            seen = image if self._brightest is None else self._brightest
+            self._brightest = np.maximum(seen, image)
+
     def lost(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing: gaps of a constant rate, or calls that failed."""
         gaps = np.diff(self.timestamps) * self.frame_rate  # frames
@@ -107,6 +134,11 @@ class VideoImages:
             raise InputError(
                 f"expected a video, but {self.path} ({size} bytes) cannot be opened as one; {hint}"
             )
+
+
+def _is_looked_at(index: int) -> bool:
+    """Tell whether an image is 0, 1, 2, 4, 8 ...: few, the first, and others far apart."""
+    return index & (index - 1) == 0
 
 
 ImageSource = FileImages | VideoImages

@@ -4,13 +4,20 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.data.preparation import ImagePreparation, seen_window, working_size
+from minislam.data.preparation import (
+    ImagePreparation,
+    picture_window,
+    seen_window,
+    working_size,
+)
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
 
 NO_DISTORTION = BrownDistortion()
 FR1 = Camera(517.3, 516.5, 318.6, 255.3, 640, 480)
 FR1_DISTORTION = BrownDistortion(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+
+WHOLE = (0, 0, 640, 480)
 
 # Known answers
 
@@ -91,8 +98,52 @@ def test_no_black_border_remains_after_undistortion():
     prepare = ImagePreparation(FR1, FR1_DISTORTION, None, 320 * 240)
     assert prepare.color(white).min() == 1.0
     assert prepare.nearest(np.ones((480, 640), np.float32)).min() == 1.0
-    window = seen_window(*FR1_DISTORTION.undistortion_maps(FR1))
+    window = seen_window(*FR1_DISTORTION.undistortion_maps(FR1), WHOLE)
     assert window[2] * window[3] > 0.85 * 640 * 480
+
+
+def test_no_black_bar_remains_after_undistortion():
+    letterboxed = np.full((480, 640, 3), 255, np.uint8)
+    letterboxed[:60] = letterboxed[-60:] = 0
+    how = FR1, FR1_DISTORTION, None, 640 * 480
+    barred, whole = ImagePreparation(*how, (0, 60, 640, 360)), ImagePreparation(*how)
+    assert barred.color(letterboxed).min() == 1.0 and whole.color(letterboxed).min() == 0.0
+    assert 300 < barred.camera.height < 360
+    # The same camera: what is cut moves the principal point alone.
+    left, top = (barred.steps["window"][k] - whole.steps["window"][k] for k in (0, 1))
+    before, after = whole.full_camera(whole.camera), barred.full_camera(barred.camera)
+    found = after.cx + left, after.cy + top, after.fx, after.fy
+    np.testing.assert_allclose(found, (before.cx, before.cy, before.fx, before.fy), atol=1e-9)
+
+
+# Black bars
+
+
+def barred(left: int, top: int, right: int, bottom: int, value: int = 90) -> np.ndarray:
+    brightest = np.full((100, 200), 20, np.uint8)  # black, as a codec leaves it
+    brightest[top : 100 - bottom, left : 200 - right] = value
+    return brightest
+
+
+@pytest.mark.parametrize(
+    "bars, window",
+    [
+        ((0, 0, 0, 0), (0, 0, 200, 100)),
+        ((0, 14, 0, 16), (0, 16, 200, 66)),  # letterbox; two rows beside a bar are blurred
+        ((30, 0, 30, 0), (32, 0, 136, 100)),  # pillarbox
+        ((10, 10, 0, 0), (12, 12, 188, 88)),
+        ((0, 30, 0, 30), (0, 0, 200, 100)),  # a lamp in the dark, not a picture
+    ],
+)
+def test_black_bars_are_no_part_of_the_picture(bars, window: tuple[int, int, int, int]):
+    assert picture_window(barred(*bars)) == window
+
+
+def test_what_is_dark_is_no_bar():
+    assert picture_window(barred(0, 14, 0, 16, value=24)) == (0, 0, 200, 100)  # all is black
+    lit = barred(0, 14, 0, 16)
+    lit[3, 60] = 25  # a star
+    assert picture_window(lit) == (0, 5, 200, 77)
 
 
 # Errors
@@ -106,4 +157,4 @@ def test_tiny_images_are_refused():
 def test_a_distortion_that_leaves_nothing_is_refused():
     maps = np.full((48, 64), -1, np.float32), np.full((48, 64), -1, np.float32)
     with pytest.raises(InputError, match="order k1 k2 p1 p2 k3"):
-        seen_window(*maps)
+        seen_window(*maps, WHOLE)

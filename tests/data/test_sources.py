@@ -10,7 +10,7 @@ import pytest
 from minislam.data import sources
 from minislam.data.options import InputOptions
 from minislam.data.sequence import RecordedSequence
-from minislam.data.sources import VideoImages, read_video
+from minislam.data.sources import VideoImages, read_image_folder, read_video
 from minislam.errors import InputError
 from tests.recordings import picture, save, video
 
@@ -58,6 +58,24 @@ def test_a_video_filmed_upright_is_turned(tmp_path: Path):
     image = VideoImages(tmp_path / "turned.mp4").read(0)
     assert image.shape == (96, 64, 3)
     assert image[5, 55, 0] > 180  # the red corner went from the upper left to the upper right
+
+
+def test_the_brightest_of_images_far_apart_tells_what_is_always_black(tmp_path: Path):
+    frames = np.zeros((40, 48, 64, 3), np.uint8)
+    for index, frame in enumerate(frames):
+        frame[8:40, index] = 200  # a bright column that walks along
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
+    (tmp_path / "b").mkdir()
+    for index, frame in enumerate(frames):
+        writer.write(frame)
+        cv2.imwrite(str(tmp_path / f"b/{index:02d}.png"), frame)
+    writer.release()
+    (tmp_path / "b/16.png").write_bytes(b"no picture")  # told when it is its turn
+    video, folder = read_video(tmp_path / "a.avi", None), read_image_folder(tmp_path / "b")
+    for images, looked_at in ((video.images, [0, 1, 2, 4, 8, 16, 32]), (folder.images, [0, 8, 32])):
+        brightest = images.brightest()
+        assert brightest.shape == (48, 64) and brightest[:6].max() < 24 < brightest[20].max()
+        assert (brightest[20, looked_at] > 150).all() and (brightest[20, 48:] < 24).all()
 
 
 # Damage
