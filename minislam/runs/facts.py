@@ -268,8 +268,8 @@ def _warnings(slam: Slam) -> Iterator[str]:
     if keyframes.overlay is not None:
         yield (
             f"{float((keyframes.overlay == 0).float().mean()):.0%} of the image stand still while "
-            "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map does "
-            "not; crop the images"
+            "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map only "
+            "as far as beta does, with all that looks like them; crop the images"
         )
     if not keyframes.has_prior:
         yield "without a depth prior the unit of length is arbitrary"

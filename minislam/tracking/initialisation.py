@@ -18,7 +18,11 @@ from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import start_pose, warp_disparities
 from minislam.tracking.safeguards.first_camera import lowest_minimum
-from minislam.tracking.safeguards.motion_memory import inherit_motion_weight, overlay_weights
+from minislam.tracking.safeguards.motion_memory import (
+    inherit_motion_weight,
+    overlay_weights,
+    without_overlay,
+)
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 
@@ -80,6 +84,8 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
     keyframes = graph.keyframes
     keyframes.overlay = overlay_weights(flow_to_next, graph.grid)
+    flow_to_next = [without_overlay(matches, keyframes.overlay) for matches in flow_to_next]
+    graph.flow_to_next = [*flow_to_next]
     for target in range(1, len(keyframes)):
         graph.match_composed(target)
     known, weights = keyframes.prior_disparities, keyframes.cell_weights[0]

@@ -161,6 +161,7 @@ class Tracker(Stateful):
         """Return the chain extended to this frame, and the flow to it from the newest keyframe."""
         assert self._chain is not None, "there is a chain from the first frame on"
         chain, matches = self._chain.advance(frame.image)
+        matches = motion_memory.without_overlay(matches, self.keyframes.overlay)
         return chain, judged_by_pose(self.graph, matches) if self.graph.is_learned else matches
 
     def _log_followed(self, frame: Frame, ratio: float) -> None:

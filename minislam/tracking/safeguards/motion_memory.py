@@ -9,6 +9,7 @@ What stands still in every image while the camera moves is no part of the scene 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -31,6 +32,7 @@ CONFIRMED = 0.2  # confidence of a flow that counts [-]
 ALWAYS = 0.8  # of the pairs in which a cell of an overlay stands [-]
 MIN_PAIRS = 2  # pairs of keyframes in which the camera moves; fewer tell nothing
 MIN_CELLS = 4
+REACH = 2  # cells around an overlay, whose flow is that of neither
 
 
 def judge_all(graph: KeyframeGraph) -> None:
@@ -144,5 +146,16 @@ def overlay_weights(flow_to_next: Sequence[FlowMatches], grid: Grid) -> Tensor |
     is_fixed = torch.stack(still).float().mean(0) >= ALWAYS
     if int(is_fixed.sum()) < MIN_CELLS:
         return None
-    covered = max_pool2d(is_fixed.float().reshape(1, 1, *grid.shape), 3, 1, 1).reshape(-1)
-    return 1 - covered
+    fixed = is_fixed.float().reshape(1, 1, *grid.shape)
+    return 1 - max_pool2d(fixed, 2 * REACH + 1, 1, REACH).reshape(-1)
+
+
+def without_overlay(matches: FlowMatches, overlay: Tensor | None) -> FlowMatches:
+    """Return matches in which no cell of an overlay counts, by its `overlay_weights`.
+
+    Its flow would delay the next keyframe, and the memory would take it for a motion and hand it on
+    to the cells where wrong matches beside it lead.
+    """
+    if overlay is None:
+        return matches
+    return replace(matches, confidences=matches.confidences * overlay)

@@ -5,14 +5,14 @@ import torch
 from torch import Tensor
 
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.safeguards.motion_memory import overlay_weights
+from minislam.tracking.safeguards.motion_memory import overlay_weights, without_overlay
 from tests.tracking.wall import GRID
 
 HEIGHT, WIDTH = GRID.shape
 LOGO = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
 LOGO[1:3, 2:5] = True
 BESIDE = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-BESIDE[0:4, 1:6] = True
+BESIDE[0:5, 0:7] = True  # two cells on each side, as far as there are any
 
 
 def flow(still: Tensor, way: float = 9.0, confidence: float = 0.9) -> FlowMatches:
@@ -29,6 +29,14 @@ def test_a_logo_and_the_cells_beside_it_count_no_longer():
     assert weights is not None
     assert torch.equal(weights.reshape(HEIGHT, WIDTH) == 0, BESIDE)
     assert set(weights.tolist()) == {0.0, 1.0}
+
+
+def test_an_overlay_counts_in_no_match():
+    matches, overlay = flow(LOGO), 1 - LOGO.reshape(-1).float()
+    seen = without_overlay(matches, overlay)
+    assert torch.equal(seen.confidences > 0, (overlay > 0).expand_as(seen.confidences))
+    assert torch.equal(seen.targets, matches.targets)
+    assert without_overlay(matches, None) is matches
 
 
 def test_most_of_the_time_is_enough():
