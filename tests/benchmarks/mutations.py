@@ -138,7 +138,14 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("> MOVES", "> 0"),
         (">= ALWAYS", "> 0"),
         ("len(still) < MIN_PAIRS", "not still"),
-        ("*grid.shape), 3, 1, 1)", "*grid.shape), 1, 1, 0)"),
+        ("2 * REACH + 1, 1, REACH", "REACH + 1, 1, REACH // 2"),
+        ("matches.confidences * overlay", "matches.confidences * (1 - overlay)"),
+    ],
+    ("tracking/initialisation.py", "tracking/test_tracker_overlay.py"): [
+        ("[without_overlay(matches, keyframes.overlay) for matches", "[matches for matches"),
+    ],
+    ("tracking/tracker.py", "tracking/test_tracker_overlay.py"): [
+        ("motion_memory.without_overlay(matches, self.keyframes.overlay)", "matches"),
     ],
     ("tracking/safeguards/pose_support.py", "tracking/safeguards/test_pose_support.py"): [
         ("fits[index].support < LOST_SUPPORT", "fits[index].support < 0 *"),
@@ -270,6 +277,19 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("data/sources.py", "data/test_sources.py"): [
         ("self.promised > len(self) > 1", "len(self) > 1"),
+        ("0 if len(stamps) == limit else promised", "promised"),
+        ("index & (index - 1) == 0", "index == 0"),
+        ("np.maximum(seen, image)", "image"),
+        ("np.maximum(found, image)", "image"),
+    ],
+    ("data/preparation.py", "data/test_preparation.py"): [
+        ("> BLACK", "> 0"),
+        ("first + BLURRED * (first > 0)", "first"),
+        ("last - BLURRED * (last < side - 1)", "last"),
+        ("LEAST_PICTURE * side", "0 * side"),
+        ("(*self._maps, self._window)", "(*self._maps, (0, 0, *self._raw_size))"),
+        ("map_y < top", "map_y < 0"),
+        ("map_y > bottom - 1", "map_y > height - 1"),
     ],
     ("data/checkpoint.py", "data/test_checkpoint.py"): [
         ("allow_pickle=False", "allow_pickle=True"),
