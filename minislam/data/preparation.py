@@ -131,9 +131,8 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
 def picture_window(brightest: np.ndarray) -> Window:
     """Return the window of the images that no black bar covers; films have such bars.
 
-    `brightest` (H, W) uint8 is the largest value of each pixel in several images. A bar would be
-    taken for a part of the scene that moves with the camera, and what is black in the scene for a
-    part of the bar.
+    `brightest` (H, W) uint8 is the largest value of each pixel in several images. Beta would learn
+    that a bar is no part of the scene, and take all that is black for a part of the bar.
     """
     window = []
     for axis, side in ((0, brightest.shape[1]), (1, brightest.shape[0])):

@@ -43,11 +43,9 @@ class FileImages:
     def brightest(self) -> np.ndarray:  # (H, W) uint8
         """Return the largest value of each pixel in some of the images, as large as the first."""
         found = self.read(0).max(2)
-        for path in (
-            self.paths[index] for index in range(1, len(self.paths)) if _is_looked_at(index)
-        ):
+        for index in filter(_is_looked_at, range(1, len(self.paths))):
             with suppress(MinislamError):  # told when it is that frame's turn
-                image = read_color(path).max(2)
+                image = self.read(index).max(2)
                 found = np.maximum(found, image) if image.shape == found.shape else found
         return found
 
