@@ -32,7 +32,8 @@ def tracker(clip: SyntheticSequence) -> Tracker:
     spots = np.random.default_rng(0).random((24, 32, 1), np.float32).repeat(5, 0).repeat(5, 1)
     k = clip.intrinsics
     parts = ClassicalFlow(), ClassicalFeatures(), NoDepth(), lambda _: torch.ones(15, 20)
-    tracker = Tracker(Camera(k.fx, k.fy, k.cx, k.cy, *SIZE), TrackingConfig(), *parts)
+    config = TrackingConfig(warmup_keyframes=4)  # so that some keyframes come after the start
+    tracker = Tracker(Camera(k.fx, k.fy, k.cx, k.cy, *SIZE), config, *parts)
     for number, index in enumerate(SHOWN):
         image = torch.from_numpy(np.where(bonnet, spots, clip.rgb[index]))
         tracker.track(Frame(number, clip.timestamps[index], image))
@@ -64,4 +65,4 @@ def test_the_camera_is_followed(tracker: Tracker, clip: SyntheticSequence):
     truth = Trajectory(clip.timestamps[shown], clip.T_world_camera[shown])
     found = se3_inverse(tracker.keyframes.T_camera_world).numpy()
     error = absolute_trajectory_error(Trajectory(clip.timestamps[shown], found), truth)
-    assert error.statistics["rmse"] < 0.008  # measured .0034 m
+    assert error.statistics["rmse"] < 0.008  # measured .0027 m
