@@ -40,7 +40,7 @@ from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty.weights import beta_of_mask, relative_weight, tracking_weight
 from minislam.workers import Workers
 
-FRAMES_AT_ONCE = 8  # between two keyframes, refined side by side: more make Ctrl-C wait
+FRAMES_AT_ONCE = 8  # whose poses are refined side by side; with more, Ctrl-C waits longer
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Slam(Stateful):
             self.tracker.refine_initialisation()
 
     def _map_new_keyframes(self) -> None:
-        """Add new keyframes to the map. Without a depth prior it is built at the end alone."""
+        """Add new keyframes to the map. Without a depth prior it is built at the end."""
         mapped, store = len(self.mapper.keyframes), self.tracker.keyframes
         if not store.has_prior or mapped == len(store):
             return

@@ -93,7 +93,10 @@ def color_loss(
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
     lambda_ssim: float,  # weight of SSIM in [0, 1]
 ) -> Tensor:  # (H, W)
-    """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. (7)."""
+    """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. (7).
+
+    It is 0 where the image is black: there undistortion left nothing.
+    """
     absolute = (rendered - image).abs().mean(-1)
     loss = (1 - lambda_ssim) * absolute
     if lambda_ssim > 0:

@@ -55,8 +55,10 @@ class Mapper(JointOptimisation):
         for position in range(count):
             self._insert(position)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
-        most = count * self.config.keyframe_iterations if online else self.config.init_iterations
-        iterations = max(min(self.config.init_iterations, most), self._weighted_from)
+        iterations = self.config.init_iterations
+        if online:
+            iterations = min(iterations, count * self.config.keyframe_iterations)
+        iterations = max(iterations, self._weighted_from)
         self._optimise([self._online_camera] * iterations, progress=progress)
         self._replace_dynamic_gaussians()
 

@@ -132,7 +132,9 @@ class JointOptimisation(Stateful):
                 turns = range(done, done + count)
                 positions = in_turn(turns, len(self.keyframes), self.seed)
             else:
-                positions = self._drawn(probabilities, count)
+                repeats = int((probabilities > 0).sum()) < count  # else none twice
+                drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)
+                positions = drawn.tolist()
             rounds = self._iteration // interval
             self._step(positions, cameras[done], last_rate ** (done / total))
             if self._iteration // interval > rounds:
@@ -140,18 +142,14 @@ class JointOptimisation(Stateful):
             if progress is not None:
                 progress(done + count, total)
 
-    def _drawn(self, probabilities: Tensor, count: int) -> list[int]:
-        """Draw keyframes at random, none twice unless there are too few."""
-        repeats = int((probabilities > 0).sum()) < count
-        return torch.multinomial(probabilities, count, repeats, generator=self._generator).tolist()
-
     def _step(self, positions: list[int], camera: Camera, rate_factor: float) -> None:
         """Take one step of the map on the mean L_render of some keyframes, then train the MLP.
 
         The mean of n gradients is less noisy, so the step is sqrt(n) times as long.
         """
         trains = self.uncertainty.is_learnt and self._iteration >= self._frozen_until
-        calls = [self._call(self.keyframes[position], camera, trains) for position in positions]
+        drawn = [self.keyframes[position] for position in positions]
+        calls = [self._view_arguments(keyframe, camera, trains) for keyframe in drawn]
         shares: list[ViewGradients] = self._workers.map(view_gradients, calls)
         for name, values in self._optimizer.gaussians.parameters.items():
             values.grad = torch.stack([share.by_parameter[name] for share in shares]).mean(0)
@@ -164,14 +162,16 @@ class JointOptimisation(Stateful):
             self.history.add(share.losses, loss, len(self._optimizer.gaussians))
         self._iteration += len(shares)
 
-    def _call(self, keyframe: Keyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
+    def _view_arguments(self, keyframe: Keyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
         """Return the arguments of `view_gradients`."""
-        (rows, columns, _), unit = keyframe.features.shape, metre(self.median_depth)
-        small = view_of(keyframe, self._online_camera)
-        grid = small, (rows, columns), keyframe.confirmation, unit, self.uncertainty
+        comparison = None
+        if trains:
+            (rows, columns, _), unit = keyframe.features.shape, metre(self.median_depth)
+            small = view_of(keyframe, self._online_camera)
+            grid = small, (rows, columns), keyframe.confirmation, unit
+            comparison = Comparison(*grid, self.uncertainty)
         pose, weight = keyframe.T_camera_world, self.static_weight(self.beta_of(keyframe), camera)
         view = camera, pose.float(), self.background, view_of(keyframe, camera), weight
-        comparison = Comparison(*grid) if trains else None
         return self.gaussians, *view, self.median_depth, self.config, comparison
 
     def _train_mlp(self, positions: list[int], shares: list[ViewGradients]) -> float:

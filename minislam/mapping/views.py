@@ -39,7 +39,7 @@ def median_depth(keyframes: list[Keyframe]) -> float:  # world units
     depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in some])
     if len(depths) == 0:
         raise InputError(
-            "expected some known depth in the first keyframes, found none; the images hold "
+            "expected some known depth in the keyframes, found none; the images hold "
             "too little texture or parallax: move the camera more, or give a depth prior"
         )
     return float(depths.median())

@@ -62,8 +62,8 @@ def sampling_probabilities(
 ) -> Tensor:  # (N,) float64, sum 1
     """Return the probability of each keyframe: in the paper, 1/2 for the window in total.
 
-    While the window holds a larger fraction of all keyframes, all are equally likely, so the
-    window is still drawn at least that often. This includes a window of all keyframes.
+    While the window holds more than `window_probability` of all keyframes, all are equally likely,
+    so the window is still drawn at least that often. This includes a window of all keyframes.
     """
     if len(window) >= window_probability * count:
         return torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")

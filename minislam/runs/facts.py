@@ -157,12 +157,6 @@ def has_large_holes(slam: Slam) -> bool:
     return shown is not None and shown < LEAST_SHOWN
 
 
-def is_hardly_more_than_a_turn(slam: Slam) -> bool:
-    """Tell whether the images alone say too little of depth, and no prior says more."""
-    seen = slam.tracker.watch.beyond_turns
-    return seen is not None and seen < LEAST_BEYOND_TURNS and not slam.tracker.keyframes.has_prior
-
-
 def _ties(slam: Slam) -> dict[str, float | None]:
     """Return how long the path is and how well poses, depths and flow agree, without any truth."""
     graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
@@ -258,7 +252,11 @@ def _warnings(slam: Slam) -> Iterator[str]:
             "turned or stood still, so the distances it moved are not determined"
             + ("" if slam.tracker.knows_depth else ", and all that the map shows is at one depth")
         )
-    elif is_hardly_more_than_a_turn(slam):
+    elif (
+        not keyframes.has_prior
+        and watch.beyond_turns is not None
+        and watch.beyond_turns < LEAST_BEYOND_TURNS
+    ):
         yield (
             f"between neighbouring keyframes only {watch.beyond_turns:.2f} px of the flow, in the "
             "median and in an image of 320x240, are more than a turn of the camera: depth is "

@@ -15,7 +15,7 @@ MAX_OPACITY = 0.99
 # Smaller alphas are dropped: they change a pixel by less than one step of an 8-bit image (3DGS).
 MIN_ALPHA = 1 / 255
 # The projection is linearised at most this fraction of a half-image outside the border, because
-# the approximation becomes poor there and grows without bound (3DGS: 1.3 half-images).
+# the approximation becomes poor there and grows without bound (3DGS: 1.3 from the centre).
 VIEW_MARGIN = 0.3
 
 

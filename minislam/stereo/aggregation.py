@@ -51,9 +51,9 @@ def _paths_down(cost: np.ndarray, gray: np.ndarray, shift: int) -> np.ndarray:
 
 
 def refined_minimum(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return per pixel the plane of least cost, (h, w) int, and its fraction of a plane (h, w).
+    """Return per pixel the plane of least cost, (h, w) int, and how far beyond it the minimum is.
 
-    The fraction, in [-0.5, 0.5], is the minimum of the parabola through three planes.
+    That is in [-0.5, 0.5] planes (h, w): the minimum of the parabola through three planes.
     """
     best = total.argmin(-1)
     inner = np.clip(best, 1, total.shape[-1] - 2)[..., None]

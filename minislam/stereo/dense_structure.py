@@ -24,13 +24,13 @@ VIEWS = 8  # other images in a sweep
 REACH = 40  # frames to either side among which they are chosen
 MAX_PARALLAX = 0.125  # image widths: with more, two images look too different
 BETWEEN = 2  # most frames between two keyframes that are swept as well
-RESTING = 8  # yet one of so many: a camera at rest makes no keyframes
+RESTING = 8  # but at least one of so many: a camera at rest makes no keyframes
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
 LARGEST_QUANTILE = 0.98
 PLANES = (48, 96)  # fewest and most
-FARTHEST = 0.5  # plane of all that lies between the first, at infinity, and this one [-]
-LEAST_COMMON = 100  # px, with two depths of which the ratio of their scales is told
+FARTHEST = 0.5  # planes: what matches farther away, even at infinity, is put here
+LEAST_COMMON = 100  # px that have both depths; with fewer their scales are not compared
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
 
 
@@ -68,15 +68,15 @@ def with_swept_depth(
 def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:
     """Return the keyframes of a camera that only turned, with all they see one world unit away.
 
-    Without parallax every depth explains the images as well, and no other view confirms any.
+    Without parallax every depth explains the images equally well, and no other view confirms any.
     """
     return [replace(k, depth=k.depth.new_ones(()).expand(k.depth.shape)) for k in keyframes]
 
 
 def _nearest(image: Tensor, camera: Camera) -> np.ndarray:
-    """Return an image (H, W) at the size of a camera."""
+    """Return the nearest pixels of an image (H, W) at the size of a camera."""
     size = camera.width, camera.height
-    return cv2.resize(image.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST)
+    return cv2.resize(image.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST_EXACT)
 
 
 def _inverse(depth: np.ndarray) -> np.ndarray:
@@ -103,12 +103,12 @@ def dense_depths(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
-    told, near = list(disparities), list(disparities.values())
+    known_frames, known = list(disparities), list(disparities.values())
     swept: list[votes.SweptView] = []
 
     def plan(frame: int) -> tuple[Any, ...]:
-        nearest = int(np.argmin([abs(frame - index) for index in told]))
-        return planner.plan(frame, np.concatenate(near[max(0, nearest - 1) : nearest + 2]))
+        nearest = int(np.argmin([abs(frame - index) for index in known_frames]))
+        return planner.plan(frame, np.concatenate(known[max(0, nearest - 1) : nearest + 2]))
 
     for view in workers.stream(swept_view, map(plan, frames)):
         swept.append(view)
@@ -124,7 +124,7 @@ def dense_depths(
 
 
 def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
-    """Return keyframes and a third of the frames between two: at least so many, at most a few."""
+    """Return the keyframes and, of n frames between two, max(least, n // 8, min(2, n // 3))."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
         there = [frame for frame in followed if first < frame < last]
@@ -138,13 +138,13 @@ def swept_view(
     camera: Camera,  # of all images
     reference: PosedImage,
     others: list[PosedImage],
-    planes: np.ndarray,  # (D,) 1/world unit, evenly spaced
+    planes: np.ndarray,  # (D,) 1/world unit, evenly spaced from 0
 ) -> votes.SweptView:
     """Sweep one image; without others nothing is found. Any process can compute it."""
     step, pose = float(planes[1]), reference.T_camera_world
     if not others:
         nothing = np.full_like(reference.gray, np.nan)
-        return votes.SweptView(nothing, nothing + 1, step, pose)
+        return votes.SweptView(nothing, np.ones_like(nothing), step, pose)
     cost = sweep(camera, reference, others, planes)
     best, fraction = refined_minimum(aggregate(cost, reference.gray))
     found = ((best + fraction) * step).clip(FARTHEST * step).astype(np.float32)

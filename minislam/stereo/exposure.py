@@ -31,7 +31,7 @@ Shot = TypeVar("Shot", Frame, Keyframe)
 
 
 def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
-    """Return how bright keyframes are (3,), by frame index, the median being 1; {}: all alike."""
+    """Return each keyframe's exposure (3,) by frame index, with median 1; {} if all are alike."""
     links, cells, frames = graph.links, graph.keyframes.cell_weights, graph.keyframes.frames
     ratios: list[list[float | None]] = []
     weights: list[float] = []
@@ -41,14 +41,14 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
         return cv2.GaussianBlur(frames[keyframe].image.cpu().numpy(), (0, 0), BLUR)
 
     for link, (source, target) in enumerate(links.edges):
-        matches, stride = links.targets[link], graph.grid.stride
+        targets, stride = links.targets[link], graph.grid.stride
         here = torch.from_numpy(blurred(source)[::stride, ::stride].reshape(-1, 3))
-        u, v = matches.cpu().numpy()
+        u, v = targets.cpu().numpy()
         moved = cv2.remap(blurred(target), u, v, cv2.INTER_LINEAR)
         there = torch.from_numpy(moved.reshape(-1, 3))
         both = torch.cat([here, there], 1)
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
-        static = cells[source] * graph.grid.sample(cells[target][:, None], matches.T)[:, 0]
+        static = cells[source] * graph.grid.sample(cells[target][:, None], targets.T)[:, 0]
         weight = visible * (links.confidences[link][0] * static).cpu()
         ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
         ratios.append([weighted_median(channel, weight) for channel in ratio.T])

@@ -6,13 +6,12 @@ multiplies the static weight of each cell, and swept depth is the start, of one 
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from minislam.records import Progress, Sequence
-from minislam.stereo.dense_structure import dense_depths, swept_frames
+from minislam.stereo.dense_structure import WIDTH, dense_depths, swept_frames
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import final_global_ba
 from minislam.tracking.reprojection import reproject
@@ -36,7 +35,7 @@ def adjust_again(
     on_progress: Callable[[str], Progress | None] = lambda stage: None,
     workers: Workers | None = None,  # sweep side by side
 ) -> None:
-    """Adjust the keyframes on what sweeps confirm, and judge them; no frame is lost yet.
+    """Adjust the keyframes on what sweeps confirm, and judge them; lost frames are told later.
 
     Frames between keyframes are posed and swept as well, to vote.
     """
@@ -51,8 +50,8 @@ def adjust_again(
     finally:
         tracker.tracked = tracked
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
-    frames = sorted(poses), keyframes
-    swept = sweep_frames(tracker.graph, sequence, poses, *frames, on_sweep, workers, COARSE_WIDTH)
+    inputs = tracker.graph, sequence, poses, sorted(poses), keyframes
+    swept = sweep_frames(*inputs, on_sweep, workers, COARSE_WIDTH)
     tracker.watch.confirmed = adjust_confirmed(tracker.graph, swept, on_round)
     tracker.conclude()
 
@@ -63,12 +62,14 @@ def sweep_frames(
     poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
     frames: list[int],  # that are swept
     wanted: list[int],  # of these, whose depths are returned
-    *how: Any,  # progress, workers and width, as `dense_depths` takes them
+    progress: Progress | None = None,
+    workers: Workers | None = None,  # sweep side by side
+    width: int = WIDTH,  # px of the images that are swept, at most
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
     keyframes = enumerate(graph.keyframes.frames)
     known = {f.frame_index: agreed_disparities(graph, k).cpu().numpy() for k, f in keyframes}
-    inputs = graph.grid.camera, poses, known, frames, wanted, *how
+    inputs = graph.grid.camera, poses, known, frames, wanted, progress, workers, width
     swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return ((depth.to(device), confirmation.to(device)) for depth, confirmation in swept)

@@ -103,7 +103,7 @@ def _dissimilarity(
     spread: np.ndarray,  # (1, h, w) of its windows
     warped: np.ndarray,  # (V, h, w), the other images on one plane
 ) -> np.ndarray:  # (V, h, w) in [0, 1]
-    """Return 1 - NCC, where it is positive, with a part of the absolute difference."""
+    """Return 1 - max(NCC, 0), mixed with the absolute difference."""
     mean_warped, variance_warped = _moments(warped)
     covariance = _window_mean(gray * warped, NCC_WINDOW) - mean * mean_warped
     ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))

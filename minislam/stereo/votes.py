@@ -91,7 +91,7 @@ def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) floa
 def count_judges(
     camera: Camera, view: SweptView, views: list[SweptView], index: int
 ) -> tuple[np.ndarray, np.ndarray]:  # 2 x (h, w)
-    """Count the votes of some views of all times on a view, the one at `index` among them."""
+    """Count the votes on the view at `index` of some other views of all times."""
     judges = np.unique(np.linspace(0, len(views) - 1, JUDGES).round().astype(int))
     return count_votes(camera, view, [views[k] for k in judges if k != index])
 

@@ -27,7 +27,7 @@ from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
 MIN_RAISED_DAMPING = 1e-6  # relative; an undamped solve that fails is tried again with this
-SETTLED = 1e-6  # of the cost: a step that saves less is the last; 1e-9 moved no pose (measured)
+LEAST_SAVING = 1e-6  # of the cost: a step that saves no more is the last; 1e-9 moved no pose
 MAX_DAMPING = 1e6  # relative; a step damped more than this would not move anything
 
 
@@ -60,7 +60,6 @@ class BundleReport:
     cost_after: float  # px^2, never larger than cost_before
     iterations: int  # accepted steps
     damping: float  # at the end
-    reason: str  # one phrase
 
 
 @dataclass(frozen=True)
@@ -103,12 +102,12 @@ def bundle_adjust(
     """Minimise over the free poses and disparities; return the new state with a report.
 
     A step that fails or raises the cost is discarded and tried again with ten times the damping.
-    If no step helps, the state is returned unchanged, with the reason. Eq. (5).
+    If no step helps, the state is returned unchanged. Eq. (5).
     """
     cost, current = _cost(problem, state)
     cost_before, equations = cost, None
     accepted, level = 0, damping
-    converged, reason = True, "all iterations used"
+    converged = True
     while accepted < iterations:
         if equations is None:
             equations = _normal_equations(problem, state, current)
@@ -118,17 +117,15 @@ def bundle_adjust(
             saved = cost - trial
             state, cost, current, equations = candidate, trial, there, None
             accepted, level = accepted + 1, max(level / 10, damping)
-            if saved <= SETTLED * cost:
-                reason = "cost settled"
+            if saved <= LEAST_SAVING * cost:
                 break
         else:
             level = max(10 * level, MIN_RAISED_DAMPING)
             if level > MAX_DAMPING:
                 # At the minimum no step lowers the cost: that is convergence, not failure.
                 converged = candidate is not None
-                reason = "no step lowers the cost" if converged else "normal equations are singular"
                 break
-    return state, BundleReport(converged, cost_before, cost, accepted, level, reason)
+    return state, BundleReport(converged, cost_before, cost, accepted, level)
 
 
 def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
@@ -181,8 +178,8 @@ def _normal_equations(
         weighted_J = (J * weight[:, None]).flatten(2)
         A = (weighted_J @ J.flatten(2).mT).double()  # (E, 6 + G, 6 + G)
         b = (weighted_J @ residual.flatten(1)[..., None]).squeeze(-1).double()  # (E, 6 + G)
-        rows.append((at.edges, A, b, adjoint := se3_adjoint(at.transforms)))
-        source = at.problem.edges_source
+        adjoint, source = se3_adjoint(at.transforms), at.problem.edges_source
+        rows.append((at.edges, A, b, adjoint))
         free = problem.free_disparities[source].to(J.dtype)
         if not free.any():
             continue

@@ -32,7 +32,7 @@ class DepthView:
 class ConsistencyCounts:
     """Per cell: number of views with a correspondence, and number whose depth agrees."""
 
-    corresponding: Tensor  # (N,) int64, views of which a point with similar features arrives
+    corresponding: Tensor  # (N,) int64, views from which a point with similar features comes
     consistent: Tensor  # (N,) int64, n_i of Eq. (8)
 
 
@@ -121,7 +121,7 @@ def warp_depth(
     points = torch.where(seen[:, None], points, points.new_ones(3))  # 1/z would not be finite
     column, row = camera.project(points).round().unbind(1)
     seen &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    # Only one pixel in stride^2 is a grid cell with an unknown disparity.
+    # Only one pixel in stride^2 is a grid cell, whose disparity Eq. (5) estimates.
     seen &= (column % stride == 0) & (row % stride == 0)
 
     cell = (row[seen] / stride).long() * grid.shape[1] + (column[seen] / stride).long()

@@ -11,10 +11,11 @@ from minislam.priors.interfaces import FlowMatches
 from minislam.state.stateful import Stateful
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
-# Fraction of cells that must stay in view, else a pair has no meaningful distance. DROID-SLAM: 0.75
-MIN_VISIBLE_FRACTION = 0.5
+# Fraction of cells that must lie in front of the other camera, inside its image or not, else a pair
+# has no meaningful distance. DROID-SLAM: 0.75
+MIN_VALID_FRACTION = 0.5
 FAR = math.inf  # px, the distance of a pair below this fraction
-COARSE, COARSE_MARGIN = 16, 2.0  # one cell in so many tells, to a factor, which pairs are far
+COARSE, COARSE_MARGIN = 16, 2.0  # one cell in so many tells a distance to such a factor
 # New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8
 
@@ -113,16 +114,16 @@ def flow_distances(
     rays: Tensor,  # (N, 3)
     pixels: Tensor,  # (N, 2) px
     camera: Camera,
-    rotation_weight: float,  # beta
+    full_flow_weight: float,  # eta
     rows: range | None = None,  # keyframes to compare with all others; None: all
-    limit: float = FAR,  # px: more counts as FAR, by a look at a few cells
+    limit: float = FAR,  # px: what a few cells put beyond twice this is FAR
 ) -> Tensor:  # (K, K) px, FAR outside the rows and their columns
     """Return the distances between keyframes, as the mean flow that their geometry predicts.
 
-    D = beta |flow| + (1 - beta) |flow without rotation|, averaged over the visible cells and
+    D = eta |flow| + (1 - eta) |flow without rotation|, averaged over the valid cells and
     both directions. Rotation counts less than translation, because it brings no parallax.
     """
-    count, view = len(T_camera_world), (camera, rotation_weight)
+    count, view = len(T_camera_world), (camera, full_flow_weight)
     rows = range(count) if rows is None else rows
     near = torch.ones(count, count, dtype=torch.bool, device=disparities.device)
     if limit < FAR:
@@ -147,16 +148,16 @@ def _directed_distances(
     rays: Tensor,  # (N, 3)
     pixels: Tensor,  # (N, 2) px
     camera: Camera,
-    rotation_weight: float,
-) -> Tensor:  # (E,) px, FAR where too little of the source stays in view
+    full_flow_weight: float,
+) -> Tensor:  # (E,) px, FAR where too few cells lie in front of the target
     without_rotation = T_target_source.clone()
     without_rotation[:, :3, :3] = torch.eye(3, device=T_target_source.device)
-    total, visible = disparities.new_zeros(2, len(T_target_source))
-    motions = (T_target_source, rotation_weight), (without_rotation, 1 - rotation_weight)
+    total, valid_cells = disparities.new_zeros(2, len(T_target_source))
+    motions = (T_target_source, full_flow_weight), (without_rotation, 1 - full_flow_weight)
     for motion, weight in motions:
         positions, valid = reproject(motion, disparities, rays, camera)
         length = lengths(positions - pixels.T)
         total += weight * (length * valid).sum(1)
-        visible += weight * valid.sum(1)
-    is_seen = visible >= MIN_VISIBLE_FRACTION * len(rays)
-    return torch.where(is_seen, total / visible.clamp_min(1), FAR)
+        valid_cells += weight * valid.sum(1)
+    is_enough = valid_cells >= MIN_VALID_FRACTION * len(rays)
+    return torch.where(is_enough, total / valid_cells.clamp_min(1), FAR)

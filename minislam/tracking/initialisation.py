@@ -36,14 +36,15 @@ def first_disparity_hypotheses(
     """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
     They are the depth prior, if there is one, a wall before the camera, a ground that is nearer
-    below, and walls that are nearer on the left or on the right. The prior comes first, because of
-    equal costs the first wins, as where no flow tells any depth.
+    below, and walls that are nearer on the left or on the right. The prior comes first, because the
+    first of equal costs wins, as where no flow tells any depth.
     """
     camera = grid.camera
     right, below = (grid.pixels / grid.pixels.new_tensor([camera.width, camera.height]) - 0.5).T
     alone = [torch.ones_like(right), *(SLOPE**slope for slope in (below, -right, right))]
     guesses = [(disparities, torch.zeros_like(known_disparities)) for disparities in alone]
-    known = (first := known_disparities[0]) > 0
+    first = known_disparities[0]
+    known = first > 0
     if bool(known.any()):
         guesses.insert(0, (torch.where(known, first, first[known].median()), known_disparities))
     return guesses
@@ -55,12 +56,12 @@ def chain_state(
     first_disparities: Tensor,  # (N,)
     known_disparities: Tensor,  # (K, N), 0 where there is no depth prior
     robust: RobustKernel | None,
-    first_weights: Tensor | None = None,  # (N,) in [0, 1] of the first keyframe; None: ones
+    first_weights: Tensor,  # (N,) in [0, 1] of the first keyframe
 ) -> BundleState:
     """Return poses and disparities of K keyframes, each from its predecessor."""
     poses = [torch.eye(4, dtype=torch.float64, device=first_disparities.device)]
     disparities = [first_disparities]
-    weights = torch.ones_like(first_disparities) if first_weights is None else first_weights
+    weights = first_weights
     for index, matches in enumerate(flow_to_next):
         last, of_last = poses[-1], disparities[-1]
         starts = [last]

@@ -49,7 +49,7 @@ GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
 ROBUST_NARROWING = 0.5  # between keyframes, because the structure is known by then [-]
 LEAST_WEIGHT = 0.01  # mean weight of cells, below which little is known of a pose between them [-]
 AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
-ROTATION_WEIGHT = 0.75  # beta of the flow distance: weight of the full motion [-]
+FULL_FLOW_WEIGHT = 0.75  # eta of the flow distance [-]
 
 
 class KeyframeGraph(Stateful):
@@ -268,7 +268,7 @@ class KeyframeGraph(Stateful):
         poses, disparities = self.keyframes.T_camera_world, self.keyframes.disparities
         known = poses[start:], disparities[start:], self.grid.rays, self.grid.pixels
         # On the CPU, because pairs are chosen by one number after the other.
-        return flow_distances(*known, self.grid.camera, ROTATION_WEIGHT, rows, limit).cpu()
+        return flow_distances(*known, self.grid.camera, FULL_FLOW_WEIGHT, rows, limit).cpu()
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""

@@ -20,7 +20,7 @@ from minislam.tracking.reprojection import lengths
 from minislam.tracking.safeguards.parts import of_cells, of_rows
 from minislam.tracking.safeguards.robust import weighted_median
 
-# Of the robust weight: else it takes the cells of a new keyframe with a large error for outliers.
+# Times the robust width: else the cells of a new keyframe, whose error is large, are outliers.
 FIRST_WIDENING = 8.0
 EVERY = 4  # one cell in so many tells the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
@@ -116,7 +116,7 @@ def typical_residual(problem: BundleProblem, state: BundleState) -> float | None
 def adjust_touched(
     problem: BundleProblem, state: BundleState, iterations: int
 ) -> tuple[BundleState, BundleReport]:
-    """Return what `bundle_adjust` does, from the keyframes that it moves or sees alone.
+    """Run `bundle_adjust` on the keyframes that it moves or has an edge to; leave the others.
 
     So a local adjustment costs the same however many keyframes there are.
     """

@@ -203,10 +203,11 @@ class Tracker(Stateful):
             self._update_static_weights(first=len(self.keyframes) - 1)
 
     def _adjust_all_if_due(self) -> None:
-        """Close loops; every `global_interval` keyframes run online global BA."""
+        """Close loops; run online global BA if `global_interval` keyframes and a fifth are new."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
-        is_due = 0 < config.global_interval <= count - self._last_global >= count // LEAST_GROWTH
+        least = max(config.global_interval, count // LEAST_GROWTH)
+        is_due = config.global_interval > 0 and count - self._last_global >= least
         if is_due and not closed:
             seek_readouts(self.graph)
             online_global_ba(self.graph)
@@ -274,7 +275,7 @@ class Tracker(Stateful):
         self.conclude()
 
     def conclude(self) -> None:
-        """Judge all keyframes, once all are adjusted; if nothing tells depth, they only turn."""
+        """Judge all keyframes, once all are adjusted; without depth, adjust turns."""
         self.watch.conclude()
         if not self.knows_depth:
             adjust_turns(self.graph)

@@ -52,7 +52,7 @@ def modified_ssim_loss(
     """Return L'_SSIM = gain (1 - l)(1 - c)(1 - s) per pixel, faded where nothing is rendered.
 
     The product is far steeper than 1 - SSIM: near 0 for small rendering errors, large where the
-    image shows another object. It is the first numerator of L_uncer.
+    image shows another object. It is the first term of L_uncer's numerator.
     """
     luminance, contrast, structure = ssim_components(image, rendered)
     product = (1 - luminance) * (1 - contrast) * (1 - structure)
@@ -91,8 +91,8 @@ def variance_regulariser(
 ) -> Tensor:  # ()
     """Return L_reg_V, the mean variance of beta among cells of similar features.
 
-    Each cell is compared with at most `neighbours` cells whose cosine exceeds `similarity`, with
-    itself among them.
+    Each cell is compared with those whose cosine exceeds `similarity`, at most the `neighbours`
+    nearest and what ties with the last of them, itself included.
     """
     unit = functional.normalize(features.detach(), dim=-1)
     cosine = unit @ unit.T

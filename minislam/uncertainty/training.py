@@ -12,7 +12,7 @@ from minislam.uncertainty import losses
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.mlp import UncertaintyMLP
 
-BETAS, EPSILON = (0.9, 0.999), 1e-8  # of Adam: decay of the moments, floor of the denominator
+DECAYS, EPSILON = (0.9, 0.999), 1e-8  # of Adam: of its moments; floor of the denominator
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,8 @@ class UncertaintyTrainer(Stateful):
         self.generator = torch.Generator().manual_seed(seed)
         mlp = UncertaintyMLP(feature_dimension, self.generator, config.hidden_units, config.dropout)
         self.mlp = mlp.to(device)
-        self._first, self._second = ([torch.zeros_like(w) for w in mlp.parameters()] for _ in "12")
+        self._first = [torch.zeros_like(w) for w in mlp.parameters()]
+        self._second = [torch.zeros_like(w) for w in mlp.parameters()]
 
     def saved_state(self) -> Tree:
         """Return the state: weights, Adam's moments and the random source."""
@@ -101,7 +102,7 @@ class UncertaintyTrainer(Stateful):
         error: RenderingError,
         nearby_features: Tensor,  # (m, C) cells of it and of its neighbours in time
     ) -> float:
-        """Take one Adam step on the mean L_uncer, n times as long, and return its value."""
+        """Take one Adam step, n times as long, on the mean L_uncer of n keyframes; return it."""
         drawn = torch.randperm(len(nearby_features), generator=self.generator)
         sample = nearby_features[drawn[: self.config.variance_samples].to(nearby_features.device)]
         beta, of_sample = self.mlp(features, self.generator), self.mlp(sample, self.generator)
@@ -114,10 +115,10 @@ class UncertaintyTrainer(Stateful):
     def _descend(self, gradients: tuple[Tensor, ...], rate: float) -> None:
         """Take a step of Adam. Not torch.optim.Adam: that loads a compiler, 2.4 s and 72 MB."""
         self._steps += 1
-        rate, norm = rate / (1 - BETAS[0] ** self._steps), math.sqrt(1 - BETAS[1] ** self._steps)
+        rate, norm = rate / (1 - DECAYS[0] ** self._steps), math.sqrt(1 - DECAYS[1] ** self._steps)
         moved = zip(self.mlp.parameters(), gradients, self._first, self._second, strict=True)
         for weight, gradient, first, second in moved:
             gradient = gradient + self.config.weight_decay * weight
-            first.lerp_(gradient, 1 - BETAS[0])
-            second.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
+            first.lerp_(gradient, 1 - DECAYS[0])
+            second.mul_(DECAYS[1]).addcmul_(gradient, gradient, value=1 - DECAYS[1])
             weight.addcdiv_(first, (second.sqrt() / norm).add_(EPSILON), value=-rate)

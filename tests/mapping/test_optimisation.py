@@ -50,7 +50,7 @@ def test_each_loss_trains_only_its_own_side():
     assert all(torch.equal(a, b) for a, b in zip(weights, mapper.mlp.parameters(), strict=True))
     assert not torch.equal(means, mapper.gaussians.means)
 
-    share = view_gradients(*mapper._call(mapper.keyframes[0], CAMERA, True))
+    share = view_gradients(*mapper._view_arguments(mapper.keyframes[0], CAMERA, True))
     mapper._train_mlp([0], [share])
     leaves = mapper._optimizer.gaussians.parameters.values()
     assert all(leaf.grad is None for leaf in leaves)

@@ -17,7 +17,7 @@ def test_the_gradients_are_those_of_the_loss_of_one_keyframe(exposure):
     mapper = make_mapper()
     mapper.initialise([replace(wall_keyframe(0), exposure=exposure)])
     keyframe, gaussians = mapper.keyframes[0], mapper._optimizer.gaussians
-    share = view_gradients(*mapper._call(keyframe, CAMERA, trains=False))
+    share = view_gradients(*mapper._view_arguments(keyframe, CAMERA, trains=False))
     assert all(parameter.grad is None for parameter in gaussians.parameters.values())
 
     pose, view = keyframe.T_camera_world.float(), view_of(keyframe, CAMERA)
@@ -37,6 +37,6 @@ def test_the_gradients_are_those_of_the_loss_of_one_keyframe(exposure):
 def test_the_error_for_the_mlp_comes_on_its_grid():
     mapper = make_mapper()
     mapper.initialise([wall_keyframe(0)])
-    share = view_gradients(*mapper._call(mapper.keyframes[0], CAMERA, trains=True))
+    share = view_gradients(*mapper._view_arguments(mapper.keyframes[0], CAMERA, trains=True))
     assert share.error.ssim.shape == mapper.keyframes[0].features.shape[:2]
     assert not share.error.ssim.requires_grad

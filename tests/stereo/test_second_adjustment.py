@@ -110,9 +110,9 @@ def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
 
     monkeypatch.setattr(second_adjustment, "dense_depths", dense_depths)
     graph, poses = true_graph(NUMBERS), {0: torch.eye(4)}
-    sweep_frames(graph, SimpleNamespace(), poses, [0, 1], [1], None)
+    sweep_frames(graph, SimpleNamespace(), poses, [0, 1], [1], width=40)
     assert told["camera"] == graph.grid.camera and told["poses"] is poses
-    assert list(told["disparities"]) == NUMBERS and told["how"] == ([0, 1], [1], None)
+    assert list(told["disparities"]) == NUMBERS and told["how"] == ([0, 1], [1], None, None, 40)
     nearest = [float(np.max(d)) for d in told["disparities"].values()]
     assert nearest == pytest.approx(graph.keyframes.disparities.amax(1).tolist(), rel=0.2)
 

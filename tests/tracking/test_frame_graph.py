@@ -87,9 +87,9 @@ def test_neighbourhood_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("rotation_weight", "name"), [(0.75, "dist_oneway_b75"), (0.25, "dist_oneway_b25")]
+    ("full_flow_weight", "name"), [(0.75, "dist_oneway_b75"), (0.25, "dist_oneway_b25")]
 )
-def test_distances_are_the_official_ones(rotation_weight: float, name: str):
+def test_distances_are_the_official_ones(full_flow_weight: float, name: str):
     # In cells there, in px here: the cells of the stored problem are px of its camera. In all of
     # its pairs most cells are in view, so the minimal fraction (0.75 there) plays no part.
     state, camera = golden.state(), golden.camera()
@@ -100,7 +100,7 @@ def test_distances_are_the_official_ones(rotation_weight: float, name: str):
         camera.rays(pixels),
         pixels,
         camera,
-        rotation_weight,
+        full_flow_weight,
     )
     one_way = golden.golden()[name]
     expected = 0.5 * (one_way + one_way.T)
@@ -113,7 +113,7 @@ def test_a_pair_that_hardly_sees_the_same_is_far(monkeypatch):
     pixels = golden.pixels()
     poses = state.T_camera_world.clone()
     poses[5] = golden.transforms_of(golden.golden()["dist_far_poses5"])
-    monkeypatch.setattr(frame_graph, "MIN_VISIBLE_FRACTION", 0.75)
+    monkeypatch.setattr(frame_graph, "MIN_VALID_FRACTION", 0.75)
     actual = flow_distances(poses, state.disparities, camera.rays(pixels), pixels, camera, 0.75)
     assert actual[0, 5] == FAR  # one way at least; the official code has 1000 px
     assert actual[:5, :5].max() < 100

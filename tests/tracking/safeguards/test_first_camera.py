@@ -39,7 +39,7 @@ def test_results_of_one_cost_are_one_minimum():
 
     class Told(Workers):
         def map(self, function, calls):
-            return [(None, BundleReport(True, c, c, 1, 0.0, "")) for c in costs]
+            return [(None, BundleReport(True, c, c, 1, 0.0)) for c in costs]
 
     results = minima(known_problem().problem, [], Told())
     assert [report.cost_after for _, report in results] == [100, 200, 300]
@@ -185,7 +185,7 @@ def found_at(cost: float, log_focal: float = 0.0, slope: float = 1.0) -> Found:
     """Return a result of this cost whose disparities are so many times as large below as above."""
     ground = slope ** (GRID.pixels[:, 1] / CAMERA.height)
     state = BundleState(torch.eye(4).repeat(2, 1, 1), ground.repeat(2, 1), log_focal)
-    return state, BundleReport(True, cost, cost, 1, 0.0, "")
+    return state, BundleReport(True, cost, cost, 1, 0.0)
 
 
 @pytest.mark.parametrize(
