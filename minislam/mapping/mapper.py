@@ -29,7 +29,6 @@ from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
 from minislam.splatting import GaussianMap, Rendering
 
-RECHECKED = 10  # keyframes beside the window whose Gaussians are looked at with every new one
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
 
 
@@ -76,8 +75,7 @@ class Mapper(JointOptimisation):
             for position in [new, *self.window]
         }
         self.window = update_window(self.window, new, seen, poses, self.config.window_size)
-        turn = range(new * RECHECKED, (new + 1) * RECHECKED)  # a constant number per keyframe
-        self._remove_dynamic_gaussians({*self.window, *(number % new for number in turn)})
+        self._remove_dynamic_gaussians(self.window)
         self._insert(new)
         if new % self.config.keyframe_stride != 0:
             return  # Fast mode: this keyframe waits for the next optimisation.
