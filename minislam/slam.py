@@ -35,6 +35,7 @@ from minislam.tracking.safeguards.focal_length import (
     check_focal_length,
     seek_focal_length,
 )
+from minislam.tracking.safeguards.lens import LensFit, check_lens
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import pose_all_frames
 from minislam.uncertainty.weights import beta_of_mask, relative_weight, tracking_weight
@@ -59,7 +60,8 @@ class Slam(Stateful):
     mapper: Mapper
     steps: Steps
     first_frame: FirstFrame
-    focal_length: FocalLengthFit | None = None  # what the check at the end has found
+    focal_length: FocalLengthFit | None = None  # what the checks at the end have found
+    lens: LensFit | None = None
     poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
@@ -80,8 +82,7 @@ class Slam(Stateful):
         self.tracker = Tracker(sequence.camera, config.tracking, *parts, device)
         self.tracker.graph.seeks_focal = sequence.refines_focal
         self.mapper = self._new_mapper(config.mapping.insertion.online_cell)
-        self._stride = priors.flow.stride
-        self.poses, self.first_frame = {}, FirstFrame()
+        self._stride, self.poses, self.first_frame = priors.flow.stride, {}, FirstFrame()
 
     def run(self) -> None:
         """Process the sequence to the final map, from its start or from a restored state."""
@@ -195,6 +196,7 @@ class Slam(Stateful):
     def _pose_all_frames(self) -> None:
         if not self.tracker.watch.only_turned:
             self.focal_length = check_focal_length(self.tracker.graph, self.workers)
+            self.lens = check_lens(self.tracker.graph)
         progress = self.steps.on_progress("posing all frames")
         self.poses = pose_all_frames(self.tracker, self.sequence, progress)
 

@@ -244,7 +244,8 @@ def _warnings(slam: Slam) -> Iterator[str]:
             f"{least}: no depth was confirmed elsewhere. The camera hardly moved, its path is "
             "wrong, or the scene has no texture; move the camera sideways, or give a depth prior"
         )
-    yield from _focal_length_warnings(slam)
+    yield from _camera_warnings(slam)
+    seen = watch.beyond_turns
     without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
     if without and 2 * without >= len(diagnostics):
         yield (
@@ -252,13 +253,9 @@ def _warnings(slam: Slam) -> Iterator[str]:
             "turned or stood still, so the distances it moved are not determined"
             + ("" if slam.tracker.knows_depth else ", and all that the map shows is at one depth")
         )
-    elif (
-        not keyframes.has_prior
-        and watch.beyond_turns is not None
-        and watch.beyond_turns < LEAST_BEYOND_TURNS
-    ):
+    elif seen is not None and seen < LEAST_BEYOND_TURNS and not keyframes.has_prior:
         yield (
-            f"between neighbouring keyframes only {watch.beyond_turns:.2f} px of the flow, in the "
+            f"between neighbouring keyframes only {seen:.2f} px of the flow, in the "
             "median and in an image of 320x240, are more than a turn of the camera: depth is "
             "hardly determined, and near and far may be exchanged; look at the pictures of the "
             "depth, and film while you walk sideways"
@@ -273,22 +270,27 @@ def _warnings(slam: Slam) -> Iterator[str]:
         yield "without a depth prior the unit of length is arbitrary"
 
 
-def _focal_length_warnings(slam: Slam) -> Iterator[str]:
-    fit, graph = slam.focal_length, slam.tracker.graph
+def _camera_warnings(slam: Slam) -> Iterator[str]:
+    fit, graph, lens = slam.focal_length, slam.tracker.graph, slam.lens
     if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
         yield (
             "the focal length is unknown and the motion does not tell it: trajectory and map may "
             "be bent; give --fx or a calibration file"
         )
         return
+    if lens is not None and lens.is_bent:
+        yield (
+            f"the flow fits a lens that bends straight lines, the corners by {lens.bend:+.0%}, "
+            f"with {lens.saved:.0%} less cost: focal length, trajectory and map may be bent; film "
+            "in the linear mode of the camera, or give --calibration with k1 and k2"
+        )
+        return
     # The flow of a broken run fits whatever focal length.
     is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
     if fit is None or not fit.is_doubtful or is_broken:
         return
-    found = (
-        f"the flow fits {fit.factor:.2f} times the present focal length better, with "
-        f"{fit.saved:.0%} less cost"
-    )
+    better = f"better, with {fit.saved:.0%} less cost"
+    found = f"the flow fits {fit.factor:.2f} times the present focal length {better}"
     zoomed = "the lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
     if fit.half:
         first, last = fit.half

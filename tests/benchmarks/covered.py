@@ -1,10 +1,11 @@
-"""Cover the images of a folder as films and dash cameras do, to see what a run makes of it.
+"""Cover the images of a folder as films and dash cameras do, or bend them as a wide lens does.
 
     python -m tests.benchmarks.covered FOLDER OUT KIND [IMAGES]
 
 KIND: `bars` (letterbox), `logo` (clock, label, a pale word across the image), `spotted` or `plain`
-(a dashboard over the lower fifth, textured or black with a few lines). OUT is a new folder with
-the first IMAGES images and what lies beside them.
+(a dashboard over the lower fifth, textured or black with a few lines), `barrel` (k1 = -.25 of a
+lens of fr1's focal length; run OUT/rgb, which has no calibration). OUT is a new folder with the
+first IMAGES images and what lies beside them.
 """
 
 import shutil
@@ -56,6 +57,16 @@ def plain(image: Image) -> Image:
     return _over(image, board)
 
 
+def barrel(image: Image) -> Image:
+    height, width = image.shape[:2]
+    focal, middle = 0.81 * width, np.array([width / 2, height / 2], np.float32)
+    seen = (np.indices((width, height), np.float32).T - middle) * 0.8 / focal  # no empty corners
+    ray = seen
+    for _ in range(20):
+        ray = seen / (1 - 0.25 * (ray**2).sum(-1, keepdims=True))
+    return cv2.remap(image, ray * focal + middle, None, cv2.INTER_LINEAR)
+
+
 def _over(image: Image, board: Image) -> Image:
     height, width = image.shape[:2]
     mask, half_axes = np.zeros((height, width), np.uint8), (int(0.59 * width), int(0.27 * height))
@@ -68,7 +79,7 @@ def _write(image: Image, text: str, x: float, y: float, size: float) -> None:
     cv2.putText(image, text, at, FONT, size, WHITE, max(2, round(3 * size)), cv2.LINE_AA)
 
 
-KINDS = {"bars": bars, "logo": logo, "spotted": spotted, "plain": plain}
+KINDS = {"bars": bars, "logo": logo, "spotted": spotted, "plain": plain, "barrel": barrel}
 
 
 def main(folder: str, out: str, kind: str, images: str = "100") -> None:

@@ -15,6 +15,7 @@ from minislam.runs import facts
 from minislam.splatting import Rendering
 from minislam.tracking.safeguards.diagnostics import Break
 from minislam.tracking.safeguards.focal_length import FocalLengthFit
+from minislam.tracking.safeguards.lens import LensFit
 
 
 def slam(**parts: object) -> SimpleNamespace:
@@ -61,6 +62,7 @@ def slam(**parts: object) -> SimpleNamespace:
         lost_frames=lambda: [None] * lost,
         tracker=tracker,
         focal_length=parts.pop("focal_length", None),
+        lens=parts.pop("lens", None),
     )
 
 
@@ -79,6 +81,8 @@ WARNINGS = [
     ({"truth": [9.0]}, "frames begin at 0.000 s, the ground truth at 9.000 s; shift its times"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
+    ({"lens": LensFit(-0.07, 0.13)}, "bends straight lines, the corners by -7%, with 13% less"),
+    ({"lens": LensFit(0.01, 0.13), "focal_length": DOUBTFUL}, "the flow fits 1.10 times the"),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
     ({"seeks_focal": True}, "the motion does not tell it"),

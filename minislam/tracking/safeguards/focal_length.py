@@ -83,15 +83,25 @@ def check_focal_length(
 
 def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) -> FocalLengthFit:
     """Return the focal length that the links among some keyframes fit."""
+    among = problem_among(graph, keyframes)
+    if among is None:
+        return FocalLengthFit(graph.grid.camera.fx, None, 0.0)
+    return fit_focal_length(*among, workers)[0]
+
+
+def problem_among(
+    graph: KeyframeGraph, keyframes: range
+) -> tuple[BundleProblem, BundleState] | None:
+    """Return problem and state of the links among some keyframes, at few cells; None: no link."""
     edges = enumerate(graph.links.edges)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
-        return FocalLengthFit(graph.grid.camera.fx, None, 0.0)
+        return None
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     rows = torch.tensor(keyframes, device=problem.rays.device)
     problem, state = _of_few_cells(graph, *of_rows(problem, graph.state, rows))
     problem.free_poses[0] = False  # the first of them is their world
-    return fit_focal_length(problem, state, workers)[0]
+    return problem, state
 
 
 def _of_few_cells(
