@@ -23,9 +23,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     what = "make a synthetic clip with moving people and run everything on it"
     demo = add_command(commands, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
     demo.add_argument("-o", "--output", metavar="DIR", help="run folder, output/demo")
+    demo.add_argument("--overwrite", action="store_true", help="replace an earlier run there")
     options.add_talk(demo)
     options.add_settings(demo)
-    demo.set_defaults(run=_run, overwrite=True, resume=False, **DEMO)
+    demo.set_defaults(run=_demo, resume=False, **DEMO)
 
     what = "run SLAM on a video, an image folder or a benchmark"
     run = add_command(commands, "run", what, "SEQUENCE [-o OUTPUT]", RUN_EPILOG)
@@ -43,6 +44,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     lpips.add_argument("--lpips-trunk", metavar="FILE", help="torchvision's AlexNet or VGG-16")
     lpips.add_argument("--lpips-heads", metavar="FILE", help="the authors' alex.pth or vgg.pth")
     run.set_defaults(run=_run)
+
+
+def _demo(args: argparse.Namespace) -> int:
+    args.overwrite |= args.output == DEMO["output"]  # what is there was a demo, too
+    return _run(args)
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -51,13 +51,14 @@ def read_color(path: Path) -> np.ndarray:  # (H, W, 3) uint8 RGB
 
 def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
     """Read a black and white picture: white is True."""
-    gray = _decode(path, cv2.IMREAD_GRAYSCALE)
-    if 0 < gray.max() <= 127:
+    gray = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    white = 255 if gray.max() <= 255 else 65535
+    if 0 < gray.max() <= white // 2:
         raise InputError(
-            f"expected a mask of 0 and 255, found {gray.max()} as the largest value in {path}; "
-            "write 255 where something moves, not its number"
+            f"expected a mask of 0 and {white}, found {gray.max()} as the largest value in {path}; "
+            f"write {white} where something moves, not its number"
         )
-    return gray > 127
+    return gray > white // 2
 
 
 def read_depth(path: Path, units_per_metre: float) -> np.ndarray:  # (H, W) float32 metre
@@ -155,8 +156,11 @@ def _is_complete(content: bytes) -> bool:
     if content.startswith(_PNG_SIGNATURE):
         return b"IEND" in content
     if content.startswith(_JPEG_SIGNATURE):
-        # A thumbnail in the header has its own end marker, so the LAST scan must be closed.
-        return content.rfind(_JPEG_END_OF_IMAGE) > content.rfind(_JPEG_START_OF_SCAN) > 0
+        # A thumbnail in the header has its own end marker, a film that phones append any bytes.
+        at = len(_JPEG_END_OF_IMAGE)
+        while content[at : at + 1] == b"\xff" and content[at : at + 2] != _JPEG_START_OF_SCAN:
+            at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+        return content.find(_JPEG_END_OF_IMAGE, at) > 0
     return False
 
 

@@ -1,6 +1,7 @@
 """Recordings: raw images, files in a folder or a video, and what lies beside them."""
 
 import math
+import os
 import re
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -121,7 +122,13 @@ class VideoImages:
 
     def _rewind(self) -> None:
         # FFmpeg, because other back ends may take the name for a camera or a pattern.
-        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        # It takes what precedes a colon for a protocol, and crashes at a name that is no text.
+        name = os.path.abspath(self.path)
+        if not name.isascii() and re.search("[\ud800-\udfff]", name):
+            raise InputError(
+                f"expected a video whose name is text, found {name!a}; give it another name"
+            )
+        self._capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
         self._grabbed = 0  # calls of grab() since the start
         if not self._capture.isOpened():
             size, hint = self.path.stat().st_size, "convert it to MP4 (H.264) or give images"

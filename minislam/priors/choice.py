@@ -64,7 +64,7 @@ def choose_depth(
         "none": NoDepth,
         "simulated": lambda: _simulated_depth(sequence, seed, simulated),
         "sensor": lambda: _sensor_depth(sequence),
-        FOLDER: lambda: FileDepth(folder_of(choice.depth, DEPTH), 1 / sequence.depth_scale),
+        FOLDER: lambda: _depth_files(sequence, folder_of(choice.depth, DEPTH)),
     }
     return _choose("depth", choice, networks, makers)
 
@@ -113,6 +113,12 @@ def _sensor_depth(sequence: Sequence) -> SensorDepth:
             f"expected a sensor's depth in {sequence.name}, found none; use another --depth"
         )
     return SensorDepth(sequence.sensor_depth)
+
+
+def _depth_files(sequence: Sequence, folder: Path) -> FileDepth:
+    depth = FileDepth(folder, 1 / sequence.depth_scale)
+    depth.files.require_frames_of(sequence)
+    return depth
 
 
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:

@@ -4,6 +4,7 @@
 where there is a GPU, and the SLAM runs anywhere.
 """
 
+import re
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.depth import as_depth
 from minislam.priors.names import FILES
-from minislam.records import Frame
+from minislam.records import Frame, Sequence
 
 INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
 FEATURES, DEPTH = "features", "depth"  # folders of one sequence's priors
@@ -47,6 +48,18 @@ class FrameFiles:
 
     def __len__(self) -> int:
         return len(self._files)
+
+    def require_frames_of(self, sequence: Sequence) -> None:
+        """Refuse files that are numbered like the images where a frame has another number."""
+        frame, image = len(sequence) - 1, sequence.source_name(len(sequence) - 1)
+        numbered = re.search(r"[0-9]{1,9}$", image)
+        number = frame if numbered is None or self._number_of is not None else int(numbered[0])
+        if number != frame and number in self._files:
+            raise InputError(
+                f"expected {self.what} files named by the frame of the run, {frame:05d} for "
+                f"{image}, found {self._files[number]}, which has the number of that image; "
+                f"rename them, or write {INDEX} beside them, as minislam priors does"
+            )
 
     def of(self, frame: Frame) -> Path | None:
         """Return the file of a frame, or None if the folder has none for it."""
@@ -110,11 +123,11 @@ class FileDepth:
         png_unit: float = 1 / 5000,  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
     ) -> None:
         self.png_unit = png_unit
-        self._files = FrameFiles(folder, "depth", (".npy", ".png"))
+        self.files = FrameFiles(folder, "depth", (".npy", ".png"))
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Read the depth of a frame, resized to its image, or return None if there is no file."""
-        path = self._files.of(frame)
+        path = self.files.of(frame)
         if path is None:
             return None
         if path.suffix.lower() == ".npy":

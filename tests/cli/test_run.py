@@ -17,6 +17,14 @@ def test_the_demo_is_a_sequence_that_exists():
     require_source(str(DEMO["sequence"]))
 
 
+def test_the_demo_replaces_no_other_run(tmp_path: Path, capsys):
+    kept = tmp_path / "out/map.ply"
+    kept.parent.mkdir()
+    kept.write_bytes(b"a map")
+    assert main(["demo", "-o", str(kept.parent), "-q"]) == 1
+    assert "add --overwrite" in the_sentence(capsys) and kept.read_bytes() == b"a map"
+
+
 def test_settings_may_stand_before_the_sequence(tmp_path: Path, capsys):
     assert main(["run", "--tracking.window", "0", str(images(tmp_path / "in", [texture(0)]))]) == 1
     assert "tracking.window of at least 1" in the_sentence(capsys)

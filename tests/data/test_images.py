@@ -49,6 +49,30 @@ def test_mask_is_true_where_white(tmp_path: Path):
     np.testing.assert_array_equal(read_mask(path), [[False, True], [False, True]])
 
 
+def test_a_film_that_a_phone_hides_behind_a_photo_does_no_harm(tmp_path: Path):
+    photo = cv2.imencode(".jpg", picture(0, 32, 24))[1].tobytes()
+    for film in (b"\xff\xd9", b"\xff\xda", b"\xff\xda\xff\xd9\xff\xda"):
+        path = tmp_path / "photo.jpg"
+        path.write_bytes(photo + b"\0\0\0\x18ftypmp42" + film)
+        assert read_color(path).shape == (24, 32, 3)
+    path.write_bytes(photo[:-40])
+    with pytest.raises(InputError, match="cut short"):
+        read_color(path)
+
+
+def test_a_mask_of_16_bits_is_read_at_its_full_range(tmp_path: Path):
+    values = np.array([[0, 65535], [32767, 32768]], np.uint16)
+    mask = read_mask(save(tmp_path / "m.png", values))
+    np.testing.assert_array_equal(mask, [[False, True], [False, True]])
+    np.testing.assert_array_equal(
+        read_mask(save(tmp_path / "n.png", values & 255)), values & 255 > 127
+    )
+    with pytest.raises(InputError, match=r"expected a mask of 0 and 255, found 3 as .* write 255"):
+        read_mask(save(tmp_path / "labels.png", np.array([[0, 3]], np.uint16)))
+    with pytest.raises(InputError, match="expected a mask of 0 and 65535, found 300 as"):
+        read_mask(save(tmp_path / "labels.png", np.array([[0, 300]], np.uint16)))
+
+
 def test_natural_order_of_300_files(tmp_path: Path):
     names = [f"frame {number}.png" for number in range(300)]
     for name in np.random.default_rng(0).permutation(names):

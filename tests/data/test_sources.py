@@ -1,6 +1,8 @@
 """Videos: counting, random access, rotation, damaged files."""
 
+import os
 import struct
+import sys
 from pathlib import Path
 
 import cv2
@@ -22,6 +24,20 @@ def test_frames_are_counted_and_stamped_by_their_rate(tmp_path: Path):
     assert len(recording.images) == 12 and recording.name == "walk_in_park"
     np.testing.assert_allclose(recording.timestamps, np.arange(12) / 10)
     assert recording.images.read(3).shape == (64, 96, 3)
+
+
+def test_a_name_with_a_colon_is_no_protocol(tmp_path: Path, monkeypatch):
+    video(tmp_path / "12:30.mp4")
+    monkeypatch.chdir(tmp_path)
+    assert len(VideoImages(Path("12:30.mp4"))) > 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names are text")
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path):
+    name = tmp_path / os.fsdecode(b"caf\xe9.mp4")
+    video(tmp_path / "v.mp4").rename(name)
+    with pytest.raises(InputError, match=r"expected a video whose name is text, found .*udce9"):
+        VideoImages(name)
 
 
 def test_any_frame_can_be_read_in_any_order(tmp_path: Path):

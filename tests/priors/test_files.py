@@ -140,6 +140,32 @@ def test_a_missing_file_and_another_network_are_refused(tmp_path: Path):
         features(frame_of(IMAGE, 1))
 
 
+@pytest.mark.parametrize(
+    ("names", "refused"),
+    [
+        (["7", "8", "9"], "00009.npy, which has the number of that image"),  # of ten, from 7 on
+        (["1", "2", "3"], None),  # files are numbered from 0, images from 1
+        (["a", "b", "c"], None),
+        (["0", "1", "2"], None),
+    ],
+)
+def test_files_with_the_numbers_of_the_images_are_refused_in_a_part(tmp_path, names, refused):
+    count = 10 if refused else 3
+    folder = folder_with(tmp_path, {f"{k:05d}.npy": np.ones((2, 2)) for k in range(count)})
+    files = FrameFiles(folder, "depth", (".npy",))
+
+    class Images:
+        source_name = staticmethod(lambda index: f"img_{names[index]}")
+        __len__ = lambda self: len(names)  # noqa: E731
+
+    if refused is None:
+        return files.require_frames_of(Images())
+    with pytest.raises(InputError, match=refused):
+        files.require_frames_of(Images())
+    (folder / "frames.txt").write_text("0 0.0\n")
+    FrameFiles(folder, "depth", (".npy",)).require_frames_of(Images())
+
+
 def test_a_damaged_index_is_refused(tmp_path: Path):
     folder_with(tmp_path, {"0.npy": grid(1)})
     for text in ("0\n", "zero 0.5\n", "0 now\n"):
