@@ -199,7 +199,7 @@ REFUSALS = [
     ),
     ([*INPUT, "--fx", "99"], "expected input.fx = None like .* found 99.0; repeat"),
     ([*INPUT, "--focal", "refine"], "expected input.focal = auto .* found refine"),
-    ([*INPUT, "--depth_scale", "9"], "expected input.depth_scale = 5000.0 .* found 9.0"),
+    ([*INPUT, "--depth-scale", "9"], "expected input.depth_scale = 5000.0 .* found 9.0"),
     ([*INPUT, "--depth", "none"], "expected priors.depth = simulated .* found none"),
     ([*INPUT, "--tracking.window", "3"], "settings.tracking.window = 10 .* found 3; repeat"),
     ([*INPUT, "--seed", "7"], "expected settings.seed = 0 .* found 7"),
