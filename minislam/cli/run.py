@@ -26,7 +26,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     demo.add_argument("--overwrite", action="store_true", help="replace an earlier run there")
     options.add_talk(demo)
     options.add_settings(demo)
-    demo.set_defaults(run=_demo, resume=False, **DEMO)
+    demo.set_defaults(run=_demo, resume=False, otherwise="", **DEMO)
 
     what = "run SLAM on a video, an image folder or a benchmark"
     run = add_command(commands, "run", what, "SEQUENCE [-o OUTPUT]", RUN_EPILOG)
@@ -43,7 +43,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     lpips = run.add_argument_group("LPIPS", "measured if both files are given")
     lpips.add_argument("--lpips-trunk", metavar="FILE", help="torchvision's AlexNet or VGG-16")
     lpips.add_argument("--lpips-heads", metavar="FILE", help="the authors' alex.pth or vgg.pth")
-    run.set_defaults(run=_run)
+    run.set_defaults(run=_run, otherwise=" (or --resume, to go on with an interrupted run)")
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -66,8 +66,7 @@ def _run(args: argparse.Namespace) -> int:
             where = f", move it back, or correct sequence, which {args.output}/config.json names"
             raise InputError(f"{error}{where if args.resume else ''}") from error
         if args.output and not args.resume:
-            also = " (or --resume, to go on with an interrupted run)"
-            require_free(args.output, args.overwrite, also)
+            require_free(args.output, args.overwrite, args.otherwise)
         choice = options.prior_choice(args, default_depth(source))
         from minislam.data.sequence import open_sequence
         from minislam.runs.resume import way_on

@@ -24,12 +24,12 @@ from minislam.tracking.optimisation import adjust_narrowing
 from minislam.tracking.safeguards.focal_length import (
     ITERATIONS,
     LEAST_KEYFRAMES,
-    MOST_KEYFRAMES,
     WIDENINGS,
     problem_among,
 )
 from minislam.tracking.safeguards.robust import MIN_RESIDUAL
 
+MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
 # RESULTS.md, "A lens that nobody told of". [-]
 WORTH_SAYING, WORTH_SAVING = 0.04, 0.03
 
