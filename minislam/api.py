@@ -16,6 +16,7 @@ from minislam.config import with_settings
 from minislam.data.options import InputOptions, default_depth
 from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
+from minislam.parameters import with_values
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run
 from minislam.runs.run import default_output, run_in_folder
@@ -41,15 +42,16 @@ def run(
     sentence; an interrupt (Ctrl-C, the square of a notebook) ends after the present step, and
     what is known by then is returned.
     """
-    inputs = {name: value for name, value in options.items() if name in _INPUTS}
-    priors = {name: value for name, value in options.items() if name in _PRIORS}
+    given = {n: str(value) if isinstance(value, Path) else value for n, value in options.items()}
+    inputs = {name: value for name, value in given.items() if name in _INPUTS}
+    priors = {name: value for name, value in given.items() if name in _PRIORS}
     for name in options.keys() - _INPUTS - _PRIORS:
         near = get_close_matches(name, _INPUTS | _PRIORS, n=1, cutoff=0)[0]
         raise InputError(f"expected a known option, found {name}; the nearest is {near}")
     from_files = {"uncertainty.given_masks": True} if inputs.get("masks") else {}
     config = with_settings(preset_of(preset), from_files | dict(settings or {}))
-    choice = PriorChoice(**{"depth": default_depth(str(source))} | priors)
-    sequence = open_sequence(str(source), InputOptions(**inputs))
+    choice = with_values(PriorChoice(depth=default_depth(str(source))), priors)
+    sequence = open_sequence(str(source), with_values(InputOptions(), inputs))
     output = output or default_output(sequence)
     progress = SilentProgress() if quiet else ProgressLine()
     progress.plan = plan_of(config, choice, sequence)

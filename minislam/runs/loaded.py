@@ -13,6 +13,7 @@ from torch.linalg import det
 
 from minislam.config import SlamConfig, settings_in, settings_of, with_settings
 from minislam.data.files import read_bytes, read_json, read_text
+from minislam.data.images import is_image
 from minislam.data.options import InputOptions
 from minislam.data.ply import GaussianArrays, read_ply
 from minislam.data.run_folder import CAMERA, CONFIG, MAP, PLOTS, VIEWER, RunFolder
@@ -197,6 +198,13 @@ class Run:
                 f"expected the {len(self.frames)} frames of the run in {source}, found "
                 f"{len(sequence)}; restore the source"
             )
+        for frame in self.frames:
+            found = sequence.source_name(frame.index)
+            if found != frame.source and is_image(Path(found)):  # a video may have another name
+                raise InputError(
+                    f"expected {frame.source} as frame {frame.index} of the run in {source}, "
+                    f"found {found}; restore the source"
+                )
         return sequence
 
     @cached_property

@@ -150,6 +150,20 @@ def test_a_source_with_fewer_frames_is_said(run: minislam.Run, root: Path, tmp_p
     write_json(tmp_path / "config.json", config)
     with pytest.raises(InputError, match="expected the 10 frames of the run"):
         _ = minislam.load(tmp_path).sequence
+    config["input"] |= {"max_frames": 10, "start": 1}
+    write_json(tmp_path / "config.json", config)
+    with pytest.raises(InputError, match=r"expected 0\.000000\.png as frame 0 of the run .* found"):
+        _ = minislam.load(tmp_path).sequence
+
+
+def test_options_are_converted_or_refused_before_anything_is_lost(run: minislam.Run, root: Path):
+    kept = sorted(run.folder.path.iterdir())
+    for wrong in ({"size": "80x60"}, {"stride": "two"}, {"fx": "wide"}, {"max_frames": 2.5}):
+        with pytest.raises(InputError, match="expected"):
+            minislam.run("synth:person", root / "run", overwrite=True, **wrong)
+    with pytest.raises(InputError, match="expected a readable file"):
+        minislam.run("synth:person", root / "run", overwrite=True, calibration=root / "none.txt")
+    assert sorted(run.folder.path.iterdir()) == kept
 
 
 def test_unknown_options_and_outputs_in_use_are_refused(run: minislam.Run):
