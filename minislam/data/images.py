@@ -157,7 +157,7 @@ def _is_complete(content: bytes) -> bool:
         return b"IEND" in content
     if content.startswith(_JPEG_SIGNATURE):
         # A thumbnail in the header has its own end marker, a film that phones append any bytes.
-        at = len(_JPEG_END_OF_IMAGE)
+        at = 2  # behind the start marker; then one segment of the header after the other
         while content[at : at + 1] == b"\xff" and content[at : at + 2] != _JPEG_START_OF_SCAN:
             at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
         return content.find(_JPEG_END_OF_IMAGE, at) > 0

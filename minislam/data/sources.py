@@ -124,7 +124,7 @@ class VideoImages:
         # FFmpeg, because other back ends may take the name for a camera or a pattern.
         # It takes what precedes a colon for a protocol, and crashes at a name that is no text.
         name = os.path.abspath(self.path)
-        if not name.isascii() and re.search("[\ud800-\udfff]", name):
+        if re.search("[\ud800-\udfff]", name):
             raise InputError(
                 f"expected a video whose name is text, found {name!a}; give it another name"
             )

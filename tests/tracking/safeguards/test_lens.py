@@ -1,13 +1,15 @@
 """A bent lens: its columns, what it costs the flow, and that a pinhole has none."""
 
+import math
+
+import pytest
 import torch
 from torch import Tensor
 
-from minislam.geometry import se3_exp
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.safeguards.lens import LensFit, check_lens, lens_columns
-from tests.tracking.scene import CAMERA, RAYS, known_problem, normal
+from tests.tracking.scene import CAMERA, RAYS, normal
 from tests.tracking.wall import GRID, disparities_at, true_graph, true_poses
 
 NUMBERS = [*range(8)]
@@ -57,14 +59,12 @@ def bent_graph():
 
 
 def test_the_columns_are_the_derivative_of_the_flow_by_the_lens():
-    known = known_problem()
-    motions = relative_transforms(
-        se3_exp(0.002 * normal(1, 4, 6)), known.problem.edges_source, known.problem.edges_target
-    )
-    motions[:, :3, :3] = torch.eye(3, dtype=motions.dtype)  # the image does not turn
-    disparities = torch.full((len(motions), len(RAYS)), 1e-3, dtype=torch.float64)
+    motions = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    motions[:, :2, 3] = torch.tensor([[0.6, -0.4], [-0.5, 0.7]])  # sideways, before a wall
+    disparities = torch.full((2, len(RAYS)), 0.5, dtype=torch.float64)
     positions, _ = reproject(motions, disparities, RAYS, CAMERA)
     columns = lens_columns(CAMERA, RAYS.double(), positions)
+    assert columns.abs().amax((0, 2, 3)).min() > 1  # px: there is something to tell
     step = 1e-5
     for n, k in enumerate([(step, 0.0), (0.0, step)]):
         # From a cell that shows the ray u - k d(u), through the motion, to where the lens shows it.
@@ -72,22 +72,24 @@ def test_the_columns_are_the_derivative_of_the_flow_by_the_lens():
         rays = torch.cat([u * (2 - stretch(u, *k)), torch.ones_like(u[:, :1])], 1)
         u_seen = tangents(reproject(motions, disparities, rays, CAMERA)[0].mT)
         change = (pixels(u_seen * stretch(u_seen, *k)).mT - positions) / step
-        torch.testing.assert_close(-columns[:, n], change, rtol=2e-3, atol=1e-2)
+        torch.testing.assert_close(-columns[:, n], change, rtol=1e-3, atol=1e-3)
 
 
 def test_a_lens_that_bends_lines_is_told_from_the_flow():
     fit = check_lens(bent_graph())
-    assert fit.is_bent and 0.5 < fit.bend / BEND < 1.5  # of one wall (measured: .6)
+    assert fit.is_bent and 0.5 < fit.bend / BEND < 0.7  # the poses bend, too (measured: .60)
 
 
-def test_a_pinhole_is_none():
+@pytest.mark.parametrize("factor", [1.0, 1.25])  # of the focal length that is believed
+def test_a_pinhole_is_none(factor: float):
     graph = true_graph(NUMBERS)
     graph.match(neighbourhood_edges(0, len(NUMBERS), 3))
+    graph.grid.zoom(math.log(factor))
     for index, target in enumerate(graph.links.targets):
         graph.links.targets[index] = target + 0.05 * normal(index, *target.shape).float()
     before = graph.keyframes.T_camera_world.clone()
     fit = check_lens(graph)
-    assert not fit.is_bent and abs(fit.bend) < 0.01
+    assert not fit.is_bent and abs(fit.bend) < 0.004
     assert torch.equal(graph.keyframes.T_camera_world, before)
 
 
@@ -97,5 +99,7 @@ def test_both_thresholds_count():
 
 
 def test_few_keyframes_and_no_links_tell_nothing():
-    assert check_lens(true_graph(NUMBERS[:3])) is None
+    few = true_graph(NUMBERS[:3])
+    few.match(neighbourhood_edges(0, 3, 2))
+    assert few.links.edges and check_lens(few) is None
     assert check_lens(true_graph(NUMBERS)) is None
