@@ -125,6 +125,7 @@ class Sequence(Protocol):
     description: str  # one line: what was found
     camera: Camera  # of the undistorted images at the working size
     refines_focal: bool  # whether the focal length is to be estimated, the camera's is a guess
+    seeks_lens: bool  # whether a lens that bends straight lines is to be found, too
     warnings: list[str]  # what the user must know, for instance that the focal length is guessed
     lost: list[tuple[float, str]]  # timestamp [s] and reason of frames that could not be decoded
     checksums: dict[int, int]  # of the images read so far, by frame index
@@ -142,6 +143,9 @@ class Sequence(Protocol):
 
     def frame(self, frame_index: int) -> Frame:
         """Return one frame again."""
+
+    def through_lens(self, fx: float, k1: float, k2: float) -> "Sequence":
+        """Return the sequence, straightened; fx [px] of the working images is a first guess."""
 
     def source_name(self, frame_index: int) -> str:
         """Return the name of a frame's image file, or of its video with the number in it."""

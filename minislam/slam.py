@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from minislam.config import SlamConfig
-from minislam.errors import MinislamError, TrackingLost
+from minislam.errors import MinislamError
 from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
@@ -35,9 +35,9 @@ from minislam.tracking.safeguards.focal_length import (
     check_focal_length,
     seek_focal_length,
 )
-from minislam.tracking.safeguards.lens import LensFit, check_lens
+from minislam.tracking.safeguards.lens import ENOUGH_KEYFRAMES, LensFit, check_lens
 from minislam.tracking.tracker import Tracker
-from minislam.tracking.trajectory import pose_all_frames
+from minislam.tracking.trajectory import as_trajectory, pose_all_frames
 from minislam.uncertainty.weights import beta_of_mask, relative_weight, tracking_weight
 from minislam.workers import Workers
 
@@ -93,9 +93,11 @@ class Slam(Stateful):
                 self._map_new_keyframes()
             elif has_new_keyframes and has_warmed_up(self.tracker):
                 self._initialise()
+            self._check_lens(ENOUGH_KEYFRAMES)
             self.steps.finish("tracking and mapping", frame.frame_index + 1, len(self.sequence))
         if not self.tracker.initialised:
             self._initialise()
+        self._check_lens(0)
 
         self.steps.once("final adjustment", self._adjust_all)
         if self.config.uncertainty.enabled and self.tracker.knows_depth:
@@ -152,6 +154,12 @@ class Slam(Stateful):
                 progress = self.steps.on_progress("first map")
                 self.mapper.initialise(new_keyframes, progress, online=True)
 
+    def _check_lens(self, least: int) -> None:
+        """Fit the lens once. If an unknown one bends straight lines, the run must begin anew."""
+        is_due = self.lens is None and len(self.tracker.keyframes) >= least
+        if is_due and not self.tracker.watch.only_turned:
+            self.lens = check_lens(self.tracker.graph, self.sequence.seeks_lens)
+
     def _move_map(self) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""
         mapped = len(self.mapper.keyframes)
@@ -196,7 +204,6 @@ class Slam(Stateful):
     def _pose_all_frames(self) -> None:
         if not self.tracker.watch.only_turned:
             self.focal_length = check_focal_length(self.tracker.graph, self.workers)
-            self.lens = check_lens(self.tracker.graph)
         progress = self.steps.on_progress("posing all frames")
         self.poses = pose_all_frames(self.tracker, self.sequence, progress)
 
@@ -263,13 +270,13 @@ class Slam(Stateful):
         if not self.poses:
             return self.keyframe_trajectory()
         stamps = {t.frame_index: t.timestamp for t in self.tracker.tracked}
-        return _trajectory([stamps[index] for index in self.poses], list(self.poses.values()))
+        return as_trajectory([stamps[index] for index in self.poses], list(self.poses.values()))
 
     def keyframe_trajectory(self) -> Trajectory:
         """Return the poses of the keyframes."""
         keyframes = self.tracker.keyframes
         stamps = [frame.timestamp for frame in keyframes.frames]
-        return _trajectory(stamps, list(keyframes.T_camera_world))
+        return as_trajectory(stamps, list(keyframes.T_camera_world))
 
     def render(self, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the colours (H, W, 3) in [0, 1] of the map, seen from a pose (4, 4)."""
@@ -291,10 +298,3 @@ class Slam(Stateful):
             for t in self.tracker.tracked
             if not t.status.is_followed
         ]
-
-
-def _trajectory(timestamps: list[float], T_camera_world: list[Tensor]) -> Trajectory:
-    if not T_camera_world:
-        raise TrackingLost("expected at least one frame with a pose, found none")
-    T_world_camera = se3_inverse(torch.stack(T_camera_world)).cpu().numpy()
-    return Trajectory(np.array(timestamps), T_world_camera)

@@ -31,13 +31,18 @@ class InputOptions:
     fy: float | None = parameter(None, "focal length of raw images, y; none: as fx [px]", 1, 1e6)
     cx: float | None = parameter(None, "principal point of raw images, x; none: centre [px]", -1)
     cy: float | None = parameter(None, "principal point of raw images, y; none: centre [px]", -1)
+    k1: float | None = parameter(
+        None, "radial distortion of raw images; none: that of the calibration [-]", -10, 10
+    )
+    k2: float | None = parameter(None, "the next term of the distortion, as k1 [-]", -100, 100)
     calibration: str | None = parameter(
         None, "file with fx fy cx cy [width height [k1 k2 p1 p2 k3]] of the raw images"
     )
     focal: str = parameter(
         "auto",
         "fixed: the focal length as given, noted or guessed; refine: estimated from the motion, "
-        "starting there; auto: refine if no calibration and no --fx is given, else fixed",
+        "starting there; auto: refine if no calibration and no --fx is given, and find a lens that "
+        "bends straight lines, else fixed",
     )
     masks: str | None = parameter(
         None,

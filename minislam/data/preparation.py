@@ -37,7 +37,7 @@ class ImagePreparation:
         pixels: int,  # about width * height of the working image when it is chosen
         picture: Window | None = None,  # of the raw image, see `picture_window`; None: all
     ) -> None:
-        self._raw_size = (raw_camera.width, raw_camera.height)
+        self.raw_camera, self._raw_size = raw_camera, (raw_camera.width, raw_camera.height)
         if min(self._raw_size) < MINIMUM_SIDE:
             raise InputError(
                 f"expected images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px, found "

@@ -47,7 +47,7 @@ class RecordedSequence:
     """The chosen frames of a recording at the working size: a `minislam.records.Sequence`."""
 
     def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
-        self._recording = recording
+        self._recording, self._options, self._source = recording, options, source
         self.depth_scale = options.depth_scale
         if not source.startswith(SYNTHETIC):  # so that it is found again from any folder
             source = str(Path(source).expanduser().absolute())
@@ -82,6 +82,7 @@ class RecordedSequence:
         self.warnings = [*recording.warnings, *doubts]
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
+        self.seeks_lens = calibration.is_rough and options.focal == "auto"
         if calibration.is_rough and not self.refines_focal:
             self.warnings.append(
                 f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}, for "
@@ -118,6 +119,14 @@ class RecordedSequence:
 
         pixels = torch.from_numpy(self._kept.get(frame_index, prepare))
         return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
+
+    def through_lens(self, fx: float, k1: float, k2: float) -> "RecordedSequence":
+        """Return the sequence, straightened: fx [px] is of the working size, fy in proportion."""
+        raw, zoom = self.prepare.raw_camera, fx / self.camera.fx
+        options = replace(
+            self._options, fx=zoom * raw.fx, fy=zoom * raw.fy, k1=k1, k2=k2, focal="refine"
+        )
+        return RecordedSequence(self._recording, options, self._source)
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
         """Return one frame undistorted, at the size of the source: `prepare.full_camera`."""
@@ -196,16 +205,19 @@ def _calibration(
     fy = options.fx if options.fy is None else options.fy
     given = {"fx": options.fx, "fy": fy, "cx": options.cx, "cy": options.cy}
     given = {name: value for name, value in given.items() if value is not None}
-    if not given:
+    radial = {"k1": options.k1, "k2": options.k2}
+    bent = {name: value for name, value in radial.items() if value is not None}
+    if not given and not bent:
         return calibration
     camera = calibration.camera_for(width, height)
-    origin = f"{' '.join(given)} given, {calibration.origin}"
+    origin = f"{' '.join([*given, *bent])} given, {calibration.origin}"
     if found is None and options.fx is not None:
         origin = "intrinsics given"
     return replace(
         calibration,
         **{name: given.get(name, getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")},
         size=(width, height),
+        distortion=replace(calibration.distortion, **bent),
         origin=origin,
         is_rough=calibration.is_rough and options.fx is None,
     )

@@ -31,6 +31,7 @@ from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints, way_on
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer
+from minislam.tracking.safeguards.lens import BentLens
 from minislam.workers import Workers, idle_cores
 
 
@@ -68,8 +69,28 @@ def run_in_folder(
     """Check everything that may be wrong, then run SLAM into a folder; return metrics and run.json.
 
     Nothing of an earlier run is removed before the checks. The threads of torch are afterwards as
-    they were.
+    they were. If an unknown lens turns out to bend straight lines, the run begins anew with it.
     """
+    rest = config, choice, output, observer, lpips
+    try:
+        return _run_once(sequence, *rest, overwrite, resume, workers)
+    except BentLens as bent:
+        observer.warn(str(bent))
+        straight = sequence.through_lens(bent.lens.focal, *bent.lens.radial)
+        return _run_once(straight, *rest, True, False, workers)
+
+
+def _run_once(
+    sequence: Sequence,
+    config: SlamConfig,
+    choice: PriorChoice,
+    output: Path | str,
+    observer: Observer,
+    lpips: Lpips | None,
+    overwrite: bool,
+    resume: bool,
+    workers: int | None,
+) -> tuple[dict[str, Any], dict[str, Any]]:
     for index in range(len(sequence)):
         if config.uncertainty.takes_masks:
             required_mask(sequence, index)
@@ -130,6 +151,8 @@ def _run(
         write_pictures(folder, slam, metrics, facts)
         clip_is_written()
         write_json(folder.path / names.RUN, facts)
+    except BentLens:
+        raise
     except (Exception, KeyboardInterrupt) as error:
         if way := way_on(path := folder.path):
             if isinstance(error, KeyboardInterrupt):

@@ -1,11 +1,14 @@
-"""Poses of the frames between the keyframes."""
+"""Poses of the frames between the keyframes, and a trajectory of poses."""
 
 from dataclasses import replace
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from minislam.geometry import se3_interpolate
-from minislam.records import Progress, Sequence, TrackedFrame, TrackingStatus
+from minislam.errors import TrackingLost
+from minislam.geometry import se3_interpolate, se3_inverse
+from minislam.records import Progress, Sequence, TrackedFrame, TrackingStatus, Trajectory
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.pose_support import PoseFit, repeats_last, retry_doubtful
 from minislam.tracking.tracker import Tracker
@@ -60,3 +63,11 @@ def _interpolate(graph: KeyframeGraph, tracked: TrackedFrame) -> Tensor:  # (4, 
         return known[0]
     first, second = (graph.keyframes.frames[k].timestamp for k in around)
     return se3_interpolate(known[0], known[1], (tracked.timestamp - first) / (second - first))
+
+
+def as_trajectory(timestamps: list[float], T_camera_world: list[Tensor]) -> Trajectory:
+    """Return poses (4, 4) and their timestamps [s], at least one, as a trajectory."""
+    if not T_camera_world:
+        raise TrackingLost("expected at least one frame with a pose, found none")
+    T_world_camera = se3_inverse(torch.stack(T_camera_world)).cpu().numpy()
+    return Trajectory(np.array(timestamps), T_world_camera)

@@ -104,6 +104,27 @@ def test_the_focal_length_is_refined_where_it_is_not_known(tmp_path: Path):
         assert sequence.refines_focal == refines and sequence.warnings == []
 
 
+def test_a_lens_is_sought_where_nothing_is_known_and_straightened_by_its_options(tmp_path: Path):
+    folder = tum_folder(tmp_path / "a")
+    assert not open_sequence(str(folder), InputOptions(focal="refine")).seeks_lens
+    (folder / "calibration.txt").unlink()
+    for given in ({"fx": 60.0}, {"focal": "fixed"}, {"focal": "refine"}):
+        assert not open_sequence(str(folder), InputOptions(**given)).seeks_lens
+    bent = open_sequence(str(folder), InputOptions(cx=20.0))
+    assert bent.seeks_lens
+    straight = bent.through_lens(0.5 * bent.camera.fx, -0.2, 0.05)
+    raw = bent.preparation["raw_camera"]
+    assert straight.opened_as["input"] == bent.opened_as["input"] | {
+        "fx": 0.5 * raw["fx"], "fy": 0.5 * raw["fy"], "k1": -0.2, "k2": 0.05, "focal": "refine"
+    }  # fmt: skip
+    assert straight.refines_focal and not straight.seeks_lens
+    assert straight.camera.fx == pytest.approx(0.5 * bent.camera.fx) and straight.camera.cx == 20
+    again = open_sequence(str(folder), InputOptions(**straight.opened_as["input"]))
+    assert np.array_equal(again.frame(1).pixels, straight.frame(1).pixels)
+    assert not np.array_equal(bent.frame(1).pixels, straight.frame(1).pixels)
+    assert again.preparation["distortion"] == dict(k1=-0.2, k2=0.05, p1=0, p2=0, k3=0)
+
+
 def test_a_focal_length_noted_in_a_photo_is_the_start(tmp_path: Path):
     for number in range(3):
         path = save(tmp_path / f"{number}.jpg", picture(number, 64, 48))

@@ -81,8 +81,14 @@ WARNINGS = [
     ({"truth": [9.0]}, "frames begin at 0.000 s, the ground truth at 9.000 s; shift its times"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
-    ({"lens": LensFit(-0.07, 0.13)}, "bends straight lines, the corners by -7%, with 13% less"),
-    ({"lens": LensFit(0.01, 0.13), "focal_length": DOUBTFUL}, "the flow fits 1.10 times the"),
+    (
+        {"lens": LensFit(300.0, (-0.1, 0.0), -0.07, 0.13)},
+        "bends straight lines, the corners by -7%, with 13% less",
+    ),
+    (
+        {"lens": LensFit(300.0, (0.0, 0.0), 0.01, 0.13), "focal_length": DOUBTFUL},
+        "the flow fits 1.10 times the",
+    ),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
     ({"seeks_focal": True}, "the motion does not tell it"),

@@ -8,12 +8,15 @@ import pytest
 
 from minislam import slam
 from minislam.cli.main import main
+from minislam.data.files import read_json
 from minislam.data.run_folder import RunFolder
 from minislam.data.sequence import RecordedSequence
 from minislam.errors import InputError
 from minislam.runs import pictures
 from minislam.state.steps import Steps
 from minislam.tracking import bundle_adjustment
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.safeguards.lens import BentLens, LensFit
 
 pytestmark = pytest.mark.slow
 
@@ -52,6 +55,29 @@ def test_a_mask_that_is_missing_is_said_before_anything_is_done(root: Path, monk
     assert "a mask of movers for every frame" in said and "found none for 2" in said
     assert not (root / "masks").exists()
     assert main([*COMMAND, "--no-uncertainty", "-o", str(root / "masks")]) in (0, 3)
+
+
+def test_a_run_begins_anew_on_straightened_images_if_an_unknown_lens_bends(
+    root: Path, monkeypatch, capsys
+):
+    check, lens = slam.check_lens, LensFit(90.0, (-0.2, 0.05), -0.1, 0.3, is_told=True)
+    asked: list[bool] = []
+
+    def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
+        asked.append(is_unknown)
+        if is_unknown:
+            raise BentLens(lens)
+        return check(graph, is_unknown)
+
+    monkeypatch.setattr(slam, "check_lens", check_lens)
+    filmed, out = ["run", "synth:person?phone", *COMMAND[2:]], root / "bent"
+    assert main([*filmed, "-o", str(out)]) in (0, 3)
+    assert asked == [True, False]
+    said = capsys.readouterr().err
+    assert "the corners by -10%: the run begins anew on straightened images, k1 = -0.200" in said
+    given = RunFolder(out).read_config()["input"]
+    assert (given["k1"], given["k2"], given["focal"]) == (-0.2, 0.05, "refine")
+    assert read_json(out / "camera.json")["preparation"]["distortion"]["k1"] == -0.2
 
 
 def test_a_run_whose_every_adjustment_fails_says_so(root: Path, monkeypatch, capsys):

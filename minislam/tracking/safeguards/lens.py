@@ -1,15 +1,18 @@
 """A lens that bends straight lines although nobody said so: told from the flow.
 
-A wide lens shows the ray u of a pinhole, |u|^2 = u_x^2 + u_y^2, not at x = c + f u, but at
+A wide lens shows the ray u of a pinhole, r = |u|, not at x = c + f u but at
 
-    x + k1 d_1(x) + k2 d_2(x),    d_n(x) = |u|^(2 n) f u    (Brown's model).
+    x + k1 d_1(x) + k2 d_2(x),    d_n(x) = r^(2 n) f u    (Brown's model).
 
-No pinhole fits its flow, so focal length and poses bend to fit it half. While the image turns
-little from one keyframe to the other, flow from cell x to p~ becomes that of a pinhole by
+No pinhole fits its flow, so focal length and poses bend to fit it half. With k1 and k2 known, cells
+and flow are straightened and Eq. (5) is that of a pinhole. By a further k a straightened point x
+moves by -d_n(x) / (1 + 3 k1 r^2 + 5 k2 r^4), which is -D_n(x). While the image turns little from
+one keyframe to the other, the flow from x to p~ is then that of a pinhole at
 
-    p~ + k1 (d_1(x) - d_1(p~)) + k2 (d_2(x) - d_2(p~)),
+    p~ + k1 (D_1(x) - D_1(p~)) + k2 (D_2(x) - D_2(p~)),
 
-to first order in k. So k1 and k2 are unknowns of Eq. (5) as the readouts of a rolling shutter are.
+so what k1 and k2 still lack are unknowns of Eq. (5), as the readouts of a rolling shutter are.
+Straightening and adjusting take turns.
 """
 
 import math
@@ -18,64 +21,136 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from minislam.errors import MinislamError
 from minislam.geometry import Camera
+from minislam.tracking.bundle_adjustment import BundleProblem
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing
 from minislam.tracking.safeguards.focal_length import (
     ITERATIONS,
     LEAST_KEYFRAMES,
     WIDENINGS,
+    fit_focal_length,
     problem_among,
 )
 from minislam.tracking.safeguards.robust import MIN_RESIDUAL
 
-MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
+ENOUGH_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
+TURNS = 8  # of straightening and adjusting, at most
+SETTLED = 0.003  # of the cost: a turn that saves no more is the last [-]
+INVERSION_STEPS = 50  # of the fixed point that inverts the lens
+LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # RESULTS.md, "A lens that nobody told of". [-]
 WORTH_SAYING, WORTH_SAVING = 0.04, 0.03
+
+Radial = tuple[float, float]  # k1, k2
 
 
 @dataclass(frozen=True)
 class LensFit:
-    """The radial distortion that the flow fits best."""
+    """The lens that the flow fits best."""
 
+    focal: float  # px, fx at the working size
+    radial: Radial  # k1 and k2 [-], with that focal length
     bend: float  # how far a corner moves, over its distance from the centre [-]
-    saved: float  # fraction of the residual cost that it saves, beside any focal length [-]
+    saved: float  # fraction of the residual cost that k1 and k2 save, beside any focal length [-]
+    is_told: bool = False  # whether the cost rises with other focal lengths, where it matters
 
     @property
     def is_bent(self) -> bool:
         """Tell whether the images are probably no pinhole's: both thresholds are exceeded."""
         return abs(self.bend) > WORTH_SAYING and self.saved > WORTH_SAVING
 
+    @property
+    def is_worth_undoing(self) -> bool:
+        """Tell whether the images should be straightened: the fit is told, and saves much."""
+        return self.is_bent and self.is_told
 
-def check_lens(graph: KeyframeGraph) -> LensFit | None:
+
+class BentLens(MinislamError):
+    """An unknown lens bends straight lines, and the images must be straightened first."""
+
+    def __init__(self, lens: LensFit) -> None:
+        self.lens = lens
+        k1, k2 = lens.radial
+        super().__init__(
+            f"the flow fits a lens that bends straight lines, the corners by {lens.bend:+.0%}: the "
+            f"run begins anew on straightened images, k1 = {k1:.3f}, k2 = {k2:.3f}; a calibration "
+            "is better, if there is one"
+        )
+
+
+def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
+    """Return the lens that fits, None if there are too few keyframes. Raises `BentLens`."""
+    lens = fit_lens(graph)
+    if is_unknown and lens is not None and lens.is_worth_undoing:
+        raise BentLens(lens)
+    return lens
+
+
+def fit_lens(graph: KeyframeGraph) -> LensFit | None:
     """Fit k1 and k2 to the links of the first keyframes; None: too few. Nothing is changed."""
-    keyframes = range(min(len(graph.keyframes), MOST_KEYFRAMES))
+    keyframes = range(min(len(graph.keyframes), ENOUGH_KEYFRAMES))
     among = problem_among(graph, keyframes) if len(keyframes) >= LEAST_KEYFRAMES else None
     if among is None:
         return None
     problem, state = replace(among[0], free_focal=True), among[1]
-    columns = lens_columns(problem.camera, problem.rays, problem.targets)
     _, pinhole = adjust_narrowing(problem, state, WIDENINGS, ITERATIONS)
-    bent = replace(problem, shutter=columns)
-    found, lens = adjust_narrowing(bent, state, WIDENINGS, ITERATIONS)
+    radial, cost, widenings = (0.0, 0.0), math.inf, WIDENINGS
+    for _ in range(TURNS):
+        lens = straightened(problem, radial)
+        found, report = adjust_narrowing(lens, state, widenings, ITERATIONS)
+        before, widenings = cost, [1.0]
+        if report.cost_after > before:  # too far: the columns hold to first order
+            break
+        cost, state = report.cost_after, replace(found, readout=(0.0, 0.0))
+        radial = radial[0] + found.readout[0], radial[1] + found.readout[1]
+        if before - cost < SETTLED * cost:
+            break
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
-    saved = (pinhole.cost_after - lens.cost_after) / max(pinhole.cost_after, floor)
-    camera, (k1, k2) = problem.camera, found.readout
-    corner = math.hypot(camera.cx / camera.fx, camera.cy / camera.fy)
-    return LensFit(k1 * corner**2 + k2 * corner**4, saved)
+    saved = (pinhole.cost_after - cost) / max(pinhole.cost_after, floor)
+    zoom, bend = math.exp(state.log_focal), bend_of(problem.camera, radial)
+    fit = LensFit(zoom * problem.camera.fx, (radial[0] * zoom**2, radial[1] * zoom**4), bend, saved)
+    if not fit.is_bent:
+        return fit
+    straight = replace(straightened(problem, radial), free_focal=False, shutter=None)
+    is_told = graph.focal_is_free or fit_focal_length(straight, state)[0].factor is not None
+    return replace(fit, is_told=is_told)
 
 
-def lens_columns(
-    camera: Camera,
-    rays: Tensor,  # (N, 3) of the source's cells
-    targets: Tensor,  # (E, 2, N) px, where the flow leads
-) -> Tensor:  # (E, 2, 2, N) px per unit of k1 and of k2
-    """Return d_n(x) - d_n(p~) for n = 1 and 2."""
-    centre = targets.new_tensor([[camera.cx], [camera.cy]])
-    focal = targets.new_tensor([[camera.fx], [camera.fy]])
+def straightened(problem: BundleProblem, radial: Radial) -> BundleProblem:
+    """Return the problem of the pinhole whose rays the lens has bent, what k lacks being free."""
+    camera, dtype = problem.camera, problem.targets.dtype
+    centre = problem.targets.new_tensor([[camera.cx], [camera.cy]])
+    focal = problem.targets.new_tensor([[camera.fx], [camera.fy]])
+    source = ray_seen(problem.rays[:, :2].mT, radial)  # (2, N)
+    target = ray_seen((problem.targets - centre) / focal, radial)  # (E, 2, N)
+    rays = torch.cat([source, torch.ones_like(source[:1])]).mT.to(dtype)
+    columns = bends(camera, source, radial) - bends(camera, target, radial)
+    positions = centre + focal * target
+    return replace(problem, rays=rays, targets=positions.to(dtype), shutter=columns.to(dtype))
 
-    def bent(u: Tensor) -> Tensor:  # (..., 2, N) -> (..., 2, 2, N)
+
+def ray_seen(u: Tensor, radial: Radial) -> Tensor:  # (..., 2, N) float64
+    """Return the rays that the lens shows at the seen ones u (..., 2, N)."""
+    seen = u.double()
+    u = seen
+    for _ in range(INVERSION_STEPS):
         squared = u.square().sum(-2, keepdim=True)
-        return torch.stack([squared * focal * u, squared**2 * focal * u], -3)
+        stretch = 1 + radial[0] * squared + radial[1] * squared.square()
+        u = seen / stretch.clamp_min(LEAST_STRETCH)
+    return u
 
-    return bent(rays[:, :2].T) - bent((targets - centre) / focal)
+
+def bends(camera: Camera, u: Tensor, radial: Radial) -> Tensor:  # (..., 2, 2, N) px per unit of k
+    """Return D_1 and D_2 of straightened points, from their rays u (..., 2, N)."""
+    squared = u.square().sum(-2, keepdim=True)
+    slope = 1 + 3 * radial[0] * squared + 5 * radial[1] * squared.square()
+    scaled = u * u.new_tensor([[camera.fx], [camera.fy]]) / slope.clamp_min(LEAST_STRETCH)
+    return torch.stack([squared * scaled, squared.square() * scaled], -3)
+
+
+def bend_of(camera: Camera, radial: Radial) -> float:
+    """Return how far the lens moves a corner of the image, over its distance from the centre."""
+    corner = torch.tensor([[camera.cx / camera.fx], [camera.cy / camera.fy]], dtype=torch.float64)
+    return float(corner[0] / ray_seen(corner, radial)[0]) - 1
