@@ -35,7 +35,7 @@ from minislam.tracking.safeguards.focal_length import (
     check_focal_length,
     seek_focal_length,
 )
-from minislam.tracking.safeguards.lens import ENOUGH_KEYFRAMES, LensFit, check_lens
+from minislam.tracking.safeguards.lens import LensFit, check_lens
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import as_trajectory, pose_all_frames
 from minislam.uncertainty.weights import beta_of_mask, relative_weight, tracking_weight
@@ -93,11 +93,9 @@ class Slam(Stateful):
                 self._map_new_keyframes()
             elif has_new_keyframes and has_warmed_up(self.tracker):
                 self._initialise()
-            self._check_lens(ENOUGH_KEYFRAMES)
             self.steps.finish("tracking and mapping", frame.frame_index + 1, len(self.sequence))
         if not self.tracker.initialised:
             self._initialise()
-        self._check_lens(0)
 
         self.steps.once("final adjustment", self._adjust_all)
         if self.config.uncertainty.enabled and self.tracker.knows_depth:
@@ -154,12 +152,6 @@ class Slam(Stateful):
                 progress = self.steps.on_progress("first map")
                 self.mapper.initialise(new_keyframes, progress, online=True)
 
-    def _check_lens(self, least: int) -> None:
-        """Fit the lens once. If an unknown one bends straight lines, the run must begin anew."""
-        is_due = self.lens is None and len(self.tracker.keyframes) >= least
-        if is_due and not self.tracker.watch.only_turned:
-            self.lens = check_lens(self.tracker.graph, self.sequence.seeks_lens)
-
     def _move_map(self) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""
         mapped = len(self.mapper.keyframes)
@@ -173,6 +165,8 @@ class Slam(Stateful):
         seek_focal_length(self.tracker.graph, self.workers)
         self.tracker.finish(self.steps.on_progress("final adjustment"))
         self._move_map()
+        if not self.tracker.watch.only_turned:
+            self.lens = check_lens(self.tracker.graph, self.sequence.seeks_lens)
 
     def _adjust_again(self) -> None:
         """Adjust all keyframes again, on what several views confirm to stand still."""

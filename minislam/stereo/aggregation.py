@@ -17,37 +17,39 @@ EDGE_SCALE = 0.05  # grey values: a difference that halves the cost of a jump
 
 
 def aggregate(
-    cost: np.ndarray,  # (h, w, D) float32
+    cost: np.ndarray,  # (D, h, w) float32
     gray: np.ndarray,  # (h, w) float32 in [0, 1]
-) -> np.ndarray:  # (h, w, D) float32
+) -> np.ndarray:  # (D, h, w) float32
     """Return the sum of L over eight directions."""
-    total = np.zeros_like(cost)
+    total, turned = np.zeros_like(cost), np.ascontiguousarray(cost.transpose(0, 2, 1))
+    across = np.zeros_like(turned)
     for flip in (slice(None), slice(None, None, -1)):
         for shift in (-1, 0, 1):
-            total[flip] += _paths_down(cost[flip], gray[flip], shift)
-        across = cost[:, flip].transpose(1, 0, 2)
-        total[:, flip] += _paths_down(across, gray[:, flip].T, 0).transpose(1, 0, 2)
-    return total
+            _add_paths_down(total[:, flip], cost[:, flip], gray[flip], shift)
+        _add_paths_down(across[:, flip], turned[:, flip], gray.T[flip], 0)
+    return total + across.transpose(0, 2, 1)
 
 
-def _paths_down(cost: np.ndarray, gray: np.ndarray, shift: int) -> np.ndarray:
-    """Return L along paths that come from the row above, `shift` columns to the left."""
-    paths = np.empty(cost.shape, np.float32)
-    paths[0] = cost[0]
-    for row in range(1, len(cost)):
-        before, shade = paths[row - 1], gray[row - 1]
-        if shift:
-            before, shade = np.roll(before, shift, 0), np.roll(shade, shift)
-        edge = 1 + np.abs(gray[row] - shade) / EDGE_SCALE
+def _add_paths_down(total: np.ndarray, cost: np.ndarray, gray: np.ndarray, shift: int) -> None:
+    """Add L along paths that come from the row above, `shift` columns to the left.
+
+    A path that would come from outside the image starts with its cost.
+    """
+    width = gray.shape[1]
+    to, come_from = (slice(max(s, 0), width + min(s, 0)) for s in (shift, -shift))
+    paths = cost[:, 0].copy()
+    total[:, 0] += paths
+    for row in range(1, len(gray)):
+        before, shade = paths[:, come_from], gray[row - 1, come_from]
+        edge = 1 + np.abs(gray[row, to] - shade) / EDGE_SCALE
         jump = np.maximum(JUMP_COST / edge, SMALLEST_JUMP_COST)
-        lowest = before.min(-1, keepdims=True)
-        best = np.minimum(before, lowest + jump[:, None])
-        np.minimum(best[:, 1:], before[:, :-1] + STEP_COST, out=best[:, 1:])
-        np.minimum(best[:, :-1], before[:, 1:] + STEP_COST, out=best[:, :-1])
-        paths[row] = cost[row] + best - lowest
-        if shift:  # the path that would come from outside the image starts here
-            paths[row, 0 if shift > 0 else -1] = cost[row, 0 if shift > 0 else -1]
-    return paths
+        lowest, stepped = before.min(0), before + STEP_COST
+        best = np.minimum(before, lowest + jump)
+        np.minimum(best[1:], stepped[:-1], out=best[1:])
+        np.minimum(best[:-1], stepped[1:], out=best[:-1])
+        paths = cost[:, row].copy()
+        paths[:, to] += best - lowest
+        total[:, row] += paths
 
 
 def refined_minimum(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -55,12 +57,12 @@ def refined_minimum(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     That is in [-0.5, 0.5] planes (h, w): the minimum of the parabola through three planes.
     """
-    best = total.argmin(-1)
-    inner = np.clip(best, 1, total.shape[-1] - 2)[..., None]
+    best = total.argmin(0)
+    inner = np.clip(best, 1, len(total) - 2)
     left, middle, right = (
-        np.take_along_axis(total, inner + offset, -1)[..., 0] for offset in (-1, 0, 1)
+        np.take_along_axis(total, inner[None] + offset, 0)[0] for offset in (-1, 0, 1)
     )
     curvature = left - 2 * middle + right
     fraction = 0.5 * (left - right) / np.maximum(curvature, 1e-6)
-    fraction = np.where(best == inner[..., 0], np.clip(fraction, -0.5, 0.5), 0)
+    fraction = np.where(best == inner, np.clip(fraction, -0.5, 0.5), 0)
     return best, fraction

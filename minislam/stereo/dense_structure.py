@@ -149,7 +149,7 @@ def swept_view(
     best, fraction = refined_minimum(aggregate(cost, reference.gray))
     found = ((best + fraction) * step).clip(FARTHEST * step).astype(np.float32)
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
-    at_best = np.take_along_axis(cost, best[..., None], -1)[..., 0]
+    at_best = np.take_along_axis(cost, best[None], 0)[0]
     found[(best == 0) & (at_best >= votes.CONFIRMING_COST)] = np.nan  # every plane costs as much
     return votes.SweptView(found, at_best, step, pose)
 

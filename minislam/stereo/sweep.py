@@ -54,7 +54,7 @@ def sweep(
     reference: PosedImage,
     others: list[PosedImage],  # V views
     inverse_depths: np.ndarray,  # (D,) 1/world unit, of the planes
-) -> np.ndarray:  # (h, w, D) float32 in [0, 1]
+) -> np.ndarray:  # (D, h, w) float32 in [0, 1]
     """Return the matching cost of every pixel and plane.
 
     The better half of the views is averaged: in the worse half the pixel may be covered, or
@@ -64,16 +64,17 @@ def sweep(
     motions = [other.T_camera_world @ T_world_this for other in others]
     homographies = np.stack([plane_homographies(camera, T, inverse_depths) for T in motions], 1)
     gray = reference.gray
-    mean, variance = _moments(gray[None])
+    mean, variance = _moments(gray)
     spread = np.sqrt(variance + NCC_VARIANCE)
     cost = np.empty((len(inverse_depths), *gray.shape), np.float32)
     for plane, of_views in enumerate(homographies):
-        views = zip(others, of_views, strict=True)
-        warped = np.stack([warp(other.gray, H) for other, H in views])
-        seen = warped >= 0
-        costs = _dissimilarity(gray, mean, spread, np.where(seen, warped, gray))
+        costs, seen = [], np.empty((len(others), *gray.shape), bool)
+        for view, (other, H) in enumerate(zip(others, of_views, strict=True)):
+            warped = warp(other.gray, H)
+            np.greater_equal(warped, 0, out=seen[view])
+            costs.append(_dissimilarity(gray, mean, spread, np.where(seen[view], warped, gray)))
         cost[plane] = _mean_of_better_half(costs, seen)
-    return np.ascontiguousarray(cost.transpose(1, 2, 0))
+    return cost
 
 
 def warp(gray: np.ndarray, H: np.ndarray) -> np.ndarray:  # (h, w)
@@ -87,23 +88,26 @@ def warp(gray: np.ndarray, H: np.ndarray) -> np.ndarray:  # (h, w)
     return cv2.warpPerspective(gray, H, (width, height), flags=flags, borderValue=OUTSIDE)
 
 
-def _moments(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variance (V, h, w) of the windows around each pixel."""
-    mean = _window_mean(images, NCC_WINDOW)
-    return mean, np.maximum(_window_mean(images * images, NCC_WINDOW) - mean * mean, 0)
+def _moments(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance (h, w) of the window around each pixel."""
+    mean = _window_mean(image, NCC_WINDOW)
+    return mean, np.maximum(_window_mean(image * image, NCC_WINDOW) - mean * mean, 0)
 
 
-def _window_mean(images: np.ndarray, size: int) -> np.ndarray:
-    return np.stack([cv2.blur(image, (size, size)) for image in images])
+def _window_mean(image: np.ndarray, size: int) -> np.ndarray:
+    return cv2.blur(image, (size, size))
 
 
 def _dissimilarity(
     gray: np.ndarray,  # (h, w), this image
-    mean: np.ndarray,  # (1, h, w) of its windows
-    spread: np.ndarray,  # (1, h, w) of its windows
-    warped: np.ndarray,  # (V, h, w), the other images on one plane
-) -> np.ndarray:  # (V, h, w) in [0, 1]
-    """Return 1 - max(NCC, 0), mixed with the absolute difference."""
+    mean: np.ndarray,  # (h, w) of its windows
+    spread: np.ndarray,  # (h, w) of its windows
+    warped: np.ndarray,  # (h, w), another image on one plane
+) -> np.ndarray:  # (h, w) in [0, 1]
+    """Return 1 - max(NCC, 0), mixed with the absolute difference.
+
+    One view at a time, because its images stay in the cache.
+    """
     mean_warped, variance_warped = _moments(warped)
     covariance = _window_mean(gray * warped, NCC_WINDOW) - mean * mean_warped
     ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))
@@ -112,15 +116,18 @@ def _dissimilarity(
     return (1 - COLOUR_WEIGHT) * (1 - ncc.clip(0, 1)) + COLOUR_WEIGHT * colour
 
 
-def _mean_of_better_half(costs: np.ndarray, seen: np.ndarray) -> np.ndarray:  # (h, w)
-    """Return the mean of the lower half of the costs (V, h, w) of the views that see a pixel."""
+def _mean_of_better_half(
+    costs: list[np.ndarray],  # (h, w) of each of V views
+    seen: np.ndarray,  # (V, h, w) bool, whether the view sees the pixel
+) -> np.ndarray:  # (h, w)
+    """Return the mean of the lower half of the costs of the views that see a pixel."""
     number = seen.sum(0, dtype=np.uint8)
     half = np.maximum((number + 1) // 2, 1)
-    ordered = np.where(seen, costs, np.float32(2))
-    total = np.zeros_like(ordered[0])
+    rest = [np.where(s, cost, np.float32(2)) for cost, s in zip(costs, seen, strict=True)]
+    total = np.zeros_like(rest[0])
     for rank in range((len(costs) + 1) // 2):
-        for first in range(len(costs) - 1, rank, -1):  # the lowest of the rest sinks to its rank
-            low, high = ordered[first - 1], ordered[first]
-            low[:], high[:] = np.minimum(low, high), np.maximum(low, high)
-        total += ordered[rank] * (rank < half)
+        lowest = rest.pop()
+        for view, cost in enumerate(rest):
+            lowest, rest[view] = np.minimum(lowest, cost), np.maximum(lowest, cost)
+        total += lowest * (rank < half)
     return np.where(number >= max(1, MIN_SEEN * len(costs)), total / half, UNSEEN_COST)

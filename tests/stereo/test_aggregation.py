@@ -15,7 +15,7 @@ from minislam.stereo.aggregation import (
 
 def twin(cost: np.ndarray, gray: np.ndarray) -> np.ndarray:
     """Return the sum of L over eight directions by plain loops, pixel by pixel."""
-    height, width, planes = cost.shape
+    planes, height, width = cost.shape
     total = np.zeros_like(cost, dtype=float)
     for down, right in [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]:
         paths = np.zeros_like(total)
@@ -24,23 +24,23 @@ def twin(cost: np.ndarray, gray: np.ndarray) -> np.ndarray:
         for y in rows:
             for x in columns:
                 b, a = y - down, x - right
-                paths[y, x] = cost[y, x]
+                paths[:, y, x] = cost[:, y, x]
                 if not (0 <= b < height and 0 <= a < width):
                     continue
                 edge = 1 + abs(float(gray[y, x]) - float(gray[b, a])) / EDGE_SCALE
                 jump = max(JUMP_COST / edge, SMALLEST_JUMP_COST)
-                before = paths[b, a]
+                before = paths[:, b, a]
                 for d in range(planes):
                     ways = [before[d], before.min() + jump]
                     ways += [before[k] + STEP_COST for k in (d - 1, d + 1) if 0 <= k < planes]
-                    paths[y, x, d] += min(ways) - before.min()
+                    paths[d, y, x] += min(ways) - before.min()
         total += paths
     return total
 
 
 def random_volume(seed: int) -> tuple[np.ndarray, np.ndarray]:
     source = np.random.default_rng(seed)
-    cost, gray = source.random((5, 6, 7)), source.random((5, 6))
+    cost, gray = source.random((7, 5, 6)), source.random((5, 6))
     return cost.astype(np.float32), gray.astype(np.float32)
 
 
@@ -53,21 +53,21 @@ def test_it_agrees_with_plain_loops(seed: int):
 
 
 def test_a_pixel_without_texture_takes_the_depth_of_its_surroundings():
-    cost = np.full((9, 9, 6), 0.8, np.float32)
-    cost[..., 2] = 0.1
-    cost[3:6, 3:6] = 0.5  # nothing is known there
+    cost = np.full((6, 9, 9), 0.8, np.float32)
+    cost[2] = 0.1
+    cost[:, 3:6, 3:6] = 0.5  # nothing is known there
     best, _ = refined_minimum(aggregate(cost, np.full((9, 9), 0.5, np.float32)))
     assert (best == 2).all()
 
 
 def test_the_fraction_is_the_minimum_of_the_parabola():
     planes = np.arange(8)
-    total = ((planes - 3.3) ** 2)[None, None] + np.zeros((2, 2, 1))
+    total = ((planes - 3.3) ** 2)[:, None, None] + np.zeros((2, 2))
     best, fraction = refined_minimum(total)
     assert (best == 3).all()
     np.testing.assert_allclose(fraction, 0.3, atol=1e-6)
 
 
 def test_at_the_ends_there_is_no_fraction():
-    best, fraction = refined_minimum(np.stack([np.arange(5.0), np.arange(5.0)[::-1]])[None])
+    best, fraction = refined_minimum(np.stack([np.arange(5.0), np.arange(5.0)[::-1]], 1)[:, None])
     assert best.tolist() == [[0, 4]] and fraction.tolist() == [[0, 0]]

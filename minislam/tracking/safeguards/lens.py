@@ -35,7 +35,7 @@ from minislam.tracking.safeguards.focal_length import (
 )
 from minislam.tracking.safeguards.robust import MIN_RESIDUAL
 
-ENOUGH_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
+MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
 TURNS = 8  # of straightening and adjusting, at most
 SETTLED = 0.003  # of the cost: a turn that saves no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
@@ -90,7 +90,7 @@ def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
 
 def fit_lens(graph: KeyframeGraph) -> LensFit | None:
     """Fit k1 and k2 to the links of the first keyframes; None: too few. Nothing is changed."""
-    keyframes = range(min(len(graph.keyframes), ENOUGH_KEYFRAMES))
+    keyframes = range(min(len(graph.keyframes), MOST_KEYFRAMES))
     among = problem_among(graph, keyframes) if len(keyframes) >= LEAST_KEYFRAMES else None
     if among is None:
         return None
