@@ -12,7 +12,7 @@ diagnostics      how well each keyframe is tied to the others
 turns            tells a camera that stands or only turns, and adjusts its turns alone
 focal_length     estimates an unknown focal length, tells whether a given one was wrong; the readout
 focal_column     the focal length as one more unknown of the bundle adjustment
-lens             tells a lens that bends straight lines although no calibration says so
+lens             finds a lens that bends straight lines although no calibration says so
 scale_drift      undoes a drift of the scale that a depth prior tells
 rolling_shutter  the time to read an image as two more, and images as a global shutter sees them
 """

@@ -41,7 +41,7 @@ SETTLED = 0.003  # of the cost: a turn that saves no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # RESULTS.md, "A lens that nobody told of". [-]
-WORTH_SAYING, WORTH_SAVING = 0.04, 0.03
+WORTH_SAYING, WORTH_SAVING, WORTH_UNDOING = 0.04, 0.03, 0.1
 
 Radial = tuple[float, float]  # k1, k2
 
@@ -63,8 +63,8 @@ class LensFit:
 
     @property
     def is_worth_undoing(self) -> bool:
-        """Tell whether the images should be straightened: the fit is told, and saves much."""
-        return self.is_bent and self.is_told
+        """Tell whether the images should be straightened: the lens is told, and saves much."""
+        return self.is_bent and self.is_told and self.saved > WORTH_UNDOING
 
 
 class BentLens(MinislamError):
@@ -96,15 +96,16 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
         return None
     problem, state = replace(among[0], free_focal=True), among[1]
     _, pinhole = adjust_narrowing(problem, state, WIDENINGS, ITERATIONS)
-    radial, cost, widenings = (0.0, 0.0), math.inf, WIDENINGS
+    radial, cost, widenings = (0.0, 0.0), pinhole.cost_after, WIDENINGS
     for _ in range(TURNS):
         lens = straightened(problem, radial)
         found, report = adjust_narrowing(lens, state, widenings, ITERATIONS)
-        before, widenings = cost, [1.0]
-        if report.cost_after > before:  # too far: the columns hold to first order
+        further = radial[0] + found.readout[0], radial[1] + found.readout[1]
+        # The columns hold to first order, and no lens folds its image.
+        if report.cost_after > cost or bend_of(problem.camera, further) <= LEAST_STRETCH - 1:
             break
-        cost, state = report.cost_after, replace(found, readout=(0.0, 0.0))
-        radial = radial[0] + found.readout[0], radial[1] + found.readout[1]
+        before, cost, radial, widenings = cost, report.cost_after, further, [1.0]
+        state = replace(found, readout=(0.0, 0.0))
         if before - cost < SETTLED * cost:
             break
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())

@@ -10,7 +10,16 @@ from torch import Tensor
 from minislam.tracking.bundle_adjustment import BundleProblem
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.reprojection import relative_transforms, reproject
-from minislam.tracking.safeguards.lens import LensFit, bend_of, fit_lens, ray_seen, straightened
+from minislam.tracking.safeguards.lens import (
+    BentLens,
+    LensFit,
+    bend_of,
+    bends,
+    check_lens,
+    fit_lens,
+    ray_seen,
+    straightened,
+)
 from tests.tracking.scene import CAMERA, RAYS, known_problem, normal
 from tests.tracking.wall import GRID, disparities_at, true_graph, true_poses
 
@@ -35,8 +44,8 @@ def pixels(u: Tensor) -> Tensor:
     return focal * u + centre
 
 
-def bent_graph():
-    """Return the graph of a wall that is filmed through the lens, linked by its true flow."""
+def bent_graph(noise: float = 0.02):
+    """Return the graph of a wall that is filmed through the lens, linked by its flow [px]."""
     graph, poses = true_graph(NUMBERS), true_poses()
     graph.match(neighbourhood_edges(0, len(NUMBERS), 3))
     u = ray_seen(tangents(GRID.pixels).mT, (K1, K2)).mT
@@ -47,7 +56,7 @@ def bent_graph():
     positions, _ = reproject(motions, disparities[sources], rays, CAMERA)
     u_seen = tangents(positions.mT)
     seen = pixels(u_seen * stretch(u_seen, K1, K2)).mT.float()
-    graph.links.targets = list(seen + 0.02 * normal(5, *seen.shape).float())
+    graph.links.targets = list(seen + noise * normal(5, *seen.shape).float())
     return graph
 
 
@@ -81,11 +90,35 @@ def test_the_seen_ray_is_inverted():
     assert bend_of(CAMERA, (0.0, 0.0)) == 0 and abs(bend_of(CAMERA, (K1, K2)) - BEND) < 1e-6
 
 
-def test_a_lens_that_bends_lines_is_told_from_the_flow():
-    fit = fit_lens(bent_graph())
+@pytest.mark.parametrize("factor", [1.0, 1.25])  # of the focal length that is believed
+def test_a_lens_that_bends_lines_is_told_from_the_flow(factor: float):
+    graph = bent_graph()
+    graph.grid.zoom(math.log(factor))
+    fit = check_lens(graph, is_unknown=False)
     assert fit.is_worth_undoing and abs(fit.bend / BEND - 1) < 0.05  # measured: .973
     assert abs(fit.focal / CAMERA.fx - 1) < 0.02 and fit.saved > 0.7
     assert abs(fit.radial[0] - K1) < 0.02 and abs(fit.radial[1] - K2) < 0.02
+
+
+def test_an_unknown_lens_that_bends_lines_asks_for_straightened_images():
+    with pytest.raises(BentLens, match=r"by -12%: the run begins anew .* k1 = -0\.297") as bent:
+        check_lens(bent_graph(), is_unknown=True)
+    assert bent.value.lens == fit_lens(bent_graph())
+
+
+def test_a_focal_length_that_was_found_tells_the_lens_too():
+    graph = bent_graph(noise=0.05)
+    assert fit_lens(graph).is_bent and not fit_lens(graph).is_told
+    graph.focal_is_free = True
+    assert fit_lens(graph).is_told
+
+
+def test_flow_that_fits_no_lens_does_not_fold_the_image():
+    fit = fit_lens(bent_graph(noise=4.0))
+    assert fit.saved >= 0 and fit.bend > -0.7 and not fit.is_told
+    corner = torch.tensor([[0.9], [0.7]])
+    assert ray_seen(corner, (-3.0, 0.0)).isfinite().all() and bend_of(CAMERA, (-9.0, 0.0)) <= -0.5
+    assert bends(CAMERA, corner, (-1 / (3 * 1.3), 0.0)).isfinite().all()
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.25])  # of the focal length that is believed
@@ -102,12 +135,13 @@ def test_a_pinhole_is_none(factor: float):
 
 
 @pytest.mark.parametrize("is_told", [True, False])
-def test_both_thresholds_count_and_only_a_lens_that_is_told_is_undone(is_told: bool):
+def test_a_lens_is_undone_if_it_is_told_and_saves_much(is_told: bool):
     def lens(bend: float, saved: float) -> LensFit:
         return LensFit(300.0, (bend, 0.0), bend, saved, is_told)
 
-    for bent in lens(-0.05, 0.04), lens(0.05, 0.04):
-        assert bent.is_bent and bent.is_worth_undoing == is_told
+    for saved in (0.04, 0.12):
+        for bent in lens(-0.05, saved), lens(0.05, saved):
+            assert bent.is_bent and bent.is_worth_undoing == (is_told and saved > 0.1)
     for straight in lens(-0.05, 0.02), lens(0.03, 0.2):
         assert not straight.is_bent and not straight.is_worth_undoing
 
