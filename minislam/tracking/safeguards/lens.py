@@ -42,6 +42,7 @@ INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # RESULTS.md, "A lens that nobody told of". [-]
 WORTH_SAYING, WORTH_SAVING, WORTH_UNDOING = 0.04, 0.03, 0.1
+MOST_BEND = 0.4  # what moves a corner farther is no lens but a failed fit [-]
 
 Radial = tuple[float, float]  # k1, k2
 
@@ -64,7 +65,8 @@ class LensFit:
     @property
     def is_worth_undoing(self) -> bool:
         """Tell whether the images should be straightened: the lens is told, and saves much."""
-        return self.is_bent and self.is_told and self.saved > WORTH_UNDOING
+        is_possible = self.is_bent and abs(self.bend) < MOST_BEND
+        return is_possible and self.is_told and self.saved > WORTH_UNDOING
 
 
 class BentLens(MinislamError):
