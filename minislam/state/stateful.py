@@ -89,8 +89,6 @@ def from_tree(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
         return frame_of(tree)
     if kind is np.ndarray:
         return np.asarray(tree)  # a pipe to another process carries tensors
-    if hasattr(kind, "from_state"):
-        return kind.from_state(tree, frame_of)
     if isinstance(kind, type) and is_dataclass(kind):
         hints = _hints(kind)
         return kind(**{name: from_tree(hints[name], tree[name], frame_of) for name in hints})
