@@ -74,11 +74,11 @@ class SimulatedDepth:
         return total
 
 
+@dataclass(frozen=True)
 class SensorDepth:
     """Depth of an RGB-D camera, as the sequence's own reader returns it."""
 
-    def __init__(self, reader: DepthReader) -> None:
-        self.reader = reader
+    reader: DepthReader
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return the sensor's depth of a frame, or None where it has none."""
@@ -91,7 +91,6 @@ class NoDepth:
 
     def __call__(self, frame: Frame, camera: Camera) -> None:
         """Return None."""
-        return None
 
 
 def _smooth_noise(width: int, height: int, source: np.random.Generator) -> np.ndarray:  # (H, W)

@@ -83,13 +83,9 @@ class ClassicalFlow(Stateful):
         both = ({e: starts[e] for e in ((i, j), (j, i)) if e in starts} for i, j in pairs)
         for measured in _THREADS.map(self._measure, both):
             self._measured |= measured
-        found = [self._measured[edge] for edge in edges]
-        return as_matches(
-            [edge.targets for edge in found],
-            [edge.confidence for edge in found],
-            [self._textures[source] for source in edges_source],
-            predicted_targets,
-        )
+        _, targets, confidences = zip(*(self._measured[edge] for edge in edges), strict=True)
+        textures = [self._textures[source] for source in edges_source]
+        return as_matches(targets, confidences, textures, predicted_targets)
 
     def disparity_damping(self, keyframes: int) -> None:
         """Return None; see FlowEstimator."""

@@ -3,6 +3,7 @@
 The confidence is forward-backward agreement times texture times similarity.
 """
 
+from collections.abc import Sequence as Series
 from dataclasses import dataclass
 
 import cv2
@@ -153,9 +154,9 @@ def similarity(windows: Windows) -> np.ndarray:
 
 
 def as_matches(
-    targets: list[np.ndarray],  # per edge (h, w, 2) px
-    confidences: list[np.ndarray],  # per edge (h, w)
-    textures: list[np.ndarray],  # per edge (h, w), the most its confidence could be
+    targets: Series[np.ndarray],  # per edge (h, w, 2) px
+    confidences: Series[np.ndarray],  # per edge (h, w)
+    textures: Series[np.ndarray],  # per edge (h, w), the most its confidence could be
     like: Tensor,  # of the dtype and on the device wanted
 ) -> FlowMatches:
     """Stack the measurements of E edges; compute the matched ratio of each edge."""
