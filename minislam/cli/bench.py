@@ -105,9 +105,8 @@ def _run(path: Path, folder: Path, options: list[str]) -> tuple[int, str]:
 
 def _wait_for(arguments: list[str]) -> int:
     """Run minislam in a process of its own; a signal reaches it through us alone, and ends it."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "minislam", *arguments], start_new_session=True
-    )
+    command = [sys.executable, "-m", "minislam", *arguments]
+    process = subprocess.Popen(command, start_new_session=True)
     caught: list[int] = []
 
     def forward(number: int, *_: object) -> None:
