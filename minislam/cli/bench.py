@@ -1,7 +1,6 @@
 """The sub-command `minislam bench`: run benchmarks, and set their errors beside the paper's.
 
-Each sequence is a `minislam run` in a process of its own: the memory or the crash of one does not
-touch the next.
+Each sequence is a `minislam run` in its own process: memory and crash of one stay with it.
 """
 
 import argparse

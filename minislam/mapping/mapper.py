@@ -62,10 +62,8 @@ class Mapper(JointOptimisation):
         self.keyframes.append(keyframe)
         new = len(self.keyframes) - 1
         poses = torch.stack([k.T_camera_world for k in self.keyframes])
-        seen = {
-            position: self.render(poses[position], self._online_camera).weight_sums > VISIBLE
-            for position in [new, *self.window]
-        }
+        camera, among = self._online_camera, [new, *self.window]
+        seen = {k: self.render(poses[k], camera).weight_sums > VISIBLE for k in among}
         self.window = update_window(self.window, new, seen, poses, self.config.window_size)
         self._remove_dynamic_gaussians(self.window)
         self._insert(new)

@@ -1,7 +1,4 @@
-"""Metric depth of single images without a network: simulated, from a sensor, none.
-
-Each is a `DepthPrior`, as interfaces.py describes it.
-"""
+"""Metric depth of single images without a network, each a `DepthPrior`: simulated, sensor, none."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -69,8 +66,7 @@ class SimulatedDepth:
             sign = source.choice([-1.0, 1.0])
             distance = np.hypot(u - centre_u, v - centre_v) / radius
             # Flat inside, falling to zero over the last third: networks err by whole objects.
-            profile = np.clip(3 * (1 - distance), 0, 1)
-            total += np.log1p(sign * _GROSS_ERROR) * profile
+            total += np.log1p(sign * _GROSS_ERROR) * np.clip(3 * (1 - distance), 0, 1)
         return total
 
 

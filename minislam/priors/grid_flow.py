@@ -160,9 +160,8 @@ def as_matches(
     like: Tensor,  # of the dtype and on the device wanted
 ) -> FlowMatches:
     """Stack the measurements of E edges; compute the matched ratio of each edge."""
-    matched, confidence, texture = (
-        torch.from_numpy(np.stack(grids)).to(like) for grids in (targets, confidences, textures)
-    )
+    grids = targets, confidences, textures
+    matched, confidence, texture = (torch.from_numpy(np.stack(g)).to(like) for g in grids)
     matched, possible = matched.flatten(1, 2).mT.contiguous(), texture.sum((1, 2))
     ratios = confidence.sum((1, 2)) / possible.clamp_min(1e-6)
     return FlowMatches(matched, confidence.flatten(1)[:, None].expand(-1, 2, -1), ratios)

@@ -20,9 +20,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 
 # What trainers put the weights into: an entry of the file, or the first part of every name.
-_WRAPPERS = (
-    "model_state_dict", "state_dict", "model", "module", "_orig_mod", "teacher", "net", "model_ema"
-)  # fmt: skip
+_WRAPPERS = "model_state_dict state_dict model module _orig_mod teacher net model_ema".split()
 
 
 class Weights:

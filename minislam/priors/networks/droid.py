@@ -123,8 +123,7 @@ class DroidFlow(Stateful):
         self._edges = dict(list(used_last.items())[-kept:])
         for source in dict.fromkeys(edges_source):
             hidden = torch.stack([states[edge][0] for edge in edges if edge[0] == source])
-            eta = self.damping(hidden).flatten().to(predicted_targets)
-            self._dampings[source] = _DAMPING * eta
+            self._dampings[source] = _DAMPING * self.damping(hidden).flatten().to(predicted_targets)
         targets = torch.stack([states[edge][1] for edge in edges])
         return as_matches(targets, torch.cat(confidences), predicted_targets)
 

@@ -114,11 +114,8 @@ def update(
     return hidden.float(), expected + revision, confidence.float()
 
 
-def damping(
-    weights: Weights,
-    hidden: Tensor,  # (E, 128, h, w) of the edges of one source
-) -> Tensor:  # (h, w)
-    """Return eta, by which a bundle adjustment should damp the disparities of that source."""
+def damping(weights: Weights, hidden: Tensor) -> Tensor:  # (E, 128, h, w) -> (h, w)
+    """Return eta from the edges of one source: how a bundle adjustment damps its disparities."""
     part = weights.below("update.agg.")
     with weights.autocast():
         seen = part.conv("conv1", hidden).relu().mean(0, keepdim=True)

@@ -79,11 +79,8 @@ class Metric3DDepth:
         padded, inside, scale = fit(image.to(self.device), self.network_size)
         return self.network(padded)[0][inside], scale
 
-    def network(
-        self,
-        image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 28
-    ) -> Tensor:  # (B, H, W) metre
-        """Return the depth for the canonical camera."""
+    def network(self, image: Tensor) -> Tensor:  # (B, 3, 28 h, 28 w) -> (B, 28 h, 28 w) metre
+        """Return the depth for the canonical camera, of a normalised image."""
         fine, middle, coarse, coarsest = self.maps(image)
         # The fusion of the official code rectifies its inputs in place: the skip of each unit, and
         # the middle and coarse maps that the refinement sees. The published weights rely on it.
