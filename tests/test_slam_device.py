@@ -73,7 +73,7 @@ ROOMS_BORDERS = {
     "tracking/pose_from_flow.py",
     "tracking/safeguards/motion_memory.py", "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py", "tracking/safeguards/rolling_shutter.py",
-    "mapping/view_gradients.py", "mapping/safeguards.py", "stereo/second_adjustment.py",
+    "mapping/views.py", "mapping/safeguards.py", "stereo/second_adjustment.py",
     "stereo/dense_structure.py", "stereo/exposure.py", "slam.py", "splatting/gaussians.py",
     "splatting/tiles.py",  # how long the lists are
 }  # fmt: skip

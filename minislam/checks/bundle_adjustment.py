@@ -9,16 +9,11 @@ from torch import Tensor
 from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse
+from minislam.tracking import reprojection
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 from minislam.tracking.disparity_prior import DepthView, depth_consistency
 from minislam.tracking.grid import Grid
 from minislam.tracking.reference import dense_normal_equations, moved
-from minislam.tracking.reprojection import (
-    relative_transforms,
-    reproject,
-    reproject_with_jacobians,
-    scaled_points,
-)
 from minislam.tracking.safeguards.robust import RobustKernel
 
 
@@ -29,13 +24,14 @@ def check_target_jacobian(student: Function) -> Verdict:
     def reference(*view: Any, slide: Any = 1, turn: Any = 1) -> Tensor:
         points, disparities, camera = view
         # A camera that stands still sees each cell where its ray points: X = ray of the cell.
-        still, ratio = torch.eye(4, dtype=points.dtype)[None], disparities / points[:, 2]
-        seen = reproject_with_jacobians(still, ratio[None], points / points[:, 2:], camera)
+        still, depth = torch.eye(4, dtype=points.dtype)[None], points[:, 2:]
+        ratio = (disparities / depth[:, 0])[None]
+        seen = reprojection.reproject_with_jacobians(still, ratio, points / depth, camera)
         J = seen.J_target[0].permute(2, 1, 0)
         return torch.cat([slide * J[..., :3], turn * J[..., 3:]], -1)
 
     def case(disparities: Tensor, description: str, seed: int = 0) -> Case:
-        points = scaled_points(any_pose(seed)[None], disparities[None], rays)[0].T
+        points = reprojection.scaled_points(any_pose(seed)[None], disparities[None], rays)[0].T
         return Case((points, disparities, CAMERA), description)
 
     cases = [
@@ -126,10 +122,10 @@ def check_bundle_adjustment(student: Function) -> Verdict:
     def case(steps: int, held: int, weights: Tensor, description: str, seed: int = 1) -> Case:
         xi, start, noise, scatter = normals(seed, 4, 3, len(rays)).clamp(-2, 2)
         truth = BundleState(se3_exp(0.1 * xi[:, :6]), 0.5 + 0.1 * scatter.abs())
-        motion = relative_transforms(truth.T_camera_world, source, target)
-        flow = reproject(motion, truth.disparities[source], rays, CAMERA)[0] + noise[:2, :]
+        motion = reprojection.relative_transforms(truth.T_camera_world, source, target)
+        flow, _ = reprojection.reproject(motion, truth.disparities[source], rays, CAMERA)
         none, number = torch.zeros_like(scatter), torch.arange(3)
-        edges, free = (source, target, flow, weights), (number >= held, number >= 0)
+        edges, free = (source, target, flow + noise[:2], weights), (number >= held, number >= 0)
         problem = BundleProblem(CAMERA, rays, *edges, none, none, *free)
         nudged = se3_exp(0.02 * start[:, :6]) @ truth.T_camera_world
         return Case((problem, BundleState(nudged, none + 0.5), steps, 10.0), description)
@@ -226,6 +222,7 @@ def check_prior_mask(student: Function) -> Verdict:
         case(1, 0.7, "a single other view"),
         *drawn(lambda seed: case(3, 0.8, "three drawn views", seed)),
     ]
+    unknown = "Without a depth, M stays 1."
     back = "T_this_other takes points of the other view to this one, not back."
     known = "A depth of 0 is unknown in the other views, too."
     relative = "Divide the difference by the other's depth."
@@ -234,10 +231,7 @@ def check_prior_mask(student: Function) -> Verdict:
         (lambda *a: 1 - reference(*a), "M is 1 where the prior counts, 0 where views contradict."),
         (lambda d, o, *a: reference(d, [(x, se3_inverse(T)) for x, T in o], *a), back),
         (lambda *a: reference(*a, agree=1), "Two views must agree, not one."),
-        (
-            lambda d, *a: reference(d, *a) * (d > 0)[::stride, ::stride],
-            "Without a depth, M stays 1.",
-        ),
+        (lambda d, *a: reference(d, *a) * (d > 0)[::stride, ::stride], unknown),
         # Where all depths are near 3 m, an absolute error is a third of it, relatively.
         (lambda *a: reference(*a[:2], a[-1] / 3), relative),
         # An error relative to the own depth, where that is the larger of the two.

@@ -86,9 +86,8 @@ def check_warped_photo(student: Function) -> Verdict:
         seen &= (points[..., 2] > 0) | (flaw in ("behind", "unmasked"))
         pixels = 2 * pixels.floor() + 1 - pixels if flaw == "turned" else pixels
         position = (2 * (pixels.round() if flaw == "rounded" else pixels) / last - 1)[None]
-        sampled = functional.grid_sample(
-            photo.permute(2, 0, 1)[None], position.to(photo), "bilinear", "border", True
-        )
+        planes, position = photo.permute(2, 0, 1)[None], position.to(photo)
+        sampled = functional.grid_sample(planes, position, "bilinear", "border", True)
         return torch.where(seen[..., None], sampled[0].permute(1, 2, 0), 0)
 
     def case(pose: Tensor, description: str) -> Case:

@@ -52,8 +52,7 @@ def check_function(
 ) -> Verdict:
     """Compare a student's function with the reference on all cases, up to the first difference.
 
-    MINISLAM_STRICT=1 raises WrongAnswer where the answer has not passed, so that nbmake and
-    nbgrader see it.
+    MINISLAM_STRICT=1 raises WrongAnswer where it has not passed, so that nbmake and nbgrader see.
     """
     seconds = SECONDS
     for case in cases:

@@ -257,14 +257,13 @@ def check_followed_pose(student: Function) -> Verdict:
         return next(pose for case, pose in pairs if case.arguments[2] is a[2])
 
     def pixels_of(follow: Function, *a: Any) -> Any:
-        pose = follow(*a)
-        if pose is None:
+        answer = follow(*a)
+        if answer is None:
             return None
-        if torch.as_tensor(pose).shape != (4, 4):
-            raise ValueError(
-                f"a pose (4, 4) is asked for, found {tuple(torch.as_tensor(pose).shape)}"
-            )
-        points = transform_points(torch.as_tensor(pose).double(), a[0].means.double())
+        pose = torch.as_tensor(answer)
+        if pose.shape != (4, 4):
+            raise ValueError(f"a pose (4, 4) is asked for, found {tuple(pose.shape)}")
+        points = transform_points(pose.double(), a[0].means.double())
         return (camera.project(points),)
 
     def motion(*a: Any) -> Tensor:
@@ -293,5 +292,4 @@ def check_followed_pose(student: Function) -> Verdict:
     mistakes = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
     cases = [case for case, _ in pairs]
     answered, right = partial(pixels_of, student), partial(pixels_of, true_pose)
-    returns = ("the Gaussians' pixels",)
-    return check_function(answered, right, cases, 0.02, mistakes, returns)
+    return check_function(answered, right, cases, 0.02, mistakes, ("the Gaussians' pixels",))

@@ -12,12 +12,10 @@ from minislam.checks.grading import Function, Verdict, check_function
 def check_gains(student: Function) -> Verdict:
     """Check (first (N, 3), second (N, 3)): colours of points -> gain (3,) of each channel."""
 
-    def ratios(first: Tensor, second: Tensor, low: float, high: float) -> Tensor:
-        both = (torch.minimum(first, second) > low) & (torch.maximum(first, second) < high)
-        return torch.where(both, second / first, torch.nan)
-
-    def reference(first: Tensor, second: Tensor, low: float = 0.05, high: float = 0.95) -> Tensor:
-        return ratios(first, second, low, high).nanquantile(0.5, dim=0)
+    def reference(*a: Tensor, low: float = 0.05, high: float = 0.95, lower: bool = False) -> Tensor:
+        both = (torch.minimum(*a) > low) & (torch.maximum(*a) < high)
+        ratios = torch.where(both, a[1] / a[0], torch.nan)
+        return ratios.nanquantile(0.5, dim=0, interpolation="lower" if lower else "linear")
 
     def case(seed: int, gain: float, what: str) -> Case:
         first, noise = normals(seed, 2, 23, 3).sigmoid()
@@ -34,13 +32,10 @@ def check_gains(student: Function) -> Verdict:
         *drawn(lambda seed: case(seed + 9, 1.1, "drawn colours")),
     ]
     mistakes = [
-        (lambda a, b: reference(a, b, -1.0, 2.0), "Saturated or dark values are no proportion."),
-        (lambda a, b: reference(a, b, -1.0), "Values below 0.05 are nearly all noise."),
-        (
-            lambda a, b: ratios(a, b, 0.05, 0.95).nanmedian(0).values,
-            "torch.median takes the lower of two.",
-        ),
-        (lambda a, b: reference(a, b, high=2.0), "Values above 0.95 are cut off."),
+        (lambda *a: reference(*a, low=-1, high=2), "Saturated or dark values are no proportion."),
+        (lambda *a: reference(*a, low=-1), "Values below 0.05 are nearly all noise."),
+        (lambda *a: reference(*a, lower=True), "torch.median takes the lower of two."),
+        (lambda *a: reference(*a, high=2.0), "Values above 0.95 are cut off."),
         (lambda a, b: reference(b, a), "This is the gain from the second frame to the first."),
         (lambda a, b: (b / a).mean(0), "A mean follows what moves: take the median."),
         (lambda a, b: reference(a, b).mean().expand(3), "Each channel has a gain of its own."),

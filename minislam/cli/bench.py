@@ -1,7 +1,6 @@
 """The sub-command `minislam bench`: run benchmarks, and set their errors beside the paper's.
 
-Each sequence is a `minislam run` in a process of its own: the memory or the crash of one does not
-touch the next.
+Each sequence is a `minislam run` in its own process: memory and crash of one stay with it.
 """
 
 import argparse
@@ -105,9 +104,8 @@ def _run(path: Path, folder: Path, options: list[str]) -> tuple[int, str]:
 
 def _wait_for(arguments: list[str]) -> int:
     """Run minislam in a process of its own; a signal reaches it through us alone, and ends it."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "minislam", *arguments], start_new_session=True
-    )
+    command = [sys.executable, "-m", "minislam", *arguments]
+    process = subprocess.Popen(command, start_new_session=True)
     caught: list[int] = []
 
     def forward(number: int, *_: object) -> None:

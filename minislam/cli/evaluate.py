@@ -87,8 +87,7 @@ def run_eval(args: argparse.Namespace) -> None:
     if plot:
         from minislam.viz import figure_png, trajectory_plot
 
-        figure = trajectory_plot(result.estimate, result.truth, unit="m")
-        atomic_write(plot, figure_png(figure))
+        atomic_write(plot, figure_png(trajectory_plot(result.estimate, result.truth, unit="m")))
 
 
 def _alignment(args: argparse.Namespace) -> Alignment:

@@ -7,7 +7,6 @@ from minislam.cli.progress import ProgressLine, say
 from minislam.data.files import atomic_write, require_free, require_new
 from minislam.errors import InputError
 
-SH_MAP = "map_sh.ply"  # in the run folder
 EPILOG = """\
 The world has the axes of the first camera, so y points down; the unit of length is printed.
 Images and masks have the size of the source; masks are 255 where static, 0 where it moves.
@@ -49,7 +48,7 @@ def _export(args: argparse.Namespace) -> None:
         )
     for folder in filter(None, folders):
         require_free(folder, args.overwrite)
-    padded, own = (Path(args.folder) / name for name in (SH_MAP, "map.ply"))
+    padded, own = (Path(args.folder) / name for name in ("map_sh.ply", "map.ply"))
     require_new([args.points, args.sh_degree and padded], args.overwrite, [own])
     import minislam
     from minislam.data.ply import encode_ply

@@ -20,7 +20,6 @@ from minislam.errors import InputError
 
 SILENCE = 120.0  # seconds without a verdict after which an exercise is given up
 VERDICTS = "verdicts.txt"  # to which the judge appends a line before and after each exercise
-PASSED = "passed"
 COLUMNS = "file key check status points of seconds sentence".split()
 
 
@@ -90,7 +89,7 @@ def _graded(path: Path, seed: int | None, without_package: bool) -> dict[str, An
     rows = []
     for exercise in exercises:
         verdict = verdicts[exercise.key]
-        points = exercise.points if verdict["status"] == PASSED else 0
+        points = exercise.points if verdict["status"] == "passed" else 0
         about = {"check": exercise.check, "points": points, "of": exercise.points}
         rows.append({"key": exercise.key, **about, **verdict})  # in the columns' order
     points, of = sum(row["points"] for row in rows), sum(row["of"] for row in rows)

@@ -85,9 +85,8 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
 class ProgressLine:
     """One line per stage with its rate, and the time of the whole run if there is a plan.
 
-    Off a terminal it is a plain line every 10 %. The first signal that comes to `interrupt` is
-    deferred to the end of the current step, when the state is consistent. A second one ends the
-    program at once.
+    Off a terminal it is a plain line every 10 %. The first signal to `interrupt` waits for the end
+    of the step, when the state is consistent. A second one ends the program at once.
     """
 
     def __init__(self, is_quiet: bool = False, is_verbose: bool = False) -> None:

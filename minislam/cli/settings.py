@@ -8,8 +8,6 @@ import textwrap
 from minislam.cli.help import nearest
 from minislam.errors import InputError
 
-MAX_WIDTH = 100  # characters of a line
-
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
     """Add `settings` to the commands."""
@@ -36,7 +34,7 @@ def _settings(args: argparse.Namespace) -> None:
         raise InputError(
             f"expected part of a setting's name, found {args.pattern!r} in none; {hint}"
         )
-    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    width = min(shutil.get_terminal_size().columns, 100)
     for name in found:
         value, about = settings[name]
         least, most = about["least"], about["most"]

@@ -70,9 +70,7 @@ def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
                 stored = torch.from_numpy(arrays[name])
                 # Strides fix the order of summation and thereby the last bits of sums.
                 there = "cpu" if written_on == "cpu" else gpu
-                tensor = torch.empty_strided(
-                    stored.shape, strides, dtype=stored.dtype, device=there
-                )
+                tensor = stored.new_empty_strided(stored.shape, strides, device=there)
                 tensors[name] = tensor.copy_(stored).expand(shape)
             return tensors[name]
 

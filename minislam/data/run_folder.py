@@ -11,15 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from minislam.data import files
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
-from minislam.data.files import (
-    atomic_write,
-    make_folder,
-    read_bytes,
-    read_json,
-    require_free,
-    write_text,
-)
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
 from minislam.records import Trajectory
@@ -28,17 +21,16 @@ CONFIG, RUN, METRICS, CAMERA = "config.json", "run.json", "metrics.json", "camer
 TRAJECTORY, KEYFRAME_TRAJECTORY = "trajectory.txt", "keyframe_trajectory.txt"
 LOST_FRAMES, MAP, MLP, REPORT = "lost_frames.txt", "map.ply", "uncertainty_mlp.pt", "report.html"
 CHECKPOINT, VIEWER, CLIP, LOG = "checkpoint.npz", "viewer.html", "clip.webp", "log.txt"
-_KEYFRAME_KINDS = ("input", "render", "depth", "beta")
 
 _FILES = (
     CONFIG, RUN, METRICS, CAMERA, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MLP, REPORT,
     CHECKPOINT, VIEWER, CLIP, LOG, "map_sh.ply",
 )  # fmt: skip
 KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
-_PLOT_NAMES = ("ate_over_time", "trajectory", "losses", "gaussians", "health", "overview")
 _OURS = re.compile(  # every path that a run writes, inside its folder, also half-written
-    rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_({'|'.join(_KEYFRAME_KINDS)})\.png|"
-    rf"{PLOTS}/({'|'.join(_PLOT_NAMES)})\.png)(\.[0-9a-f]{{8}}\.tmp)?"
+    rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_(input|render|depth|beta)\.png|"
+    rf"{PLOTS}/(ate_over_time|trajectory|losses|gaussians|health|overview)\.png)"
+    r"(\.[0-9a-f]{8}\.tmp)?"
 )
 _CONFIG_PARTS = {"sequence", "input", "priors", "tracking", "mapping"}  # of every config.json
 
@@ -84,28 +76,28 @@ class RunFolder:
         With `overwrite`, what an earlier run wrote is removed, and only that.
         """
         path = Path(path)
-        require_free(path, overwrite)
+        files.require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():
             file.unlink()
         for folder in (KEYFRAMES, PLOTS):
-            make_folder(path / folder)
+            files.make_folder(path / folder)
         return cls(path)
 
     def write_lost_frames(self, lost: list[tuple[int, float, str]]) -> None:
         """Write (frame_index, timestamp [s], reason); the index is -1 if there is no image."""
-        rows = [f"{index} {stamp:.6f} {reason}\n" for index, stamp, reason in lost]
-        write_text(self.path / LOST_FRAMES, "# frame_index timestamp reason\n" + "".join(rows))
+        rows = "".join(f"{index} {stamp:.6f} {reason}\n" for index, stamp, reason in lost)
+        files.write_text(self.path / LOST_FRAMES, f"# frame_index timestamp reason\n{rows}")
 
     def write_mlp(self, state: dict[str, Tensor]) -> None:
         """Write the weights of the uncertainty MLP."""
         buffer = io.BytesIO()
         torch.save({name: values.cpu() for name, values in state.items()}, buffer)
-        atomic_write(self.path / MLP, buffer.getvalue())
+        files.atomic_write(self.path / MLP, buffer.getvalue())
 
     def write_picture(self, name: str, png: bytes) -> None:
         """Write a plot, plots/NAME.png, or what a keyframe shows, keyframes/000123_KIND.png."""
         assert _OURS.fullmatch(name), name
-        atomic_write(self.path / name, png)
+        files.atomic_write(self.path / name, png)
 
     def write_checkpoint(self, tree: dict[str, Any]) -> None:
         """Write the state from which an interrupted run can continue."""
@@ -124,15 +116,15 @@ class RunFolder:
 
     def read_config(self) -> dict[str, Any]:
         """Return sequence, input, priors and settings."""
-        return read_json(self.path / CONFIG)
+        return files.read_json(self.path / CONFIG)
 
     def read_run(self) -> dict[str, Any]:
         """Return version, seed, command, timings and exit state."""
-        return read_json(self.path / RUN)
+        return files.read_json(self.path / RUN)
 
     def read_metrics(self) -> dict[str, Any]:
         """Return the errors against the ground truth."""
-        return read_json(self.path / METRICS)
+        return files.read_json(self.path / METRICS)
 
     def read_trajectory(self) -> Trajectory:
         """Return the poses of all tracked frames."""
@@ -140,7 +132,7 @@ class RunFolder:
 
     def read_mlp(self) -> dict[str, Tensor]:
         """Return the weights of the uncertainty MLP."""
-        content = io.BytesIO(read_bytes(self.path / MLP))
+        content = io.BytesIO(files.read_bytes(self.path / MLP))
         try:
             return torch.load(content, weights_only=True)
         except Exception as error:  # damaged bytes fail inside torch in many ways
@@ -155,7 +147,7 @@ def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:
     entries = [*path.iterdir(), *path.glob(f"{KEYFRAMES}/*"), *path.glob(f"{PLOTS}/*")]
     is_ours = {entry.name for entry in entries} <= {KEYFRAMES, PLOTS}
     with suppress(InputError, TypeError):
-        is_ours = is_ours or _CONFIG_PARTS <= set(read_json(path / CONFIG))
+        is_ours = is_ours or _CONFIG_PARTS <= set(files.read_json(path / CONFIG))
     wrong = [e for e in entries if e.is_symlink() and e.name in (*_FILES, KEYFRAMES, PLOTS)]
     wrong += [i for i in inputs if i.resolve().is_relative_to(path.resolve())]
     if wrong or not is_ours:
@@ -164,5 +156,5 @@ def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:
             f"images of this one, found {[*wrong, path][0]}; nothing was removed, choose another "
             "--output"
         )
-    files = [entry for entry in entries if entry.is_file() and not entry.is_symlink()]
-    return [file for file in files if _OURS.fullmatch(file.relative_to(path).as_posix())]
+    plain = [entry for entry in entries if entry.is_file() and not entry.is_symlink()]
+    return [file for file in plain if _OURS.fullmatch(file.relative_to(path).as_posix())]

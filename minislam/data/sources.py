@@ -17,7 +17,6 @@ from minislam.errors import InputError, MinislamError
 from minislam.records import Trajectory
 
 FILES = "files:"  # before the name of a folder
-_IMAGE_FOLDERS = ("images", "rgb")
 _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
@@ -189,7 +188,7 @@ class Recording:
 
 def read_image_folder(folder: Path) -> Recording:
     """Read a folder of images, in natural order; they may lie in `images/` or `rgb/`."""
-    candidates = [folder, *(folder / name for name in _IMAGE_FOLDERS)]
+    candidates = [folder, *(folder / name for name in ("images", "rgb"))]
     paths = next(filter(None, map(list_images, candidates)), [])
     if not paths:
         raise InputError(f"expected PNG or JPEG images in {folder}, found {_found(folder)}")

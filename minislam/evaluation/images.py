@@ -55,8 +55,7 @@ def depth_l1(
 ) -> float | None:  # units of the truth
     """Return the mean |scale D^ - D| over static pixels known to both; None if there is none.
 
-    The scale is that of the trajectory, not fitted to the depths: a map too large for its
-    trajectory is an error.
+    The scale is that of the trajectory, not of the depths: a map too large for it is an error.
     """
     depth, reference = np.asarray(depth, np.float64), np.asarray(reference, np.float64)
     hidden = np.zeros(depth.shape, bool) if moving is None else np.asarray(moving, bool)

@@ -43,9 +43,8 @@ class _Trunk:
     smallest_side: int  # px of an image whose coarsest map has one cell
 
 
-_ALEXNET = _Trunk(
-    "AlexNet", ((0,), (3,), (6,), (8,), (10,)), (64, 192, 384, 256, 256), 2, 3, 11, 4, 31
-)
+_ALEXNET_CONVS = (0,), (3,), (6,), (8,), (10,)
+_ALEXNET = _Trunk("AlexNet", _ALEXNET_CONVS, (64, 192, 384, 256, 256), 2, 3, 11, 4, 31)
 _VGG_CONVS = (0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)
 _VGG16 = _Trunk("VGG-16", _VGG_CONVS, (64, 128, 256, 512, 512), 4, 2, 3, 1, 16)
 

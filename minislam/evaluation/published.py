@@ -37,9 +37,7 @@ def compare(ours: dict[str, str]) -> dict[str, list[list[str]]]:
                 key = row["system"], row["input"]
                 systems.setdefault(key, dict.fromkeys(mine, "-"))[row["sequence"]] = row["ate_cm"]
         systems["minislam", "Monocular"] = mine
-        lines = [
-            [*key, *found.values(), _mean(list(found.values()))] for key, found in systems.items()
-        ]
+        lines = [[*key, *row.values(), _mean(list(row.values()))] for key, row in systems.items()]
         tables[dataset] = [["ATE [cm]", "input", *mine, "mean"], *lines]
     return tables
 

@@ -10,8 +10,6 @@ from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 
-DEFAULT_MAX_DIFFERENCE = 0.01  # second between two poses that belong together (evo's default)
-
 
 class Alignment(Enum):
     """What is fitted before the comparison. A monocular estimate needs a scale, so Sim(3)."""
@@ -37,7 +35,7 @@ def absolute_trajectory_error(
     estimate: Trajectory,
     truth: Trajectory,
     alignment: Alignment = Alignment.SIM3,
-    max_difference: float = DEFAULT_MAX_DIFFERENCE,  # second
+    max_difference: float = 0.01,  # second between two poses of a pair, evo's default
 ) -> TrajectoryError:
     """Return the distances between estimated and true camera centres (ATE)."""
     estimate, truth = paired(estimate, truth, max_difference)
@@ -64,11 +62,9 @@ def relative_pose_error(
             "choose a step between"
         )
     first = np.arange(0, len(truth) - step, step)
-    true_motion, motion = (
-        np.linalg.inv(poses[first]) @ poses[first + step]
-        for poses in (truth.T_world_camera, estimate.T_world_camera)
-    )
-    error = np.linalg.inv(true_motion) @ motion
+    true, found = truth.T_world_camera, estimate.T_world_camera
+    true_motion = np.linalg.inv(true[first]) @ true[first + step]
+    error = np.linalg.inv(true_motion) @ (np.linalg.inv(found[first]) @ found[first + step])
     angles = Rotation.from_matrix(error[:, :3, :3]).magnitude()
     return np.linalg.norm(error[:, :3, 3], axis=1), angles
 

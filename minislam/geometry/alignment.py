@@ -37,8 +37,7 @@ def umeyama(
 ) -> Similarity:
     """Return the similarity with the least mean squared distance |target - S(source)|^2.
 
-    With the covariance Sigma = mean of (target - mean)(source - mean)^T = U D V^T, Umeyama's
-    equations (38) to (43) are
+    With Sigma = mean of (target - mean)(source - mean)^T = U D V^T, equations (38) to (43) are
 
         R = U S V^T,   c = trace(D S) / var(source),   t = mean(target) - c R mean(source),
 

@@ -28,9 +28,7 @@ def _rotation_coefficients(angle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     t = torch.where(small, torch.ones_like(angle), angle)
     t2 = torch.where(small, angle, torch.zeros_like(angle)) ** 2
     a = torch.where(small, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), t.sin() / t)
-    b = torch.where(
-        small, 0.5 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56))), (1 - t.cos()) / t**2
-    )
+    b = torch.where(small, (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56))) / 2, (1 - t.cos()) / t**2)
     c = torch.where(small, (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72))) / 6, (t - t.sin()) / t**3)
     return a, b, c
 

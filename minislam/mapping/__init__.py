@@ -4,7 +4,7 @@ Read the files in this order:
 
     mapper             when the map gets and loses Gaussians, and when it is optimised
     optimisation       one step of the map on L_render, and of the MLP on L_uncer
-    view_gradients     what one keyframe adds to a step; worker processes compute it
+    views              keyframes at several sizes; what one adds to a step, in any process
     losses             L_render, Eq. (6), and L_color, Eq. (7)
     insertion          where a keyframe adds Gaussians, and which lie on dynamic objects
     window             the local window of keyframes, and which keyframe each iteration renders
@@ -12,13 +12,8 @@ Read the files in this order:
     pose_refinement    the poses between the keyframes, by re-rendering
     density            clone, split and prune
     safeguards         ours: what other views, and all betas of a clip, know of dynamic things
-    views, config      keyframes at several image sizes; the settings
+    config             the settings
 """
 
-from minislam.mapping.config import (
-    DensityConfig,
-    InsertionConfig,
-    MappingConfig,
-    PoseRefinementConfig,
-)
+from minislam.mapping.config import InsertionConfig, MappingConfig
 from minislam.mapping.mapper import Mapper

@@ -37,8 +37,8 @@ def densify(
     median_depth: float,  # world units, of the scene
     config: DensityConfig,
     generator: torch.Generator,
-) -> int:
-    """Clone small and split large Gaussians of large screen gradient; return the rows added.
+) -> None:
+    """Clone small and split large Gaussians of large screen gradient.
 
     A clone starts as a copy, and later gradients move the two apart. A split replaces the parent
     by two children at random places inside it. Both keep the anchor keyframe.
@@ -46,7 +46,7 @@ def densify(
     gaussians = optimizer.gaussians.detach()
     capacity = config.max_gaussians - len(gaussians)
     if capacity <= 0:
-        return 0
+        return
     lengths, views = gradients
     means = lengths / views.clamp_min(1)
     chosen = means > config.gradient
@@ -60,7 +60,6 @@ def densify(
     optimizer.append(clones.concatenate(children))
     added = torch.ones(len(clones) + len(children), dtype=torch.bool, device=chosen.device)
     optimizer.prune(torch.cat([~(chosen & large), added]))
-    return len(clones) + len(children) - len(parents)
 
 
 def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:

@@ -30,10 +30,8 @@ def gaussians_of_keyframe(
     allowed = insertable_pixels(keyframe.depth, FAR_FACTOR * median_depth, weight, rendering)
     pixels = draw_pixels(keyframe.depth > 0, config.cell, generator)
     pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
-    return gaussians_at_pixels(
-        pixels, keyframe.levelled, keyframe.depth, camera,
-        keyframe.T_camera_world, position, config,
-    )  # fmt: skip
+    view = keyframe.levelled, keyframe.depth, camera, keyframe.T_camera_world
+    return gaussians_at_pixels(pixels, *view, position, config)
 
 
 def insertable_pixels(
@@ -68,9 +66,8 @@ def draw_pixels(
     height, width = known.shape
     priority = torch.rand(height, width, generator=generator).to(known.device)
     priority = torch.where(known, priority, -1)
-    highest, where = functional.max_pool2d(
-        priority[None], cell, ceil_mode=True, return_indices=True
-    )
+    square = cell, cell
+    highest, where = functional.max_pool2d_with_indices(priority[None], square, ceil_mode=True)
     drawn = where[highest >= 0]
     return torch.stack([drawn % width, drawn // width], -1)
 

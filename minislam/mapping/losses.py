@@ -55,9 +55,8 @@ class _SsimLoss(torch.autograd.Function):
     def backward(ctx, v_loss: Tensor) -> tuple[Tensor, None]:  # (H, W) -> (H, W, 3)
         x, y, slopes = ctx.saved_tensors
         # The window is symmetric: a blur is its own transpose.
-        v_mean_x, v_mean_xx, v_mean_xy = gaussian_blur(
-            slopes * (v_loss / -len(x)), SSIM_WINDOW, SSIM_SIGMA
-        )
+        v_means = slopes * (v_loss / -len(x))
+        v_mean_x, v_mean_xx, v_mean_xy = gaussian_blur(v_means, SSIM_WINDOW, SSIM_SIGMA)
         v_x = v_mean_x + 2 * x * v_mean_xx + y * v_mean_xy
         return v_x.permute(1, 2, 0), None
 

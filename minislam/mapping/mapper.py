@@ -11,19 +11,11 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
+from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
-from minislam.mapping.safeguards import (
-    FIRST_VIEWS,
-    LEAST_STATIC,
-    LEAST_VIEWS,
-    OPAQUE,
-    blending_weights,
-    least_weight,
-    shown_fraction,
-)
 from minislam.mapping.views import median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
@@ -50,7 +42,7 @@ class Mapper(JointOptimisation):
             self.background = torch.stack(means).mean(0)
         count = len(self.keyframes)
         if self.uncertainty.is_learnt:
-            self._weighted_from = FIRST_VIEWS * count
+            self._weighted_from = safeguards.FIRST_VIEWS * count
         for position in range(count):
             self._insert(position)
         self.window = list(range(count - 1, -1, -1))[: self.config.window_size]
@@ -70,18 +62,15 @@ class Mapper(JointOptimisation):
         self.keyframes.append(keyframe)
         new = len(self.keyframes) - 1
         poses = torch.stack([k.T_camera_world for k in self.keyframes])
-        seen = {
-            position: self.render(poses[position], self._online_camera).weight_sums > VISIBLE
-            for position in [new, *self.window]
-        }
+        camera, among = self._online_camera, [new, *self.window]
+        seen = {k: self.render(poses[k], camera).weight_sums > VISIBLE for k in among}
         self.window = update_window(self.window, new, seen, poses, self.config.window_size)
         self._remove_dynamic_gaussians(self.window)
         self._insert(new)
         if new % self.config.keyframe_stride != 0:
             return  # Fast mode: this keyframe waits for the next optimisation.
-        probabilities = sampling_probabilities(
-            len(self.keyframes), self.window, self.config.window_probability
-        )
+        share = self.config.window_probability
+        probabilities = sampling_probabilities(len(self.keyframes), self.window, share)
         self._optimise([self._online_camera] * self.config.keyframe_iterations, probabilities)
 
     def update_keyframes(self, T_camera_world: Tensor) -> None:
@@ -109,12 +98,12 @@ class Mapper(JointOptimisation):
         half = iterations // 2 // self.config.views_per_step * self.config.views_per_step
         if done <= half:
             self._optimise(*how, range(done, half))
-            if half >= LEAST_VIEWS * len(self.keyframes):
+            if half >= safeguards.LEAST_VIEWS * len(self.keyframes):
                 self._exclude_upper_mode()
         self._optimise(*how, range(max(done, half), iterations))
         if self.uncertainty.enabled:
             self._remove_unsupported()
-        self.shown = [*self._workers.stream(shown_fraction, self._small_views())]
+        self.shown = [*self._workers.stream(safeguards.shown_fraction, self._small_views())]
 
     def refine_poses(
         self,
@@ -151,16 +140,15 @@ class Mapper(JointOptimisation):
             keyframe = self.keyframes[position]
             anchored = (gaussians.anchor_keyframe == position).nonzero().squeeze(-1)
             weight = self.static_weight(self.beta_of(keyframe), self._online_camera)
-            keep[anchored] = ~is_on_dynamic_object(
-                gaussians.means[anchored], self._online_camera, keyframe.T_camera_world, weight
-            )
+            view = self._online_camera, keyframe.T_camera_world, weight
+            keep[anchored] = ~is_on_dynamic_object(gaussians.means[anchored], *view)
         self._optimizer.prune(keep)
         self._reset_gradients()
 
     def _exclude_upper_mode(self) -> None:
         """Exclude the upper mode of all betas, if there is one; only confirmed images are asked."""
         betas = [self.beta_of(k).flatten() for k in self.keyframes if k.confirmation is not None]
-        least = least_weight(torch.cat(betas)) if betas else self.least_weight
+        least = safeguards.least_weight(torch.cat(betas)) if betas else self.least_weight
         if least > self.least_weight and self.uncertainty.enabled:
             self.least_weight = least
             self._replace_dynamic_gaussians()
@@ -173,11 +161,11 @@ class Mapper(JointOptimisation):
         those that no keyframe shows.
         """
         sums = self.gaussians.means.new_zeros(2, len(self.gaussians))
-        for of_view in self._workers.stream(blending_weights, self._small_views()):
+        for of_view in self._workers.stream(safeguards.blending_weights, self._small_views()):
             sums += of_view
         static, whole = sums
         if static.any():
-            self._optimizer.prune(static >= LEAST_STATIC * whole)
+            self._optimizer.prune(static >= safeguards.LEAST_STATIC * whole)
             self._reset_gradients()
 
     def _small_views(self) -> Iterator[tuple[GaussianMap, Camera, Tensor, Tensor]]:
@@ -196,5 +184,5 @@ class Mapper(JointOptimisation):
 
 def surface_depth(rendering: Rendering) -> Tensor:  # (H, W)
     """Return the depth of the visible surface [world units], 0 where the map is transparent."""
-    depth = rendering.depth / rendering.opacity.clamp_min(OPAQUE)
-    return torch.where(rendering.opacity > OPAQUE, depth, 0)
+    depth = rendering.depth / rendering.opacity.clamp_min(safeguards.OPAQUE)
+    return torch.where(rendering.opacity > safeguards.OPAQUE, depth, 0)

@@ -11,8 +11,7 @@ from minislam.mapping.config import MappingConfig
 from minislam.mapping.density import densify, useful_rows
 from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
-from minislam.mapping.view_gradients import ViewGradients, view_gradients
-from minislam.mapping.views import Comparison, view_of
+from minislam.mapping.views import Comparison, ViewGradients, view_gradients, view_of
 from minislam.mapping.window import in_turn
 from minislam.records import Keyframe, MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
@@ -129,8 +128,7 @@ class JointOptimisation(Stateful):
         for done in (range(total) if iterations is None else iterations)[::views]:
             count = min(views, total - done)
             if probabilities is None:
-                turns = range(done, done + count)
-                positions = in_turn(turns, len(self.keyframes), self.seed)
+                positions = in_turn(range(done, done + count), len(self.keyframes), self.seed)
             else:
                 repeats = int((probabilities > 0).sum()) < count  # else none twice
                 drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)

@@ -103,8 +103,7 @@ def curvature(
     x, y, _ = camera.rays(pixels.reshape(-1, 2)).unbind(-1)
     u, v = camera.twist_jacobian(x, y, 1 / depth.reshape(-1)).unbind(1)  # (6, H W) each
     uu, uv, vv = uu.reshape(-1), uv.reshape(-1), vv.reshape(-1)
-    hessian = u @ (uu * u + uv * v).T + v @ (uv * u + vv * v).T
-    return hessian.double()
+    return (u @ (uu * u + uv * v).T + v @ (uv * u + vv * v).T).double()
 
 
 def image_slope(image: Tensor) -> Tensor:  # (H, W, 3) -> (2, H, W, 3)

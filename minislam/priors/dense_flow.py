@@ -1,8 +1,7 @@
 """Dense optical flow (OpenCV's DIS), and how to warp by it, compose it and invert it.
 
-Dense inverse search (DIS) finds small displacements well and large ones badly. So the target image
-is first warped by the expected displacement, DIS finds the remainder, and the two are composed
-("warp-compose").
+Dense inverse search (DIS) finds small displacements well, large ones badly. So the target is first
+warped by the expected displacement, DIS finds the rest, and both are composed ("warp-compose").
 """
 
 import cv2

@@ -1,7 +1,4 @@
-"""Metric depth of single images without a network: simulated, from a sensor, none.
-
-Each is a `DepthPrior`, as interfaces.py describes it.
-"""
+"""Metric depth of single images without a network, each a `DepthPrior`: simulated, sensor, none."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -69,16 +66,15 @@ class SimulatedDepth:
             sign = source.choice([-1.0, 1.0])
             distance = np.hypot(u - centre_u, v - centre_v) / radius
             # Flat inside, falling to zero over the last third: networks err by whole objects.
-            profile = np.clip(3 * (1 - distance), 0, 1)
-            total += np.log1p(sign * _GROSS_ERROR) * profile
+            total += np.log1p(sign * _GROSS_ERROR) * np.clip(3 * (1 - distance), 0, 1)
         return total
 
 
+@dataclass(frozen=True)
 class SensorDepth:
     """Depth of an RGB-D camera, as the sequence's own reader returns it."""
 
-    def __init__(self, reader: DepthReader) -> None:
-        self.reader = reader
+    reader: DepthReader
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return the sensor's depth of a frame, or None where it has none."""
@@ -91,7 +87,6 @@ class NoDepth:
 
     def __call__(self, frame: Frame, camera: Camera) -> None:
         """Return None."""
-        return None
 
 
 def _smooth_noise(width: int, height: int, source: np.random.Generator) -> np.ndarray:  # (H, W)

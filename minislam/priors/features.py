@@ -1,8 +1,7 @@
 """Dense image features without a network, and any features on a finer grid.
 
 The uncertainty MLP must tell objects apart by their appearance. Statistics of colour and texture
-are enough for many scenes, but not for a grey person before a grey wall: there a pretrained
-network is needed.
+are enough for many scenes, but a grey person before a grey wall takes a pretrained network.
 """
 
 from dataclasses import replace
@@ -41,10 +40,7 @@ class ClassicalFeatures:
     stride = STRIDE
     dimension = len(WINDOWS) * (3 + 3 + ORIENTATION_BINS + 1)
 
-    def __call__(
-        self,
-        frame: Frame,
-    ) -> Tensor:  # (H // stride, W // stride, C) float32, each of length sqrt(C)
+    def __call__(self, frame: Frame) -> Tensor:  # (H // stride, W // stride, C), of length sqrt(C)
         """Return one vector per cell; the cosine of two is the similarity of their surroundings."""
         image = frame.image
         height, width = (side // STRIDE for side in image.shape[:2])

@@ -1,7 +1,6 @@
 """Features and depth made elsewhere: a folder with one file per frame.
 
-`minislam priors` writes such folders, and so may anything else: heavy networks then run once,
-where there is a GPU, and the SLAM runs anywhere.
+`minislam priors` (cli/priors.py) writes such folders, and so may anything else.
 """
 
 import re

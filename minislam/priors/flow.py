@@ -1,7 +1,4 @@
-"""Classical optical flow as a `FlowEstimator`: between pairs of keyframes, and in chains of frames.
-
-Every flow starts from an expected one: the prediction of the geometry, or the last frame's flow.
-"""
+"""Classical optical flow as a `FlowEstimator`: between pairs of keyframes, in chains of frames."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,13 +8,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from minislam.priors import grid_flow
 from minislam.priors.dense_flow import composed_flow, dense_from_grid, grayscale, reverse_flow
-from minislam.priors.grid_flow import (
-    ClassicalFlowConfig,
-    as_matches,
-    measure_on_grid,
-    texture_confidence,
-)
 from minislam.priors.interfaces import FlowMatches
 from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
 
@@ -42,11 +34,11 @@ class ClassicalFlow(Stateful):
 
     learned_confidence = False
 
-    def __init__(self, config: ClassicalFlowConfig | None = None) -> None:
+    def __init__(self, config: grid_flow.ClassicalFlowConfig | None = None) -> None:
         # DIS splits the image in one stripe per OpenCV thread and does not propagate matches
         # across them: with more than one, the result would depend on the machine.
         cv2.setNumThreads(1)
-        self.config = config or ClassicalFlowConfig()
+        self.config = config or grid_flow.ClassicalFlowConfig()
         self.stride = self.config.stride
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[int, np.ndarray] = {}
@@ -64,7 +56,7 @@ class ClassicalFlow(Stateful):
         """Register the image (H, W, 3) of a keyframe under its index."""
         gray = grayscale(image)
         self._images[keyframe_index] = gray
-        self._textures[keyframe_index] = texture_confidence(gray, self.stride)
+        self._textures[keyframe_index] = grid_flow.texture_confidence(gray, self.stride)
 
     def remove_frame(self, keyframe_index: int) -> None:
         """Forget a keyframe."""
@@ -83,13 +75,9 @@ class ClassicalFlow(Stateful):
         both = ({e: starts[e] for e in ((i, j), (j, i)) if e in starts} for i, j in pairs)
         for measured in _THREADS.map(self._measure, both):
             self._measured |= measured
-        found = [self._measured[edge] for edge in edges]
-        return as_matches(
-            [edge.targets for edge in found],
-            [edge.confidence for edge in found],
-            [self._textures[source] for source in edges_source],
-            predicted_targets,
-        )
+        _, targets, confidences = zip(*(self._measured[edge] for edge in edges), strict=True)
+        textures = [self._textures[source] for source in edges_source]
+        return grid_flow.as_matches(targets, confidences, textures, predicted_targets)
 
     def disparity_damping(self, keyframes: int) -> None:
         """Return None; see FlowEstimator."""
@@ -112,7 +100,8 @@ class ClassicalFlow(Stateful):
             images, backward = (self._images[i], self._images[j]), flows.get((j, i))
             if backward is None:
                 backward = reverse_flow(*images, flow)
-            matches = measure_on_grid(*images, flow, backward, self._textures[i], self.stride)
+            texture = self._textures[i]
+            matches = grid_flow.measure_on_grid(*images, flow, backward, texture, self.stride)
             # A copy: a view would keep the starts of all edges of this call.
             measured[i, j] = MeasuredEdge(starts[i, j].copy(), *matches)
         return measured
@@ -141,25 +130,25 @@ class FlowChain(Stateful):
     newest: np.ndarray  # (H, W) uint8
     flow: np.ndarray  # (H, W, 2) px, reference to newest
     increment: np.ndarray  # (H, W, 2) px, how much of it the last frame added
-    config: ClassicalFlowConfig
+    config: grid_flow.ClassicalFlowConfig
 
     def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
         gray, stride = grayscale(image), self.config.stride
-        texture = texture_confidence(self.reference, stride)
+        texture = grid_flow.texture_confidence(self.reference, stride)
 
         def follow(start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             images = self.reference, gray
             flow = composed_flow(*images, start)
             backward = reverse_flow(*images, flow)
-            return flow, *measure_on_grid(*images, flow, backward, texture, stride)
+            return flow, *grid_flow.measure_on_grid(*images, flow, backward, texture, stride)
 
         # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
         # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
         measured = _THREADS.map(follow, (self.flow, self.flow + self.increment))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self.reference, gray, flow, flow - self.flow, self.config)
-        return chain, as_matches([targets], [confidence], [texture], image)
+        return chain, grid_flow.as_matches([targets], [confidence], [texture], image)
 
     def restart(self) -> "FlowChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""

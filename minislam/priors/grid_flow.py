@@ -3,6 +3,7 @@
 The confidence is forward-backward agreement times texture times similarity.
 """
 
+from collections.abc import Sequence as Series
 from dataclasses import dataclass
 
 import cv2
@@ -153,15 +154,14 @@ def similarity(windows: Windows) -> np.ndarray:
 
 
 def as_matches(
-    targets: list[np.ndarray],  # per edge (h, w, 2) px
-    confidences: list[np.ndarray],  # per edge (h, w)
-    textures: list[np.ndarray],  # per edge (h, w), the most its confidence could be
+    targets: Series[np.ndarray],  # per edge (h, w, 2) px
+    confidences: Series[np.ndarray],  # per edge (h, w)
+    textures: Series[np.ndarray],  # per edge (h, w), the most its confidence could be
     like: Tensor,  # of the dtype and on the device wanted
 ) -> FlowMatches:
     """Stack the measurements of E edges; compute the matched ratio of each edge."""
-    matched, confidence, texture = (
-        torch.from_numpy(np.stack(grids)).to(like) for grids in (targets, confidences, textures)
-    )
+    grids = targets, confidences, textures
+    matched, confidence, texture = (torch.from_numpy(np.stack(g)).to(like) for g in grids)
     matched, possible = matched.flatten(1, 2).mT.contiguous(), texture.sum((1, 2))
     ratios = confidence.sum((1, 2)) / possible.clamp_min(1e-6)
     return FlowMatches(matched, confidence.flatten(1)[:, None].expand(-1, 2, -1), ratios)

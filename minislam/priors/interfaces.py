@@ -36,8 +36,7 @@ class FlowChain(Protocol):
 class FlowEstimator(Protocol):
     """Dense correspondence between keyframes, started from a prediction.
 
-    An estimator and its chains must also be `Stateful` (minislam/state), so that an interrupted
-    run can be resumed.
+    An estimator and its chains are also `Stateful` (minislam/state), for a run to be resumed.
     """
 
     stride: int  # px between neighbouring grid cells

@@ -50,8 +50,7 @@ class Workspace:
     def block(self, number: int, slots: int, tiles: int, tile_major: bool = False) -> Block:
         """Return buffer `number` as a block; `tile_major` is the order of its memory."""
         key = number, slots, tiles
-        # Kept for the next chunk, because cutting a block into slots takes as long as the
-        # arithmetic on two of them.
+        # Kept for the next chunk: cutting it into slots takes as long as the arithmetic on two.
         if key not in self._blocks:
             flat = self._buffers[number, : slots * tiles * PIXELS]
             if tile_major:

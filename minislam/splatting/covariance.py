@@ -1,18 +1,15 @@
 """The shape of a Gaussian: Sigma = R(q) diag(s)^2 R(q)^T (Sec. 3.1), written as Sigma = L L^T.
 
-The factor L = R(q) diag(s) is all that the renderer needs: it turns with the camera, it projects
-linearly, and it keeps Sigma positive semi-definite by construction. Arrays are component-first,
-see splatting/__init__.py.
+The factor L = R(q) diag(s) is all that the renderer needs: it turns with the camera, projects
+linearly, and keeps Sigma positive semi-definite. Arrays are component-first, see __init__.py.
 """
 
 import torch
 from torch import Tensor
 
 
-def rotations(
-    quats: Tensor,  # (4, N) w, x, y, z, any length; zero is the identity
-) -> Tensor:  # (3, 3, N)
-    """Return the rotation of each quaternion q / |q|.
+def rotations(quats: Tensor) -> Tensor:  # (4, N) w, x, y, z of any length -> (3, 3, N)
+    """Return the rotation of each quaternion q / |q|, the identity for zero.
 
     Slow twin: geometry.se3.rotation_from_quaternion.
     """

@@ -52,11 +52,9 @@ class GaussianMap:
         return {name: t for name, t in vars(self).items() if name != "anchor_keyframe"}
 
     @classmethod
-    def empty(
-        cls, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-    ) -> "GaussianMap":
+    def empty(cls, device: torch.device | str = "cpu") -> "GaussianMap":
         """Return a map of no Gaussians."""
-        tensors = [torch.zeros(0, *row, dtype=dtype, device=device) for row in ROWS]
+        tensors = [torch.zeros(0, *row, dtype=torch.float32, device=device) for row in ROWS]
         return cls(*[*tensors[:-1], tensors[-1].long()])
 
     def concatenate(self, other: "GaussianMap") -> "GaussianMap":

@@ -179,5 +179,4 @@ def _limited_tangents(points_camera: Tensor, camera: Camera) -> tuple[Tensor, Te
     """Return (x/z, y/z) (2, N), kept near the view, and where (2, N) they needed no limit."""
     tangents = points_camera[:2] / points_camera[2]
     lower, upper = (tangents.new_tensor(limit)[:, None] for limit in tangent_limits(camera))
-    inside = (tangents >= lower) & (tangents <= upper)
-    return torch.clamp(tangents, lower, upper), inside
+    return torch.clamp(tangents, lower, upper), (tangents >= lower) & (tangents <= upper)

@@ -2,8 +2,7 @@
 
 It evaluates every Gaussian at every pixel and is therefore slow. Read it first. The fast renderer
 is tested against its values and gradients. Where both compute the same thing, its functions have
-the names of their fast twins. Its arrays have one row per Gaussian, (N, 3), where the fast ones
-are component-first, (3, N).
+the names of their fast twins.
 """
 
 import torch
@@ -70,9 +69,8 @@ def project_gaussians(
     means2d = camera.project(points_camera)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[rows]
-    covariances2d = project_covariances(
-        covariances(gaussians)[rows], points_camera, T_camera_world, camera
-    )
+    of_rows = covariances(gaussians)[rows]
+    covariances2d = project_covariances(of_rows, points_camera, T_camera_world, camera)
     return rows, points_camera, means2d, covariances2d
 
 
@@ -82,8 +80,7 @@ def covariances(gaussians: GaussianMap) -> Tensor:  # (N, 3, 3) world units^2
     Fast twin: covariance.covariance_factors, the L of Sigma = L L^T.
     """
     rotations = rotation_from_quaternion(gaussians.quats_wxyz)
-    variances = gaussians.scales**2
-    return rotations @ torch.diag_embed(variances) @ rotations.transpose(-1, -2)
+    return rotations @ torch.diag_embed(gaussians.scales**2) @ rotations.transpose(-1, -2)
 
 
 def project_covariances(

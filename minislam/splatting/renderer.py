@@ -77,11 +77,9 @@ class _Render(torch.autograd.Function):
         weight_sums = means.new_zeros(len(means))
         weight_sums[visible.rows] = image.weight_sums
         color = image.channels[:3].permute(1, 2, 0).contiguous()
-        outputs = color, image.channels[3].clone(), image.opacity, weight_sums
-        tiles = image.groups, image.workspace
-        ctx.state = visible, tiles, T, background, camera, len(means), twist
+        ctx.state = visible, image.groups, image.workspace, T, background, camera, len(means), twist
         ctx.mark_non_differentiable(weight_sums)
-        return outputs
+        return color, image.channels[3].clone(), image.opacity, weight_sums
 
     @staticmethod
     @once_differentiable
@@ -92,7 +90,7 @@ class _Render(torch.autograd.Function):
         v_opacity: Tensor,  # (H, W)
         _v_weight_sums: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        visible, (groups, workspace), T, background, camera, count, twist = ctx.state
+        visible, groups, workspace, T, background, camera, count, twist = ctx.state
         needs = ctx.needs_input_grad  # in the order of the inputs of `forward`
         v_image = torch.cat([v_color.permute(2, 0, 1), v_depth[None]])
         with _denormals_flushed():

@@ -77,8 +77,7 @@ def composite_image(
         kept = tiles, gaussians, chunks, offsets, coefficients, group_channels, out.checkpoints
         groups.append(CompositedGroup(*kept))
     opacity = from_tiles(opacities, camera)[0].clone()
-    image = from_tiles(canvas, camera)
-    return CompositedImage(image, opacity, weight_sums[:-1], groups, workspace)
+    return CompositedImage(from_tiles(canvas, camera), opacity, weight_sums[:-1], groups, workspace)
 
 
 def composite_image_vjp(

@@ -82,8 +82,7 @@ def build_tile_lists(
     counts = torch.bincount(tile, minlength=rows * columns)
     starts = counts.cumsum(0) - counts
 
-    # Sorted by length: of a group, the lists that end first come first, so each chunk can leave
-    # them out.
+    # Sorted by length: in a group, lists that end first come first, so chunks can leave them out.
     by_length = counts.argsort(stable=True)
     by_length = by_length[counts[by_length] > 0]
     gaussian_or_padding = pad(gaussian, (0, 1), value=means2d.shape[1])

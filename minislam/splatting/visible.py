@@ -64,14 +64,11 @@ def project_gaussians(
     """
     rows = _visible_front_to_back(means, scales, opacities, T_camera_world, camera)
     # index_select throughout: it is several times faster than indexing with a tensor.
-    means, quats, scales = (
-        values.index_select(0, rows).T.contiguous() for values in (means, quats, scales)
-    )
+    means, quats, scales = (x.index_select(0, rows).T.contiguous() for x in (means, quats, scales))
     # Capped per Gaussian, not per pixel: the profile stays smooth, and alpha <= o is safe as well.
     opacities = opacities[rows].clamp(max=MAX_OPACITY)
-    points_camera, camera_factors = projection.to_camera(
-        means, covariance_factors(quats, scales), T_camera_world
-    )
+    factors = covariance_factors(quats, scales)
+    points_camera, camera_factors = projection.to_camera(means, factors, T_camera_world)
     means2d = projection.project_means(points_camera, camera)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[rows].T

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
-from types import NoneType, UnionType
+from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -75,8 +75,7 @@ def from_tree(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
         return None
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is UnionType:
-        kind = next(part for part in arguments if part is not NoneType)
-        return from_tree(kind, tree, frame_of)
+        return from_tree(arguments[0], tree, frame_of)  # of a kind | None
     if origin is list:
         return [from_tree(arguments[0], item, frame_of) for item in tree]
     if origin is tuple:
@@ -89,8 +88,6 @@ def from_tree(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
         return frame_of(tree)
     if kind is np.ndarray:
         return np.asarray(tree)  # a pipe to another process carries tensors
-    if hasattr(kind, "from_state"):
-        return kind.from_state(tree, frame_of)
     if isinstance(kind, type) and is_dataclass(kind):
         hints = _hints(kind)
         return kind(**{name: from_tree(hints[name], tree[name], frame_of) for name in hints})

@@ -9,14 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from minislam.records import Trajectory
-from minislam.viz.style import (
-    ESTIMATE_STYLE,
-    TRUTH_STYLE,
-    WIDE,
-    beta_to_rgb,
-    new_figure,
-    show_image,
-)
+from minislam.viz.style import ESTIMATE_STYLE, TRUTH_STYLE, beta_to_rgb, new_figure, show_image
 
 _AVERAGED = 30  # iterations in the running mean of a loss
 
@@ -25,7 +18,7 @@ def trajectory_plot(
     estimate: Trajectory, truth: Trajectory | None = None, unit: str = "world units"
 ) -> Figure:
     """Draw camera centres in the planes x-z and x-y; the estimate must be aligned already."""
-    figure = new_figure(WIDE)
+    figure = new_figure()
     for axes, second in zip(figure.subplots(1, 2), (2, 1), strict=True):
         _draw_path(axes, estimate, truth, second, unit)
     return figure
@@ -55,7 +48,7 @@ def loss_curves(history: Mapping[str, Series[float]]) -> Figure:
     curves = {name: np.asarray(values, dtype=np.float64) for name, values in history.items()}
     logarithmic = {n: v for n, v in curves.items() if np.all(v[np.isfinite(v)] > 0)}
     linear = {n: v for n, v in curves.items() if n not in logarithmic}
-    figure = new_figure(WIDE)
+    figure = new_figure()
     panels = [panel for panel in (logarithmic, linear) if panel] or [{}]
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for number, (name, values) in enumerate(panel.items()):
@@ -130,8 +123,8 @@ def overview(
     return figure
 
 
-def _one_panel(xlabel: str, ylabel: str, height: float = WIDE[1]) -> tuple[Figure, Axes]:
-    figure = new_figure((WIDE[0], height))
+def _one_panel(xlabel: str, ylabel: str, height: float = 3.0) -> tuple[Figure, Axes]:
+    figure = new_figure((9.0, height))
     axes = figure.subplots()
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3)

@@ -53,7 +53,9 @@ def flipbook(
     for scale, quality in product(_SCALES, _QUALITIES):
         urls: list[str] = []
         while len(urls) < count and sum(map(len, urls)) < LARGEST:
-            urls.append(_url(images[len(urls)], scale, quality))
+            small = cv2.resize(images[len(urls)], None, None, scale, scale, cv2.INTER_AREA)
+            webp = cv2.imencode(".webp", small[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])[1]
+            urls.append(picture_url(webp.tobytes()))
         html = _player(urls, texts, max(images[0].shape[1], _LEAST_WIDTH), frames_per_second)
         if len(urls) == count and len(html.encode()) < LARGEST:
             return FlipBook(html)
@@ -67,12 +69,6 @@ def _bytes_of(picture: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
     if picture.dtype == np.uint8:
         return picture
     return np.round(255 * np.clip(np.nan_to_num(picture), 0, 1)).astype(np.uint8)
-
-
-def _url(image: np.ndarray, scale: float, quality: int) -> str:
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    options = [cv2.IMWRITE_WEBP_QUALITY, quality]
-    return picture_url(cv2.imencode(".webp", small[..., ::-1], options)[1].tobytes())
 
 
 def _player(urls: list[str], captions: list[str], width: int, rate: float) -> str:

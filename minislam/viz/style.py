@@ -33,7 +33,7 @@ def set_notebook_style() -> None:
     rcParams.update({"figure.dpi": _DPI, "figure.constrained_layout.use": True, "font.size": 9})
 
 
-def new_figure(size: tuple[float, float]) -> Figure:
+def new_figure(size: tuple[float, float] = WIDE) -> Figure:
     """Return an empty figure (inches) that belongs to no window and no global state."""
     return Figure(figsize=size, dpi=_DPI, layout="constrained")
 

@@ -27,9 +27,8 @@ def build_viewer(
 ) -> str:
     """Return the HTML of the viewer, which opens where the first camera stood.
 
-    Centres are stored as float32, shapes as float16, colours and opacities as bytes: 30 bytes for
-    each Gaussian. A float16 is wrong by 0.05 %, which moves the edge of a splat 100 px wide by
-    0.03 px.
+    Centres are stored as float32, shapes as float16, colours and opacities as bytes: 30 bytes a
+    Gaussian. A float16 is wrong by 0.05 %: the edge of a splat 100 px wide moves by 0.03 px.
     """
     quats = gaussians["quats_wxyz"]
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)

@@ -149,7 +149,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("mapping/mapper.py", "mapping/test_safeguards.py"): [
         ("if static.any():", "if True:"),
         ("self._remove_unsupported()", "pass"),
-        ("static >= LEAST_STATIC * whole", "static < LEAST_STATIC * whole"),
+        ("static >= safeguards.LEAST_STATIC * whole", "static < safeguards.LEAST_STATIC * whole"),
     ],
     ("tracking/keyframe_selection.py", "tracking/test_keyframe_selection.py"): [
         ("if not graph.keyframes.has_prior", "if True"),

@@ -3,7 +3,7 @@ from dataclasses import replace
 import torch
 
 from minislam.geometry import Camera
-from minislam.mapping import DensityConfig
+from minislam.mapping.config import DensityConfig
 from minislam.mapping.density import densify, screen_gradients, split, useful_rows
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer
 from tests.helpers import generator
@@ -41,9 +41,9 @@ def test_screen_gradient_is_in_half_images_and_counts_only_views_that_see():
 def test_small_ones_are_cloned_and_large_ones_split():
     optimizer = MapOptimizer(map_of([0.01, 0.01, 0.5]), LearningRates())
     gradients = over_three_views(torch.tensor([1.0, 0.0, 1.0]))
-    added = densify(optimizer, gradients, 1.0, CONFIG, generator(0))
+    densify(optimizer, gradients, 1.0, CONFIG, generator(0))
     gaussians = optimizer.gaussians
-    assert added == 2 and len(gaussians) == 5
+    assert len(gaussians) == 5
     # The large one is gone; a clone and two children, with the anchors of their parents.
     assert gaussians.anchor_keyframe.tolist() == [0, 1, 0, 2, 2]
     assert torch.equal(gaussians.means[2], gaussians.means[0])
@@ -72,9 +72,10 @@ def test_no_more_than_the_largest_number_of_gaussians():
     config = replace(CONFIG, max_gaussians=6)
     optimizer = MapOptimizer(map_of([0.01] * 5), LearningRates())
     gradients = over_three_views(torch.tensor([1.0, 5.0, 2.0, 3.0, 4.0]))
-    assert densify(optimizer, gradients, 1.0, config, generator(0)) == 1
-    assert optimizer.gaussians.anchor_keyframe[-1] == 1
-    assert densify(optimizer, over_three_views(torch.ones(6)), 1.0, config, generator(0)) == 0
+    densify(optimizer, gradients, 1.0, config, generator(0))
+    assert optimizer.gaussians.anchor_keyframe.tolist() == [0, 1, 2, 3, 4, 1]
+    densify(optimizer, over_three_views(torch.ones(6)), 1.0, config, generator(0))
+    assert len(optimizer.gaussians) == 6
 
 
 # Degenerate input
@@ -82,5 +83,6 @@ def test_no_more_than_the_largest_number_of_gaussians():
 
 def test_an_empty_map_stays_empty():
     optimizer = MapOptimizer(GaussianMap.empty(), LearningRates())
-    assert densify(optimizer, torch.zeros(2, 0), 1.0, CONFIG, generator(0)) == 0
+    densify(optimizer, torch.zeros(2, 0), 1.0, CONFIG, generator(0))
+    assert len(optimizer.gaussians) == 0
     assert useful_rows(optimizer.gaussians, 1.0).tolist() == []

@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import torch
 
-from minislam.mapping import DensityConfig
-from minislam.mapping.view_gradients import view_gradients
+from minislam.mapping.config import DensityConfig
+from minislam.mapping.views import view_gradients
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 

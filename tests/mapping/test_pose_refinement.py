@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from minislam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform_points
-from minislam.mapping import Mapper, MappingConfig, PoseRefinementConfig
+from minislam.mapping import Mapper, MappingConfig
+from minislam.mapping.config import PoseRefinementConfig
 from minislam.mapping.pose_refinement import (
     curvature,
     image_slope,

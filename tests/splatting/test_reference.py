@@ -164,7 +164,7 @@ def test_faint_and_capped_opacities(renderer: Callable):
 @both
 def test_nothing_to_see_is_the_background(renderer: Callable):
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    empty = GaussianMap.empty(torch.float64)
+    empty = one_gaussian((0, 0, 1)).prune(torch.tensor([False]))
     for gaussians in (empty, one_gaussian((0, 0, -1)), one_gaussian((9, 0, 1))):
         rendering = renderer(gaussians, CAMERA, IDENTITY, background)
         assert rendering.color.shape == (21, 27, 3)

@@ -20,10 +20,7 @@ from torch.nn import functional
 from minislam.errors import InputError
 
 # What trainers put the weights into: an entry of the file, or the first part of every name.
-_WRAPPERS = (
-    "model_state_dict", "state_dict", "model", "module", "_orig_mod", "teacher", "net", "model_ema"
-)  # fmt: skip
-_SHOWN = 300  # characters of the list of entries in a message
+_WRAPPERS = "model_state_dict state_dict model module _orig_mod teacher net model_ema".split()
 
 
 class Weights:
@@ -163,7 +160,7 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
     if not tensors:
         found = f"the entries {list(content)}" if isinstance(content, dict) else type(content)
         raise InputError(
-            f"expected named tensors in {path}, found {str(found)[:_SHOWN]}; give the file with "
+            f"expected named tensors in {path}, found {str(found)[:300]}; give the file with "
             "the weights, or save the dictionary of its tensors alone to a file"
         )
     _require_numbers(tensors, path)

@@ -51,10 +51,7 @@ class DepthAnything:
         depth = self.depth_limit * torch.sigmoid(self.network(seen))
         return resize(depth[None], frame.image.shape[:2])[0, 0].to(frame.image.device)
 
-    def network(
-        self,
-        image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 14
-    ) -> Tensor:  # (B, H, W), before the last activation
+    def network(self, image: Tensor) -> Tensor:  # (B, 3, 14 h, 14 w) normalised -> (B, 14 h, 14 w)
         """Return the raw output: its sigmoid is metric depth, its ReLU relative disparity."""
         head, scratch = self._head, self._head.below("scratch.")
         readings = self._transformer(image, _TAPS[self._transformer.depth])

@@ -123,8 +123,7 @@ class DroidFlow(Stateful):
         self._edges = dict(list(used_last.items())[-kept:])
         for source in dict.fromkeys(edges_source):
             hidden = torch.stack([states[edge][0] for edge in edges if edge[0] == source])
-            eta = self.damping(hidden).flatten().to(predicted_targets)
-            self._dampings[source] = _DAMPING * eta
+            self._dampings[source] = _DAMPING * self.damping(hidden).flatten().to(predicted_targets)
         targets = torch.stack([states[edge][1] for edge in edges])
         return as_matches(targets, torch.cat(confidences), predicted_targets)
 
@@ -179,14 +178,13 @@ class DroidChain(Stateful):
         """Return the chain and the matches (E = 1) from the reference to this next image."""
         flow, reference, newest = self.flow, self.reference, self.flow.encode(image)
         hidden, context = reference.context
+        features = reference.features, newest.features
         target, updates = self.target, flow.config.chain_updates
         if target is None or updates == 1:
             target = net.cell_grid(hidden.new_zeros(1, *hidden.shape[2:], 2))[None]
         for _ in range(updates):
             # Without geometry, the last answer is the best guess.
-            hidden, target, confidence = flow.update(
-                reference.features, newest.features, hidden, context, target, target
-            )
+            hidden, target, confidence = flow.update(*features, hidden, context, target, target)
         return DroidChain(flow, reference, newest, target), as_matches(target, confidence, image)
 
     def restart(self) -> "DroidChain":

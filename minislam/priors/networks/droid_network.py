@@ -101,27 +101,21 @@ def update(
     motion = motion.clamp(-_MOTION_LIMIT, _MOTION_LIMIT).permute(0, 3, 1, 2)
     with weights.autocast():
         correlation = look_up(correlation_pyramid(source, target), expected)
-        inputs = [
-            context,
-            parts.below("corr_encoder.").convs(correlation).relu(),
-            parts.below("flow_encoder.").convs(motion).relu(),
-        ]
+        compared = parts.below("corr_encoder.").convs(correlation).relu()
+        moved = parts.below("flow_encoder.").convs(motion).relu()
         unit = parts.below("gru.")
         # Every cell also gets a gated mean over the whole image.
         whole = (unit.conv("w", hidden).sigmoid() * hidden).mean((2, 3), keepdim=True)
         offsets = [unit.conv(f"conv{gate}_glo", whole) for gate in "zrq"]  # (E, 128, 1, 1) each
-        hidden = unit.gru(hidden, torch.cat(inputs, 1), offsets)
+        hidden = unit.gru(hidden, torch.cat([context, compared, moved], 1), offsets)
         revision = parts.below("delta.").convs(hidden, channels=_HEAD)[:, :2]
         confidence = parts.below("weight.").convs(hidden, channels=_HEAD)[:, :2].sigmoid()
     revision, confidence = (x.permute(0, 2, 3, 1) for x in (revision, confidence))
     return hidden.float(), expected + revision, confidence.float()
 
 
-def damping(
-    weights: Weights,
-    hidden: Tensor,  # (E, 128, h, w) of the edges of one source
-) -> Tensor:  # (h, w)
-    """Return eta, by which a bundle adjustment should damp the disparities of that source."""
+def damping(weights: Weights, hidden: Tensor) -> Tensor:  # (E, 128, h, w) -> (h, w)
+    """Return eta from the edges of one source: how a bundle adjustment damps its disparities."""
     part = weights.below("update.agg.")
     with weights.autocast():
         seen = part.conv("conv1", hidden).relu().mean(0, keepdim=True)

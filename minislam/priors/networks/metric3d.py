@@ -36,7 +36,6 @@ _NEAREST, _FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
 _BINS = 256  # of depth, between the two on a logarithmic scale
 _STATE_UNIT = 100.0  # metre per unit of the state's depth channel
 _EPSILON = 1e-5  # of the layer norms in the convolutional part
-_UPSAMPLING = 4
 _MASK_SCALE = 0.25  # of the upsampling logits, as in RAFT
 
 
@@ -80,11 +79,8 @@ class Metric3DDepth:
         padded, inside, scale = fit(image.to(self.device), self.network_size)
         return self.network(padded)[0][inside], scale
 
-    def network(
-        self,
-        image: Tensor,  # (B, 3, H, W) normalised, H and W multiples of 28
-    ) -> Tensor:  # (B, H, W) metre
-        """Return the depth for the canonical camera."""
+    def network(self, image: Tensor) -> Tensor:  # (B, 3, 28 h, 28 w) -> (B, 28 h, 28 w) metre
+        """Return the depth for the canonical camera, of a normalised image."""
         fine, middle, coarse, coarsest = self.maps(image)
         # The fusion of the official code rectifies its inputs in place: the skip of each unit, and
         # the middle and coarse maps that the refinement sees. The published weights rely on it.
@@ -156,7 +152,7 @@ def _refine(
         normal = head.conv("conv2n", head.conv("conv1n", hidden[0]).relu(), channels=(4,))
         state = state + torch.cat([depth, normal], 1)
     mask = update.below("mask.").convs(hidden[0])
-    fine = convex_upsample(state[:, :1], _MASK_SCALE * mask, _UPSAMPLING)[:, 0]
+    fine = convex_upsample(state[:, :1], _MASK_SCALE * mask, factor=4)[:, 0]
     return (_STATE_UNIT * fine + _FARTHEST).clamp(_NEAREST, _FARTHEST)
 
 

@@ -134,8 +134,7 @@ class DinoFeatures:
         whole_patches = [side // PATCH * PATCH for side in image.shape[:2]]
         seen = normalise(image.to(self.device))
         whole = functional.interpolate(seen, whole_patches, mode="bilinear")
-        patches = self._transformer(whole)[0].patches[0]
-        return patches.permute(1, 2, 0).to(image.device)
+        return self._transformer(whole)[0].patches[0].permute(1, 2, 0).to(image.device)
 
 
 def is_antialiased(weights: Weights) -> bool:

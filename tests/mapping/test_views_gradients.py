@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from minislam.mapping.losses import render_loss
-from minislam.mapping.view_gradients import view_gradients
-from minislam.mapping.views import view_of
+from minislam.mapping.views import view_gradients, view_of
 from minislam.splatting import render
 from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 
