@@ -72,6 +72,8 @@ def run_in_folder(
     they were. If an unknown lens turns out to bend straight lines, the run begins anew with it.
     """
     rest = config, choice, output, observer, lpips
+    if choice.features.startswith(FILES) or choice.depth.startswith(FILES):
+        sequence.seeks_lens = False  # the files belong to the images as they are
     try:
         return _run_once(sequence, *rest, overwrite, resume, workers)
     except BentLens as bent:

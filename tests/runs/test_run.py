@@ -8,12 +8,15 @@ import pytest
 
 from minislam import slam
 from minislam.cli.main import main
+from minislam.config import SlamConfig
 from minislam.data.files import read_json
+from minislam.data.options import InputOptions
 from minislam.data.run_folder import RunFolder
-from minislam.data.sequence import RecordedSequence
+from minislam.data.sequence import RecordedSequence, open_sequence
 from minislam.errors import InputError
-from minislam.runs import pictures
-from minislam.state.steps import Steps
+from minislam.priors.choice import PriorChoice
+from minislam.runs import pictures, run
+from minislam.state.steps import SilentObserver, Steps
 from minislam.tracking import bundle_adjustment
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.lens import BentLens, LensFit
@@ -78,6 +81,16 @@ def test_a_run_begins_anew_on_straightened_images_if_an_unknown_lens_bends(
     given = RunFolder(out).read_config()["input"]
     assert (given["k1"], given["k2"], given["focal"]) == (-0.2, 0.05, "refine")
     assert read_json(out / "camera.json")["preparation"]["distortion"]["k1"] == -0.2
+
+
+@pytest.mark.parametrize("given", [{"depth": "files:d"}, {"features": "files:f"}, {}])
+def test_images_that_files_belong_to_are_not_straightened(given: dict[str, str], monkeypatch):
+    sequence, sought = open_sequence("synth:person?phone", InputOptions(max_frames=2)), []
+    monkeypatch.setattr(
+        run, "_run_once", lambda sequence, *rest: sought.append(sequence.seeks_lens)
+    )
+    run.run_in_folder(sequence, SlamConfig(), PriorChoice(**given), "folder", SilentObserver())
+    assert sought == [not given]
 
 
 def test_a_run_whose_every_adjustment_fails_says_so(root: Path, monkeypatch, capsys):
