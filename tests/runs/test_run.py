@@ -63,7 +63,7 @@ def test_a_mask_that_is_missing_is_said_before_anything_is_done(root: Path, monk
 def test_a_run_begins_anew_on_straightened_images_if_an_unknown_lens_bends(
     root: Path, monkeypatch, capsys
 ):
-    check, lens = slam.check_lens, LensFit(90.0, (-0.2, 0.05), -0.1, 0.3, is_told=True)
+    check, lens = slam.check_lens, LensFit(90.0, (-0.2, 0.05), -0.1, 0.3)
     asked: list[bool] = []
 
     def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:

@@ -30,14 +30,13 @@ from minislam.tracking.safeguards.focal_length import (
     ITERATIONS,
     LEAST_KEYFRAMES,
     WIDENINGS,
-    fit_focal_length,
     problem_among,
 )
 from minislam.tracking.safeguards.robust import MIN_RESIDUAL
 
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
-TURNS = 8  # of straightening and adjusting, at most
-SETTLED = 0.003  # of the cost: a turn that saves no more is the last [-]
+TURNS = 16  # of straightening and adjusting, at most
+SETTLED = 0.001  # a turn that bends a corner by no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # RESULTS.md, "A lens that nobody told of". [-]
@@ -55,7 +54,6 @@ class LensFit:
     radial: Radial  # k1 and k2 [-], with that focal length
     bend: float  # how far a corner moves, over its distance from the centre [-]
     saved: float  # fraction of the residual cost that k1 and k2 save, beside any focal length [-]
-    is_told: bool = False  # whether the cost rises with other focal lengths, where it matters
 
     @property
     def is_bent(self) -> bool:
@@ -64,9 +62,8 @@ class LensFit:
 
     @property
     def is_worth_undoing(self) -> bool:
-        """Tell whether the images should be straightened: the lens is told, and saves much."""
-        is_possible = self.is_bent and abs(self.bend) < MOST_BEND
-        return is_possible and self.is_told and self.saved > WORTH_UNDOING
+        """Tell whether the images should be straightened: that saves much."""
+        return WORTH_SAYING < abs(self.bend) < MOST_BEND and self.saved > WORTH_UNDOING
 
 
 class BentLens(MinislamError):
@@ -98,31 +95,37 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
         return None
     problem, state = replace(among[0], free_focal=True), among[1]
     _, pinhole = adjust_narrowing(problem, state, WIDENINGS, ITERATIONS)
-    radial, cost, widenings = (0.0, 0.0), pinhole.cost_after, WIDENINGS
+    radial, widenings = (0.0, 0.0), WIDENINGS
     for _ in range(TURNS):
         lens = straightened(problem, radial)
-        found, report = adjust_narrowing(lens, state, widenings, ITERATIONS)
-        further = radial[0] + found.readout[0], radial[1] + found.readout[1]
-        # The columns hold to first order, and no lens folds its image.
-        if report.cost_after > cost or bend_of(problem.camera, further) <= LEAST_STRETCH - 1:
+        found, _ = adjust_narrowing(lens, state, widenings, ITERATIONS)
+        state, widenings = replace(found, readout=(0.0, 0.0)), [1.0]
+        before, radial = radial, _without_fold(problem.camera, radial, found.readout)
+        if abs(bend_of(problem.camera, radial) - bend_of(problem.camera, before)) < SETTLED:
             break
-        before, cost, radial, widenings = cost, report.cost_after, further, [1.0]
-        state = replace(found, readout=(0.0, 0.0))
-        if before - cost < SETTLED * cost:
-            break
+    lens = replace(straightened(problem, radial), shutter=None)
+    state, held = adjust_narrowing(lens, state, [1.0], ITERATIONS)
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
-    saved = (pinhole.cost_after - cost) / max(pinhole.cost_after, floor)
+    saved = (pinhole.cost_after - held.cost_after) / max(pinhole.cost_after, floor)
     zoom, bend = math.exp(state.log_focal), bend_of(problem.camera, radial)
-    fit = LensFit(zoom * problem.camera.fx, (radial[0] * zoom**2, radial[1] * zoom**4), bend, saved)
-    if not fit.is_bent:
-        return fit
-    straight = replace(straightened(problem, radial), free_focal=False, shutter=None)
-    is_told = graph.focal_is_free or fit_focal_length(straight, state)[0].factor is not None
-    return replace(fit, is_told=is_told)
+    radial = radial[0] * zoom**2, radial[1] * zoom**4
+    return LensFit(zoom * problem.camera.fx, radial, bend, saved)
+
+
+def _without_fold(camera: Camera, radial: Radial, step: Radial) -> Radial:
+    """Return radial + step, or less of the step where the lens would fold the image."""
+    while True:
+        further = radial[0] + step[0], radial[1] + step[1]
+        if bend_of(camera, further) > LEAST_STRETCH - 1:
+            return further
+        step = step[0] / 2, step[1] / 2
 
 
 def straightened(problem: BundleProblem, radial: Radial) -> BundleProblem:
-    """Return the problem of the pinhole whose rays the lens has bent, what k lacks being free."""
+    """Return the problem of the pinhole whose rays the lens has bent, what k lacks being free.
+
+    Where straightening spreads the image, errors of the flow spread with it and weigh less.
+    """
     camera, dtype = problem.camera, problem.targets.dtype
     centre = problem.targets.new_tensor([[camera.cx], [camera.cy]])
     focal = problem.targets.new_tensor([[camera.fx], [camera.fy]])
@@ -131,7 +134,9 @@ def straightened(problem: BundleProblem, radial: Radial) -> BundleProblem:
     rays = torch.cat([source, torch.ones_like(source[:1])]).mT.to(dtype)
     columns = bends(camera, source, radial) - bends(camera, target, radial)
     positions = centre + focal * target
-    return replace(problem, rays=rays, targets=positions.to(dtype), shutter=columns.to(dtype))
+    weights = problem.weights * stretch(target, radial).square().to(dtype)
+    targets, columns = positions.to(dtype), columns.to(dtype)
+    return replace(problem, rays=rays, targets=targets, weights=weights, shutter=columns)
 
 
 def ray_seen(u: Tensor, radial: Radial) -> Tensor:  # (..., 2, N) float64
@@ -139,10 +144,14 @@ def ray_seen(u: Tensor, radial: Radial) -> Tensor:  # (..., 2, N) float64
     seen = u.double()
     u = seen
     for _ in range(INVERSION_STEPS):
-        squared = u.square().sum(-2, keepdim=True)
-        stretch = 1 + radial[0] * squared + radial[1] * squared.square()
-        u = seen / stretch.clamp_min(LEAST_STRETCH)
+        u = seen / stretch(u, radial)
     return u
+
+
+def stretch(u: Tensor, radial: Radial) -> Tensor:  # (..., 1, N)
+    """Return how much farther from the centre the lens shows rays u (..., 2, N)."""
+    squared = u.square().sum(-2, keepdim=True)
+    return (1 + radial[0] * squared + radial[1] * squared.square()).clamp_min(LEAST_STRETCH)
 
 
 def bends(camera: Camera, u: Tensor, radial: Radial) -> Tensor:  # (..., 2, 2, N) px per unit of k

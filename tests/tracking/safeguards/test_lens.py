@@ -19,6 +19,7 @@ from minislam.tracking.safeguards.lens import (
     fit_lens,
     ray_seen,
     straightened,
+    stretch,
 )
 from tests.tracking.scene import CAMERA, RAYS, known_problem, normal
 from tests.tracking.wall import GRID, disparities_at, true_graph, true_poses
@@ -26,12 +27,6 @@ from tests.tracking.wall import GRID, disparities_at, true_graph, true_poses
 NUMBERS = [*range(8)]
 K1, K2 = -0.3, 0.1
 BEND = -0.125867  # of a corner, from the root .710 of r (1 + K1 r^2 + K2 r^4) = .621
-
-
-def stretch(u: Tensor, k1: float, k2: float) -> Tensor:  # (..., 2) tangents -> (..., 1)
-    """Return how much farther from the centre the lens shows a ray."""
-    squared = u.square().sum(-1, keepdim=True)
-    return 1 + k1 * squared + k2 * squared**2
 
 
 def tangents(positions: Tensor) -> Tensor:  # (..., 2) px
@@ -55,7 +50,7 @@ def bent_graph(noise: float = 0.02):
     motions = relative_transforms(poses[NUMBERS], sources, targets)
     positions, _ = reproject(motions, disparities[sources], rays, CAMERA)
     u_seen = tangents(positions.mT)
-    seen = pixels(u_seen * stretch(u_seen, K1, K2)).mT.float()
+    seen = pixels(u_seen * stretch(u_seen.mT, (K1, K2)).mT).mT.float()
     graph.links.targets = list(seen + noise * normal(5, *seen.shape).float())
     return graph
 
@@ -74,6 +69,19 @@ def bent_problem(radial: tuple[float, float]) -> tuple[BundleProblem, Tensor]:
     return problem, problem.targets - reproject(motions, disparities, problem.rays, CAMERA)[0]
 
 
+def test_errors_that_straightening_spreads_weigh_less():
+    problem, _ = bent_problem((K1, K2))
+    before, _ = bent_problem((0.0, 0.0))
+    distances = [(tangents(p.targets.mT) ** 2).sum(-1)[:, None] for p in (problem, before)]
+    torch.testing.assert_close(problem.weights * distances[0], before.weights * distances[1])
+
+
+def test_the_stretch_is_browns():
+    u = torch.tensor([[0.3], [0.4]])
+    assert stretch(u, (-0.2, 0.4)).item() == pytest.approx(1 - 0.2 * 0.25 + 0.4 * 0.0625)
+    assert stretch(u, (-9.0, 0.0)).item() == pytest.approx(0.3)  # no lens folds its image
+
+
 def test_what_k_lacks_moves_the_flow_along_the_columns():
     step, columns = 1e-5, bent_problem((K1, K2))[0].shutter
     assert columns.abs().amax((0, 2, 3)).min() > 1  # px: there is something to tell
@@ -86,7 +94,7 @@ def test_what_k_lacks_moves_the_flow_along_the_columns():
 def test_the_seen_ray_is_inverted():
     seen = tangents(GRID.pixels.double())
     u = ray_seen(seen.mT, (K1, K2)).mT
-    torch.testing.assert_close(u * stretch(u, K1, K2), seen, atol=1e-9, rtol=0)
+    torch.testing.assert_close(u * stretch(u.mT, (K1, K2)).mT, seen, atol=1e-9, rtol=0)
     assert bend_of(CAMERA, (0.0, 0.0)) == 0 and abs(bend_of(CAMERA, (K1, K2)) - BEND) < 1e-6
 
 
@@ -106,16 +114,9 @@ def test_an_unknown_lens_that_bends_lines_asks_for_straightened_images():
     assert bent.value.lens == fit_lens(bent_graph())
 
 
-def test_a_focal_length_that_was_found_tells_the_lens_too():
-    graph = bent_graph(noise=0.05)
-    assert fit_lens(graph).is_bent and not fit_lens(graph).is_told
-    graph.focal_is_free = True
-    assert fit_lens(graph).is_told
-
-
 def test_flow_that_fits_no_lens_does_not_fold_the_image():
     fit = fit_lens(bent_graph(noise=4.0))
-    assert fit.saved >= 0 and fit.bend > -0.7 and not fit.is_told
+    assert fit.bend > -0.7 and not fit.is_bent
     corner = torch.tensor([[0.9], [0.7]])
     assert ray_seen(corner, (-3.0, 0.0)).isfinite().all() and bend_of(CAMERA, (-9.0, 0.0)) <= -0.5
     assert bends(CAMERA, corner, (-1 / (3 * 1.3), 0.0)).isfinite().all()
@@ -134,14 +135,13 @@ def test_a_pinhole_is_none(factor: float):
     assert torch.equal(graph.keyframes.T_camera_world, before)
 
 
-@pytest.mark.parametrize("is_told", [True, False])
-def test_a_lens_is_undone_if_it_is_told_and_saves_much(is_told: bool):
+def test_a_lens_is_undone_if_that_saves_much():
     def lens(bend: float, saved: float) -> LensFit:
-        return LensFit(300.0, (bend, 0.0), bend, saved, is_told)
+        return LensFit(300.0, (bend, 0.0), bend, saved)
 
     for saved in (0.04, 0.12):
         for bent in lens(-0.05, saved), lens(0.05, saved):
-            assert bent.is_bent and bent.is_worth_undoing == (is_told and saved > 0.1)
+            assert bent.is_bent and bent.is_worth_undoing == (saved > 0.1)
     assert not lens(-0.45, 0.12).is_worth_undoing  # nothing moves a corner so far
     for straight in lens(-0.05, 0.02), lens(0.03, 0.2):
         assert not straight.is_bent and not straight.is_worth_undoing
