@@ -88,7 +88,7 @@ def focal_length_note(slam: Slam) -> str:
     elif graph.focal_is_free:
         how = f"estimated from the motion, from {slam.sequence.camera.fx:.1f} px on"
     else:
-        how = "kept as noted or guessed, because the motion does not tell it"
+        how = "kept as at the start, because the motion does not tell it"
     return f"{camera.fx:.1f} px for {camera.width}x{camera.height} images, {how}"
 
 
