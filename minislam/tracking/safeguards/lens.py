@@ -164,5 +164,5 @@ def bends(camera: Camera, u: Tensor, radial: Radial) -> Tensor:  # (..., 2, 2, N
 
 def bend_of(camera: Camera, radial: Radial) -> float:
     """Return how far the lens moves a corner of the image, over its distance from the centre."""
-    corner = torch.tensor([[camera.cx / camera.fx], [camera.cy / camera.fy]], dtype=torch.float64)
-    return float(corner[0] / ray_seen(corner, radial)[0]) - 1
+    corner = torch.tensor([[camera.cx / camera.fx], [camera.cy / camera.fy]], device="cpu")
+    return float(stretch(ray_seen(corner, radial), radial)) - 1
