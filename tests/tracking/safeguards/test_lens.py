@@ -13,6 +13,7 @@ from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.safeguards.lens import (
     BentLens,
     LensFit,
+    _without_fold,
     bend_of,
     bends,
     check_lens,
@@ -74,6 +75,13 @@ def test_errors_that_straightening_spreads_weigh_less():
     before, _ = bent_problem((0.0, 0.0))
     distances = [(tangents(p.targets.mT) ** 2).sum(-1)[:, None] for p in (problem, before)]
     torch.testing.assert_close(problem.weights * distances[0], before.weights * distances[1])
+
+
+def test_of_a_step_that_folds_the_image_a_part_is_taken():
+    assert bend_of(CAMERA, (-9.0, 0.0)) <= -0.69
+    k1, k2 = _without_fold(CAMERA, (0.0, 0.0), (-9.0, 0.0))
+    assert -9 < k1 < -0.1 and k2 == 0 and bend_of(CAMERA, (k1, k2)) > -0.69
+    assert _without_fold(CAMERA, (-0.1, 0.0), (-0.1, 0.1)) == (-0.2, 0.1)
 
 
 def test_the_stretch_is_browns():
