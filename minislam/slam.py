@@ -11,6 +11,7 @@ by the MLP's beta. `_move_map` deforms the map when an adjustment has moved keyf
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import torch
@@ -109,8 +110,8 @@ class Slam(Stateful):
     def _new_mapper(self, cell: int) -> Mapper:
         config, dimension = self.config, self._features.dimension
         camera = self.tracker.grid.camera
-        parts = config.mapping, config.uncertainty
-        mapper = Mapper(camera, *parts, dimension, config.seed, self.device, self.workers)
+        parts = camera, config.mapping, config.uncertainty, dimension, config.seed
+        mapper = Mapper(*parts, self.device, self.workers, self.tracker.keyframes.shelf)
         mapper.cell = cell
         return mapper
 
@@ -182,7 +183,8 @@ class Slam(Stateful):
         if self.tracker.knows_depth:
             parts = graph, self.sequence, self.poses, frames, frames
             swept = sweep_frames(*parts, progress, self.workers)
-            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
+            shelf = graph.keyframes.shelf
+            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, shelf)
         else:
             keyframes = on_backdrop(keyframes)
         exposures = keyframe_exposures(graph)
@@ -248,15 +250,17 @@ class Slam(Stateful):
         """Return keyframes of the tracker from `first` on, and others, which insert nothing."""
         store, shutter = self.tracker.keyframes, self.tracker.graph.shutter
         columns = store.frames, store.features, store.metric_depths, store.T_camera_world
-        rows = list(zip(*(column[first:] for column in columns), strict=True))
-        for frame in map(self.frame, others):
-            rows.append((frame, self._features(frame), None, self.poses[frame.frame_index]))
+        rows = zip(*(column[first:] for column in columns), strict=True)
+        read = (
+            (f, self._features(f), None, self.poses[f.frame_index]) for f in map(self.frame, others)
+        )
         result = []
-        for position, (frame, features, depth, pose) in enumerate(rows, first):
+        for position, (frame, features, depth, pose) in enumerate(chain(rows, read), first):
             pixels, mask = shutter.undone(frame).pixels, self._given_mask(frame.frame_index)
             unknown = torch.zeros((), device=self.device).expand(pixels.shape[:2])
             seen = pixels, features, unknown if depth is None else depth, pose, mask
             result.append(Keyframe(frame.frame_index, *seen, inserts=position < len(store)))
+            store.shelf.put([pixels, features])
         return sorted(result, key=lambda keyframe: keyframe.frame_index)
 
     def trajectory(self) -> Trajectory:

@@ -7,8 +7,6 @@ Two threads (not run here: they take a minute on a busy machine) add up in anoth
 other last bits, 642 instead of 640 Gaussians, and poses that differ by 1.1e-5 of the path.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -34,7 +32,9 @@ SHORT = {
 }
 
 
-def finished(frames: int) -> Slam:
+@pytest.fixture(scope="module")
+def slam() -> Slam:
+    frames = 20
     sequence = open_sequence("synth:static:1", InputOptions(max_frames=frames, size=(80, 60)))
     truth = sequence.ground_truth
     depth = np.array([truth.depth(index) for index in range(frames)])
@@ -57,8 +57,7 @@ def path_length(slam: Slam) -> float:
     return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
 
 
-def test_exact_flow_and_depth_leave_hardly_an_error(root: Path):
-    slam = finished(20)
+def test_exact_flow_and_depth_leave_hardly_an_error(slam: Slam):
     found, truth = slam.trajectory(), slam.sequence.ground_truth.trajectory
     error = absolute_trajectory_error(found, truth).statistics["rmse"]
     views = zip(found.T_world_camera, slam.sequence, strict=True)
@@ -66,3 +65,10 @@ def test_exact_flow_and_depth_leave_hardly_an_error(root: Path):
     assert not slam.lost_frames()
     assert error < 4e-4 * path_length(slam)  # 2.4e-4 were measured
     assert quality > 25.5  # dB; 26.5 were measured, 28.5 after 200 iterations
+
+
+def test_what_a_run_keeps_of_old_images_lies_on_the_shelf(slam: Slam):
+    assert len(slam.mapper.keyframes) > len(slam.tracker.keyframes)
+    for keyframe in slam.mapper.keyframes:
+        for images in (keyframe.pixels, keyframe.features, keyframe.depth):
+            assert slam.tracker.keyframes.shelf.holds(images)

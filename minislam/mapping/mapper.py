@@ -38,7 +38,10 @@ class Mapper(JointOptimisation):
         self.median_depth = median_depth(keyframes)
         self.keyframes = list(keyframes)
         if self.config.mean_background:
-            means = [keyframe.levelled.mean((0, 1)) for keyframe in self.keyframes]
+            means = []
+            for keyframe in self.keyframes:
+                means.append(keyframe.levelled.mean((0, 1)))
+                self._shelf.release()
             self.background = torch.stack(means).mean(0)
         count = len(self.keyframes)
         if self.uncertainty.is_learnt:

@@ -11,6 +11,7 @@ from torch import Tensor
 from minislam.priors import grid_flow
 from minislam.priors.dense_flow import composed_flow, dense_from_grid, grayscale, reverse_flow
 from minislam.priors.interfaces import FlowMatches
+from minislam.shelf import Shelf
 from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
@@ -40,6 +41,7 @@ class ClassicalFlow(Stateful):
         cv2.setNumThreads(1)
         self.config = config or grid_flow.ClassicalFlowConfig()
         self.stride = self.config.stride
+        self._shelf = Shelf()
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[int, np.ndarray] = {}
         self._measured: dict[Edge, MeasuredEdge] = {}
@@ -50,12 +52,12 @@ class ClassicalFlow(Stateful):
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
-        self._measured = {(i, j): MeasuredEdge(*parts) for i, j, *parts in state["measured"]}
+        self._measured = {(i, j): self._kept(*parts) for i, j, *parts in state["measured"]}
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
         gray = grayscale(image)
-        self._images[keyframe_index] = gray
+        self._images[keyframe_index] = self._shelf.array(gray)
         self._textures[keyframe_index] = grid_flow.texture_confidence(gray, self.stride)
 
     def remove_frame(self, keyframe_index: int) -> None:
@@ -74,10 +76,12 @@ class ClassicalFlow(Stateful):
         pairs = dict.fromkeys((min(edge), max(edge)) for edge in moved)
         both = ({e: starts[e] for e in ((i, j), (j, i)) if e in starts} for i, j in pairs)
         for measured in _THREADS.map(self._measure, both):
-            self._measured |= measured
+            self._measured |= {edge: self._kept(*parts) for edge, parts in measured.items()}
         _, targets, confidences = zip(*(self._measured[edge] for edge in edges), strict=True)
         textures = [self._textures[source] for source in edges_source]
-        return grid_flow.as_matches(targets, confidences, textures, predicted_targets)
+        matches = grid_flow.as_matches(targets, confidences, textures, predicted_targets)
+        self._shelf.release()
+        return matches
 
     def disparity_damping(self, keyframes: int) -> None:
         """Return None; see FlowEstimator."""
@@ -105,6 +109,9 @@ class ClassicalFlow(Stateful):
             # A copy: a view would keep the starts of all edges of this call.
             measured[i, j] = MeasuredEdge(starts[i, j].copy(), *matches)
         return measured
+
+    def _kept(self, *parts: np.ndarray) -> MeasuredEdge:
+        return MeasuredEdge(*map(self._shelf.array, parts))
 
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""

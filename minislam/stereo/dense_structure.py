@@ -14,6 +14,7 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.images import resample
 from minislam.records import Frame, Keyframe, Progress
+from minislam.shelf import Shelf
 from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
@@ -38,30 +39,40 @@ def with_swept_depth(
     camera: Camera,  # of the images
     keyframes: list[Keyframe],
     swept: Iterable[tuple[Tensor, Tensor]],  # of each, depth (H, W) and confirmation (H, W)
+    shelf: Shelf,  # takes the depths
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth and confirmation.
 
     Where nothing was swept their own depth fills in, scaled to what was swept in the same image,
     because a network errs image by image. What other views look through moves, and stays empty.
     """
-    small, views, result = _small(camera, WIDTH), [], []
-    for keyframe, (depth, confirmation) in zip(keyframes, swept, strict=True):
-        cost, pose = 1 - _nearest(confirmation, small), keyframe.T_camera_world.cpu().numpy()
-        views.append(votes.SweptView(_inverse(_nearest(depth, small)), cost, 0.0, pose))
+    small, judges, result = _small(camera, WIDTH), votes.judges(len(keyframes)), []
+    judging: dict[int, votes.SweptView] = {}
+
+    def view(keyframe: Keyframe, depth: Tensor, cost: np.ndarray) -> votes.SweptView:
+        pose = keyframe.T_camera_world.cpu().numpy()
+        return votes.SweptView(_inverse(_nearest(depth, small)), cost, 0.0, pose)
+
+    for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
+        shelf.put([depth])
+        if index in judges:
+            judging[index] = view(keyframe, depth, 1 - _nearest(confirmation, small))
         confirmation = resample(confirmation, *keyframe.features.shape[:2])
         result.append(replace(keyframe, depth=depth, confirmation=confirmation))
     for index, (keyframe, found) in enumerate(zip(keyframes, result, strict=True)):
+        depth = found.depth
         if bool(keyframe.depth.any()):
-            depth = found.depth
             both = (depth > 0) & (keyframe.depth > 0)
             enough = int(both.sum()) > LEAST_COMMON
             guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
-            guessed = replace(views[index], inverse_depth=_inverse(_nearest(guess, small)))
-            agreeing, refuting = votes.count_judges(small, guessed, views, index)
+            guessed = view(keyframe, guess, np.zeros((small.height, small.width), np.float32))
+            others = [judge for at, judge in judging.items() if at != index]
+            agreeing, refuting = votes.count_votes(small, guessed, others)
             moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
             depth = torch.where((depth > 0) | moves, depth, guess)
-            result[index] = replace(found, depth=depth)
+        shelf.put([depth])
+        result[index] = replace(found, depth=depth)
     return result
 
 
@@ -104,20 +115,22 @@ def dense_depths(
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     known_frames, known = list(disparities), list(disparities.values())
-    swept: list[votes.SweptView] = []
+    shelf, swept = Shelf(), []
 
     def plan(frame: int) -> tuple[Any, ...]:
         nearest = int(np.argmin([abs(frame - index) for index in known_frames]))
         return planner.plan(frame, np.concatenate(known[max(0, nearest - 1) : nearest + 2]))
 
     for view in workers.stream(swept_view, map(plan, frames)):
-        swept.append(view)
+        images = {name: shelf.array(getattr(view, name)) for name in ("inverse_depth", "cost")}
+        swept.append(replace(view, **images))
         if progress:
             progress(len(swept), len(frames))
     depths = []
     for at, view in enumerate(swept):
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
-        depths.append(votes.confirm(planner.camera, view, others))
+        found = votes.confirm(planner.camera, view, others)
+        depths.append(votes.ConfirmedDepth(*map(shelf.array, vars(found).values())))
     positions = [frames.index(frame) for frame in wanted]
     kept = votes.keep_what_stays(planner.camera, swept, depths, positions)
     return (full_size(depth, camera) for depth in kept)

@@ -38,6 +38,7 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
 
     @lru_cache(maxsize=KEPT)
     def blurred(keyframe: int) -> np.ndarray:  # (H, W, 3)
+        graph.keyframes.shelf.release()
         return cv2.GaussianBlur(frames[keyframe].image.cpu().numpy(), (0, 0), BLUR)
 
     for link, (source, target) in enumerate(links.edges):

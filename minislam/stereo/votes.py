@@ -6,6 +6,7 @@ the point is refuted. With a moving object no other view agrees. What stands sti
 refuted by views of all times, which look through it before it came or after it left.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -58,29 +59,27 @@ def keep_what_stays(
     views: list[SweptView],  # in the order of time
     depths: list[ConfirmedDepth],  # of the views
     wanted: list[int],  # positions of views
-) -> list[ConfirmedDepth]:  # of the wanted views
+) -> Iterator[ConfirmedDepth]:  # of the wanted views
     """Drop, by confirmed depths alone, what views of other times look through.
 
     Around a dropped pixel the confirmation fades too.
     """
-    known_only = [
-        replace(
-            view,
-            inverse_depth=np.where(depth.inverse_depth > 0, depth.inverse_depth, np.nan),
-            cost=1 - depth.confirmation,
-        )
-        for view, depth in zip(views, depths, strict=True)
-    ]
-    kept = []
+
+    def known_only(index: int) -> SweptView:
+        inverse_depth, cost = depths[index].inverse_depth, 1 - depths[index].confirmation
+        inverse_depth = np.where(inverse_depth > 0, inverse_depth, np.nan)
+        return replace(views[index], inverse_depth=inverse_depth, cost=cost)
+
+    judging = {index: known_only(index) for index in judges(len(views))}
     for index in wanted:
         depth = depths[index]
-        agreeing, refuting = count_judges(camera, known_only[index], known_only, index)
+        others = [view for judge, view in judging.items() if judge != index]
+        agreeing, refuting = count_votes(camera, known_only(index), others)
         left = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
         known = (depth.inverse_depth > 0) & ~left
         known &= _window_share(known) >= MIN_SUPPORT
         confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(left), 0)
-        kept.append(ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation))
-    return kept
+        yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
@@ -88,12 +87,9 @@ def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) floa
     return cv2.blur(mask.astype(np.float32), (SUPPORT_WINDOW, SUPPORT_WINDOW))
 
 
-def count_judges(
-    camera: Camera, view: SweptView, views: list[SweptView], index: int
-) -> tuple[np.ndarray, np.ndarray]:  # 2 x (h, w)
-    """Count the votes on the view at `index` of some other views of all times."""
-    judges = np.unique(np.linspace(0, len(views) - 1, JUDGES).round().astype(int))
-    return count_votes(camera, view, [views[k] for k in judges if k != index])
+def judges(count: int) -> list[int]:
+    """Return the positions of the views, of all times, that tell for `count` views what stays."""
+    return np.unique(np.linspace(0, count - 1, JUDGES).round().astype(int)).tolist()
 
 
 def count_votes(

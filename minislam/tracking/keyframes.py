@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from minislam.records import Frame
-from minislam.state.stateful import Stateful
+from minislam.shelf import Shelf
+from minislam.state.stateful import FrameOf, Stateful, Tree
 
 
 class KeyframeStore(Stateful):
@@ -23,6 +24,7 @@ class KeyframeStore(Stateful):
 
     def __init__(self, like: Tensor) -> None:
         """Start empty, for as many cells as a tensor (N,) has, and on its device."""
+        self.shelf = Shelf()
         self.frames = []
         self.features = []
         self.metric_depths = []
@@ -30,6 +32,12 @@ class KeyframeStore(Stateful):
         self.disparities = self.prior_disparities = like.new_zeros(0, len(like))
         self.static_weights = self.motion_weights = like.new_zeros(0, len(like))
         self.prior_masks = self.disparities.bool()
+
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state."""
+        super().restore_state(state, frame_of)
+        for images in zip(self.frames, self.features, self.metric_depths, strict=True):
+            self._shelve(*images)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -55,6 +63,7 @@ class KeyframeStore(Stateful):
         prior_disparities: Tensor,  # (N,)
     ) -> None:
         """Add one keyframe. Every cell starts with weight one."""
+        self._shelve(frame, features, metric_depth)
         self.frames.append(frame)
         self.features.append(features)
         self.metric_depths.append(metric_depth)
@@ -66,10 +75,13 @@ class KeyframeStore(Stateful):
         self.static_weights = torch.cat([self.static_weights, ones])
         self.motion_weights = torch.cat([self.motion_weights, ones])
 
+    def _shelve(self, frame: Frame, features: Tensor, metric_depth: Tensor | None) -> None:
+        self.shelf.put([frame.pixels, features, metric_depth])
+
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
         for column, rows in vars(self).items():
-            if column != "overlay":
+            if column not in ("overlay", "shelf"):
                 setattr(self, column, rows[:-1])
 
     def set_geometry(self, T_camera_world: Tensor, disparities: Tensor) -> None:

@@ -119,7 +119,7 @@ def of_time(time: int, stands: bool) -> tuple[SweptView, ConfirmedDepth]:
 
 def kept(stands: list[bool]) -> list[ConfirmedDepth]:
     views, depths = zip(*(of_time(*at) for at in enumerate(stands)), strict=True)
-    return keep_what_stays(CAMERA, list(views), list(depths), list(range(len(views))))
+    return [*keep_what_stays(CAMERA, list(views), list(depths), list(range(len(views))))]
 
 
 def test_a_box_that_leaves_is_dropped_though_the_views_before_confirm_it():

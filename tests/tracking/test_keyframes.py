@@ -1,5 +1,7 @@
 """The keyframe store: rows that belong together."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 
@@ -119,3 +121,15 @@ def test_a_prior_gives_its_unit_of_length_where_it_is_known():
     torch.testing.assert_close(store.disparities, 5 * before.disparities)
     moved = 5 * store.T_camera_world[:, :3, 3]
     torch.testing.assert_close(moved, before.T_camera_world[:, :3, 3])
+
+
+def test_images_lie_on_the_shelf_also_of_a_restored_store():
+    frame = Frame(0, 0.0, torch.zeros(60, 80, 3, dtype=torch.uint8))
+    features, depth, row = normal(0, 10, 10, 20), torch.ones(60, 80), torch.ones(CELLS)
+    store, restored = KeyframeStore(row), KeyframeStore(row)
+    store.append(frame, features, depth, torch.eye(4), row, row)
+    restored.restore_state(deepcopy(store.saved_state()), lambda index: deepcopy(frame))
+    for known in (store, restored):
+        images = known.frames[0].pixels, known.features[0], known.metric_depths[0]
+        assert all(known.shelf.holds(image) for image in images)
+        assert torch.equal(images[1], normal(0, 10, 10, 20))
