@@ -3,11 +3,13 @@
 So the memory of a long run does not grow by them. Whoever holds such a tensor notices nothing.
 """
 
+import ctypes
 import mmap
 import os
 import tempfile
 import weakref
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import BinaryIO
 
 import numpy as np
@@ -76,6 +78,12 @@ class Shelf:
             self._free = torch.frombuffer(mapped, dtype=torch.uint8)
             self._blocks.append((weakref.ref(mapped), self._free.data_ptr(), len(self._free)))
         return True
+
+
+def give_back_freed() -> None:
+    """Give memory that was freed in pieces back to the system, which takes some milliseconds."""
+    with suppress(OSError, TypeError, AttributeError):  # another C library than glibc has no way
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _fill(file: BinaryIO, length: int) -> None:

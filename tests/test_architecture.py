@@ -23,7 +23,7 @@ ALLOWED = {
     "images": [],
     "records": ["errors", "parameters", "geometry"],
     "shelf": [],
-    "state": ["records"],
+    "state": ["records", "shelf"],
     "workers": ["errors", "records", "state"],
     "splatting": FOUNDATION,
     "priors": [*FOUNDATION, "splatting"],

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from minislam import shelf as shelf_module
-from minislam.shelf import Shelf
+from minislam.shelf import Shelf, give_back_freed
 
 
 def noise(*shape: int) -> torch.Tensor:
@@ -119,3 +119,20 @@ def test_the_file_goes_with_the_last_tensor() -> None:
     del tensor
     gc.collect()
     assert mapped() == before
+
+
+@pytest.mark.parametrize("problem", [OSError, AttributeError])
+def test_without_glibc_freed_memory_stays(monkeypatch: pytest.MonkeyPatch, problem: type) -> None:
+    def no_library(name: None) -> None:
+        raise problem
+
+    monkeypatch.setattr(shelf_module.ctypes, "CDLL", no_library)
+    give_back_freed()
+
+
+def test_without_fallocate_the_block_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(shelf_module.os, "posix_fallocate", raising=False)
+    monkeypatch.setattr(shelf_module, "FIRST_BLOCK", (1 << 20) + 7)
+    shelf, tensor = Shelf(), noise(5000)
+    shelf.put([tensor])
+    assert shelf.holds(tensor) and torch.equal(tensor, noise(5000))

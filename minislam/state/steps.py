@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from minislam.shelf import give_back_freed
 from minislam.state.stateful import Stateful
 
 
@@ -51,6 +52,7 @@ class Steps(Stateful):
         """Do a stage that is a single step, unless it is done already."""
         if not self.done(stage):
             self._save_and_stop_if_asked(force=True)
+            give_back_freed()
             with self.timed(stage):
                 work()
             self._done[stage] = 1

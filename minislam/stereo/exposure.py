@@ -10,6 +10,7 @@ A common factor is free: the median is 1. Not in the paper; MonoGS optimises suc
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import TypeVar
 
 import cv2
@@ -56,17 +57,32 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
         weights.append(float(weight.mean()))
     least = LEAST_WEIGHT * max(weights, default=0.0)
     telling = [link for link, weight in enumerate(weights) if weight > least]
-    axes = np.eye(len(frames))
-    steady, edges = np.diff(axes, axis=0), links.edges
-    steps = [*steady, *(axes[edges[k][1]] - axes[edges[k][0]] for k in telling)]
-    values = [[0.0] * 3] * len(steady) + [ratios[k] for k in telling]
-    root = np.sqrt([STEADY] * len(steady) + [weights[k] for k in telling])[:, None]
-    levels = np.linalg.lstsq(root * steps, root * np.array(values, float), rcond=None)[0]
-    levels -= np.median(levels, 0)
+    neighbours = list(pairwise(range(len(frames))))
+    edges = [*neighbours, *(links.edges[k] for k in telling)]
+    steps = [[0.0] * 3] * len(neighbours) + [ratios[k] for k in telling]
+    counts = [STEADY] * len(neighbours) + [weights[k] for k in telling]
+    levels = _levels(len(frames), edges, np.array(counts), np.array(steps, float))
     if np.abs(levels).max() < LEAST_CHANGE:
         return {}
     exposures = torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)
     return {frame.frame_index: exposure for frame, exposure in zip(frames, exposures, strict=True)}
+
+
+def _levels(
+    count: int,  # K images
+    edges: list[tuple[int, int]],  # E pairs of them
+    weights: np.ndarray,  # (E,)
+    steps: np.ndarray,  # (E, 3) how much higher the second of a pair is
+) -> np.ndarray:  # (K, 3) of median 0
+    """Return the levels that fit the steps best, by the normal equations: E is up to 20 K."""
+    source, target = np.array(edges, int).reshape(-1, 2).T
+    matrix, right = np.zeros((count, count)), np.zeros((count, 3))
+    for here, there, sign in ((target, source, 1), (source, target, -1)):
+        np.add.at(matrix, (here, here), weights)
+        np.add.at(matrix, (here, there), -weights)
+        np.add.at(right, here, sign * weights[:, None] * steps.reshape(-1, 3))
+    levels = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    return levels - np.median(levels, 0)
 
 
 def with_exposure(frame: Shot, exposures: dict[int, Tensor]) -> Shot:

@@ -20,7 +20,7 @@ from torch import Tensor
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
 from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal, within_reach
-from minislam.tracking.safeguards.parts import CELLS_KEPT, in_parts, joined
+from minislam.tracking.safeguards.parts import CELLS_KEPT, SourceBlocks, in_parts, joined
 from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
 from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
 
@@ -89,7 +89,7 @@ class _NormalEquations:
     pose_gradient: Tensor  # g (6P,) float64
     disparity_diagonal: Tensor  # C (K, N)
     disparity_gradient: Tensor  # s (K, N)
-    source_blocks: list[tuple[int, Tensor, Tensor]]  # per source k: k, rows (R,), E_k (R, N)
+    source_blocks: SourceBlocks  # per source k: k, rows (R,), E_k (R, N)
 
 
 def bundle_adjust(
@@ -172,7 +172,7 @@ def _normal_equations(
 ) -> _NormalEquations:
     C = problem.prior_weights * problem.free_disparities[:, None]
     s = C * (problem.prior_disparities - state.disparities)
-    rows, blocks = [], []
+    rows, blocks = [], SourceBlocks(problem)
     for at in known or _linearised(problem, state):
         residual, weight, J = at.residual, at.weight, at.reprojection.J_target
         weighted_J = (J * weight[:, None]).flatten(2)
@@ -189,7 +189,7 @@ def _normal_equations(
         E_source = -adjoint.mT.to(J.dtype) @ E_target[:, :6]
         C.index_add_(0, source, (weighted_Jd * J_disparity).sum(1))
         s.index_add_(0, source, (weighted_Jd * residual).sum(1))
-        blocks += _source_blocks(at.problem, E_target, E_source)
+        blocks.add(_source_blocks(at.problem, E_target, E_source))
     H, g = _assemble_poses(problem, *joined(rows))
     return _NormalEquations(H, g, C, s, blocks)
 

@@ -11,14 +11,39 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from minislam.shelf import Shelf
+
 if TYPE_CHECKING:
     from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 
 CELLS_AT_ONCE = 50_000  # of all edges of a part: 200 bytes a cell
 CELLS_KEPT = 300_000  # of all edges of a problem whose derivatives are kept from cost to step
+CELLS_COUPLED = (
+    3_000_000  # of all edges of a problem whose couplings are in memory: 24 bytes a cell
+)
 _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
 _OF_CELLS = "targets weights shutter prior_disparities prior_weights disparity_damping"
+
+
+class SourceBlocks:
+    """Couplings of disparities and poses by source frame; those of thousands of edges in a file."""
+
+    def __init__(self, problem: "BundleProblem") -> None:
+        self._blocks: list[tuple[int, Tensor, Tensor]] = []
+        self._shelf = Shelf() if problem.weights[:, 0].numel() > CELLS_COUPLED else None
+
+    def add(self, blocks: list[tuple[int, Tensor, Tensor]]) -> None:
+        """Append the blocks of some source frames: k, rows (R,), E_k (R, N)."""
+        self._blocks += blocks
+        if self._shelf:
+            self._shelf.put(E for _, _, E in blocks)
+
+    def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor]]:
+        for block in self._blocks:
+            yield block
+            if self._shelf:
+                self._shelf.release()
 
 
 def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"]]:

@@ -5,8 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from minislam import shelf
 from minislam.tracking import bundle_adjustment, optimisation
-from minislam.tracking.bundle_adjustment import bundle_adjust, edge_costs, residuals
+from minislam.tracking.bundle_adjustment import (
+    _normal_equations,
+    bundle_adjust,
+    edge_costs,
+    residuals,
+)
 from minislam.tracking.optimisation import adjust_touched, touched_rows
 from minislam.tracking.safeguards import parts
 from minislam.tracking.safeguards.parts import in_parts, of_cells
@@ -46,6 +52,21 @@ def test_an_adjustment_in_parts_is_that_of_all_edges(monkeypatch: pytest.MonkeyP
         assert again.cost_after == pytest.approx(report.cost_after, rel=1e-12)
     assert torch.equal(edge_costs(problem, start), costs)
     assert all(torch.equal(a, b) for a, b in zip(residuals(problem, start), rest, strict=True))
+
+
+def test_couplings_in_a_file_are_those_in_memory(monkeypatch: pytest.MonkeyPatch):
+    known = known_problem(4)
+    problem, start = noisy(known, 1.0), perturbed(known, 0.02)
+    whole, _ = bundle_adjust(problem, start, 4)
+    monkeypatch.setattr(parts, "CELLS_COUPLED", 12 * CELLS - 1)
+    monkeypatch.setattr(shelf, "SMALLEST", 1)
+    blocks = _normal_equations(problem, start, []).source_blocks
+    assert len(list(blocks)) == 4 and all(blocks._shelf.holds(E) for _, _, E in blocks)
+    in_file, _ = bundle_adjust(problem, start, 4)
+    assert torch.equal(in_file.T_camera_world, whole.T_camera_world)
+    assert torch.equal(in_file.disparities, whole.disparities)
+    monkeypatch.setattr(parts, "CELLS_COUPLED", 12 * CELLS)
+    assert _normal_equations(problem, start, []).source_blocks._shelf is None
 
 
 def test_rows_that_nothing_touches_stay_and_the_others_move_as_in_the_whole(
