@@ -16,6 +16,7 @@ from minislam.data.preparation import ImagePreparation, KeptImages, picture_wind
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
+from minislam.parameters import absolute_path
 from minislam.records import Frame, GroundTruth, Progress
 
 _SYNTHETIC_SIZE = (320, 240)  # px
@@ -47,10 +48,12 @@ class RecordedSequence:
     """The chosen frames of a recording at the working size: a `minislam.records.Sequence`."""
 
     def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
+        paths = {name: getattr(options, name) for name in ("calibration", "masks")}
+        paths = {name: absolute_path(path) for name, path in paths.items() if path}
+        options = replace(options, **paths)
         self._recording, self._options, self._source = recording, options, source
         self.depth_scale = options.depth_scale
-        if not source.startswith(SYNTHETIC):  # so that it is found again from any folder
-            source = str(Path(source).expanduser().absolute())
+        source = source if source.startswith(SYNTHETIC) else absolute_path(source)
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
         self._chosen = chosen[: options.max_frames]

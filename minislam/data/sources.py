@@ -14,9 +14,9 @@ from minislam.data.calibration import Calibration, read_calibration
 from minislam.data.images import is_image, list_images, read_color
 from minislam.data.metadata import noted_focal_length
 from minislam.errors import InputError, MinislamError
+from minislam.parameters import FILES
 from minislam.records import Trajectory
 
-FILES = "files:"  # before the name of a folder
 _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 

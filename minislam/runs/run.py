@@ -71,6 +71,7 @@ def run_in_folder(
     Nothing of an earlier run is removed before the checks. The threads of torch are afterwards as
     they were. If an unknown lens turns out to bend straight lines, the run begins anew with it.
     """
+    choice = choice.from_anywhere()
     rest = config, choice, output, observer, lpips
     if choice.features.startswith(FILES) or choice.depth.startswith(FILES):
         sequence.seeks_lens = False  # the files belong to the images as they are

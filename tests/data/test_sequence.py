@@ -172,6 +172,18 @@ def test_rendering_reports_its_progress(tmp_path: Path, monkeypatch):
     assert calls[-1] == (2, 2)  # from the cache: nothing to wait for
 
 
+def test_what_the_options_name_is_found_again_from_any_folder(tmp_path: Path, monkeypatch):
+    folder = tum_folder(tmp_path / "desk")
+    monkeypatch.chdir(folder)
+    (folder / "lens.txt").write_text("50 50 23 16\n")
+    options = InputOptions(calibration="lens.txt", masks="files:masks")
+    opened = open_sequence("../desk", options)
+    monkeypatch.chdir(tmp_path)
+    again = open_sequence(opened.opened_as["sequence"], InputOptions(**opened.opened_as["input"]))
+    assert again.camera.fx == 50 and again.description == opened.description
+    assert again.given_mask(1).any() and again.opened_as == opened.opened_as
+
+
 # Identities
 
 
