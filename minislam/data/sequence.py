@@ -52,7 +52,8 @@ class RecordedSequence:
         paths = {name: absolute_path(path) for name, path in paths.items() if path}
         options = replace(options, **paths)
         self._recording, self._options, self._source = recording, options, source
-        self.depth_scale = options.depth_scale
+        read = partial(read_depth, units_per_metre=options.depth_scale)
+        self.read_depth: Callable[[Path], np.ndarray] = read
         source = source if source.startswith(SYNTHETIC) else absolute_path(source)
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
@@ -147,8 +148,7 @@ class RecordedSequence:
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        read = partial(read_depth, units_per_metre=self.depth_scale)
-        return self.picture(self._recording.depth_paths, frame_index, read)
+        return self.picture(self._recording.depth_paths, frame_index, self.read_depth)
 
     def picture(
         self, paths: dict[int, Path], frame_index: int, read: Callable[[Path], np.ndarray]
