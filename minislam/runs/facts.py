@@ -5,7 +5,6 @@ import platform
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -27,6 +26,7 @@ from minislam.splatting import Rendering
 from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
 from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS
+from minislam.workers import peak_memory_mb
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
 # that hangs together badly .65.
@@ -53,7 +53,7 @@ def run_facts(
         "seed": slam.config.seed,
         "state": state,
         "exit_code": exit_code,
-        "warnings": [*_warnings(slam), *filter(None, [checkpoints.problem])],
+        "warnings": [*_warnings(slam, choice.depth), *filter(None, [checkpoints.problem])],
         "seconds": {"total": checkpoints.run_seconds, **slam.steps.seconds},
         "checkpoint_seconds": checkpoints.seconds,
         "frames": len(slam.tracker.tracked),
@@ -185,23 +185,7 @@ def _segment_errors(slam: Slam) -> dict[str, float | None]:
     return errors
 
 
-def peak_memory_mb() -> float | None:
-    """Return the most memory this process has used so far [MB], or None on Windows."""
-    try:
-        import resource
-    except ImportError:
-        return None
-    # What Linux returns counts the process that started this one, too; its status does not.
-    status = Path("/proc/self/status")
-    if sys.platform == "linux" and status.exists():
-        _, _, rest = status.read_text(encoding="ascii", errors="replace").partition("VmHWM:")
-        if rest:
-            return int(rest.split()[0]) / 1024  # kB
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes
-
-
-def _warnings(slam: Slam) -> Iterator[str]:
+def _warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name of the prior
     """Yield what the user must know of a run."""
     watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
     diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
@@ -265,6 +249,13 @@ def _warnings(slam: Slam) -> Iterator[str]:
             f"{float((keyframes.overlay == 0).float().mean()):.0%} of the image stand still while "
             "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map only "
             "as far as beta does, with all that looks like them; crop the images"
+        )
+    knows = (keyframes.prior_disparities > 0).any(1).tolist() if depth != "none" else []
+    if not all(knows):
+        yield (
+            f"--depth {depth} knows nothing of {knows.count(False)} of {len(knows)} keyframes, "
+            f"such as frame {keyframes.frames[knows.index(False)].frame_index}: there depth is "
+            "that of the motion alone; give it for all frames"
         )
     if not keyframes.has_prior:
         yield "without a depth prior the unit of length is arbitrary"

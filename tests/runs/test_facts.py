@@ -1,7 +1,5 @@
 """What a run tells about itself: warnings, and the memory it took."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,6 +11,7 @@ from minislam.geometry import Camera
 from minislam.records import Keyframe, Pictured, Trajectory
 from minislam.runs import facts
 from minislam.splatting import Rendering
+from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.safeguards.diagnostics import Break
 from minislam.tracking.safeguards.focal_length import FocalLengthFit
 from minislam.tracking.safeguards.lens import LensFit
@@ -107,6 +106,17 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
     assert words in warning
 
 
+def test_keyframes_without_depth_are_warned_of_where_a_prior_was_given():
+    run = slam()
+    run.tracker.keyframes = KeyframeStore(torch.zeros(2))
+    for frame, depths in ((0, [0.5, 0.0]), (8, [0.0, 0.0]), (16, [0.0, 0.0])):
+        row = SimpleNamespace(frame_index=frame), torch.zeros(1), None, torch.eye(4)
+        run.tracker.keyframes.append(*row, torch.ones(2), torch.tensor(depths))
+    assert not list(facts._warnings(run, "none"))
+    (warning,) = facts._warnings(run, "files:made")
+    assert "--depth files:made knows nothing of 2 of 3 keyframes, such as frame 8:" in warning
+
+
 def test_a_truth_that_a_frame_matches_is_not_warned_of():
     assert not list(facts._warnings(slam(truth=[0.05, 9.0])))
 
@@ -152,34 +162,6 @@ def test_the_focal_length_is_said_with_its_origin(parts: dict, words: str):
 def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
     (warning,) = facts._warnings(slam(focal_length=DOUBTFUL, **broken))
     assert "present focal length" not in warning
-
-
-def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
-    on_linux = facts.peak_memory_mb()
-    assert 30 < on_linux < 30_000
-    monkeypatch.setattr(facts.sys, "platform", "darwin")  # there the system counts bytes
-    assert facts.peak_memory_mb() == pytest.approx(on_linux / 1024, rel=0.1)
-
-
-@pytest.mark.slow
-def test_the_memory_of_the_process_that_starts_a_run_is_not_counted():
-    child = "from minislam.runs.facts import peak_memory_mb; print(peak_memory_mb() or 0)"
-    parent = (
-        "import subprocess, sys\nlarge = bytearray(b'1') * 900_000_000\n"
-        f"subprocess.run([sys.executable, '-c', {child!r}])"
-    )
-    done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True)
-    assert float(done.stdout) < 800, done.stderr
-
-
-@pytest.mark.slow
-def test_without_the_counter_of_unix_the_package_still_imports():
-    program = (
-        "import sys; sys.modules['resource'] = None\n"
-        "from minislam.runs import facts, run\nprint(facts.peak_memory_mb())"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout == "None\n", done.stderr
 
 
 def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():
