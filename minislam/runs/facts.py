@@ -13,10 +13,11 @@ import scipy
 import torch
 
 import minislam
+from minislam.errors import InputError
 from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MAX_DIFFERENCE, MappedView, ate_cm, measure_run
-from minislam.evaluation.trajectory import associate
+from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
 from minislam.mapping.mapper import Mapper, surface_depth
 from minislam.priors.choice import PriorChoice
 from minislam.records import Keyframe, Trajectory
@@ -190,14 +191,14 @@ def _warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name 
     watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
     diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
     yield from slam.sequence.warnings
-    path = slam.sequence.ground_truth and slam.sequence.ground_truth.trajectory
-    stamps = np.array([tracked.timestamp for tracked in slam.tracker.tracked])
-    if path and len(stamps) and not len(associate(stamps, path.timestamps, MAX_DIFFERENCE)[0]):
-        yield (
-            f"no frame has a true pose within {MAX_DIFFERENCE:g} s, so there is no ATE: frames "
-            f"begin at {stamps[0]:.3f} s, the ground truth at {path.timestamps[0]:.3f} s; shift "
-            "its times"
-        )
+    truth = slam.sequence.ground_truth and slam.sequence.ground_truth.trajectory
+    if truth and slam.tracker.initialised:
+        doubt = doubt_of_units(estimate := slam.trajectory(), truth)
+        try:
+            absolute_trajectory_error(estimate, truth, max_difference=MAX_DIFFERENCE)
+        except InputError as error:
+            doubt = f"there is no ATE: {error}"
+        yield from filter(None, [doubt])
     if lost:
         tracked = slam.tracker.tracked
         since = 1 + max((t.frame_index for t in tracked if t.status.is_followed), default=-1)
