@@ -62,6 +62,7 @@ class Slam(Stateful):
     first_frame: FirstFrame
     focal_length: FocalLengthFit | None = None  # what the checks at the end have found
     lens: LensFit | None = None
+    undone_lens: LensFit | None = None  # which the images are freed of since the run began anew
     poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(

@@ -26,6 +26,7 @@ from minislam.slam import Slam
 from minislam.splatting import Rendering
 from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
+from minislam.tracking.safeguards.lens import BentLens
 from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS
 from minislam.workers import peak_memory_mb
 
@@ -67,6 +68,7 @@ def run_facts(
         "camera": asdict(slam.tracker.grid.camera),
         "focal_length": {"used": focal_length_note(slam)}
         | (asdict(fit) | {"is_doubtful": fit.is_doubtful} if fit else {}),
+        "began_anew": {"lens": asdict(slam.undone_lens)} if slam.undone_lens else None,
         "readout_seconds": list(graph.shutter.readout),
         # Numbered images are a second apart.
         "frame_seconds": float(np.median(np.diff(stamps))) if len(stamps) > 1 else None,
@@ -191,6 +193,8 @@ def _warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name 
     watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
     diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
     yield from slam.sequence.warnings
+    if slam.undone_lens:
+        yield str(BentLens(slam.undone_lens))
     truth = slam.sequence.ground_truth and slam.sequence.ground_truth.trajectory
     if truth and slam.tracker.initialised:
         doubt = doubt_of_units(estimate := slam.trajectory(), truth)

@@ -28,7 +28,12 @@ class Checkpoints:
     """Saves the state of a run in its folder; saving takes a small fraction of the time."""
 
     def __init__(
-        self, folder: RunFolder, sequence: Sequence, config: SlamConfig, choice: PriorChoice
+        self,
+        folder: RunFolder,
+        sequence: Sequence,
+        config: SlamConfig,
+        choice: PriorChoice,
+        seconds_before: float = 0.0,  # that the run has taken before it began anew
     ) -> None:
         self.seconds = 0.0  # spent on writing
         self.problem: str | None = None  # why the last checkpoint could not be written
@@ -47,7 +52,8 @@ class Checkpoints:
             "settings": asdict(config),
         }  # must be the same for a run to be resumed, as it is read back from JSON
         self._origin: dict[str, Any] = json.loads(json.dumps(origin))
-        self._start = self._last = time.perf_counter()  # of the run and of the last checkpoint
+        self._last = time.perf_counter()  # of the last checkpoint
+        self._start = self._last - seconds_before  # of the run
         self._cost = 0.0  # of the last checkpoint [s]
 
     @property

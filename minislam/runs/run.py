@@ -80,7 +80,7 @@ def run_in_folder(
     except BentLens as bent:
         observer.warn(str(bent))
         straight = sequence.through_lens(bent.lens.focal, *bent.lens.radial)
-        return _run_once(straight, *rest, True, False, workers)
+        return _run_once(straight, *rest, True, False, workers, bent)
 
 
 def _run_once(
@@ -93,6 +93,7 @@ def _run_once(
     overwrite: bool,
     resume: bool,
     workers: int | None,
+    bent: BentLens | None = None,  # with which the run has begun anew
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     for index in range(len(sequence)):
         if config.uncertainty.takes_masks:
@@ -108,7 +109,8 @@ def _run_once(
         )
         try:
             torch.set_num_threads(config.threads)
-            checkpoints = Checkpoints(folder, sequence, config, choice)
+            seconds_before = bent.seconds if bent else 0.0
+            checkpoints = Checkpoints(folder, sequence, config, choice, seconds_before)
             preview, said = Preview(folder), set[str]()
 
             def between_steps(force: bool) -> None:
@@ -120,6 +122,9 @@ def _run_once(
                 preview.update(slam, facts_of)
 
             slam = Slam(sequence, config, priors, observer, between_steps, choice.device, helpers)
+            if bent:
+                slam.undone_lens = bent.lens
+                slam.steps.seconds["before the lens was known"] = bent.seconds
             facts_of = partial(run_facts, slam, choice, checkpoints)
             if resume:
                 checkpoints.restore(slam)
@@ -154,7 +159,8 @@ def _run(
         write_pictures(folder, slam, metrics, facts)
         clip_is_written()
         write_json(folder.path / names.RUN, facts)
-    except BentLens:
+    except BentLens as bent:
+        bent.seconds = facts_of("running", None)["seconds"]["total"]
         raise
     except (Exception, KeyboardInterrupt) as error:
         if way := way_on(path := folder.path):

@@ -66,6 +66,7 @@ def slam(**parts: object) -> SimpleNamespace:
         tracker=tracker,
         focal_length=parts.pop("focal_length", None),
         lens=parts.pop("lens", None),
+        undone_lens=parts.pop("undone_lens", None),
     )
 
 
@@ -96,6 +97,10 @@ WARNINGS = [
     (
         {"lens": LensFit(300.0, (0.0, 0.0), 0.01, 0.13), "focal_length": DOUBTFUL},
         "the flow fits 1.10 times the",
+    ),
+    (
+        {"undone_lens": LensFit(300.0, (-0.1, 0.02), -0.07, 0.13)},
+        "by -7%: the run begins anew on straightened images, k1 = -0.100, k2 = 0.020",
     ),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
