@@ -11,9 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from minislam.cli.options import input_options, lpips_of, prior_choice, settings
 from minislam.cli.progress import ending_signals, say
 from minislam.data.files import make_folder, read_json, write_json, write_text
-from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, USAGE_EXIT, InputError
+from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
 LEGEND = """\
@@ -43,6 +44,7 @@ def _bench(args: argparse.Namespace) -> int:
     own.add_argument("-o", "--output", default="output/bench", type=Path)
     given, options = own.parse_known_args(args.options)
     sequences, noted = find_sequences(args.folders), given.output / "options.json"
+    _check_options(next(iter(sequences.values())), options)
     make_folder(given.output)
     if noted.exists() and (then := read_json(noted)) != options:
         raise InputError(
@@ -55,13 +57,21 @@ def _bench(args: argparse.Namespace) -> int:
     for number, (name, path) in enumerate(sequences.items(), start=1):
         say(f"== {number} of {len(sequences)}: {name}")
         code, ate_cm = _run(path, given.output / name, options)
-        if code in (USAGE_EXIT, INTERRUPTED_EXIT):  # a wrong option is wrong for every sequence
+        if code == INTERRUPTED_EXIT:
             break
         ours[name] = ate_cm
         tables = _write_tables(given.output, ours)
     if tables:
         say(f"\n{tables}\nin {given.output}/bench.md and {given.output}/bench.csv")
     return code if len(ours) < len(sequences) else int("F" in ours.values())
+
+
+def _check_options(path: Path, options: list[str]) -> None:
+    """Refuse options that no run would take, before the first run and before they are noted."""
+    from minislam.cli.main import parsed
+
+    args = parsed(["run", str(path), "--overwrite", *options])
+    settings(args), input_options(args), prior_choice(args, "none"), lpips_of(args)
 
 
 def find_sequences(folders: list[str]) -> dict[str, Path]:
