@@ -48,9 +48,8 @@ class RecordedSequence:
     """The chosen frames of a recording at the working size: a `minislam.records.Sequence`."""
 
     def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
-        paths = {name: getattr(options, name) for name in ("calibration", "masks")}
-        paths = {name: absolute_path(path) for name, path in paths.items() if path}
-        options = replace(options, **paths)
+        masks, lens = (p and absolute_path(p) for p in (options.masks, options.calibration))
+        options = replace(options, masks=masks, calibration=lens)
         self._recording, self._options, self._source = recording, options, source
         read = partial(read_depth, units_per_metre=options.depth_scale)
         self.read_depth: Callable[[Path], np.ndarray] = read
@@ -86,7 +85,8 @@ class RecordedSequence:
         self.warnings = [*recording.warnings, *doubts]
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
-        self.seeks_lens = calibration.is_rough and options.focal == "auto"
+        knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
+        self.seeks_lens = knows_nothing and options.focal == "auto"
         if calibration.is_rough and not self.refines_focal:
             self.warnings.append(
                 f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}, for "
@@ -190,7 +190,7 @@ def _doubts(raw: np.ndarray, label: str, fx: float) -> Iterator[str]:
     angle = 2 * np.degrees(np.arctan(raw.shape[1] / 2 / fx)) if fx else 60
     if not 15 <= angle <= 130:  # degree
         how = "in millimetres" if angle > 130 else "for larger images"
-        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: was it given {how}?"
+        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: check if it is {how}"
 
 
 def _calibration(
