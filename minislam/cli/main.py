@@ -93,7 +93,7 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     if not arguments[0].startswith("-") and arguments[0] not in commands:
         hint = nearest(arguments[0], commands, f"choose one of {', '.join(commands)}")
         raise UsageError(f"expected a command, found {arguments[0]!r}; {hint}")
-    given: dict[str, str | None] = {}
+    given: dict[str, str] = {}
     if arguments[0] in commands and commands[arguments[0]].get_default("takes_settings"):
         arguments, given = take_settings(arguments)
     args, unknown = parser.parse_known_args(arguments)

@@ -109,8 +109,7 @@ def _run_once(
         )
         try:
             torch.set_num_threads(config.threads)
-            seconds_before = bent.seconds if bent else 0.0
-            checkpoints = Checkpoints(folder, sequence, config, choice, seconds_before)
+            checkpoints = Checkpoints(folder, sequence, config, choice)
             preview, said = Preview(folder), set[str]()
 
             def between_steps(force: bool) -> None:
@@ -124,6 +123,7 @@ def _run_once(
             slam = Slam(sequence, config, priors, observer, between_steps, choice.device, helpers)
             if bent:
                 slam.undone_lens = bent.lens
+                checkpoints.start -= bent.seconds
                 slam.steps.seconds["before the lens was known"] = bent.seconds
             facts_of = partial(run_facts, slam, choice, checkpoints)
             if resume:

@@ -173,6 +173,21 @@ def test_pairs_that_are_few_by_their_units_or_too_few_to_compare_are_said(tmp_pa
         run_eval(parse(*names[1:], "--no_align", "--rpe"))
 
 
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--t_offset", "nan"], "expected --t_offset of at least -1e"),
+        (["--t_offset=-inf"], "expected --t_offset of at least -1e"),
+        (["--t_max_diff", "-1"], "expected --t_max_diff of at least 0"),
+        (["--t_max_diff", "nan"], "expected --t_max_diff of at least 0"),
+        (["--save_plot", "plot.svg"], r"expected --save_plot FILE\.png, found plot\.svg"),
+    ],
+)
+def test_times_that_are_none_and_pictures_of_other_kinds_are_refused(files, flags, words: str):
+    with pytest.raises(InputError, match=words):
+        run_eval(parse(*files, *flags))
+
+
 def test_files_of_the_user_stay(files, tmp_path: Path):
     for name in ("ate.json", "plot.png"):
         (tmp_path / name).write_text("mine")
