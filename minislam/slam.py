@@ -155,8 +155,7 @@ class Slam(Stateful):
 
     def _move_map(self) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""
-        mapped = len(self.mapper.keyframes)
-        if mapped:
+        if mapped := len(self.mapper.keyframes):
             self.mapper.camera = self.tracker.grid.camera
             self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped])
 

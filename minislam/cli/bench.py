@@ -40,11 +40,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def _bench(args: argparse.Namespace) -> int:
     """Run what is not finished, print and write the tables; return the exit code."""
+    from minislam.cli.main import parsed  # which imports this module
+
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
     own.add_argument("-o", "--output", default="output/bench", type=Path)
     given, options = own.parse_known_args(args.options)
     sequences, noted = find_sequences(args.folders), given.output / "options.json"
-    _check_options(next(iter(sequences.values())), options)
+    run = parsed(["run", args.folders[0], "--overwrite", *options])
+    settings(run), input_options(run), prior_choice(run, "none"), lpips_of(run)  # or refuse them
     make_folder(given.output)
     if noted.exists() and (then := read_json(noted)) != options:
         raise InputError(
@@ -64,14 +67,6 @@ def _bench(args: argparse.Namespace) -> int:
     if tables:
         say(f"\n{tables}\nin {given.output}/bench.md and {given.output}/bench.csv")
     return code if len(ours) < len(sequences) else int("F" in ours.values())
-
-
-def _check_options(path: Path, options: list[str]) -> None:
-    """Refuse options that no run would take, before the first run and before they are noted."""
-    from minislam.cli.main import parsed
-
-    args = parsed(["run", str(path), "--overwrite", *options])
-    settings(args), input_options(args), prior_choice(args, "none"), lpips_of(args)
 
 
 def find_sequences(folders: list[str]) -> dict[str, Path]:

@@ -11,8 +11,6 @@ from minislam.data.files import atomic_write, require_new, write_json
 from minislam.errors import InputError
 from minislam.parameters import require_bounds
 
-MOST_SECONDS = 1e20  # also times that count in nanoseconds, since 1970
-
 if TYPE_CHECKING:
     from minislam.evaluation.trajectory import Alignment, TrajectoryError
 
@@ -56,8 +54,8 @@ def run_eval(args: argparse.Namespace) -> None:
     if Path(args.estimate).is_dir():
         args.estimate = str(Path(args.estimate) / TRAJECTORY)
     plot = args.save_plot and args.save_plot + ("" if Path(args.save_plot).suffix else ".png")
-    for name, least in (("t_max_diff", 0), ("t_offset", -MOST_SECONDS)):
-        require_bounds(f"--{name}", getattr(args, name), least, MOST_SECONDS)
+    for name, least in (("t_max_diff", 0), ("t_offset", -1e20)):  # that is no NaN either
+        require_bounds(f"--{name}", getattr(args, name), least, 1e20)
     require_new([args.save_results, plot], args.overwrite, [args.reference, args.estimate])
     if plot and Path(plot).suffix.lower() != ".png":
         raise InputError(f"expected --save_plot FILE.png, found {plot}; give another name")

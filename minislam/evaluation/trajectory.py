@@ -10,9 +10,7 @@ from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 
-# A trajectory counts in milliseconds if its poses are farther apart than this, and than this many
-# times the distance of the other one's.
-MOST_SECONDS, MOST_RATIO = 1.0, 20.0
+MOST_SECONDS, MOST_RATIO = 1.0, 20.0  # between poses, and to the other's; more: milliseconds
 
 
 class Alignment(Enum):
@@ -107,9 +105,9 @@ def paired(
 
 def doubt_of_units(estimate: Trajectory, truth: Trajectory) -> str:
     """Return what to do if the times of one are probably no seconds, "" if nothing says so."""
-    both = estimate.timestamps, truth.timestamps
-    found, true = (float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in both)
-    if max(found, true) <= MOST_SECONDS or max(found, true) <= MOST_RATIO * min(found, true):
+    paths = estimate.timestamps, truth.timestamps
+    found, true = (float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in paths)
+    if max(found, true) <= max(MOST_SECONDS, MOST_RATIO * min(found, true)):
         return ""
     return (
         f"check that the times of both are in seconds: poses of the estimate are {found:.3g} s "
