@@ -5,8 +5,10 @@ Settings stand in trees of dataclasses; names with dots reach every part of one:
 
 import difflib
 import math
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, field, fields, is_dataclass, replace
+from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -14,6 +16,7 @@ from minislam.errors import InputError
 
 Tree = TypeVar("Tree")  # a dataclass whose fields are values or again dataclasses
 
+FILES = "files:"  # before the name of a folder with one file per frame
 MOST = 1e9  # no setting of the package is larger, where it does not say so
 
 
@@ -30,6 +33,12 @@ def require_bounds(name: str, value: Any, least: float, most: float) -> None:
                 f"expected {name} of at least {least:g} and at most {most:g}, found {value}; "
                 "choose a value between"
             )
+
+
+def absolute_path(name: str) -> str:
+    """Return a path, or files:FOLDER, by which what it names is found from any folder."""
+    path = os.path.expanduser(name.removeprefix(FILES))
+    return FILES * name.startswith(FILES) + str(Path(path).absolute())
 
 
 def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any, Field[Any]]]:

@@ -130,7 +130,7 @@ class Sequence(Protocol):
     lost: list[tuple[float, str]]  # timestamp [s] and reason of frames that could not be decoded
     checksums: dict[int, int]  # of the images read so far, by frame index
     ground_truth: GroundTruth | None
-    depth_scale: float  # units of a stored depth image per metre
+    read_depth: Callable[[Path], np.ndarray]  # a depth image, as (H, W) [m], 0 where unknown
     files: list[Path]  # that hold the images and masks
     opened_as: dict[str, Any]  # "sequence" and "input", the part of config.json that opens it
     preparation: dict[str, Any]  # how raw images became working images, see `ImagePreparation`

@@ -63,6 +63,7 @@ class Slam(Stateful):
     first_frame: FirstFrame
     focal_length: FocalLengthFit | None = None  # what the checks at the end have found
     lens: LensFit | None = None
+    undone_lens: LensFit | None = None  # which the images are freed of since the run began anew
     poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
@@ -155,8 +156,7 @@ class Slam(Stateful):
 
     def _move_map(self) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""
-        mapped = len(self.mapper.keyframes)
-        if mapped:
+        if mapped := len(self.mapper.keyframes):
             self.mapper.camera = self.tracker.grid.camera
             self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped])
 

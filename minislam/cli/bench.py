@@ -11,9 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from minislam.cli.options import input_options, lpips_of, prior_choice, settings
 from minislam.cli.progress import ending_signals, say
 from minislam.data.files import make_folder, read_json, write_json, write_text
-from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, USAGE_EXIT, InputError
+from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
 LEGEND = """\
@@ -39,10 +40,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def _bench(args: argparse.Namespace) -> int:
     """Run what is not finished, print and write the tables; return the exit code."""
+    from minislam.cli.main import parsed  # which imports this module
+
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
     own.add_argument("-o", "--output", default="output/bench", type=Path)
     given, options = own.parse_known_args(args.options)
     sequences, noted = find_sequences(args.folders), given.output / "options.json"
+    run = parsed(["run", args.folders[0], "--overwrite", *options])
+    settings(run), input_options(run), prior_choice(run, "none"), lpips_of(run)  # or refuse them
     make_folder(given.output)
     if noted.exists() and (then := read_json(noted)) != options:
         raise InputError(
@@ -55,7 +60,7 @@ def _bench(args: argparse.Namespace) -> int:
     for number, (name, path) in enumerate(sequences.items(), start=1):
         say(f"== {number} of {len(sequences)}: {name}")
         code, ate_cm = _run(path, given.output / name, options)
-        if code in (USAGE_EXIT, INTERRUPTED_EXIT):  # a wrong option is wrong for every sequence
+        if code == INTERRUPTED_EXIT:
             break
         ours[name] = ate_cm
         tables = _write_tables(given.output, ours)

@@ -6,8 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from minislam.cli.progress import say
 from minislam.data.files import atomic_write, require_new, write_json
 from minislam.errors import InputError
+from minislam.parameters import require_bounds
 
 if TYPE_CHECKING:
     from minislam.evaluation.trajectory import Alignment, TrajectoryError
@@ -46,17 +48,23 @@ def run_eval(args: argparse.Namespace) -> None:
     """Compare two trajectory files."""
     from minislam.data.run_folder import TRAJECTORY
     from minislam.data.trajectory import read_trajectory
-    from minislam.evaluation.trajectory import absolute_trajectory_error
+    from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
     from minislam.records import Trajectory
 
     if Path(args.estimate).is_dir():
         args.estimate = str(Path(args.estimate) / TRAJECTORY)
     plot = args.save_plot and args.save_plot + ("" if Path(args.save_plot).suffix else ".png")
+    for name, least in (("t_max_diff", 0), ("t_offset", -1e20)):  # that is no NaN either
+        require_bounds(f"--{name}", getattr(args, name), least, 1e20)
     require_new([args.save_results, plot], args.overwrite, [args.reference, args.estimate])
+    if plot and Path(plot).suffix.lower() != ".png":
+        raise InputError(f"expected --save_plot FILE.png, found {plot}; give another name")
     estimate, truth = read_trajectory(args.estimate), read_trajectory(args.reference)
     shifted = Trajectory(estimate.timestamps + args.t_offset, estimate.T_world_camera)
     alignment = _alignment(args)
     result = absolute_trajectory_error(shifted, truth, alignment, args.t_max_diff)
+    if doubt := doubt_of_units(shifted, truth):
+        say(f"WARNING: only {len(result.errors)} pairs: {doubt}", "stderr")
     tables = {"APE w.r.t. translation part (m)": result.statistics}
     if args.rpe:
         tables = _relative_errors(args, result)
@@ -109,6 +117,8 @@ def _relative_errors(
 
     from minislam.evaluation.trajectory import relative_pose_error, statistics
 
+    if len(result.truth) < 2:
+        raise InputError("expected at least 2 pairs of poses for --rpe, found 1; give longer paths")
     step, is_possible = args.delta, 0 < args.delta < 1e9  # not NaN either
     if args.delta_unit == "s" and is_possible:
         step = max(1, round(step / float(np.median(np.diff(result.truth.timestamps)))))

@@ -77,24 +77,30 @@ def set_malloc() -> None:
 
 
 def _command(arguments: list[str]) -> int:
+    if not arguments:
+        _parser().print_help()
+        return USAGE_EXIT
+    args = parsed(arguments)
+    return args.run(args) or 0  # a command without an exit code of its own has succeeded
+
+
+def parsed(arguments: list[str]) -> argparse.Namespace:
+    """Return the arguments of a command; raises `UsageError` for one that it does not have."""
     parser = _parser()
     commands = parser.get_default("commands")
     if arguments[:1] == ["help"]:
         arguments = [*arguments[1:], "-h"]
-    if not arguments:
-        parser.print_help()
-        return USAGE_EXIT
     if not arguments[0].startswith("-") and arguments[0] not in commands:
         hint = nearest(arguments[0], commands, f"choose one of {', '.join(commands)}")
         raise UsageError(f"expected a command, found {arguments[0]!r}; {hint}")
-    given: dict[str, str | None] = {}
+    given: dict[str, str] = {}
     if arguments[0] in commands and commands[arguments[0]].get_default("takes_settings"):
         arguments, given = take_settings(arguments)
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
         raise unknown_option(unknown[0], args.parser)
     args.settings = given
-    return args.run(args) or 0  # a command without an exit code of its own has succeeded
+    return args
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -99,7 +100,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     add("--no-uncertainty", action="store_true", help="give every pixel the same weight (ablation)")
 
 
-def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str | None]]:
+def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
     """Return what is no setting, and the values of settings like --tracking.window 8 by name.
 
     Names with a dot are settings. Which of them there are is known only with torch.
@@ -108,12 +109,14 @@ def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str | None
     if len(behind) > 1:
         raise UsageError(f"expected one name after --, found also {behind[1]}; put options first")
     rest: list[str] = []
-    given: dict[str, str | None] = {}
+    given: dict[str, str] = {}
     todo = iter(arguments)
     for argument in todo:
         name, equals, value = argument.partition("=")
         if name.startswith("--") and "." in name:
-            given[name.removeprefix("--")] = value if equals else next(todo, None)
+            if not equals and re.match("--?[a-z]|$", value := next(todo, "")):
+                raise UsageError(f"expected a value after {name}, found none; give one")
+            given[name.removeprefix("--")] = value
         else:
             rest.append(argument)
     return rest, given

@@ -16,6 +16,7 @@ from minislam.data.preparation import ImagePreparation, KeptImages, picture_wind
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
+from minislam.parameters import absolute_path
 from minislam.records import Frame, GroundTruth, Progress
 
 _SYNTHETIC_SIZE = (320, 240)  # px
@@ -47,10 +48,12 @@ class RecordedSequence:
     """The chosen frames of a recording at the working size: a `minislam.records.Sequence`."""
 
     def __init__(self, recording: Recording, options: InputOptions, source: str) -> None:
+        masks, lens = (p and absolute_path(p) for p in (options.masks, options.calibration))
+        options = replace(options, masks=masks, calibration=lens)
         self._recording, self._options, self._source = recording, options, source
-        self.depth_scale = options.depth_scale
-        if not source.startswith(SYNTHETIC):  # so that it is found again from any folder
-            source = str(Path(source).expanduser().absolute())
+        read = partial(read_depth, units_per_metre=options.depth_scale)
+        self.read_depth: Callable[[Path], np.ndarray] = read
+        source = source if source.startswith(SYNTHETIC) else absolute_path(source)
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
         self._chosen = chosen[: options.max_frames]
@@ -82,7 +85,8 @@ class RecordedSequence:
         self.warnings = [*recording.warnings, *doubts]
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
-        self.seeks_lens = calibration.is_rough and options.focal == "auto"
+        knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
+        self.seeks_lens = knows_nothing and options.focal == "auto"
         if calibration.is_rough and not self.refines_focal:
             self.warnings.append(
                 f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}, for "
@@ -144,8 +148,7 @@ class RecordedSequence:
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        read = partial(read_depth, units_per_metre=self.depth_scale)
-        return self.picture(self._recording.depth_paths, frame_index, read)
+        return self.picture(self._recording.depth_paths, frame_index, self.read_depth)
 
     def picture(
         self, paths: dict[int, Path], frame_index: int, read: Callable[[Path], np.ndarray]
@@ -187,7 +190,7 @@ def _doubts(raw: np.ndarray, label: str, fx: float) -> Iterator[str]:
     angle = 2 * np.degrees(np.arctan(raw.shape[1] / 2 / fx)) if fx else 60
     if not 15 <= angle <= 130:  # degree
         how = "in millimetres" if angle > 130 else "for larger images"
-        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: was it given {how}?"
+        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: check if it is {how}"
 
 
 def _calibration(

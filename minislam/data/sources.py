@@ -14,14 +14,15 @@ from minislam.data.calibration import Calibration, read_calibration
 from minislam.data.images import is_image, list_images, read_color
 from minislam.data.metadata import noted_focal_length
 from minislam.errors import InputError, MinislamError
+from minislam.parameters import FILES
 from minislam.records import Trajectory
 
-FILES = "files:"  # before the name of a folder
 _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
 _ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
+_TEXT = cv2.VideoWriter.fourcc(*"ansi")  # FFmpeg films a text file on a terminal
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
 
@@ -129,7 +130,8 @@ class VideoImages:
             )
         self._capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
         self._grabbed = 0  # calls of grab() since the start
-        if not self._capture.isOpened():
+        codec = self._capture.get(cv2.CAP_PROP_FOURCC)
+        if not self._capture.isOpened() or codec == _TEXT:
             size, hint = self.path.stat().st_size, "convert it to MP4 (H.264) or give images"
             content = np.memmap(self.path, mode="r").data if size else memoryview(b"")
             # The table of contents, which cameras write at the end of an MP4

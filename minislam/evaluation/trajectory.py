@@ -10,6 +10,8 @@ from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 
+MOST_SECONDS, MOST_RATIO = 1.0, 20.0  # between poses, and to the other's; more: milliseconds
+
 
 class Alignment(Enum):
     """What is fitted before the comparison. A monocular estimate needs a scale, so Sim(3)."""
@@ -38,7 +40,8 @@ def absolute_trajectory_error(
     max_difference: float = 0.01,  # second between two poses of a pair, evo's default
 ) -> TrajectoryError:
     """Return the distances between estimated and true camera centres (ATE)."""
-    estimate, truth = paired(estimate, truth, max_difference)
+    least = 1 if alignment is Alignment.NONE else 3  # pairs
+    estimate, truth = paired(estimate, truth, max_difference, least)
     similarity = fit_alignment(estimate, truth, alignment)
     aligned = Trajectory(estimate.timestamps, similarity.transform_poses(estimate.T_world_camera))
     errors = np.linalg.norm(centres(aligned) - centres(truth), axis=1)
@@ -82,21 +85,34 @@ def straight_line_error(truth: Trajectory) -> float:
 
 
 def paired(
-    estimate: Trajectory, truth: Trajectory, max_difference: float
+    estimate: Trajectory, truth: Trajectory, max_difference: float, least: int = 1
 ) -> tuple[Trajectory, Trajectory]:
     """Return the poses of both trajectories that belong together, in order of time."""
     pairs = associate(estimate.timestamps, truth.timestamps, max_difference)
-    if len(pairs[0]) == 0:
+    if len(pairs[0]) < least:
+        advice = "check that both belong together, or use --t_offset and --t_max_diff of eval"
         raise InputError(
-            f"expected timestamps of estimate and truth within {max_difference:g} s of each "
-            f"other, found none (estimate {_span(estimate)}, truth {_span(truth)}); check that "
-            "the files belong together, or use --t_offset and --t_max_diff"
+            f"expected at least {least} timestamps of estimate and truth within {max_difference:g} "
+            f"s of each other, found {len(pairs[0])} (estimate {_span(estimate)}, truth "
+            f"{_span(truth)}); {doubt_of_units(estimate, truth) or advice}"
         )
     estimate, truth = (
         Trajectory(whole.timestamps[kept], whole.T_world_camera[kept])
         for whole, kept in zip((estimate, truth), pairs, strict=True)
     )
     return estimate, truth
+
+
+def doubt_of_units(estimate: Trajectory, truth: Trajectory) -> str:
+    """Return what to do if the times of one are probably no seconds, "" if nothing says so."""
+    paths = estimate.timestamps, truth.timestamps
+    found, true = (float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in paths)
+    if max(found, true) <= max(MOST_SECONDS, MOST_RATIO * min(found, true)):
+        return ""
+    return (
+        f"check that the times of both are in seconds: poses of the estimate are {found:.3g} s "
+        f"apart, those of the truth {true:.3g} s"
+    )
 
 
 def associate(
@@ -169,4 +185,6 @@ def centres(trajectory: Trajectory) -> np.ndarray:
 def _span(trajectory: Trajectory) -> str:
     if len(trajectory) == 0:
         return "empty"
-    return f"{trajectory.timestamps[0]:.3f} to {trajectory.timestamps[-1]:.3f} s"
+    ends = trajectory.timestamps[[0, -1]]
+    poses = "1 pose" if len(trajectory) == 1 else f"{len(trajectory)} poses"
+    return f"{poses}, {ends[0]:.3f} to {ends[1]:.3f} s"

@@ -7,7 +7,7 @@ installed package gives its factory a name of its own by an entry point in the g
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -108,17 +108,24 @@ def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any:
 
 
 def _sensor_depth(sequence: Sequence) -> SensorDepth:
-    if all(sequence.sensor_depth(index) is None for index in range(len(sequence))):
-        raise InputError(
-            f"expected a sensor's depth in {sequence.name}, found none; use another --depth"
-        )
+    depths = map(sequence.sensor_depth, range(len(sequence)))
+    _require_some(depths, f"a sensor's depth in {sequence.name}", "use another --depth")
     return SensorDepth(sequence.sensor_depth)
 
 
 def _depth_files(sequence: Sequence, folder: Path) -> FileDepth:
-    depth = FileDepth(folder, 1 / sequence.depth_scale)
+    depth = FileDepth(folder, sequence.read_depth)
     depth.files.require_frames_of(sequence)
+    depths = (depth(sequence.frame(index), sequence.camera) for index in range(len(sequence)))
+    advice = "name the files by frame index, and write metres, not 0 or NaN"
+    _require_some(depths, f"depth of any frame in {folder}", advice)
     return depth
+
+
+def _require_some(depths: Iterable[Any], what: str, advice: str) -> None:
+    """Refuse depths that are unknown everywhere; the first that is known ends the search."""
+    if not any(depth is not None and bool((depth > 0).any()) for depth in depths):
+        raise InputError(f"expected {what}, found none; {advice}")
 
 
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:

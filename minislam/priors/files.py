@@ -4,9 +4,9 @@
 """
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -119,9 +119,9 @@ class FileDepth:
     def __init__(
         self,
         folder: Path | str,
-        png_unit: float = 1 / 5000,  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
+        read_png: Callable[[Path], np.ndarray],  # (H, W) world units; `Sequence.read_depth`
     ) -> None:
-        self.png_unit = png_unit
+        self._read_png = read_png
         self.files = FrameFiles(folder, "depth", (".npy", ".png"))
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
@@ -129,15 +129,9 @@ class FileDepth:
         path = self.files.of(frame)
         if path is None:
             return None
-        if path.suffix.lower() == ".npy":
-            return as_depth(read_array(path, DEPTH), frame, str(path))
-        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if counts is None or counts.ndim != 2 or counts.dtype != np.uint16:
-            raise InputError(
-                f"expected a single-channel 16-bit .png of depth, found something else in {path}; "
-                "export depth, not its coloured picture"
-            )
-        return as_depth(counts.astype(np.float32) * self.png_unit, frame, str(path))
+        is_array = path.suffix.lower() == ".npy"
+        depth = read_array(path, DEPTH) if is_array else self._read_png(path)
+        return as_depth(depth, frame, str(path))
 
 
 def folder_of(name: str, kind: str) -> Path:

@@ -5,13 +5,13 @@ The official checkpoints are listed in networks/weights.csv; `minislam weights` 
 
 import csv
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from minislam.errors import InputError
+from minislam.parameters import FILES, absolute_path
 
-FILES = "files:"  # before the name of a folder of results made elsewhere
 PYTHON = "python:"  # before MODULE:FACTORY
 FOLDER = f"{FILES}FOLDER"
 PRECISIONS = {"fp32": "float32", "bf16": "bfloat16", "fp16": "float16"}  # names of torch
@@ -53,6 +53,15 @@ class PriorChoice:
                 f"expected --precision {' or '.join(usable)} with --device {self.device}, found "
                 f"{self.precision!r}; choose one"
             )
+
+    def from_anywhere(self) -> "PriorChoice":
+        """Return the same choice by absolute paths, which a run folder keeps."""
+        found = {}
+        for name, value in vars(self).items():
+            is_file = name.endswith("_weights") and value and value not in published_files()
+            if str(value).startswith(FILES) or (is_file and os.path.exists(absolute_path(value))):
+                found[name] = absolute_path(value)
+        return replace(self, **found)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from minislam.data.files import atomic_file, atomic_write, make_folder, write_json, write_text
 from minislam.data.images import encode_png
 from minislam.data.ply import encode_points
+from minislam.data.run_folder import RUN
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.dense_flow import sample, warp
@@ -124,8 +125,10 @@ def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera
 
 
 def _make_apart(run: Run, folder: Path, *parts: str) -> None:
-    """Make an output folder and its parts; refuse one that holds images of the run's source."""
+    """Make an output folder and its parts; refuse that of a run, or of images of its source."""
     make_folder(folder := folder.resolve())
+    if (folder / RUN).exists():  # whose camera.json would be replaced
+        raise InputError(f"expected a folder of no run, found {RUN} in {folder}; choose another")
     if any(folder.iterdir()):  # only then, because depth can be written without the source
         if inside := [f for f in run.sequence.files if f.resolve().is_relative_to(folder)]:
             raise InputError(

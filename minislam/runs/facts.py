@@ -5,7 +5,6 @@ import platform
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,10 +13,11 @@ import scipy
 import torch
 
 import minislam
+from minislam.errors import InputError
 from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MAX_DIFFERENCE, MappedView, ate_cm, measure_run
-from minislam.evaluation.trajectory import associate
+from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
 from minislam.mapping.mapper import Mapper, surface_depth
 from minislam.priors.choice import PriorChoice
 from minislam.records import Keyframe, Trajectory
@@ -26,7 +26,9 @@ from minislam.slam import Slam
 from minislam.splatting import Rendering
 from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
+from minislam.tracking.safeguards.lens import BentLens
 from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS
+from minislam.workers import peak_memory_mb
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
 # that hangs together badly .65.
@@ -53,7 +55,7 @@ def run_facts(
         "seed": slam.config.seed,
         "state": state,
         "exit_code": exit_code,
-        "warnings": [*_warnings(slam), *filter(None, [checkpoints.problem])],
+        "warnings": [*_warnings(slam, choice.depth), *filter(None, [checkpoints.problem])],
         "seconds": {"total": checkpoints.run_seconds, **slam.steps.seconds},
         "checkpoint_seconds": checkpoints.seconds,
         "frames": len(slam.tracker.tracked),
@@ -66,6 +68,7 @@ def run_facts(
         "camera": asdict(slam.tracker.grid.camera),
         "focal_length": {"used": focal_length_note(slam)}
         | (asdict(fit) | {"is_doubtful": fit.is_doubtful} if fit else {}),
+        "began_anew": {"lens": asdict(slam.undone_lens)} if slam.undone_lens else None,
         "readout_seconds": list(graph.shutter.readout),
         # Numbered images are a second apart.
         "frame_seconds": float(np.median(np.diff(stamps))) if len(stamps) > 1 else None,
@@ -185,35 +188,21 @@ def _segment_errors(slam: Slam) -> dict[str, float | None]:
     return errors
 
 
-def peak_memory_mb() -> float | None:
-    """Return the most memory this process has used so far [MB], or None on Windows."""
-    try:
-        import resource
-    except ImportError:
-        return None
-    # What Linux returns counts the process that started this one, too; its status does not.
-    status = Path("/proc/self/status")
-    if sys.platform == "linux" and status.exists():
-        _, _, rest = status.read_text(encoding="ascii", errors="replace").partition("VmHWM:")
-        if rest:
-            return int(rest.split()[0]) / 1024  # kB
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes
-
-
-def _warnings(slam: Slam) -> Iterator[str]:
+def _warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name of the prior
     """Yield what the user must know of a run."""
     watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
     diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
     yield from slam.sequence.warnings
-    path = slam.sequence.ground_truth and slam.sequence.ground_truth.trajectory
-    stamps = np.array([tracked.timestamp for tracked in slam.tracker.tracked])
-    if path and len(stamps) and not len(associate(stamps, path.timestamps, MAX_DIFFERENCE)[0]):
-        yield (
-            f"no frame has a true pose within {MAX_DIFFERENCE:g} s, so there is no ATE: frames "
-            f"begin at {stamps[0]:.3f} s, the ground truth at {path.timestamps[0]:.3f} s; shift "
-            "its times"
-        )
+    if slam.undone_lens:
+        yield str(BentLens(slam.undone_lens))
+    truth = slam.sequence.ground_truth and slam.sequence.ground_truth.trajectory
+    if truth and slam.tracker.initialised:
+        doubt = doubt_of_units(estimate := slam.trajectory(), truth)
+        try:
+            absolute_trajectory_error(estimate, truth, max_difference=MAX_DIFFERENCE)
+        except InputError as error:
+            doubt = f"there is no ATE: {error}"
+        yield from filter(None, [doubt])
     if lost:
         tracked = slam.tracker.tracked
         since = 1 + max((t.frame_index for t in tracked if t.status.is_followed), default=-1)
@@ -265,6 +254,13 @@ def _warnings(slam: Slam) -> Iterator[str]:
             f"{float((keyframes.overlay == 0).float().mean()):.0%} of the image stand still while "
             "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map only "
             "as far as beta does, with all that looks like them; crop the images"
+        )
+    knows = (keyframes.prior_disparities > 0).any(1).tolist() if depth != "none" else []
+    if not all(knows):
+        yield (
+            f"--depth {depth} knows nothing of {knows.count(False)} of {len(knows)} keyframes, "
+            f"such as frame {keyframes.frames[knows.index(False)].frame_index}: there depth is "
+            "that of the motion alone; give it for all frames"
         )
     if not keyframes.has_prior:
         yield "without a depth prior the unit of length is arbitrary"

@@ -47,13 +47,13 @@ class Checkpoints:
             "settings": asdict(config),
         }  # must be the same for a run to be resumed, as it is read back from JSON
         self._origin: dict[str, Any] = json.loads(json.dumps(origin))
-        self._start = self._last = time.perf_counter()  # of the run and of the last checkpoint
+        self.start = self._last = time.perf_counter()  # of the run and of the last checkpoint
         self._cost = 0.0  # of the last checkpoint [s]
 
     @property
     def run_seconds(self) -> float:
         """Return how long the run has taken, interrupted parts included."""
-        return time.perf_counter() - self._start
+        return time.perf_counter() - self.start
 
     def save(self, slam: Slam, force: bool) -> None:
         """Save a checkpoint if one is due; with `force`, always. A full disk does not end the run.
@@ -110,7 +110,7 @@ class Checkpoints:
                         "another image; restore it, or start anew in another folder"
                     )
             slam.restore_state(found["slam"], functools.cache(slam.frame))
-            self._start -= float(found["run_seconds"])
+            self.start -= float(found["run_seconds"])
             self.seconds = float(found["checkpoint_seconds"])
         except MinislamError:
             raise

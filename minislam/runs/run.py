@@ -71,6 +71,7 @@ def run_in_folder(
     Nothing of an earlier run is removed before the checks. The threads of torch are afterwards as
     they were. If an unknown lens turns out to bend straight lines, the run begins anew with it.
     """
+    choice = choice.from_anywhere()
     rest = config, choice, output, observer, lpips
     if choice.features.startswith(FILES) or choice.depth.startswith(FILES):
         sequence.seeks_lens = False  # the files belong to the images as they are
@@ -79,7 +80,7 @@ def run_in_folder(
     except BentLens as bent:
         observer.warn(str(bent))
         straight = sequence.through_lens(bent.lens.focal, *bent.lens.radial)
-        return _run_once(straight, *rest, True, False, workers)
+        return _run_once(straight, *rest, True, False, workers, bent)
 
 
 def _run_once(
@@ -92,6 +93,7 @@ def _run_once(
     overwrite: bool,
     resume: bool,
     workers: int | None,
+    bent: BentLens | None = None,  # with which the run has begun anew
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     for index in range(len(sequence)):
         if config.uncertainty.takes_masks:
@@ -119,6 +121,10 @@ def _run_once(
                 preview.update(slam, facts_of)
 
             slam = Slam(sequence, config, priors, observer, between_steps, choice.device, helpers)
+            if bent:
+                slam.undone_lens = bent.lens
+                checkpoints.start -= bent.seconds
+                slam.steps.seconds["before the lens was known"] = bent.seconds
             facts_of = partial(run_facts, slam, choice, checkpoints)
             if resume:
                 checkpoints.restore(slam)
@@ -153,7 +159,8 @@ def _run(
         write_pictures(folder, slam, metrics, facts)
         clip_is_written()
         write_json(folder.path / names.RUN, facts)
-    except BentLens:
+    except BentLens as bent:
+        bent.seconds = facts_of("running", None)["seconds"]["total"]
         raise
     except (Exception, KeyboardInterrupt) as error:
         if way := way_on(path := folder.path):

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from minislam.records import Trajectory
 from minislam.viz.style import ESTIMATE_STYLE, TRUTH_STYLE, beta_to_rgb, new_figure, show_image
 
+_NO_LENGTH = 1e-9  # units of the path; a shorter line cannot be seen
 _AVERAGED = 30  # iterations in the running mean of a loss
 
 
@@ -139,7 +140,9 @@ def _draw_path(
     for path, label, style in paths:
         if path is not None:
             centres = path.T_world_camera[:, :3, 3]
-            axes.plot(centres[:, 0], centres[:, second], label=label, **style)
+            stands = len(centres) > 0 and bool((np.ptp(centres, axis=0) < _NO_LENGTH).all())
+            how = {"marker": "o", "label": f"{label} (stands)"} if stands else {"label": label}
+            axes.plot(centres[:, 0], centres[:, second], **style | how)
     axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[second]} [{unit}]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)

@@ -32,8 +32,6 @@ def end(state, code, ate_cm=None):
     sys.exit(code)
 if name == "broken":
     end("failed: no memory", 1)
-if "--wrong" in sys.argv:
-    sys.exit(2)
 if name == "slow" and "--resume" not in sys.argv:
     (folder / "checkpoint.npz").touch()
     signal.signal(signal.SIGTERM, lambda *_: end("interrupted", 130))
@@ -124,11 +122,26 @@ def test_an_interrupted_bench_keeps_its_tables_and_goes_on(made: Bench):
     assert made.commands()[2:] == [["slow", "--resume"]]
 
 
-def test_a_wrong_option_ends_the_bench_at_once(made: Bench):
-    for name in ("ball", "crowd"):
-        made.sequence(name)
-    assert made.run("--wrong") == 2
-    assert len(made.commands()) == 1
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--strid", "2"], 2, "expected a known option, found --strid; the nearest is --stride"),
+        (["--tracking.windw=3"], 2, "found --tracking.windw; the nearest is --tracking.window"),
+        (["--stride", "0"], 1, "expected stride of at least 1"),
+        (["--seed", "2", "--depth", "laser"], 1, "expected --depth none, simulated"),
+        (["--preset", "fast"], 1, "expected a preset among"),
+        (["other"], 2, "found also 'other'"),
+        (["--resume"], 2, "not allowed with argument --overwrite"),
+    ],
+)
+def test_options_of_no_run_are_refused_and_not_kept(made: Bench, capsys, options, code, words):
+    made.sequence("ball")
+    try:
+        assert made.run(*options) == code
+    except SystemExit as ended:  # of argparse
+        assert ended.code == code
+    assert words in capsys.readouterr().err
+    assert made.commands() == [] and not made.out.exists()
 
 
 def test_tables_are_of_one_kind_of_run(made: Bench, capsys):

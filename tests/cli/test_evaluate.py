@@ -158,6 +158,36 @@ def test_contradicting_flags_and_strange_clocks(files):
         run_eval(parse(*files, "--t_offset", "1000"))
 
 
+def test_pairs_that_are_few_by_their_units_or_too_few_to_compare_are_said(tmp_path: Path, capsys):
+    poses, times = random_transforms(200, "normal", 0).numpy(), np.arange(200) / 4
+    names = [str(tmp_path / name) for name in ("truth.txt", "estimate.txt", "one.txt")]
+    write_trajectory(names[0], Trajectory(times * 1e3 / 20, poses))
+    write_trajectory(names[1], Trajectory(times, poses))
+    run_eval(parse(*names[:2], "--silent"))
+    said = capsys.readouterr().err
+    assert said.startswith("WARNING: only 4 pairs: check that the times of both are in seconds")
+    write_trajectory(names[2], Trajectory(times[:1], poses[:1]))
+    run_eval(parse(*names[1:], "--no_align"))
+    assert "rmse\t0.000000" in capsys.readouterr().out
+    with pytest.raises(InputError, match="expected at least 2 pairs of poses for --rpe, found 1"):
+        run_eval(parse(*names[1:], "--no_align", "--rpe"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--t_offset", "nan"], "expected --t_offset of at least -1e"),
+        (["--t_offset=-inf"], "expected --t_offset of at least -1e"),
+        (["--t_max_diff", "-1"], "expected --t_max_diff of at least 0"),
+        (["--t_max_diff", "nan"], "expected --t_max_diff of at least 0"),
+        (["--save_plot", "plot.svg"], r"expected --save_plot FILE\.png, found plot\.svg"),
+    ],
+)
+def test_times_that_are_none_and_pictures_of_other_kinds_are_refused(files, flags, words: str):
+    with pytest.raises(InputError, match=words):
+        run_eval(parse(*files, *flags))
+
+
 def test_files_of_the_user_stay(files, tmp_path: Path):
     for name in ("ate.json", "plot.png"):
         (tmp_path / name).write_text("mine")

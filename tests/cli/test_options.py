@@ -62,6 +62,9 @@ def test_the_presets_are_those_of_the_configuration():
 def test_names_with_a_dot_are_settings_wherever_they_stand():
     rest, given = take_settings(["--a.b", "-3", "x.mp4", "-o", "y.z", "--c.d=e=f", "--g"])
     assert rest == ["x.mp4", "-o", "y.z", "--g"] and given == {"a.b": "-3", "c.d": "e=f"}
+    for wrong in (["--a.b", "-o", "out"], ["--a.b", "--c.d=3"], ["x.mp4", "--a.b"]):
+        with pytest.raises(UsageError, match=r"expected a value after --a\.b, found none"):
+            take_settings(wrong)
 
 
 def test_behind_two_dashes_there_is_one_name():

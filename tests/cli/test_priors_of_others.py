@@ -91,7 +91,8 @@ def test_masks_from_files_replace_the_learnt_uncertainty(here: Path, cache, caps
         (here / "masks" / path.name).write_bytes(encode_png(truth.astype(np.uint8) * 255))
     assert main(["run", *CLIP, "--masks", "files:masks", "-o", "out"]) in (0, 3)
     config = json.loads((here / "out/config.json").read_text())
-    assert config["input"]["masks"] == "files:masks" and config["uncertainty"]["given_masks"]
+    assert config["input"]["masks"] == f"files:{here}/masks"
+    assert config["uncertainty"]["given_masks"]
     assert RunFolder("out").read_metrics()["beta_auroc"] is None  # nothing was learnt
     found = read_mask(next((here / "out/keyframes").glob("*_beta.png")))
     assert found[:, 104:].all() and not found[:, 60:96].all()

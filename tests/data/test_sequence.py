@@ -73,8 +73,8 @@ def test_what_the_user_gives_wins(tmp_path: Path):
 @pytest.mark.parametrize(
     ("fx", "words"),
     [
-        (3.0, "fx 3 px means a field of view of 166 degrees: was it given in millimetres?"),
-        (400.0, "fx 400 px means a field of view of 7 degrees: was it given for larger images?"),
+        (3.0, "fx 3 px means a field of view of 166 degrees: check if it is in millimetres"),
+        (400.0, "fx 400 px means a field of view of 7 degrees: check if it is for larger images"),
         (12.0, None),  # 127 degrees
     ],
 )
@@ -108,7 +108,7 @@ def test_a_lens_is_sought_where_nothing_is_known_and_straightened_by_its_options
     folder = tum_folder(tmp_path / "a")
     assert not open_sequence(str(folder), InputOptions(focal="refine")).seeks_lens
     (folder / "calibration.txt").unlink()
-    for given in ({"fx": 60.0}, {"focal": "fixed"}, {"focal": "refine"}):
+    for given in ({"fx": 60.0}, {"focal": "fixed"}, {"focal": "refine"}, {"k1": -0.2}, {"k2": 0.1}):
         assert not open_sequence(str(folder), InputOptions(**given)).seeks_lens
     bent = open_sequence(str(folder), InputOptions(cx=20.0))
     assert bent.seeks_lens
@@ -170,6 +170,18 @@ def test_rendering_reports_its_progress(tmp_path: Path, monkeypatch):
     assert calls[-1] == (2, 2)
     open_sequence("synth:static", options, lambda done, total: calls.append((done, total)))
     assert calls[-1] == (2, 2)  # from the cache: nothing to wait for
+
+
+def test_what_the_options_name_is_found_again_from_any_folder(tmp_path: Path, monkeypatch):
+    folder = tum_folder(tmp_path / "desk")
+    monkeypatch.chdir(folder)
+    (folder / "lens.txt").write_text("50 50 23 16\n")
+    options = InputOptions(calibration="lens.txt", masks="files:masks")
+    opened = open_sequence("../desk", options)
+    monkeypatch.chdir(tmp_path)
+    again = open_sequence(opened.opened_as["sequence"], InputOptions(**opened.opened_as["input"]))
+    assert again.camera.fx == 50 and again.description == opened.description
+    assert again.given_mask(1).any() and again.opened_as == opened.opened_as
 
 
 # Identities

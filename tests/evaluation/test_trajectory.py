@@ -11,6 +11,7 @@ from minislam.evaluation.trajectory import (
     Alignment,
     absolute_trajectory_error,
     associate,
+    doubt_of_units,
     relative_pose_error,
     statistics,
     straight_line_error,
@@ -191,8 +192,25 @@ def test_clocks_that_never_meet_are_refused():
 
 
 def test_a_single_pair_cannot_be_aligned():
-    with pytest.raises(InputError, match="at least 3 pairs"):
+    words = (
+        r"at least 3 timestamps .* found 1 \(estimate 1 pose, 100\.000 to 100\.000 s, truth 10 p"
+    )
+    with pytest.raises(InputError, match=words):
         absolute_trajectory_error(spiral(1), spiral(10))
+    assert absolute_trajectory_error(spiral(1), spiral(10), Alignment.NONE).statistics["max"] == 0
+
+
+def test_times_in_milliseconds_are_told_from_a_truth_of_few_poses():
+    truth = spiral(10)
+    for unit in (1e3, 1e9):
+        other = Trajectory(truth.timestamps * unit, truth.T_world_camera)
+        words = r"found 0 .*; check that the times of both are in seconds: poses of the"
+        with pytest.raises(InputError, match=words):
+            absolute_trajectory_error(truth, other)
+        assert doubt_of_units(truth, other) and doubt_of_units(other, truth)
+        assert not doubt_of_units(other, other)  # numbered images are a second apart
+    rare = Trajectory(truth.timestamps[[0, 9]], truth.T_world_camera[[0, 9]])
+    assert not doubt_of_units(truth, rare) and not doubt_of_units(truth, spiral(1))
 
 
 @pytest.mark.parametrize("step", [0, 10])

@@ -1,9 +1,12 @@
 """Priors are chosen by name; what does not fit together is refused in one sentence."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
+from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
@@ -11,7 +14,9 @@ from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
+from minislam.priors.interfaces import DepthPrior
 from minislam.priors.networks.table import NetworksConfig
+from tests.recordings import tum_folder
 
 CAMERA, NETWORKS = Camera(60.0, 60.0, 39.5, 29.5, 80, 60), NetworksConfig()
 
@@ -81,6 +86,25 @@ def test_a_gpu_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_sensor_that_measured_nothing_is_no_prior(monkeypatch):
-    monkeypatch.setattr(Recorded, "with_depth", None)
-    with pytest.raises(InputError, match=r"a sensor's depth in desk, found none"):
-        depth(depth="sensor")
+    for measured in (lambda self, index: None, lambda self, index: np.zeros((3, 4))):
+        monkeypatch.setattr(Recorded, "sensor_depth", measured)
+        with pytest.raises(InputError, match=r"a sensor's depth in desk, found none"):
+            depth(depth="sensor")
+
+
+def test_files_that_know_nothing_of_any_frame_are_no_prior(tmp_path: Path):
+    images, folder = tum_folder(tmp_path / "desk", 3, (80, 64)), tmp_path / "made"
+    folder.mkdir()
+    sequence = open_sequence(str(images))
+
+    def choose() -> DepthPrior:
+        choice = PriorChoice(depth=f"files:{folder}")
+        return choose_depth(choice, sequence, 0, SimulatedDepthConfig(), NETWORKS)
+
+    np.save(folder / "0.npy", np.full((64, 80), np.nan))
+    np.save(folder / "1.npy", np.zeros((64, 80)))
+    np.save(folder / "7.npy", np.ones((64, 80)))  # of no frame
+    with pytest.raises(InputError, match=r"depth of any frame in .*made, found none; name the fil"):
+        choose()
+    np.save(folder / "2.npy", np.ones((64, 80)))
+    assert choose()(sequence.frame(2), sequence.camera).unique().tolist() == [1.0]

@@ -1,5 +1,7 @@
 """Depth priors: the simulated errors have the declared size; files are read or refused."""
 
+import os
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from minislam.data.images import encode_png, read_depth
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
@@ -14,6 +17,7 @@ from minislam.priors.files import FileDepth
 from minislam.records import Frame
 
 CAMERA = Camera(60.0, 60.0, 39.5, 29.5, 80, 60)
+READ_PNG = partial(read_depth, units_per_metre=5000)
 
 
 def frame(index: int, width: int = 80, height: int = 60) -> Frame:
@@ -89,7 +93,7 @@ def test_an_image_of_one_pixel_gets_a_finite_depth():
 def test_npy_files_are_found_by_frame_index_with_and_without_leading_zeros(tmp_path: Path):
     np.save(tmp_path / "00003.npy", np.full((60, 80), 3, np.float32))
     np.save(tmp_path / "4.npy", np.full((1, 60, 80), 4, np.float32))
-    prior = FileDepth(tmp_path)
+    prior = FileDepth(tmp_path, READ_PNG)
     assert prior(frame(3), CAMERA).unique().tolist() == [3.0]
     assert prior(frame(4), CAMERA).unique().tolist() == [4.0]
     assert prior(frame(5), CAMERA) is None
@@ -97,8 +101,18 @@ def test_npy_files_are_found_by_frame_index_with_and_without_leading_zeros(tmp_p
 
 def test_sixteen_bit_png_is_scaled_by_the_declared_unit(tmp_path: Path):
     cv2.imwrite(str(tmp_path / "000000.png"), np.full((60, 80), 5000, np.uint16))
-    depth = FileDepth(tmp_path, png_unit=1 / 5000)(frame(0), CAMERA)
+    depth = FileDepth(tmp_path, READ_PNG)(frame(0), CAMERA)
     torch.testing.assert_close(depth, torch.ones(60, 80))
+
+
+def test_a_depth_image_whose_name_is_no_text_is_read(tmp_path: Path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/d\xe9pth"))
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("this file system takes text only")
+    (folder / "0.png").write_bytes(encode_png(np.full((60, 80), 5000, np.uint16)))
+    assert FileDepth(folder, READ_PNG)(frame(0), CAMERA).unique().tolist() == [1.0]
 
 
 def test_another_size_is_resized_without_inventing_depths(tmp_path: Path):
@@ -106,7 +120,7 @@ def test_another_size_is_resized_without_inventing_depths(tmp_path: Path):
     depth[:, 100] = np.nan
     depth[:, 102] = -1
     np.save(tmp_path / "0.npy", depth)
-    read = FileDepth(tmp_path)(frame(0), CAMERA)
+    read = FileDepth(tmp_path, READ_PNG)(frame(0), CAMERA)
     assert read.shape == (60, 80) and read.dtype == torch.float32
     assert set(read.unique().tolist()) <= {0.0, 1.0, 9.0}
     assert (read[:, :40] == 1).all() and (read[:, 52:] == 9).all()
@@ -148,36 +162,36 @@ def write_broken_png(folder: Path) -> None:
         (write_pickle, r"unreadable file .*0\.npy"),
         (write_flat, r"of shape \(rows, columns\) in .*0\.npy, found float32 of shape \(7,\)"),
         (write_other_aspect, r"found 60x60 of another aspect ratio"),
-        (write_color_png, r"single-channel 16-bit .*0\.png"),
-        (write_broken_png, r"single-channel 16-bit .*0\.png"),
+        (write_color_png, r"a 16-bit single-channel depth image, found uint8 .*0\.png"),
+        (write_broken_png, r"whole PNG or JPEG image, but .*0\.png \(8 bytes\) is damaged"),
     ],
 )
 def test_bad_folders_are_refused_in_one_sentence(tmp_path: Path, write, sentence: str):
     write(tmp_path)
     with pytest.raises(InputError, match=sentence) as caught:
-        FileDepth(tmp_path, png_unit=0.001)(frame(0), CAMERA)
+        FileDepth(tmp_path, READ_PNG)(frame(0), CAMERA)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_folder_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="found 0 such files"):
-        FileDepth(tmp_path / "none")
+        FileDepth(tmp_path / "none", READ_PNG)
 
 
 def test_an_empty_or_endless_array_and_depths_of_no_scene_are_refused(tmp_path: Path):
     np.save(tmp_path / "0.npy", np.zeros((0, 0), np.float32))
     with pytest.raises(InputError, match=r"floating-point depth of shape \(rows, columns\)"):
-        FileDepth(tmp_path)(frame(0), CAMERA)
+        FileDepth(tmp_path, READ_PNG)(frame(0), CAMERA)
     header = "{'descr': '<f4', 'fortran_order': False, 'shape': (10**6, 10**6), }"
     header = header.replace("10**6", "1000000").ljust(117) + "\n"
     content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
     (tmp_path / "0.npy").write_bytes(content)  # 4 TB
     with pytest.raises(InputError, match="unreadable file"):
-        FileDepth(tmp_path)(frame(0), CAMERA)
+        FileDepth(tmp_path, READ_PNG)(frame(0), CAMERA)
     for depth in (1e30, 1e-30):
         np.save(tmp_path / "0.npy", np.full((CAMERA.height, CAMERA.width), depth, np.float32))
         with pytest.raises(InputError, match=r"expected depths of 0\.0001 to 100000 world units"):
-            FileDepth(tmp_path)(frame(0), CAMERA)
+            FileDepth(tmp_path, READ_PNG)(frame(0), CAMERA)
 
 
 # The other two

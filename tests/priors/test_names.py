@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from minislam.errors import InputError
-from minislam.priors.names import require_prior
+from minislam.priors.names import PriorChoice, require_prior
 from minislam.priors.networks.table import NETWORKS
 
 
@@ -30,6 +30,18 @@ def test_a_folder_of_files_must_exist(tmp_path: Path):
     assert require_prior("features", f"files:{tmp_path}", None) is None
     with pytest.raises(InputError, match="expected a folder of features files, found nothing at"):
         require_prior("features", f"files:{tmp_path}/nowhere", None)
+
+
+def test_what_a_run_folder_keeps_is_found_from_any_folder(tmp_path: Path, monkeypatch):
+    (tmp_path / "droid.pth").touch()
+    monkeypatch.chdir(tmp_path)
+    given = PriorChoice(features="files:f", depth="python:my:depth", depth_weights="large")
+    assert given.from_anywhere() == PriorChoice(
+        features=f"files:{tmp_path}/f", depth="python:my:depth", depth_weights="large"
+    )
+    (tmp_path / "droid").touch()  # the name of the published file comes first
+    found = PriorChoice(flow_weights="droid", features_weights="./droid.pth").from_anywhere()
+    assert (found.flow_weights, found.features_weights) == ("droid", f"{tmp_path}/droid.pth")
 
 
 def test_no_torch_is_needed():

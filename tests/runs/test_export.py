@@ -248,6 +248,15 @@ def test_images_of_the_sequence_are_never_written_over(run, tmp_path: Path):
     assert {path.name: path.read_bytes() for path in (tmp_path / "images").iterdir()} == before
 
 
+def test_the_folder_of_a_run_is_never_written_over(run, tmp_path: Path):
+    (tmp_path / "run").mkdir()
+    for name in ("run.json", "camera.json"):
+        (tmp_path / "run" / name).write_text("{}")
+    with pytest.raises(InputError, match=r"expected a folder of no run, found run\.json in .*run;"):
+        export.export_depth(run, tmp_path / "run", FRAMES)
+    assert (tmp_path / "run/camera.json").read_text() == "{}"
+
+
 def test_masks_that_were_given_are_never_written_over(run, tmp_path: Path):
     shutil.copytree(tmp_path / "in", tmp_path / "own")
     run.sequence = open_sequence(str(tmp_path / "in"), InputOptions(masks=f"files:{tmp_path}/own"))

@@ -1,7 +1,5 @@
 """What a run tells about itself: warnings, and the memory it took."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,9 +11,11 @@ from minislam.geometry import Camera
 from minislam.records import Keyframe, Pictured, Trajectory
 from minislam.runs import facts
 from minislam.splatting import Rendering
+from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.safeguards.diagnostics import Break
 from minislam.tracking.safeguards.focal_length import FocalLengthFit
 from minislam.tracking.safeguards.lens import LensFit
+from tests.helpers import random_transforms
 
 
 def slam(**parts: object) -> SimpleNamespace:
@@ -37,6 +37,7 @@ def slam(**parts: object) -> SimpleNamespace:
         for k, there in enumerate(follows)
     ]
     tracker = SimpleNamespace(
+        initialised=True,
         tracked=frames,
         graph=graph,
         knows_depth=parts.pop("knows_depth", True),
@@ -52,7 +53,8 @@ def slam(**parts: object) -> SimpleNamespace:
     )
     truth = parts.pop("truth", None)  # s, of the true poses
     if truth is not None:
-        poses = np.tile(np.eye(4), (len(truth), 1, 1))
+        poses = random_transforms(len(truth), "normal", 0).numpy()
+        poses = np.tile(poses[:1], (len(truth), 1, 1)) if parts.pop("stands", False) else poses
         truth = SimpleNamespace(trajectory=Trajectory(np.array(truth), poses))
     shown = parts.pop("shown", [1.0])
     keyframes = [SimpleNamespace(frame_index=8 * k) for k in range(len(shown))]
@@ -60,9 +62,11 @@ def slam(**parts: object) -> SimpleNamespace:
         mapper=SimpleNamespace(shown=shown, keyframes=keyframes),
         sequence=SimpleNamespace(warnings=[], camera=CAMERA, ground_truth=truth),
         lost_frames=lambda: [None] * lost,
+        trajectory=lambda: Trajectory(np.arange(4) / 30, random_transforms(4, "normal", 1).numpy()),
         tracker=tracker,
         focal_length=parts.pop("focal_length", None),
         lens=parts.pop("lens", None),
+        undone_lens=parts.pop("undone_lens", None),
     )
 
 
@@ -77,8 +81,13 @@ WARNINGS = [
     ({"lost": 2, "ends_lost": True}, "If the film is cut at frame 2, run the rest by itself"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
     ({"breaks": [Break(2, 2)]}, "look at each piece (frames 0 to 1, 3 to 3) by itself"),
-    ({"truth": [9.0, 9.5]}, "no frame has a true pose within 0.02 s, so there is no ATE"),
-    ({"truth": [9.0]}, "frames begin at 0.000 s, the ground truth at 9.000 s; shift its times"),
+    (
+        {"truth": [9.0, 9.5]},
+        "there is no ATE: expected at least 3 timestamps of estimate and truth",
+    ),
+    ({"truth": [0.0]}, "found 1 (estimate 4 poses, 0.000 to 0.100 s, truth 1 pose, 0.000 to 0.000"),
+    ({"truth": [0.0, 33.0, 67.0]}, "check that the times of both are in seconds: poses of the est"),
+    ({"truth": [k / 30 for k in range(3)], "stands": True}, "or a camera that does not move"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
     (
@@ -88,6 +97,10 @@ WARNINGS = [
     (
         {"lens": LensFit(300.0, (0.0, 0.0), 0.01, 0.13), "focal_length": DOUBTFUL},
         "the flow fits 1.10 times the",
+    ),
+    (
+        {"undone_lens": LensFit(300.0, (-0.1, 0.02), -0.07, 0.13)},
+        "by -7%: the run begins anew on straightened images, k1 = -0.100, k2 = 0.020",
     ),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
@@ -107,8 +120,19 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
     assert words in warning
 
 
-def test_a_truth_that_a_frame_matches_is_not_warned_of():
-    assert not list(facts._warnings(slam(truth=[0.05, 9.0])))
+def test_keyframes_without_depth_are_warned_of_where_a_prior_was_given():
+    run = slam()
+    run.tracker.keyframes = KeyframeStore(torch.zeros(2))
+    for frame, depths in ((0, [0.5, 0.0]), (8, [0.0, 0.0]), (16, [0.0, 0.0])):
+        row = SimpleNamespace(frame_index=frame), torch.zeros(1), None, torch.eye(4)
+        run.tracker.keyframes.append(*row, torch.ones(2), torch.tensor(depths))
+    assert not list(facts._warnings(run, "none"))
+    (warning,) = facts._warnings(run, "files:made")
+    assert "--depth files:made knows nothing of 2 of 3 keyframes, such as frame 8:" in warning
+
+
+def test_a_truth_that_frames_match_is_not_warned_of():
+    assert not list(facts._warnings(slam(truth=[k / 30 for k in range(3)])))
 
 
 def test_without_an_ate_there_is_no_straight_walk(monkeypatch: pytest.MonkeyPatch):
@@ -152,34 +176,6 @@ def test_the_focal_length_is_said_with_its_origin(parts: dict, words: str):
 def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
     (warning,) = facts._warnings(slam(focal_length=DOUBTFUL, **broken))
     assert "present focal length" not in warning
-
-
-def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
-    on_linux = facts.peak_memory_mb()
-    assert 30 < on_linux < 30_000
-    monkeypatch.setattr(facts.sys, "platform", "darwin")  # there the system counts bytes
-    assert facts.peak_memory_mb() == pytest.approx(on_linux / 1024, rel=0.1)
-
-
-@pytest.mark.slow
-def test_the_memory_of_the_process_that_starts_a_run_is_not_counted():
-    child = "from minislam.runs.facts import peak_memory_mb; print(peak_memory_mb() or 0)"
-    parent = (
-        "import subprocess, sys\nlarge = bytearray(b'1') * 900_000_000\n"
-        f"subprocess.run([sys.executable, '-c', {child!r}])"
-    )
-    done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True)
-    assert float(done.stdout) < 800, done.stderr
-
-
-@pytest.mark.slow
-def test_without_the_counter_of_unix_the_package_still_imports():
-    program = (
-        "import sys; sys.modules['resource'] = None\n"
-        "from minislam.runs import facts, run\nprint(facts.peak_memory_mb())"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout == "None\n", done.stderr
 
 
 def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import minislam
@@ -9,6 +10,7 @@ from minislam.cli.main import main
 from minislam.data.run_folder import RunFolder
 from minislam.errors import InputError
 from tests.cli.test_main import images, texture
+from tests.recordings import save
 from tests.runs.test_resume import TRACKING, assert_one_sentence, ctrl_c, run_until
 
 pytestmark = pytest.mark.slow
@@ -34,3 +36,20 @@ def test_a_source_that_has_moved_is_found_again_with_config_json(tmp_path: Path,
     (out / "config.json").write_text(config.replace(str(source), str(moved)))
     assert run_until(ctrl_c, TRACKING, 4, moved, out, "--resume") == 130
     assert RunFolder(out).read_checkpoint()["slam"]["steps"]["_done"] == {TRACKING: 4}
+
+
+def test_files_named_from_one_folder_are_found_from_another(tmp_path: Path, monkeypatch):
+    source, out = images(tmp_path / "photos", [texture(k) for k in range(27)]), tmp_path / "out"
+    (tmp_path / "lens.txt").write_text("80 80 47.5 35.5\n")
+    for number in range(27):
+        save(tmp_path / f"masks/{number:05d}.png", np.zeros((72, 96), np.uint8))
+        save(tmp_path / f"made/depth/{number:05d}.png", np.full((72, 96), 9000, np.uint16))
+    files = "--calibration lens.txt --masks files:masks --depth files:made".split()
+    monkeypatch.chdir(tmp_path)
+    assert run_until(ctrl_c, TRACKING, 3, source, out, *files) == 130
+    assert run_until(ctrl_c, TRACKING, 4, source, out, *files, "--resume") == 130
+    (tmp_path / "else/where").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "else/where")
+    assert main(["run", "--resume", "-o", str(out)]) in (0, 3)
+    done = minislam.load(out)
+    assert done.beta(2).shape == (72, 96) and done.sequence.camera.fx == 80

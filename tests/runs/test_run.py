@@ -74,13 +74,26 @@ def test_a_run_begins_anew_on_straightened_images_if_an_unknown_lens_bends(
 
     monkeypatch.setattr(slam, "check_lens", check_lens)
     filmed, out = ["run", "synth:person?phone", *COMMAND[2:]], root / "bent"
-    assert main([*filmed, "-o", str(out)]) in (0, 3)
+
+    def interrupt(run: slam.Slam) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(slam.Slam, "_refine_map", interrupt)
+        assert main([*filmed, "-o", str(out)]) == 130
     assert asked == [True, False]
+    assert main(["run", "--resume", "-o", str(out)]) in (0, 3) and len(asked) == 2
     said = capsys.readouterr().err
     assert "the corners by -10%: the run begins anew on straightened images, k1 = -0.200" in said
     given = RunFolder(out).read_config()["input"]
     assert (given["k1"], given["k2"], given["focal"]) == (-0.2, 0.05, "refine")
     assert read_json(out / "camera.json")["preparation"]["distortion"]["k1"] == -0.2
+    facts = RunFolder(out).read_run()
+    assert facts["began_anew"]["lens"]["radial"] == [-0.2, 0.05]
+    assert any("begins anew on straightened images" in text for text in facts["warnings"])
+    seconds = facts["seconds"]
+    assert 0 < seconds["before the lens was known"] < seconds["total"]
+    assert seconds["total"] >= sum(spent for stage, spent in seconds.items() if stage != "total")
 
 
 @pytest.mark.parametrize("given", [{"depth": "files:d"}, {"features": "files:f"}, {}])

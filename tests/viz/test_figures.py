@@ -73,3 +73,15 @@ def test_losses_of_both_signs_have_a_linear_panel_of_their_own():
 def test_figures_do_not_touch_the_state_of_pyplot():
     FIGURES["overview"]()
     assert pyplot.get_fignums() == []
+
+
+def test_a_path_of_no_length_is_a_point():
+    still = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    for estimate, marker, label in (
+        (still, "o", "estimate (stands)"),
+        (path(1), "o", "estimate (stands)"),
+        (path(3), "None", "estimate"),
+    ):
+        for axes in trajectory_plot(estimate).axes:
+            (line,) = axes.lines
+            assert (line.get_marker(), line.get_label()) == (marker, label)

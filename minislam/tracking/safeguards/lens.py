@@ -69,6 +69,8 @@ class LensFit:
 class BentLens(MinislamError):
     """An unknown lens bends straight lines, and the images must be straightened first."""
 
+    seconds = 0.0  # that the run has taken until then
+
     def __init__(self, lens: LensFit) -> None:
         self.lens = lens
         k1, k2 = lens.radial
