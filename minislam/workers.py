@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from functools import cache
 from itertools import islice
-from pathlib import Path
 from threading import Lock, Thread
 from typing import Any, get_type_hints
 
@@ -48,22 +47,6 @@ def idle_cores() -> int:
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     return max(1, min(MOST_WORKERS, math.ceil(cores - busy)))
-
-
-def peak_memory_mb() -> float | None:
-    """Return the most memory this process has used so far [MB], or None on Windows."""
-    try:
-        import resource
-    except ImportError:
-        return None
-    # What Linux returns counts the process that started this one, too; its status does not.
-    status = Path("/proc/self/status")
-    if sys.platform == "linux" and status.exists():
-        _, _, rest = status.read_text(encoding="ascii", errors="replace").partition("VmHWM:")
-        if rest:
-            return int(rest.split()[0]) / 1024  # kB
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes
 
 
 class Workers(AbstractContextManager["Workers"]):

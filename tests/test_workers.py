@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from minislam.errors import InputError
-from minislam.workers import AT_ONCE, MOST_WORKERS, Workers, idle_cores, peak_memory_mb
+from minislam.workers import AT_ONCE, MOST_WORKERS, Workers, idle_cores
 from tests.mapping.plane_scene import CONFIG, make_mapper, wall_keyframe
 from tests.worker_calls import Pair, dies_in_a_helper, fails, prints, process_of, swapped
 
@@ -182,34 +182,3 @@ def test_an_error_of_a_function_is_raised_here(two):
         Workers(2).map(fails, [(1,), (1,)])
     with pytest.raises(InputError, match="expected at least 1 worker, found 0"):
         Workers(0)
-
-
-# Memory
-
-
-def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
-    on_linux = peak_memory_mb()
-    assert 30 < on_linux < 30_000
-    monkeypatch.setattr(sys, "platform", "darwin")  # there the system counts bytes
-    assert peak_memory_mb() == pytest.approx(on_linux / 1024, rel=0.1)
-
-
-@pytest.mark.slow
-def test_the_memory_of_the_process_that_starts_a_run_is_not_counted():
-    child = "from minislam.workers import peak_memory_mb; print(peak_memory_mb() or 0)"
-    parent = (
-        "import subprocess, sys\nlarge = bytearray(b'1') * 900_000_000\n"
-        f"subprocess.run([sys.executable, '-c', {child!r}])"
-    )
-    done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True)
-    assert float(done.stdout) < 800, done.stderr
-
-
-@pytest.mark.slow
-def test_without_the_counter_of_unix_the_package_still_imports():
-    program = (
-        "import sys; sys.modules['resource'] = None\n"
-        "import minislam.api; from minislam.workers import peak_memory_mb\nprint(peak_memory_mb())"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout == "None\n", done.stderr

@@ -19,6 +19,7 @@ from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MAX_DIFFERENCE, MappedView, ate_cm, measure_run
 from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
 from minislam.mapping.mapper import Mapper, surface_depth
+from minislam.memory import peak_memory_mb
 from minislam.priors.choice import PriorChoice
 from minislam.records import Keyframe, Trajectory
 from minislam.runs.resume import Checkpoints
@@ -28,7 +29,6 @@ from minislam.stereo.exposure import with_exposure
 from minislam.tracking.optimisation import bundle_problem, typical_residual
 from minislam.tracking.safeguards.lens import BentLens
 from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS
-from minislam.workers import peak_memory_mb
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
 # that hangs together badly .65.

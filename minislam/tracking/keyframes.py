@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+from minislam.memory import Shelf
 from minislam.records import Frame
-from minislam.shelf import Shelf
 from minislam.state.stateful import FrameOf, Stateful, Tree
 
 

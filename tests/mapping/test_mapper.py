@@ -7,8 +7,8 @@ from minislam.errors import InputError
 from minislam.geometry import se3_exp
 from minislam.mapping import Mapper
 from minislam.mapping.views import view_of
+from minislam.memory import Shelf
 from minislam.records import Frame
-from minislam.shelf import Shelf
 from minislam.splatting.constants import MIN_ALPHA
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe

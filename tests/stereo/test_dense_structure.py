@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
+from minislam.memory import Shelf
 from minislam.records import Keyframe
-from minislam.shelf import Shelf
 from minislam.stereo import dense_structure
 from minislam.stereo.dense_structure import (
     FARTHEST,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from minislam.shelf import Shelf
+from minislam.memory import Shelf
 
 if TYPE_CHECKING:
     from minislam.tracking.bundle_adjustment import BundleProblem, BundleState

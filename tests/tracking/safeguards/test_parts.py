@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from minislam import shelf
+from minislam import memory
 from minislam.tracking import bundle_adjustment, optimisation
 from minislam.tracking.bundle_adjustment import (
     _normal_equations,
@@ -59,7 +59,7 @@ def test_couplings_in_a_file_are_those_in_memory(monkeypatch: pytest.MonkeyPatch
     problem, start = noisy(known, 1.0), perturbed(known, 0.02)
     whole, _ = bundle_adjust(problem, start, 4)
     monkeypatch.setattr(parts, "CELLS_COUPLED", 12 * CELLS - 1)
-    monkeypatch.setattr(shelf, "SMALLEST", 1)
+    monkeypatch.setattr(memory, "SMALLEST", 1)
     blocks = _normal_equations(problem, start, []).source_blocks
     assert len(list(blocks)) == 4 and all(blocks._shelf.holds(E) for _, _, E in blocks)
     in_file, _ = bundle_adjust(problem, start, 4)

@@ -1,7 +1,8 @@
-"""Tensors on the shelf: nobody notices, and their memory can be given back."""
+"""Tensors on the shelf, whose memory is given back and nobody notices; the peak of a process."""
 
 import errno
 import gc
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from minislam import shelf as shelf_module
-from minislam.shelf import Shelf, give_back_freed
+from minislam import memory
+from minislam.memory import Shelf, give_back_freed, peak_memory_mb
 
 
 def noise(*shape: int) -> torch.Tensor:
@@ -38,7 +39,7 @@ def test_the_layout_stays_that_of_a_tensor_in_memory() -> None:
     shelf = Shelf()
     tensors = [noise(1000 + odd, 3) for odd in range(3)]
     shelf.put(tensors)
-    assert [t.data_ptr() % shelf_module.ALIGNMENT for t in tensors] == [0, 0, 0]
+    assert [t.data_ptr() % memory.ALIGNMENT for t in tensors] == [0, 0, 0]
     assert all(t.is_contiguous() for t in tensors)
     assert all(torch.equal(t, noise(len(t), 3)) for t in tensors)
 
@@ -69,7 +70,7 @@ def test_what_does_not_fit_the_shelf_is_left_alone(tensor: torch.Tensor) -> None
 
 
 def test_many_tensors_take_many_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shelf_module, "FIRST_BLOCK", 1 << 20)
+    monkeypatch.setattr(memory, "FIRST_BLOCK", 1 << 20)
     shelf = Shelf()
     tensors = [noise(100_000 + n) for n in range(40)]  # .4 MB each
     shelf.put(tensors)
@@ -126,13 +127,41 @@ def test_without_glibc_freed_memory_stays(monkeypatch: pytest.MonkeyPatch, probl
     def no_library(name: None) -> None:
         raise problem
 
-    monkeypatch.setattr(shelf_module.ctypes, "CDLL", no_library)
+    monkeypatch.setattr(memory.ctypes, "CDLL", no_library)
     give_back_freed()
 
 
 def test_without_fallocate_the_block_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(shelf_module.os, "posix_fallocate", raising=False)
-    monkeypatch.setattr(shelf_module, "FIRST_BLOCK", (1 << 20) + 7)
+    monkeypatch.delattr(memory.os, "posix_fallocate", raising=False)
+    monkeypatch.setattr(memory, "FIRST_BLOCK", (1 << 20) + 7)
     shelf, tensor = Shelf(), noise(5000)
     shelf.put([tensor])
     assert shelf.holds(tensor) and torch.equal(tensor, noise(5000))
+
+
+def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
+    on_linux = peak_memory_mb()
+    assert 30 < on_linux < 30_000
+    monkeypatch.setattr(sys, "platform", "darwin")  # there the system counts bytes
+    assert peak_memory_mb() == pytest.approx(on_linux / 1024, rel=0.1)
+
+
+@pytest.mark.slow
+def test_the_memory_of_the_process_that_starts_a_run_is_not_counted():
+    child = "from minislam.memory import peak_memory_mb; print(peak_memory_mb() or 0)"
+    parent = (
+        "import subprocess, sys\nlarge = bytearray(b'1') * 900_000_000\n"
+        f"subprocess.run([sys.executable, '-c', {child!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True)
+    assert float(done.stdout) < 800, done.stderr
+
+
+@pytest.mark.slow
+def test_without_the_counter_of_unix_the_package_still_imports():
+    program = (
+        "import sys; sys.modules['resource'] = None\n"
+        "import minislam.api; from minislam.memory import peak_memory_mb\nprint(peak_memory_mb())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "None\n", done.stderr

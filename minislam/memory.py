@@ -1,15 +1,18 @@
-"""A file for what a run keeps but seldom reads: images, features, depths and flow of old keyframes.
+"""The memory of a run: what is seldom read lies in a file, and what was freed is given back.
 
-So the memory of a long run does not grow by them. Whoever holds such a tensor notices nothing.
+Images, features, depths and flow of old keyframes are put on a `Shelf`, so the memory of a long run
+does not grow by them. Whoever holds such a tensor notices nothing.
 """
 
 import ctypes
 import mmap
 import os
+import sys
 import tempfile
 import weakref
 from collections.abc import Iterable
 from contextlib import suppress
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -84,6 +87,22 @@ def give_back_freed() -> None:
     """Give memory that was freed in pieces back to the system, which takes some milliseconds."""
     with suppress(OSError, TypeError, AttributeError):  # another C library than glibc has no way
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def peak_memory_mb() -> float | None:
+    """Return the most memory this process has used so far [MB], or None on Windows."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    # What Linux returns counts the process that started this one, too; its status does not.
+    status = Path("/proc/self/status")
+    if sys.platform == "linux" and status.exists():
+        _, _, rest = status.read_text(encoding="ascii", errors="replace").partition("VmHWM:")
+        if rest:
+            return int(rest.split()[0]) / 1024  # kB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes
 
 
 def _fill(file: BinaryIO, length: int) -> None:
