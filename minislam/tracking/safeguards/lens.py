@@ -41,7 +41,8 @@ INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # RESULTS.md, "A lens that nobody told of". [-]
 WORTH_SAYING, WORTH_SAVING, WORTH_UNDOING = 0.04, 0.03, 0.1
-MOST_BEND = 0.4  # what moves a corner farther is no lens but a failed fit [-]
+# What moves a corner farther, or sees 130 degrees and more, is no lens but a failed fit.
+MOST_BEND, LEAST_FOCAL = 0.4, 0.23  # [-] and image widths
 
 Radial = tuple[float, float]  # k1, k2
 
@@ -85,7 +86,8 @@ def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
     """Return the lens that fits, None if there are too few keyframes. Raises `BentLens`."""
     lens = fit_lens(graph)
     if is_unknown and lens is not None and lens.is_worth_undoing:
-        raise BentLens(lens)
+        if lens.focal > LEAST_FOCAL * graph.grid.camera.width:
+            raise BentLens(lens)
     return lens
 
 

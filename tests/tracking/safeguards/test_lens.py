@@ -1,6 +1,7 @@
 """A bent lens: its columns, what it costs the flow, and that a pinhole has none."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ from torch import Tensor
 from minislam.tracking.bundle_adjustment import BundleProblem
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.safeguards import lens as lens_module
 from minislam.tracking.safeguards.lens import (
     BentLens,
     LensFit,
@@ -160,3 +162,13 @@ def test_few_keyframes_and_no_links_tell_nothing():
     few.match(neighbourhood_edges(0, 3, 2))
     assert few.links.edges and fit_lens(few) is None
     assert fit_lens(true_graph(NUMBERS)) is None
+
+
+@pytest.mark.parametrize(("widths", "is_undone"), [(0.2, False), (0.3, True)])
+def test_a_fit_that_sees_136_degrees_has_failed(
+    monkeypatch: pytest.MonkeyPatch, widths: float, is_undone: bool
+):
+    fit = LensFit(widths * CAMERA.width, (-0.2, 0.0), -0.2, 0.5)
+    monkeypatch.setattr(lens_module, "fit_lens", lambda graph: fit)
+    with pytest.raises(BentLens) if is_undone else nullcontext():
+        assert check_lens(true_graph(NUMBERS), is_unknown=True) is fit
