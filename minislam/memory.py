@@ -13,7 +13,6 @@ import weakref
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -22,15 +21,20 @@ from torch import Tensor
 SMALLEST = 1 << 12  # bytes, a page: smaller tensors stay in memory
 FIRST_BLOCK, LARGEST_BLOCK = 1 << 24, 1 << 28  # bytes: each block is as large as all before it
 PIECE = 1 << 20  # bytes, written at once
+Place = tuple[mmap.mmap, int]  # a block, and the first byte in it
 ALIGNMENT = 64  # bytes, that of tensors in memory: another one can change the last bits of sums
 
 
 class Shelf:
-    """Holds tensors in temporary files (of TMPDIR), which vanish with the last of their tensors."""
+    """Holds tensors in temporary files (of TMPDIR), where the place of one that is gone is reused.
+
+    The files vanish with the shelf and the last of its tensors.
+    """
 
     def __init__(self) -> None:
-        self._blocks: list[tuple[weakref.ref[mmap.mmap], int, int]] = []  # address, bytes
-        self._free = torch.empty(0, dtype=torch.uint8)  # the rest of the newest block
+        self._blocks: list[mmap.mmap] = []
+        self._used = 0  # bytes of the newest block
+        self._spare: dict[int, list[Place]] = {}  # by bytes
 
     def put(self, tensors: Iterable[Tensor | None]) -> None:
         """Move tensors (any shape) to the file, for all that hold them; then release.
@@ -41,10 +45,10 @@ class Shelf:
         for tensor in tensors:
             if tensor is None or tensor.device.type != "cpu" or not tensor.is_contiguous():
                 continue
-            if tensor.nbytes >= SMALLEST and not self.holds(tensor) and self._has_room(tensor):
-                place, rest = self._free.tensor_split([tensor.nbytes])
-                self._free = rest[-tensor.nbytes % ALIGNMENT :]
-                tensor.data = place.view(tensor.dtype).view(tensor.shape).copy_(tensor)
+            if tensor.nbytes >= SMALLEST and not self.holds(tensor):
+                with suppress(OSError):
+                    place = torch.from_numpy(self._room(tensor.nbytes))
+                    tensor.data = place.view(tensor.dtype).view(tensor.shape).copy_(tensor)
         self.release()
 
     def array(self, values: np.ndarray) -> np.ndarray:
@@ -54,33 +58,44 @@ class Shelf:
 
     def holds(self, tensor: Tensor) -> bool:
         """Tell whether a tensor is here."""
-        address = tensor.data_ptr()
-        return any(
-            first <= address < first + length and block() is not None
-            for block, first, length in self._blocks
-        )
+        starts = [np.frombuffer(block, np.uint8).ctypes.data for block in self._blocks]
+        ranges = zip(starts, map(len, self._blocks), strict=True)
+        return any(start <= tensor.data_ptr() < start + length for start, length in ranges)
 
     def release(self) -> None:
         """Give back the memory of what was read or put since; the file has it."""
-        for block, _, _ in self._blocks:
-            if (mapped := block()) is not None and hasattr(mmap, "MADV_DONTNEED"):
-                mapped.madvise(mmap.MADV_DONTNEED)
+        for block in self._blocks:
+            if hasattr(mmap, "MADV_DONTNEED"):
+                block.madvise(mmap.MADV_DONTNEED)
 
-    def _has_room(self, tensor: Tensor) -> bool:
-        """Begin another block if a tensor needs one; tell whether it has a place now."""
-        if tensor.nbytes > len(self._free):
-            self._blocks = [block for block in self._blocks if block[0]() is not None]
-            held = sum(length for *_, length in self._blocks)
-            wanted = max(tensor.nbytes, min(max(held, FIRST_BLOCK), LARGEST_BLOCK))
-            try:
-                with tempfile.TemporaryFile() as file:
-                    _fill(file, wanted)
-                    mapped = mmap.mmap(file.fileno(), 0)
-            except OSError:
-                return False
-            self._free = torch.frombuffer(mapped, dtype=torch.uint8)
-            self._blocks.append((weakref.ref(mapped), self._free.data_ptr(), len(self._free)))
-        return True
+    def _room(self, length: int) -> np.ndarray:  # (length,) uint8
+        """Return bytes that are free until the array is gone; OSError: the disk is full."""
+        size = -(-length // ALIGNMENT) * ALIGNMENT
+        spare = self._spare.setdefault(size, [])
+        if spare:
+            block, first = spare.pop()
+        else:
+            if not self._blocks or self._used + size > len(self._blocks[-1]):
+                held = sum(map(len, self._blocks))
+                self._blocks.append(_block(max(size, min(max(held, FIRST_BLOCK), LARGEST_BLOCK))))
+                self._used = 0
+            block, first = self._blocks[-1], self._used
+            self._used += size
+        place = np.frombuffer(block, np.uint8, length, first)
+        weakref.finalize(place, spare.append, (block, first)).atexit = False
+        return place
+
+
+def _block(length: int) -> mmap.mmap:
+    """Return so many bytes of a new file, with room on the disk: else writing them would crash."""
+    with tempfile.TemporaryFile() as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, length)
+        else:
+            for first in range(0, length, PIECE):
+                file.write(bytes(min(PIECE, length - first)))
+            file.flush()
+        return mmap.mmap(file.fileno(), 0)
 
 
 def give_back_freed() -> None:
@@ -103,13 +118,3 @@ def peak_memory_mb() -> float | None:
             return int(rest.split()[0]) / 1024  # kB
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024**2 if sys.platform == "darwin" else 1024)  # macOS: bytes
-
-
-def _fill(file: BinaryIO, length: int) -> None:
-    """Take room on the disk: a full one is an error here, but a crash once pages are written."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file.fileno(), 0, length)
-        return
-    for first in range(0, length, PIECE):
-        file.write(bytes(min(PIECE, length - first)))
-    file.flush()

@@ -78,6 +78,19 @@ def test_many_tensors_take_many_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(torch.equal(t, noise(len(t))) for t in tensors)
 
 
+def test_the_place_of_a_tensor_that_is_gone_is_taken_again() -> None:
+    shelf, tensor, other = Shelf(), noise(5000), noise(6000)
+    shelf.put([tensor, other])
+    place, view = tensor.data_ptr(), tensor[1:]
+    del tensor
+    shelf.put([second := noise(5000)])
+    assert second.data_ptr() != place  # a view still needs it
+    del view
+    shelf.put([third := noise(5000)])
+    assert third.data_ptr() == place
+    assert torch.equal(third, noise(5000)) and torch.equal(other, noise(6000))
+
+
 def test_an_array_is_kept() -> None:
     shelf, given = Shelf(), np.arange(5000.0).reshape(50, 100)
     kept = shelf.array(given)
