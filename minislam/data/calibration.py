@@ -50,16 +50,18 @@ class Calibration:
 
 
 def rough_calibration(
-    width: int, height: int, noted: tuple[float, str] | None = None
+    picture: tuple[int, int, int, int],  # left, top, width, height [px] between black bars
+    noted: tuple[float, str] | None = None,
 ) -> Calibration:
-    """Return rough intrinsics of images of a size: guessed, unless the camera noted its own.
+    """Return rough intrinsics of images: guessed, unless the camera noted its own.
 
-    A note is the focal length over the diagonal of the image, and its origin.
+    A note is the focal length over the diagonal of the picture, and its origin.
     """
+    left, top, width, height = picture
     focal, origin = _GUESSED_FOCAL_RATIO * max(width, height), "guessed intrinsics"
     if noted:
         focal, origin = noted[0] * math.hypot(width, height), noted[1]
-    centre = (width - 1) / 2, (height - 1) / 2
+    centre = left + (width - 1) / 2, top + (height - 1) / 2
     return Calibration(focal, focal, *centre, origin=origin, is_rough=True)
 
 

@@ -19,7 +19,8 @@ Window = tuple[int, int, int, int]  # left, top, width, height px
 SIZE_MULTIPLE = 8  # px
 BLACK = 24  # of 255: the brightest that a codec leaves in a black bar
 BLURRED = 2  # px of the picture, beside a bar, that a codec mixes with it
-LEAST_PICTURE = 0.5  # fraction of each side; a scene that leaves less is dark, not barred [-]
+# A scene that leaves less of a side is dark, not barred [-], unless both bars are alike [px].
+LEAST_PICTURE, ALIKE = 0.5, 4
 
 
 class ImagePreparation:
@@ -139,7 +140,9 @@ def picture_window(brightest: np.ndarray) -> Window:
         (shown,) = np.nonzero(brightest.max(axis) > BLACK)
         first, last = (int(shown[0]), int(shown[-1])) if len(shown) else (0, side - 1)
         first, last = first + BLURRED * (first > 0), last - BLURRED * (last < side - 1)
-        is_picture = last + 1 - first >= max(LEAST_PICTURE * side, MINIMUM_SIDE)
+        are_alike = abs(first - (side - 1 - last)) <= ALIKE  # an upright film in a wide one
+        least = MINIMUM_SIDE if are_alike else max(LEAST_PICTURE * side, MINIMUM_SIDE)
+        is_picture = last + 1 - first >= least
         window.append((first, last + 1 - first) if is_picture else (0, side))
     (left, width), (top, height) = window
     return left, top, width, height

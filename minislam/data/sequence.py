@@ -12,7 +12,7 @@ import torch
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
-from minislam.data.preparation import ImagePreparation, KeptImages, picture_window
+from minislam.data.preparation import ImagePreparation, KeptImages, Window, picture_window
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
@@ -72,9 +72,9 @@ class RecordedSequence:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
         self.files = [*recording.images.paths, *self._masks.values()]
         height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
-        calibration = _calibration(recording, options, width, height)
-        camera, distortion = calibration.camera_for(width, height), calibration.distortion
         picture = picture_window(recording.images.brightest())
+        calibration = _calibration(recording, options, width, height, picture)
+        camera, distortion = calibration.camera_for(width, height), calibration.distortion
         how = options.size, options.pixels, picture
         self.prepare = ImagePreparation(camera, distortion, *how)
         self.name = recording.name
@@ -194,9 +194,9 @@ def _doubts(raw: np.ndarray, label: str, fx: float) -> Iterator[str]:
 
 
 def _calibration(
-    recording: Recording, options: InputOptions, width: int, height: int
+    recording: Recording, options: InputOptions, width: int, height: int, picture: Window
 ) -> Calibration:
-    """Return the calibration of raw images of this size.
+    """Return the calibration of raw images of this size, which show a picture in a window.
 
     The options come before files, files before known cameras, known cameras before what the
     camera noted in its files, that before the guess.
@@ -204,7 +204,7 @@ def _calibration(
     found = recording.calibration
     if options.calibration:
         found = read_calibration(Path(options.calibration))
-    calibration = found or rough_calibration(width, height, recording.noted_focal_length)
+    calibration = found or rough_calibration(picture, recording.noted_focal_length)
     fy = options.fx if options.fy is None else options.fy
     given = {"fx": options.fx, "fy": fy, "cx": options.cx, "cy": options.cy}
     given = {name: value for name, value in given.items() if value is not None}

@@ -24,11 +24,12 @@ from minislam.priors.choice import PriorChoice, choose_depth, choose_features, c
 from minislam.priors.names import FILES
 from minislam.records import Sequence, required_mask
 from minislam.runs.alarms import alarms
-from minislam.runs.facts import has_large_holes, measure, run_facts
+from minislam.runs.facts import measure, run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
 from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints, way_on
+from minislam.runs.warnings import has_large_holes
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer
 from minislam.tracking.safeguards.lens import BentLens

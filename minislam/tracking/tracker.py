@@ -8,6 +8,7 @@ from torch import Tensor
 
 from minislam.errors import TrackingLost
 from minislam.geometry import Camera
+from minislam.memory import give_back_freed
 from minislam.priors.interfaces import (
     DepthPrior,
     FeatureExtractor,
@@ -211,6 +212,7 @@ class Tracker(Stateful):
         if is_due and not closed:
             seek_readouts(self.graph)
             online_global_ba(self.graph)
+            give_back_freed()
         if is_due or closed:
             self._last_global = count
 

@@ -26,6 +26,7 @@ _QUANTILES = (0.02, 0.98)  # a few outliers must not take the whole colour range
 _LEAST_BETA = 0.1  # a smaller one counts as this, `uncertainty.weights.clipped_beta`
 # A range at least this wide keeps the noise of a static frame from filling all colours.
 _LEAST_BETA_RATIO = 4.0
+_LEAST_DEPTH_RATIO = 1.1  # of the farthest to the nearest: a backdrop is one colour
 
 
 def set_notebook_style() -> None:
@@ -127,7 +128,7 @@ def depth_limits(depth: np.ndarray) -> tuple[float, float]:
     """Return the nearest and the farthest depth of the colours, for maps of any shape."""
     known = depth[np.isfinite(depth) & (depth > 0)]
     low, high = np.quantile(known, _QUANTILES) if len(known) else (0.0, 1.0)
-    return float(low), float(high)
+    return float(low), max(float(high), _LEAST_DEPTH_RATIO * float(low))
 
 
 def beta_to_rgb(

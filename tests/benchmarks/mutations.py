@@ -59,9 +59,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("opacity[weight > 0] > OPAQUE", "opacity[weight > 0] < OPAQUE"),
         ("float(len(gaussians) > 0)", "1.0"),
     ],
-    ("runs/facts.py", "runs/test_facts.py runs/test_run_ending.py"): [
+    ("runs/warnings.py", "runs/test_warnings.py runs/test_run_ending.py"): [
         ("shown is not None and shown < LEAST_SHOWN", "bool(shown) and shown < LEAST_SHOWN"),
-        ("if index not in seen", "if index in seen"),
         ("np.argmin(slam.mapper.shown)", "np.argmax(slam.mapper.shown)"),
     ],
     ("tracking/initialisation.py", "tracking/test_initialisation.py"): [
@@ -283,11 +282,14 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if slam.tracker.watch.breaks:", "if False:"),
     ],
     ("runs/facts.py", "runs/test_facts.py"): [
-        ("if since < len(tracked)", "if True"),
-        ("since = 1 + max", "since = max"),
+        ("if index not in seen", "if index in seen"),
         ("keyframe.exposed(rendering.color), keyframe", "rendering.color, keyframe"),
         ("keyframe.image, static\n", "keyframe.image, None\n"),
         ("if static.any() else None", "if True else None"),
+    ],
+    ("runs/warnings.py", "runs/test_warnings.py"): [
+        ("if since < len(tracked)", "if True"),
+        ("since = 1 + max", "since = max"),
         ("seen < LEAST_BEYOND_TURNS", "seen < 0"),
         ("2 * without >= len", "2 * without < len"),
         ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),

@@ -39,14 +39,19 @@ def test_a_calibration_is_carried_to_images_resized_by_half(tmp_path: Path):
 
 def test_the_guess_is_a_field_of_view_of_about_sixty_degrees():
     for width, height in ((1280, 720), (720, 1280)):
-        camera = rough_calibration(width, height).camera_for(width, height)
+        camera = rough_calibration((0, 0, width, height)).camera_for(width, height)
         angle = 2 * np.degrees(np.arctan(max(width, height) / 2 / camera.fx))
         assert 55 < angle < 65
         assert (camera.cx, camera.cy) == ((width - 1) / 2, (height - 1) / 2)
 
 
+def test_the_guess_is_of_the_picture_between_black_bars():
+    upright, alone = rough_calibration((656, 0, 608, 1080)), rough_calibration((0, 0, 608, 1080))
+    assert (upright.fx, upright.cx, upright.cy) == (alone.fx, 656 + alone.cx, alone.cy)
+
+
 def test_a_noted_focal_length_comes_before_the_guess(tmp_path: Path):
-    noted = rough_calibration(400, 300, (0.6, "EXIF of a photo"))
+    noted = rough_calibration((0, 0, 400, 300), (0.6, "EXIF of a photo"))
     assert (noted.fx, noted.fy, noted.origin) == (300, 300, "EXIF of a photo")
     assert noted.is_rough and not read("500 500 320 240", tmp_path).is_rough
 

@@ -132,7 +132,9 @@ def barred(left: int, top: int, right: int, bottom: int, value: int = 90) -> np.
         ((0, 14, 0, 16), (0, 16, 200, 66)),  # letterbox; two rows beside a bar are blurred
         ((30, 0, 30, 0), (32, 0, 136, 100)),  # pillarbox
         ((10, 10, 0, 0), (12, 12, 188, 88)),
-        ((0, 30, 0, 30), (0, 0, 200, 100)),  # a lamp in the dark, not a picture
+        ((0, 24, 0, 36), (0, 0, 200, 100)),  # a lamp in the dark, not a picture
+        ((66, 0, 70, 0), (68, 0, 60, 100)),  # an upright film: bars that are alike
+        ((65, 0, 70, 0), (0, 0, 200, 100)),
     ],
 )
 def test_black_bars_are_no_part_of_the_picture(bars, window: tuple[int, int, int, int]):

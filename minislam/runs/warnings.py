@@ -1,0 +1,151 @@
+"""What the user must know of a run at its end."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from minislam.errors import InputError
+from minislam.evaluation.metrics import MAX_DIFFERENCE
+from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
+from minislam.slam import Slam
+from minislam.tracking.safeguards.lens import BentLens
+from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS
+
+# Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
+# that hangs together badly .65.
+LEAST_SHOWN = 0.75
+# Of the images, in their mean [-]: RESULTS.md, "Real footage, without any depth prior".
+MOST_LEFT_OUT = 0.4
+
+
+def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name of the prior
+    """Yield what the user must know of a run."""
+    watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
+    diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
+    yield from slam.sequence.warnings
+    if slam.undone_lens:
+        yield str(BentLens(slam.undone_lens))
+    truth = slam.sequence.ground_truth and slam.sequence.ground_truth.trajectory
+    if truth and slam.tracker.initialised:
+        doubt = doubt_of_units(estimate := slam.trajectory(), truth)
+        try:
+            absolute_trajectory_error(estimate, truth, max_difference=MAX_DIFFERENCE)
+        except InputError as error:
+            doubt = f"there is no ATE: {error}"
+        yield from filter(None, [doubt])
+    if lost:
+        tracked = slam.tracker.tracked
+        since = 1 + max((t.frame_index for t in tracked if t.status.is_followed), default=-1)
+        rest = f". If the film is cut at frame {since}, run the rest by itself (--start)"
+        yield (
+            f"{lost} of {len(tracked)} frames could not be tracked and have no pose; "
+            f"lost_frames.txt lists them{rest if since < len(tracked) else ''}"
+        )
+    if watch.breaks:
+        where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
+        pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
+        yield (
+            f"the trajectory is broken at frames {where}: motion or depth contradicts the images, "
+            "or the camera follows something that came into view. "
+            "Before and after, scale and direction do not belong together; look at each piece "
+            f"(frames {pieces or 'none'}) by itself. If the images lie far apart, give more frames "
+            "per second (a smaller --stride)"
+        )
+    if graph.failed_adjustments:
+        yield (
+            f"{graph.failed_adjustments} of {graph.adjustments} bundle adjustments failed "
+            "and changed nothing: poses and depths there are those of the start"
+        )
+    if has_large_holes(slam):
+        least = slam.mapper.keyframes[int(np.argmin(slam.mapper.shown))].frame_index
+        yield (
+            f"the map shows only {shown_static(slam):.0%} of what stands still, least in frame "
+            f"{least}: no depth was confirmed elsewhere. The camera hardly moved, its path is "
+            "wrong, or the scene has no texture; move the camera sideways, or give a depth prior"
+        )
+    if (hidden := left_out(slam)) > MOST_LEFT_OUT:
+        yield (
+            f"beta leaves {hidden:.0%} of the images out, as if they moved: what it always covers "
+            "is missing from the map and from the figures; look at the pictures of beta"
+        )
+    yield from _camera_warnings(slam)
+    seen = watch.beyond_turns
+    without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
+    if without and 2 * without >= len(diagnostics):
+        yield (
+            f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera "
+            "turned or stood still, so the distances it moved are not determined (if it moved, "
+            "crop what is fixed to it, such as a bonnet or a windscreen)"
+            + ("" if slam.tracker.knows_depth else ", and all that the map shows is at one depth")
+        )
+    elif seen is not None and seen < LEAST_BEYOND_TURNS and not keyframes.has_prior:
+        yield (
+            f"between neighbouring keyframes only {seen:.2f} px of the flow, in the "
+            "median and in an image of 320x240, are more than a turn of the camera: depth is "
+            "hardly determined, and near and far may be exchanged; look at the pictures of the "
+            "depth, and film while you walk sideways"
+        )
+    if keyframes.overlay is not None:
+        yield (
+            f"{float((keyframes.overlay == 0).float().mean()):.0%} of the image stand still while "
+            "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map only "
+            "as far as beta does, with all that looks like them; crop the images"
+        )
+    knows = (keyframes.prior_disparities > 0).any(1).tolist() if depth != "none" else []
+    if not all(knows):
+        yield (
+            f"--depth {depth} knows nothing of {knows.count(False)} of {len(knows)} keyframes, "
+            f"such as frame {keyframes.frames[knows.index(False)].frame_index}: there depth is "
+            "that of the motion alone; give it for all frames"
+        )
+    if not keyframes.has_prior:
+        yield "without a depth prior the unit of length is arbitrary"
+
+
+def _camera_warnings(slam: Slam) -> Iterator[str]:
+    fit, graph, lens = slam.focal_length, slam.tracker.graph, slam.lens
+    if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
+        yield (
+            "the focal length is unknown and the motion does not tell it: trajectory and map may "
+            "be bent; give --fx or a calibration file"
+        )
+        return
+    if lens is not None and lens.is_bent:
+        yield (
+            f"the flow fits a lens that bends straight lines, the corners by {lens.bend:+.0%}, "
+            f"with {lens.saved:.0%} less cost: focal length, trajectory and map may be bent; film "
+            "in the linear mode of the camera, or give --calibration with k1 and k2"
+        )
+        return
+    # The flow of a broken run fits whatever focal length.
+    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
+    if fit is None or not fit.is_doubtful or is_broken:
+        return
+    better = f"better, with {fit.saved:.0%} less cost"
+    found = f"the flow fits {fit.factor:.2f} times the present focal length {better}"
+    zoomed = "the lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
+    if fit.half:
+        first, last = fit.half
+        yield f"from frame {first} to {last} {found}: if {zoomed}; run each part for itself"
+    else:
+        advice = f"check the calibration, or give {fit.factor:.2f} times the present --fx and --fy"
+        yield f"{found}: {advice}. If {zoomed}"
+
+
+def shown_static(slam: Slam) -> float | None:
+    """Return the fraction of what stands still that the map shows [-]; None before the end."""
+    return float(np.mean(slam.mapper.shown)) if slam.mapper.shown else None
+
+
+def has_large_holes(slam: Slam) -> bool:
+    """Tell whether the map shows too little for its poses and depths to be right."""
+    shown = shown_static(slam)
+    return shown is not None and shown < LEAST_SHOWN
+
+
+def left_out(slam: Slam) -> float:
+    """Return the fraction of the map's images that beta leaves out [-]; 0 before the end."""
+    mapper = slam.mapper
+    images = mapper.keyframes if mapper.shown else []
+    weights = (mapper.static_weight(mapper.beta_of(k), mapper.camera) for k in images)
+    return float(np.mean([float((weight == 0).float().mean()) for weight in weights] or 0.0))

@@ -1,0 +1,68 @@
+"""A finished run with nothing to warn of, made of what warnings and facts read."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from minislam.geometry import Camera
+from minislam.records import Trajectory
+from tests.helpers import random_transforms
+
+CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
+
+
+def finished(**parts: object) -> SimpleNamespace:
+    """Return a finished run of four frames without anything to warn of, but for these parts."""
+    failed = parts.pop("failed", 0)
+    graph = SimpleNamespace(
+        adjustments=2 + failed,
+        failed_adjustments=failed,
+        least_parallax=1.0,
+        seeks_focal=parts.pop("seeks_focal", False),
+        focal_is_free=parts.pop("focal_is_free", False),
+        grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
+        shutter=SimpleNamespace(readout=(0.0, 0.0)),
+    )
+    lost, ends_lost = parts.pop("lost", 0), parts.pop("ends_lost", False)
+    follows = [k < 4 - lost if ends_lost else k > lost for k in range(4)]
+    frames = [
+        SimpleNamespace(frame_index=k, timestamp=k / 30, status=SimpleNamespace(is_followed=there))
+        for k, there in enumerate(follows)
+    ]
+    tracker = SimpleNamespace(
+        initialised=True,
+        tracked=frames,
+        graph=graph,
+        knows_depth=parts.pop("knows_depth", True),
+        watch=SimpleNamespace(
+            diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
+            beyond_turns=parts.pop("beyond_turns", 3.0),
+            breaks=parts.pop("breaks", []),
+            segments=[(0, 1), (3, 3)],
+        ),
+        keyframes=SimpleNamespace(
+            has_prior=parts.pop("has_prior", True), overlay=parts.pop("overlay", None)
+        ),
+    )
+    truth = parts.pop("truth", None)  # s, of the true poses
+    if truth is not None:
+        poses = random_transforms(len(truth), "normal", 0).numpy()
+        poses = np.tile(poses[:1], (len(truth), 1, 1)) if parts.pop("stands", False) else poses
+        truth = SimpleNamespace(trajectory=Trajectory(np.array(truth), poses))
+    shown = parts.pop("shown", [1.0])
+    keyframes = [SimpleNamespace(frame_index=8 * k) for k in range(len(shown))]
+    hidden = torch.arange(10) >= 10 * parts.pop("left_out", 0.0)
+    mapper = SimpleNamespace(shown=shown, keyframes=keyframes, camera=CAMERA)
+    mapper.beta_of, mapper.static_weight = lambda keyframe: hidden, lambda beta, camera: beta
+    return SimpleNamespace(
+        mapper=mapper,
+        sequence=SimpleNamespace(warnings=[], camera=CAMERA, ground_truth=truth),
+        lost_frames=lambda: [None] * lost,
+        trajectory=lambda: Trajectory(np.arange(4) / 30, random_transforms(4, "normal", 1).numpy()),
+        tracker=tracker,
+        focal_length=parts.pop("focal_length", None),
+        lens=parts.pop("lens", None),
+        undone_lens=parts.pop("undone_lens", None),
+    )

@@ -1,0 +1,98 @@
+"""Each thing that the user must know of a run is one warning, and a good run has none."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from minislam.runs.warnings import LEAST_BEYOND_TURNS, warnings
+from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.safeguards.diagnostics import Break
+from minislam.tracking.safeguards.focal_length import FocalLengthFit
+from minislam.tracking.safeguards.lens import LensFit
+from tests.runs.finished import finished
+
+DOUBTFUL = FocalLengthFit(272.0, 1.1, 0.25)
+ZOOMED = FocalLengthFit(272.0, 1.4, 0.52, half=(8, 15))
+WARNINGS = [
+    (
+        {"lost": 1},
+        "1 of 4 frames could not be tracked and have no pose; lost_frames.txt lists them",
+    ),
+    ({"lost": 2, "ends_lost": True}, "If the film is cut at frame 2, run the rest by itself"),
+    ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
+    ({"breaks": [Break(2, 2)]}, "look at each piece (frames 0 to 1, 3 to 3) by itself"),
+    (
+        {"truth": [9.0, 9.5]},
+        "there is no ATE: expected at least 3 timestamps of estimate and truth",
+    ),
+    ({"truth": [0.0]}, "found 1 (estimate 4 poses, 0.000 to 0.100 s, truth 1 pose, 0.000 to 0.000"),
+    ({"truth": [0.0, 33.0, 67.0]}, "check that the times of both are in seconds: poses of the est"),
+    ({"truth": [k / 30 for k in range(3)], "stands": True}, "or a camera that does not move"),
+    ({"failed": 3}, "3 of 5 bundle adjustments failed"),
+    ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
+    (
+        {"lens": LensFit(300.0, (-0.1, 0.0), -0.07, 0.13)},
+        "bends straight lines, the corners by -7%, with 13% less",
+    ),
+    (
+        {"lens": LensFit(300.0, (0.0, 0.0), 0.01, 0.13), "focal_length": DOUBTFUL},
+        "the flow fits 1.10 times the",
+    ),
+    (
+        {"undone_lens": LensFit(300.0, (-0.1, 0.02), -0.07, 0.13)},
+        "by -7%: the run begins anew on straightened images, k1 = -0.100, k2 = 0.020",
+    ),
+    ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
+    ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
+    ({"seeks_focal": True}, "the motion does not tell it"),
+    ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
+    ({"parallax": [0.1], "knows_depth": False}, "and all that the map shows is at one depth"),
+    ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),
+    ({"overlay": torch.tensor([0.0, 1, 1, 1])}, "25% of the image stand still while the rest mov"),
+    ({"left_out": 0.5}, "beta leaves 50% of the images out"),
+    ({"has_prior": False}, "the unit of length is arbitrary"),
+]
+
+
+@pytest.mark.parametrize(("parts", "words"), WARNINGS)
+def test_each_fault_is_one_warning(parts: dict, words: str):
+    assert not list(warnings(finished()))
+    (warning,) = warnings(finished(**parts))
+    assert words in warning
+
+
+def test_keyframes_without_depth_are_warned_of_where_a_prior_was_given():
+    run = finished()
+    run.tracker.keyframes = KeyframeStore(torch.zeros(2))
+    for frame, depths in ((0, [0.5, 0.0]), (8, [0.0, 0.0]), (16, [0.0, 0.0])):
+        row = SimpleNamespace(frame_index=frame, pixels=None), torch.zeros(1), None, torch.eye(4)
+        run.tracker.keyframes.append(*row, torch.ones(2), torch.tensor(depths))
+    assert not list(warnings(run, "none"))
+    (warning,) = warnings(run, "files:made")
+    assert "--depth files:made knows nothing of 2 of 3 keyframes, such as frame 8:" in warning
+
+
+def test_a_truth_that_frames_match_is_not_warned_of():
+    assert not list(warnings(finished(truth=[k / 30 for k in range(3)])))
+
+
+def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_depth():
+    weak = {"beyond_turns": 0.9 * LEAST_BEYOND_TURNS}
+    assert not list(warnings(finished(**weak)))
+    warning, _ = warnings(finished(**weak, has_prior=False))
+    assert "only 0.41 px of the flow, in the median" in warning
+    assert len(list(warnings(finished(beyond_turns=None, has_prior=False)))) == 1
+    warning, _ = warnings(finished(**weak, has_prior=False, parallax=[0.1]))  # said once
+    assert "hardly any parallax" in warning
+
+
+@pytest.mark.parametrize("broken", [{"lost": 1}, {"failed": 3}])
+def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
+    (warning,) = warnings(finished(focal_length=DOUBTFUL, **broken))
+    assert "present focal length" not in warning
+
+
+def test_a_film_that_goes_on_after_a_loss_is_not_called_cut():
+    (warning,) = warnings(finished(lost=1))
+    assert "cut" not in warning
