@@ -79,10 +79,9 @@ def auroc(
     mask = np.asarray(mask, dtype=bool).ravel()
     positives, negatives = int(mask.sum()), int((~mask).sum())
     if scores.shape != mask.shape or positives == 0 or negatives == 0:
-        raise InputError(
-            f"expected one score per pixel and pixels of both kinds, found {scores.size} scores, "
-            f"{positives} moving and {negatives} static pixels; choose frames with dynamic objects"
-        )
+        kinds = f"{positives} moving and {negatives} static pixels"
+        found = f"{scores.size} scores, {kinds}; choose frames with dynamic objects"
+        raise InputError(f"expected one score per pixel and pixels of both kinds, found {found}")
     if not np.isfinite(scores).all():
         raise InputError("expected finite scores, found NaN or infinity; check the uncertainty")
     static, moving = np.sort(scores[~mask]), scores[mask]

@@ -57,10 +57,8 @@ def relative_pose_error(
     motions do not overlap. Where the scale is unknown, align it first.
     """
     if not 1 <= step < len(truth):
-        raise InputError(
-            f"expected a step of 1 to {len(truth) - 1} of {len(truth)} paired poses, found {step}; "
-            "choose a step between"
-        )
+        wanted = f"a step of 1 to {len(truth) - 1} of {len(truth)} paired poses"
+        raise InputError(f"expected {wanted}, found {step}; choose a step between")
     first = np.arange(0, len(truth) - step, step)
     true, found = truth.T_world_camera, estimate.T_world_camera
     true_motion = np.linalg.inv(true[first]) @ true[first + step]
@@ -87,11 +85,10 @@ def paired(
     """Return the poses of both trajectories that belong together, in order of time."""
     pairs = associate(estimate.timestamps, truth.timestamps, max_difference)
     if len(pairs[0]) == 0:
-        raise InputError(
-            f"expected timestamps of estimate and truth within {max_difference:g} s of each "
-            f"other, found none (estimate {_span(estimate)}, truth {_span(truth)}); check that "
-            "the files belong together, or use --t_offset and --t_max_diff"
-        )
+        wanted = f"timestamps of estimate and truth within {max_difference:g} s of each other"
+        found = f"none (estimate {_span(estimate)}, truth {_span(truth)})"
+        advice = "check that the files belong together, or use --t_offset and --t_max_diff"
+        raise InputError(f"expected {wanted}, found {found}; {advice}")
     estimate, truth = (
         Trajectory(whole.timestamps[kept], whole.T_world_camera[kept])
         for whole, kept in zip((estimate, truth), pairs, strict=True)

@@ -98,20 +98,18 @@ def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any:
         make = entry.load()
         prior = make(device) if weights is None else make(device, weights)
     except (Exception, SystemExit) as error:
-        raise InputError(
-            f"expected --{kind} {name} to name a function that makes a prior of a device, found "
-            f"{type(error).__name__}: {str(error).partition(chr(10))[0]}; write it like "
-            f"{PYTHON}MODULE:FUNCTION, see minislam/priors/networks/README.md"
-        ) from error
+        wanted = f"--{kind} {name} to name a function that makes a prior of a device"
+        found = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        advice = f"write it like {PYTHON}MODULE:FUNCTION, see minislam/priors/networks/README.md"
+        raise InputError(f"expected {wanted}, found {found}; {advice}") from error
     _CHECKS[kind](prior, f"--{kind} {name}")
     return prior
 
 
 def _sensor_depth(sequence: Sequence) -> SensorDepth:
     if all(sequence.sensor_depth(index) is None for index in range(len(sequence))):
-        raise InputError(
-            f"expected a sensor's depth in {sequence.name}, found none; use another --depth"
-        )
+        wanted = f"a sensor's depth in {sequence.name}"
+        raise InputError(f"expected {wanted}, found none; use another --depth")
     return SensorDepth(sequence.sensor_depth)
 
 
@@ -124,8 +122,7 @@ def _depth_files(sequence: Sequence, folder: Path) -> FileDepth:
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:
     truth = sequence.ground_truth
     if truth is None or truth.depth(0) is None:
-        raise InputError(
-            "expected a sequence with true depth for --depth simulated, found none in "
-            f"{sequence.name}; use --depth none or --depth files:FOLDER"
-        )
+        wanted = "a sequence with true depth for --depth simulated"
+        found = f"none in {sequence.name}; use --depth none or --depth files:FOLDER"
+        raise InputError(f"expected {wanted}, found {found}")
     return SimulatedDepth(truth.depth, seed, config)

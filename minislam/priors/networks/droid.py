@@ -74,10 +74,9 @@ class DroidFlow(Stateful):
     def encode(self, image: Tensor) -> EncodedFrame:
         """Return an image (H, W, 3) encoded; chain and keyframe share the newest one."""
         if min(image.shape[:2]) <= _TOO_SMALL:
-            raise InputError(
-                f"expected images of more than {_TOO_SMALL} px per side for DROID, found "
-                f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
-            )
+            wanted = f"images of more than {_TOO_SMALL} px per side for DROID"
+            found = f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
+            raise InputError(f"expected {wanted}, found {found}")
         if self._newest is None or not torch.equal(self._newest.image, image):
             self._newest = EncodedFrame(self.weights, image)
         return self._newest

@@ -53,10 +53,9 @@ class VisionTransformer:
         self._block = "blocks.0.{}." if "blocks.0.0.norm1.weight" in weights else "blocks.{}."
         self.width = weights["patch_embed.proj.weight"].shape[0]
         if self.width not in _BLOCKS:
-            raise InputError(
-                f"expected a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in "
-                f"{weights.file}, found one of width {self.width}; give another size of the network"
-            )
+            wanted = f"a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in {weights.file}"
+            found = f"one of width {self.width}; give another size of the network"
+            raise InputError(f"expected {wanted}, found {found}")
         self.depth = _BLOCKS[self.width]
         class_token, positions = weights["cls_token"], weights["pos_embed"]
         if positions.shape[1] == _TRAINED_GRID**2 + 1:
