@@ -120,8 +120,5 @@ class Camera:
 
 
 def pixel_scale(camera: Camera) -> float:
-    """Return how many pixels correspond to one pixel of a 320x240 image.
-
-    Thresholds in pixels are given for that size and are multiplied by this factor.
-    """
+    """Return how many pixels are one of a 320x240 image, for which thresholds are given [px]."""
     return math.hypot(camera.width, camera.height) / REFERENCE_DIAGONAL
