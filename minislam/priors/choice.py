@@ -27,6 +27,8 @@ from minislam.priors.names import FILES, FOLDER, PYTHON, PriorChoice, plugins, r
 from minislam.priors.networks.table import NetworksConfig, find_network, load_network
 from minislam.records import Sequence
 
+Makers = dict[str, Callable[[], Any]]  # by name, of what needs no weights
+
 _CHECKS = {
     "flow": conformance.check_flow_estimator,
     "features": conformance.check_feature_extractor,
@@ -45,7 +47,7 @@ def choose_features(
     choice: PriorChoice, camera: Camera, networks: NetworksConfig, frames: int = 0
 ) -> FeatureExtractor:
     """Return the features: classical, a network, a plugin, or files:FOLDER of so many frames."""
-    makers: dict[str, Callable[[], Any]] = {
+    makers: Makers = {
         "classical": ClassicalFeatures,
         FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera, frames),
     }
@@ -60,7 +62,7 @@ def choose_depth(
     networks: NetworksConfig,
 ) -> DepthPrior:
     """Return the depth: none, simulated, sensor, a network, a plugin, or files:FOLDER."""
-    makers: dict[str, Callable[[], Any]] = {
+    makers: Makers = {
         "none": NoDepth,
         "simulated": lambda: _simulated_depth(sequence, seed, simulated),
         "sensor": lambda: _sensor_depth(sequence),
@@ -69,12 +71,7 @@ def choose_depth(
     return _choose("depth", choice, networks, makers)
 
 
-def _choose(
-    kind: str,
-    choice: PriorChoice,
-    networks: NetworksConfig,
-    makers: dict[str, Callable[[], Any]],  # by name, of what needs no weights
-) -> Any:
+def _choose(kind: str, choice: PriorChoice, networks: NetworksConfig, makers: Makers) -> Any:
     """Return the prior that --KIND and --KIND-weights name."""
     name = getattr(choice, kind)
     weights = require_prior(kind, name, getattr(choice, f"{kind}_weights"))

@@ -49,11 +49,9 @@ class SimulatedDepth:
             return None
         source = np.random.default_rng([self.seed, frame.frame_index])
         height, width = truth.shape
-        log_factor = (
-            self.config.scale_error * source.standard_normal()
-            + self.config.field_error * _smooth_noise(width, height, source)
-            + self._gross(width, height, source)
-        )
+        of_scale = self.config.scale_error * source.standard_normal()
+        of_field = self.config.field_error * _smooth_noise(width, height, source)
+        log_factor = of_scale + of_field + self._gross(width, height, source)
         return as_depth(truth * np.exp(log_factor), frame, "the simulated depth")
 
     def _gross(self, width: int, height: int, source: np.random.Generator) -> np.ndarray:

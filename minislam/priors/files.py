@@ -109,12 +109,8 @@ class FileFeatures:
 class FileDepth:
     """Depth made elsewhere, from .npy (world units) or 16-bit .png files: a `DepthPrior`."""
 
-    def __init__(
-        self,
-        folder: Path | str,
-        png_unit: float = 1 / 5000,  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
-    ) -> None:
-        self.png_unit = png_unit
+    def __init__(self, folder: Path | str, png_unit: float = 1 / 5000) -> None:
+        self.png_unit = png_unit  # world units of one count in a .png; TUM and Bonn: 1 / 5000 m
         self.files = FrameFiles(folder, "depth", (".npy", ".png"))
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:

@@ -78,10 +78,7 @@ def published_files() -> dict[str, PublishedFile]:
 
 
 def find_weights(use: str, given: str | None) -> str | None:
-    """Return the path of what a flag like "--flow droid" reads, if it was given or fetched.
-
-    What was given is a path, or the name of a row.
-    """
+    """Return the path of what "--flow droid" reads: given (a path or a row's name), or fetched."""
     row = published_files().get(given or use.split()[-1])
     if row is None or row.use != use or not (given or row.path.exists()):
         return given

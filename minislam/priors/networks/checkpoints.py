@@ -2,8 +2,7 @@
 
 The networks of this folder are plain functions over `Weights`, a dictionary of tensors under
 their official names. Sizes are read from the shapes, and each name is written where it is used.
-Therefore one run on a tiny image checks a file completely: a missing tensor is named, and a
-tensor that was never read is unexpected.
+So one run on a tiny image checks a file: a missing tensor is named, one never read is unexpected.
 """
 
 import re

@@ -1,8 +1,7 @@
 """The table of pretrained networks, read by `choice.py` and `minislam weights`.
 
-To add a network, write a class that is a `FlowEstimator`, a `FeatureExtractor`, or a `DepthPrior`
-with a method `network` behind its resizing. Then add its row to NETWORKS below and to weights.csv,
-and a field to NetworksConfig if it has settings.
+To add a network, write a `FlowEstimator`, a `FeatureExtractor`, or a `DepthPrior` with a method
+`network` behind its resizing; then rows in NETWORKS and weights.csv, settings in NetworksConfig.
 """
 
 import warnings

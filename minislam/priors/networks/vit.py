@@ -1,11 +1,9 @@
 """The vision transformer of DINOv2, and the features of the paper's uncertainty MLP.
 
-FiT3D is DINOv2 made consistent across views; its files come in the layout of the timm library. Both
-depth networks are built on the same transformer.
+FiT3D is DINOv2 made consistent across views, in timm's layout. Both depth networks are built on it.
 
 Patches of 14x14 px become tokens; one class token, and in some checkpoints four "registers", stand
-before them. A block adds to each token first what it reads from all tokens (attention), then the
-output of an MLP on the token itself:
+before them. A block adds to each token what it reads from all (attention), then an MLP's output:
 
     x <- x + ls1 * proj(attention(norm1(x)))
     x <- x + ls2 * fc2(gelu(fc1(norm2(x))))
