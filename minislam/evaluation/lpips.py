@@ -52,23 +52,16 @@ _VGG16 = _Trunk("VGG-16", _VGG_CONVS, (64, 128, 256, 512, 512), 4, 2, 3, 1, 16)
 class Lpips:
     """Measures the distance between images."""
 
-    def __init__(
-        self,
-        trunk: Mapping[str, Tensor],  # torchvision's names: features.0.weight, ...
-        heads: Mapping[str, Tensor],  # the authors' names: lin0.model.1.weight, ...
-    ) -> None:
+    def __init__(self, trunk: Mapping[str, Tensor], heads: Mapping[str, Tensor]) -> None:
+        """Take torchvision's features.0.weight, ..., and the authors' lin0.model.1.weight, ..."""
         self._layout, self.name = recognise_trunk(trunk), recognise_heads(heads)
         if self.name != self._layout.name:
             found = f"heads for {self.name}; give alex.pth with AlexNet and vgg.pth with VGG-16"
             raise InputError(f"expected LPIPS heads for {self._layout.name}, found {found}")
         self._trunk, self._heads = trunk, heads
 
-    def __call__(
-        self,
-        image: ArrayLike,  # (H, W, 3) RGB in [0, 1]
-        reference: ArrayLike,  # the same shape
-    ) -> float:
-        """Return the distance of two images, 0 for equal ones."""
+    def __call__(self, image: ArrayLike, reference: ArrayLike) -> float:
+        """Return the distance of two images (H, W, 3) RGB in [0, 1], 0 for equal ones."""
         both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
         height, width, _ = shape = both[0].shape
         assert both[1].shape == shape and shape[2] == 3, (shape, both[1].shape)

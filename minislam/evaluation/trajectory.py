@@ -89,11 +89,9 @@ def paired(
         found = f"none (estimate {_span(estimate)}, truth {_span(truth)})"
         advice = "check that the files belong together, or use --t_offset and --t_max_diff"
         raise InputError(f"expected {wanted}, found {found}; {advice}")
-    estimate, truth = (
-        Trajectory(whole.timestamps[kept], whole.T_world_camera[kept])
-        for whole, kept in zip((estimate, truth), pairs, strict=True)
-    )
-    return estimate, truth
+    both = zip((estimate, truth), pairs, strict=True)
+    matched = [Trajectory(path.timestamps[k], path.T_world_camera[k]) for path, k in both]
+    return matched[0], matched[1]
 
 
 def associate(
@@ -101,10 +99,7 @@ def associate(
     second: np.ndarray,  # (M,) second, increasing
     max_difference: float,  # second
 ) -> tuple[np.ndarray, np.ndarray]:  # (K,) and (K,) int, positions in the first and the second
-    """Pair timestamps: each one of the shorter list with the nearest of the longer.
-
-    Pairs farther apart than `max_difference` are left out.
-    """
+    """Pair each timestamp of the shorter list with the nearest of the longer, if near enough."""
     if len(first) > len(second):
         of_second, of_first = associate(second, first, max_difference)
         return of_first, of_second
@@ -126,15 +121,11 @@ def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     return fitted
 
 
-def oriented_truth_to_estimate(
-    estimate: Trajectory,  # (N) as the truth, paired
-    truth: Trajectory,  # (N)
-) -> Similarity:
-    """Return the Sim(3) from truth to estimate with the mean rotation between the cameras.
+def oriented_truth_to_estimate(estimate: Trajectory, truth: Trajectory) -> Similarity:
+    """Return the Sim(3) from truth to estimate, paired, with the mean rotation between cameras.
 
     If the camera moves nearly along a line, its centres hardly determine the rotation about that
-    line, and 3 mrad of it move a held-out view by a pixel. The orientations determine it.
-    Scale and translation come from the centres.
+    line, and 3 mrad of it move a held-out view by a pixel. The rest comes from the centres.
     """
     turned = estimate.T_world_camera[:, :3, :3] @ truth.T_world_camera[:, :3, :3].mT
     rotation = Rotation.from_matrix(turned).mean().as_matrix()
