@@ -3,8 +3,7 @@
 A check calls the function with a few inputs, compares the answers with the package, and returns a
 sentence that names the first wrong number. It never raises, so that a notebook with open exercises
 still runs from top to bottom. Three more are for authors of priors: `check_depth_prior`,
-`check_feature_extractor` and `check_flow_estimator` raise InputError where an object is not what
-its interface asks for.
+`check_feature_extractor` and `check_flow_estimator` raise InputError for what is no such thing.
 """
 
 from minislam.checks.bundle_adjustment import (

@@ -118,10 +118,7 @@ def largest(value: Any) -> float:
 
 
 def as_numbers(answer: Any) -> Tensor:
-    """Return numbers in any form in float64.
-
-    Raises TypeError or ValueError where they are no numbers, or rows of different lengths.
-    """
+    """Return numbers in float64. Raises TypeError where they are none, ValueError if ragged."""
     if isinstance(answer, np.ndarray | np.generic):
         answer = torch.from_numpy(np.array(answer))  # a copy: also of what runs backwards
     if isinstance(answer, Tensor):

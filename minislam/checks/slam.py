@@ -131,8 +131,7 @@ def check_alignment(student: Function) -> Verdict:
 def check_sign_test(student: Function) -> Verdict:
     """Check (errors with, errors without (N,)) -> how often chance does at least as much.
 
-    Of all 2^N choices of signs for the differences, the fraction whose mean is at least as far
-    from 0 as the mean that was measured.
+    Of all 2^N signs of the differences, the part whose mean is at least as far from 0 as measured.
     """
 
     def reference(a: np.ndarray, b: np.ndarray, slack: float = 1e-12, sided: int = 2) -> float:

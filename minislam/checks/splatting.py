@@ -132,7 +132,7 @@ def check_rendered_image(student: Function) -> Verdict:
         case(5, back, "a camera that looks back"),
         *drawn(draw),
     ]
-    uncapped = patch("minislam.splatting.reference.MAX_OPACITY", 1.0)(rendered)
+    uncapped = patch("minislam.splatting.constants.MAX_OPACITY", 1.0)(rendered)
     mistakes = [
         ("unsorted", "Sort by the depth in the camera frame: the list has no order."),
         ("far first", "This is sorted the wrong way: the nearest Gaussian comes first."),

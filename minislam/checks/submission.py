@@ -30,14 +30,11 @@ def exercises_of(notebook: dict, name: str) -> list[Exercise]:
     """Return the exercises that a notebook should hold, told by its checks or else by its name."""
     called = re.findall(r"\bcheck_\w+", "\n".join(_code(notebook)))
     number = name.split("_")[0]
-    votes = [e.notebook for e in EXERCISES if e.check in called] or [
-        e.notebook for e in EXERCISES if e.notebook.split("_")[0] == number
-    ]
+    numbered = [e.notebook for e in EXERCISES if e.notebook.split("_")[0] == number]
+    votes = [e.notebook for e in EXERCISES if e.check in called] or numbered
     if not votes:
-        raise InputError(
-            f"expected a notebook of the course, found none of its exercises in {name}; give one "
-            "that `minislam notebooks` has made"
-        )
+        found = f"none of its exercises in {name}; give one that `minislam notebooks` has made"
+        raise InputError(f"expected a notebook of the course, found {found}")
     return [e for e in EXERCISES if e.notebook == mode(votes)]
 
 
@@ -52,9 +49,8 @@ def _code(notebook: dict) -> list[str]:
         cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
         texts = ["".join(cell["source"]) for cell in cells]
     except (KeyError, TypeError) as error:
-        raise InputError(
-            f"expected a notebook with cells, found {type(error).__name__} {error}; save it again"
-        ) from error
+        found = f"{type(error).__name__} {error}; save it again"
+        raise InputError(f"expected a notebook with cells, found {found}") from error
     return [re.sub(r"^[ \t]*[%!].*$", "", text, flags=re.M) for text in texts]
 
 

@@ -31,11 +31,8 @@ def psnr(
     return float("inf") if error == 0 else float(-10 * np.log10(error))
 
 
-def ssim(
-    image: ArrayLike,  # (H, W, 3) or (H, W) in [0, 1]
-    reference: ArrayLike,  # the same shape
-) -> float:  # at most 1
-    """Return the mean structural similarity over all windows that lie inside the image."""
+def ssim(image: ArrayLike, reference: ArrayLike) -> float:  # both (H, W, 3) or (H, W) in [0, 1]
+    """Return the mean structural similarity, at most 1, over all windows inside the image."""
     x, y = _checked(image, reference)
     assert min(x.shape[:2]) > 2 * _SSIM_RADIUS, x.shape
     mean_x, mean_y = _window_mean(x), _window_mean(y)
@@ -66,23 +63,19 @@ def depth_l1(
     return float(np.abs(scale * depth - reference)[known].mean())
 
 
-def auroc(
-    scores: ArrayLike,  # any shape, for instance beta; larger means "moving"
-    mask: ArrayLike,  # the same shape, True on dynamic objects
-) -> float:  # 1: perfect, 0.5: chance, 0: inverted
+def auroc(scores: ArrayLike, mask: ArrayLike) -> float:  # 1: perfect, 0.5: chance, 0: inverted
     """Return the area under the ROC curve: Mann and Whitney's U over the number of pairs.
 
-    It is the probability that a random moving pixel scores higher than a random static one;
-    equal scores count half. No threshold is needed.
+    It is the probability that a random moving pixel (True in the mask, of the same shape) scores
+    higher, for instance by beta, than a static one; equal scores count half. It needs no threshold.
     """
     scores = np.asarray(scores, dtype=np.float64).ravel()
     mask = np.asarray(mask, dtype=bool).ravel()
     positives, negatives = int(mask.sum()), int((~mask).sum())
     if scores.shape != mask.shape or positives == 0 or negatives == 0:
-        raise InputError(
-            f"expected one score per pixel and pixels of both kinds, found {scores.size} scores, "
-            f"{positives} moving and {negatives} static pixels; choose frames with dynamic objects"
-        )
+        kinds = f"{positives} moving and {negatives} static pixels"
+        found = f"{scores.size} scores, {kinds}; choose frames with dynamic objects"
+        raise InputError(f"expected one score per pixel and pixels of both kinds, found {found}")
     if not np.isfinite(scores).all():
         raise InputError("expected finite scores, found NaN or infinity; check the uncertainty")
     static, moving = np.sort(scores[~mask]), scores[mask]

@@ -52,25 +52,16 @@ _VGG16 = _Trunk("VGG-16", _VGG_CONVS, (64, 128, 256, 512, 512), 4, 2, 3, 1, 16)
 class Lpips:
     """Measures the distance between images."""
 
-    def __init__(
-        self,
-        trunk: Mapping[str, Tensor],  # torchvision's names: features.0.weight, ...
-        heads: Mapping[str, Tensor],  # the authors' names: lin0.model.1.weight, ...
-    ) -> None:
+    def __init__(self, trunk: Mapping[str, Tensor], heads: Mapping[str, Tensor]) -> None:
+        """Take torchvision's features.0.weight, ..., and the authors' lin0.model.1.weight, ..."""
         self._layout, self.name = recognise_trunk(trunk), recognise_heads(heads)
         if self.name != self._layout.name:
-            raise InputError(
-                f"expected LPIPS heads for {self._layout.name}, found heads for {self.name}; give "
-                "alex.pth with AlexNet and vgg.pth with VGG-16"
-            )
+            found = f"heads for {self.name}; give alex.pth with AlexNet and vgg.pth with VGG-16"
+            raise InputError(f"expected LPIPS heads for {self._layout.name}, found {found}")
         self._trunk, self._heads = trunk, heads
 
-    def __call__(
-        self,
-        image: ArrayLike,  # (H, W, 3) RGB in [0, 1]
-        reference: ArrayLike,  # the same shape
-    ) -> float:
-        """Return the distance of two images, 0 for equal ones."""
+    def __call__(self, image: ArrayLike, reference: ArrayLike) -> float:
+        """Return the distance of two images (H, W, 3) RGB in [0, 1], 0 for equal ones."""
         both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
         height, width, _ = shape = both[0].shape
         assert both[1].shape == shape and shape[2] == 3, (shape, both[1].shape)
@@ -86,10 +77,9 @@ class Lpips:
         """Refuse images that are too small to compare [px]."""
         side = self._layout.smallest_side
         if min(width, height) < side:
-            raise InputError(
-                f"expected images of at least {side}x{side} px for LPIPS with {self.name}, found "
-                f"{width}x{height}; give a larger working size"
-            )
+            wanted = f"images of at least {side}x{side} px for LPIPS with {self.name}"
+            found = f"{width}x{height}; give a larger working size"
+            raise InputError(f"expected {wanted}, found {found}")
 
     def _features(self, image: Tensor) -> list[Tensor]:  # five of (C, h, w), of unit length
         scaled = (2 * image - 1 - image.new_tensor(_SHIFT)) / image.new_tensor(_SCALE)
@@ -116,10 +106,9 @@ def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:
     kernel = trunk["features.0.weight"].shape[-1] if "features.0.weight" in trunk else 0
     layout = {known.first_kernel: known for known in (_ALEXNET, _VGG16)}.get(kernel)
     if layout is None:
-        raise InputError(
-            "expected the convolutions of AlexNet or VGG-16 for LPIPS, found another network; give "
-            "alexnet-owt-*.pth or vgg16-*.pth of torchvision"
-        )
+        advice = "give alexnet-owt-*.pth or vgg16-*.pth of torchvision"
+        wanted = "the convolutions of AlexNet or VGG-16 for LPIPS"
+        raise InputError(f"expected {wanted}, found another network; {advice}")
     before = 3
     for channels, convs in zip(layout.channels, layout.convs, strict=True):
         for number in convs:
@@ -127,10 +116,9 @@ def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:
                 name = f"features.{number}.{part}"
                 found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
                 if found != shape:
-                    raise InputError(
-                        f"expected {name} of {layout.name} to have {shape} channels, found "
-                        f"{found}; give torchvision's file of this network, whole"
-                    )
+                    found = f"{found}; give torchvision's file of this network, whole"
+                    wanted = f"{name} of {layout.name} to have {shape} channels"
+                    raise InputError(f"expected {wanted}, found {found}")
             before = channels
     return layout
 
@@ -142,7 +130,6 @@ def recognise_heads(heads: Mapping[str, Tensor]) -> str:
     for layout in (_ALEXNET, _VGG16):
         if found == [(1, channels, 1, 1) for channels in layout.channels]:
             return layout.name
-    raise InputError(
-        f"expected five LPIPS heads lin0 to lin4 for AlexNet or VGG-16, found shapes {found}; give "
-        "alex.pth or vgg.pth of the authors' weights/v0.1"
-    )
+    advice = "give alex.pth or vgg.pth of the authors' weights/v0.1"
+    wanted = "five LPIPS heads lin0 to lin4 for AlexNet or VGG-16"
+    raise InputError(f"expected {wanted}, found shapes {found}; {advice}")

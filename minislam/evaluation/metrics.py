@@ -100,8 +100,7 @@ def _novel_errors(
     """Compare held-out static views with renderings from their Sim(3)-aligned poses.
 
     The paper aligns by camera centres, here into the world of the map, where the error counts.
-    `psnr_novel_oriented_db` aligns by the orientations too, so that errors of the alignment count
-    less and errors of the map count more.
+    `psnr_novel_oriented_db` aligns by the orientations too: errors of the alignment count less.
     """
     if not views:
         return

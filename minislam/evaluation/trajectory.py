@@ -60,10 +60,8 @@ def relative_pose_error(
     motions do not overlap. Where the scale is unknown, align it first.
     """
     if not 1 <= step < len(truth):
-        raise InputError(
-            f"expected a step of 1 to {len(truth) - 1} of {len(truth)} paired poses, found {step}; "
-            "choose a step between"
-        )
+        wanted = f"a step of 1 to {len(truth) - 1} of {len(truth)} paired poses"
+        raise InputError(f"expected {wanted}, found {step}; choose a step between")
     first = np.arange(0, len(truth) - step, step)
     true, found = truth.T_world_camera, estimate.T_world_camera
     true_motion = np.linalg.inv(true[first]) @ true[first + step]
@@ -90,17 +88,14 @@ def paired(
     """Return the poses of both trajectories that belong together, in order of time."""
     pairs = associate(estimate.timestamps, truth.timestamps, max_difference)
     if len(pairs[0]) < least:
+        wanted = f"at least {least} timestamps of estimate and truth within {max_difference:g} s"
+        found = f"{len(pairs[0])} (estimate {_span(estimate)}, truth {_span(truth)})"
         advice = "check that both belong together, or use --t_offset and --t_max_diff of eval"
-        raise InputError(
-            f"expected at least {least} timestamps of estimate and truth within {max_difference:g} "
-            f"s of each other, found {len(pairs[0])} (estimate {_span(estimate)}, truth "
-            f"{_span(truth)}); {doubt_of_units(estimate, truth) or advice}"
-        )
-    estimate, truth = (
-        Trajectory(whole.timestamps[kept], whole.T_world_camera[kept])
-        for whole, kept in zip((estimate, truth), pairs, strict=True)
-    )
-    return estimate, truth
+        advice = doubt_of_units(estimate, truth) or advice
+        raise InputError(f"expected {wanted} of each other, found {found}; {advice}")
+    both = zip((estimate, truth), pairs, strict=True)
+    matched = [Trajectory(path.timestamps[k], path.T_world_camera[k]) for path, k in both]
+    return matched[0], matched[1]
 
 
 def doubt_of_units(estimate: Trajectory, truth: Trajectory) -> str:
@@ -120,10 +115,7 @@ def associate(
     second: np.ndarray,  # (M,) second, increasing
     max_difference: float,  # second
 ) -> tuple[np.ndarray, np.ndarray]:  # (K,) and (K,) int, positions in the first and the second
-    """Pair timestamps: each one of the shorter list with the nearest of the longer.
-
-    Pairs farther apart than `max_difference` are left out.
-    """
+    """Pair each timestamp of the shorter list with the nearest of the longer, if near enough."""
     if len(first) > len(second):
         of_second, of_first = associate(second, first, max_difference)
         return of_first, of_second
@@ -145,15 +137,11 @@ def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     return fitted
 
 
-def oriented_truth_to_estimate(
-    estimate: Trajectory,  # (N) as the truth, paired
-    truth: Trajectory,  # (N)
-) -> Similarity:
-    """Return the Sim(3) from truth to estimate with the mean rotation between the cameras.
+def oriented_truth_to_estimate(estimate: Trajectory, truth: Trajectory) -> Similarity:
+    """Return the Sim(3) from truth to estimate, paired, with the mean rotation between cameras.
 
     If the camera moves nearly along a line, its centres hardly determine the rotation about that
-    line, and 3 mrad of it move a held-out view by a pixel. The orientations determine it.
-    Scale and translation come from the centres.
+    line, and 3 mrad of it move a held-out view by a pixel. The rest comes from the centres.
     """
     turned = estimate.T_world_camera[:, :3, :3] @ truth.T_world_camera[:, :3, :3].mT
     rotation = Rotation.from_matrix(turned).mean().as_matrix()

@@ -46,20 +46,17 @@ def umeyama(
     """
     assert source.shape == target.shape and source.shape[1:] == (3,), (source.shape, target.shape)
     if len(source) < 3 or not (np.isfinite(source).all() and np.isfinite(target).all()):
-        raise InputError(
-            f"expected at least 3 pairs of finite points to align, found {len(source)} pairs; "
-            "check that the timestamps of both trajectories belong together"
-        )
+        advice = "check that the timestamps of both trajectories belong together"
+        found = f"{len(source)} pairs; {advice}"
+        raise InputError(f"expected at least 3 pairs of finite points to align, found {found}")
     source_mean, target_mean = source.mean(0), target.mean(0)  # (34), (35)
     source_centred, target_centred = source - source_mean, target - target_mean
     source_variance = (source_centred**2).sum(1).mean()  # (36)
     covariance = target_centred.T @ source_centred / len(source)  # (38)
     u, singular_values, v_transposed = np.linalg.svd(covariance)
     if singular_values[1] <= _RANK_TOLERANCE * singular_values[0]:
-        raise InputError(
-            "expected points that are not all on one line, found points that are (or a camera "
-            "that does not move); no unique alignment exists"
-        )
+        found = "points that are (or a camera that does not move); no unique alignment exists"
+        raise InputError(f"expected points that are not all on one line, found {found}")
     signs = np.ones(3)
     if np.linalg.det(u) * np.linalg.det(v_transposed) < 0:
         signs[2] = -1.0  # (39), (43)

@@ -29,19 +29,15 @@ class Camera:
 
     def __post_init__(self) -> None:
         if not 0 < min(self.fx, self.fy) <= max(self.fx, self.fy) <= LONGEST_FOCAL:
-            raise InputError(
-                f"expected positive focal lengths up to {LONGEST_FOCAL:g}, found fx={self.fx} "
-                f"fy={self.fy}; give them in pixels with --fx and --fy"
-            )
+            found = f"fx={self.fx} fy={self.fy}; give them in pixels with --fx and --fy"
+            wanted = f"positive focal lengths up to {LONGEST_FOCAL:g}"
+            raise InputError(f"expected {wanted}, found {found}")
+        size = f"{self.width}x{self.height}"
         if not (self.width >= 1 and self.height >= 1):
-            raise InputError(
-                f"expected an image of at least 1x1 pixels, found {self.width}x{self.height}"
-            )
+            raise InputError(f"expected an image of at least 1x1 pixels, found {size}")
         if not (-0.5 <= self.cx <= self.width - 0.5 and -0.5 <= self.cy <= self.height - 0.5):
-            raise InputError(
-                f"expected a principal point inside the {self.width}x{self.height} image, found "
-                f"cx={self.cx} cy={self.cy}; check that calibration and images belong together"
-            )
+            found = f"cx={self.cx} cy={self.cy}; check that calibration and images belong together"
+            raise InputError(f"expected a principal point inside the {size} image, found {found}")
 
     def project(self, points_camera: Tensor) -> Tensor:
         """Return pixels (..., 2) of points (..., 3) in front of the camera.
@@ -124,8 +120,5 @@ class Camera:
 
 
 def pixel_scale(camera: Camera) -> float:
-    """Return how many pixels correspond to one pixel of a 320x240 image.
-
-    Thresholds in pixels are given for that size and are multiplied by this factor.
-    """
+    """Return how many pixels are one of a 320x240 image, for which thresholds are given [px]."""
     return math.hypot(camera.width, camera.height) / REFERENCE_DIAGONAL

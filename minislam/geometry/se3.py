@@ -1,8 +1,7 @@
 """Rigid motions: SO(3) and SE(3), with exponential, logarithm and the left Jacobian.
 
 The formulas divide by the rotation angle, so near zero each coefficient is replaced by the first
-terms of its Taylor series. All functions take any number of leading batch dimensions and keep
-the dtype and device of their input.
+terms of its Taylor series. All functions take leading batch dimensions and keep dtype and device.
 """
 
 import torch
@@ -144,14 +143,10 @@ def se3_interpolate(first: Tensor, second: Tensor, fraction: float) -> Tensor:
 
 
 def se3_adjoint(transforms: Tensor) -> Tensor:
-    """Return Ad(T) (..., 6, 6), defined by T exp(xi) T^-1 = exp(Ad(T) xi).
-
-    For xi = (rho, phi) it is [[R, hat(t) R], [0, R]].
-    """
+    """Return Ad(T) = [[R, hat(t) R], [0, R]] (..., 6, 6), with T exp(xi) T^-1 = exp(Ad(T) xi)."""
     rotation = transforms[..., :3, :3]
     adjoint = transforms.new_zeros(*transforms.shape[:-2], 6, 6)
-    adjoint[..., :3, :3] = rotation
-    adjoint[..., 3:, 3:] = rotation
+    adjoint[..., :3, :3] = adjoint[..., 3:, 3:] = rotation
     adjoint[..., :3, 3:] = hat(transforms[..., :3, 3]) @ rotation
     return adjoint
 

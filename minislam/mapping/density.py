@@ -72,11 +72,8 @@ def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
     return replace(doubled, means=doubled.means + offsets, log_scales=log_scales)
 
 
-def useful_rows(
-    gaussians: GaussianMap,
-    median_depth: float,  # world units, of the scene
-) -> Tensor:  # (N,) bool
-    """Tell which Gaussians stay: those that are neither faint nor huge, and finite."""
+def useful_rows(gaussians: GaussianMap, median_depth: float) -> Tensor:  # (N,) bool
+    """Tell which Gaussians stay: neither faint nor huge in median depths of the scene, finite."""
     opaque = gaussians.opacities > PRUNE_OPACITY
     small = gaussians.scales.max(-1).values < PRUNE_SCALE * median_depth
     # One bad number would spread to every pixel that the Gaussian touches.

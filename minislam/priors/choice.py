@@ -27,6 +27,8 @@ from minislam.priors.names import FILES, FOLDER, PYTHON, PriorChoice, plugins, r
 from minislam.priors.networks.table import NetworksConfig, find_network, load_network
 from minislam.records import Sequence
 
+Makers = dict[str, Callable[[], Any]]  # by name, of what needs no weights
+
 _CHECKS = {
     "flow": conformance.check_flow_estimator,
     "features": conformance.check_feature_extractor,
@@ -45,7 +47,7 @@ def choose_features(
     choice: PriorChoice, camera: Camera, networks: NetworksConfig, frames: int = 0
 ) -> FeatureExtractor:
     """Return the features: classical, a network, a plugin, or files:FOLDER of so many frames."""
-    makers: dict[str, Callable[[], Any]] = {
+    makers: Makers = {
         "classical": ClassicalFeatures,
         FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera, frames),
     }
@@ -60,7 +62,7 @@ def choose_depth(
     networks: NetworksConfig,
 ) -> DepthPrior:
     """Return the depth: none, simulated, sensor, a network, a plugin, or files:FOLDER."""
-    makers: dict[str, Callable[[], Any]] = {
+    makers: Makers = {
         "none": NoDepth,
         "simulated": lambda: _simulated_depth(sequence, seed, simulated),
         "sensor": lambda: _sensor_depth(sequence),
@@ -69,12 +71,7 @@ def choose_depth(
     return _choose("depth", choice, networks, makers)
 
 
-def _choose(
-    kind: str,
-    choice: PriorChoice,
-    networks: NetworksConfig,
-    makers: dict[str, Callable[[], Any]],  # by name, of what needs no weights
-) -> Any:
+def _choose(kind: str, choice: PriorChoice, networks: NetworksConfig, makers: Makers) -> Any:
     """Return the prior that --KIND and --KIND-weights name."""
     name = getattr(choice, kind)
     weights = require_prior(kind, name, getattr(choice, f"{kind}_weights"))
@@ -98,11 +95,10 @@ def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any:
         make = entry.load()
         prior = make(device) if weights is None else make(device, weights)
     except (Exception, SystemExit) as error:
-        raise InputError(
-            f"expected --{kind} {name} to name a function that makes a prior of a device, found "
-            f"{type(error).__name__}: {str(error).partition(chr(10))[0]}; write it like "
-            f"{PYTHON}MODULE:FUNCTION, see minislam/priors/networks/README.md"
-        ) from error
+        wanted = f"--{kind} {name} to name a function that makes a prior of a device"
+        found = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        advice = f"write it like {PYTHON}MODULE:FUNCTION, see minislam/priors/networks/README.md"
+        raise InputError(f"expected {wanted}, found {found}; {advice}") from error
     _CHECKS[kind](prior, f"--{kind} {name}")
     return prior
 
@@ -131,8 +127,7 @@ def _require_some(depths: Iterable[Any], what: str, advice: str) -> None:
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:
     truth = sequence.ground_truth
     if truth is None or truth.depth(0) is None:
-        raise InputError(
-            "expected a sequence with true depth for --depth simulated, found none in "
-            f"{sequence.name}; use --depth none or --depth files:FOLDER"
-        )
+        wanted = "a sequence with true depth for --depth simulated"
+        found = f"none in {sequence.name}; use --depth none or --depth files:FOLDER"
+        raise InputError(f"expected {wanted}, found {found}")
     return SimulatedDepth(truth.depth, seed, config)

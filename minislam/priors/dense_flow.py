@@ -21,12 +21,8 @@ def pixel_positions(shape: tuple[int, int]) -> np.ndarray:  # (H, W, 2) float32
     return np.stack(np.meshgrid(*sides), -1)
 
 
-def sample(
-    image: np.ndarray,
-    positions: np.ndarray,  # (h, w, 2) px
-    method: int = cv2.INTER_LINEAR,
-) -> np.ndarray:
-    """Return the image at these positions; those outside take the nearest border pixel."""
+def sample(image: np.ndarray, positions: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Return the image at positions (h, w, 2) [px]; outside, the nearest border pixel counts."""
     column, row = cv2.split(positions)
     return cv2.remap(image, column, row, method, borderMode=cv2.BORDER_REPLICATE)
 
@@ -62,8 +58,7 @@ def composed_flow(source: np.ndarray, target: np.ndarray, start: np.ndarray) -> 
 def reverse_flow(source: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Return the flow from target to source (H, W, 2), started at the inverse of `forward`.
 
-    The inverse is a fixed point: b(q) = -forward(q + b(q)). For a smooth field, three iterations
-    bring it close enough for DIS to correct the rest.
+    The inverse is a fixed point: b(q) = -forward(q + b(q)). After three iterations DIS corrects it.
     """
     inverse = -forward
     for _ in range(3):

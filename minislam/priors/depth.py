@@ -49,11 +49,9 @@ class SimulatedDepth:
             return None
         source = np.random.default_rng([self.seed, frame.frame_index])
         height, width = truth.shape
-        log_factor = (
-            self.config.scale_error * source.standard_normal()
-            + self.config.field_error * _smooth_noise(width, height, source)
-            + self._gross(width, height, source)
-        )
+        of_scale = self.config.scale_error * source.standard_normal()
+        of_field = self.config.field_error * _smooth_noise(width, height, source)
+        log_factor = of_scale + of_field + self._gross(width, height, source)
         return as_depth(truth * np.exp(log_factor), frame, "the simulated depth")
 
     def _gross(self, width: int, height: int, source: np.random.Generator) -> np.ndarray:
@@ -102,10 +100,9 @@ def as_depth(depth: np.ndarray, frame: Frame, name: str) -> Tensor:
     height, width = frame.image.shape[:2]
     aspect = (depth.shape[1] / depth.shape[0]) / (width / height)
     if abs(aspect - 1) > _ASPECT_TOLERANCE:
-        raise InputError(
-            f"expected {name} to show what the image of {width}x{height} shows, found "
-            f"{depth.shape[1]}x{depth.shape[0]} of another aspect ratio; crop it like the image"
-        )
+        wanted = f"{name} to show what the image of {width}x{height} shows"
+        found = f"{depth.shape[1]}x{depth.shape[0]} of another aspect ratio; crop it like the image"
+        raise InputError(f"expected {wanted}, found {found}")
     depth = np.asarray(depth, np.float32)
     if depth.shape != (height, width):
         # Not bilinear: a mean over an object's edge is a depth where nothing is.
@@ -113,8 +110,7 @@ def as_depth(depth: np.ndarray, frame: Frame, name: str) -> Tensor:
     known = np.isfinite(depth) & (depth > 0)
     usable = known & (depth > _RANGE[0]) & (depth < _RANGE[1])
     if known.any() and not usable.any():
-        raise InputError(
-            f"expected depths of {_RANGE[0]:g} to {_RANGE[1]:g} world units in {name}, found "
-            f"{depth[known].min():g} to {depth[known].max():g}; write metres"
-        )
+        wanted = f"depths of {_RANGE[0]:g} to {_RANGE[1]:g} world units in {name}"
+        found = f"{depth[known].min():g} to {depth[known].max():g}; write metres"
+        raise InputError(f"expected {wanted}, found {found}")
     return torch.from_numpy(np.where(usable, depth, np.float32(0))).to(frame.image.device)

@@ -15,9 +15,8 @@ from torch.nn import functional
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Frame
 
-# Centre and spread of each raw feature, rounded from statistics of everyday video (indoor and
-# outdoor, about a hundred frames). Without the centring all colours share one large common part
-# and every cosine similarity would be close to 1.
+# Centre and spread of each raw feature, of a hundred frames of everyday video, indoor and outdoor.
+# Without the centring all colours share one large part, and every cosine would be close to 1.
 _LAB_CENTRE = np.array([50.0, 4.0, 10.0], np.float32)  # Lab units of a float image: L is 0..100
 _LAB_SPREAD = np.array([23.0, 9.0, 14.0], np.float32)
 _CONTRAST_UNIT = np.array([1.0, 0.5, 0.5], np.float32)  # Lab units: contrasts below are noise
@@ -77,10 +76,8 @@ def _describe(
     return np.concatenate([color, *(TEXTURE_WEIGHT * part for part in texture)], -1)
 
 
-def oriented_edges(
-    brightness: np.ndarray,  # (H, W) float32
-) -> list[np.ndarray]:  # per bin (H, W) float32, with the gradient magnitude per px as their sum
-    """Split the gradient magnitude among orientation bins over 180 degrees, linearly."""
+def oriented_edges(brightness: np.ndarray) -> list[np.ndarray]:  # (H, W) float32, so each bin's
+    """Split the gradient magnitude per px among orientation bins over 180 degrees, linearly."""
     # The 3x3 Sobel kernel sums to 8 per unit slope.
     du = cv2.Sobel(brightness, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     dv = cv2.Sobel(brightness, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
@@ -99,9 +96,8 @@ def with_finer_grid(extractor: FeatureExtractor, factor: int) -> FeatureExtracto
 class HighResolutionFeatures:
     """A feature extractor whose grid is `factor` times as fine as that of the extractor inside.
 
-    DINOv2 gives one feature per patch of 14 px, so beta is blurred at the outline of an object. If
-    the image is shifted by a fraction of a patch, the same network describes the patches in
-    between, at the cost of factor^2 passes (paper supplement).
+    DINOv2 gives one feature per patch of 14 px, so beta is blurred at outlines. On images shifted
+    by parts of a patch it describes the patches between, in factor^2 passes (paper supplement).
     """
 
     def __init__(self, extractor: FeatureExtractor, factor: int) -> None:
@@ -126,11 +122,7 @@ class HighResolutionFeatures:
         return fine.flatten(0, 1).flatten(1, 2)
 
 
-def shift_image(
-    image: Tensor,  # (H, W, 3)
-    right: float,  # px
-    down: float,  # px
-) -> Tensor:  # (H, W, 3)
+def shift_image(image: Tensor, right: float, down: float) -> Tensor:  # (H, W, 3), px
     """Return the image whose pixel (u, v) shows (u + right, v + down); its border is repeated."""
     height, width = image.shape[:2]
     # The unit of affine_grid is half an image.

@@ -21,6 +21,7 @@ INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
 FEATURES, DEPTH = "features", "depth"  # folders of one sequence's priors
 _FOLDERS = {FEATURES: ("features",), DEPTH: ("depth", "depths")}  # the last: of WildGS-SLAM
 _AXES = {FEATURES: ("rows", "columns", "channels"), DEPTH: ("rows", "columns")}
+_MAKE = "make them from this sequence with minislam priors"  # advice where files are missing
 
 
 class FrameFiles:
@@ -37,10 +38,9 @@ class FrameFiles:
         files = sorted(p for p in self.folder.glob("*") if p.suffix.lower() in endings)
         self._files = {int(path.stem): path for path in files if path.stem.isdecimal()}
         if not self._files:
-            raise InputError(
-                f"expected {' or '.join(endings)} files named by frame index in {self.folder}, "
-                f"found {len(files)} such files and none that fits; name them like 00017.npy"
-            )
+            wanted = f"{' or '.join(endings)} files named by frame index in {self.folder}"
+            found = f"{len(files)} such files and none that fits; name them like 00017.npy"
+            raise InputError(f"expected {wanted}, found {found}")
         self.first = self._files[min(self._files)]
         index = self.folder / INDEX
         self._number_of = _read_index(index) if index.is_file() else None
@@ -54,11 +54,10 @@ class FrameFiles:
         numbered = re.search(r"[0-9]{1,9}$", image)
         number = frame if numbered is None or self._number_of is not None else int(numbered[0])
         if number != frame and number in self._files:
-            raise InputError(
-                f"expected {self.what} files named by the frame of the run, {frame:05d} for "
-                f"{image}, found {self._files[number]}, which has the number of that image; "
-                f"rename them, or write {INDEX} beside them, as minislam priors does"
-            )
+            wanted = f"{self.what} files named by the frame of the run, {frame:05d} for {image}"
+            found = f"{self._files[number]}, which has the number of that image"
+            advice = f"rename them, or write {INDEX} beside them, as minislam priors does"
+            raise InputError(f"expected {wanted}, found {found}; {advice}")
 
     def of(self, frame: Frame) -> Path | None:
         """Return the file of a frame, or None if the folder has none for it."""
@@ -66,10 +65,9 @@ class FrameFiles:
             return self._files.get(frame.frame_index)
         number = self._number_of.get(round(frame.timestamp, 6))
         if number is None:
-            raise InputError(
-                f"expected {self.what} of the frame at {frame.timestamp:.6f} s, found no such "
-                f"frame in {self.folder / INDEX}; make them from this sequence with minislam priors"
-            )
+            wanted = f"{self.what} of the frame at {frame.timestamp:.6f} s"
+            found = f"no such frame in {self.folder / INDEX}"
+            raise InputError(f"expected {wanted}, found {found}; {_MAKE}")
         return self._files.get(number)
 
 
@@ -80,10 +78,8 @@ class FileFeatures:
         """Open a folder; raises InputError where it has fewer files than there are `frames`."""
         self._files = FrameFiles(folder, "features", (".npy",))
         if len(self._files) < frames:
-            raise InputError(
-                f"expected features of every frame in {folder}, {frames} files, found "
-                f"{len(self._files)}; make them from this sequence with minislam priors"
-            )
+            wanted = f"features of every frame in {folder}, {frames} files"
+            raise InputError(f"expected {wanted}, found {len(self._files)}; {_MAKE}")
         rows, _, self.dimension = read_array(self._files.first, FEATURES).shape
         self.stride = max(1, round(camera.height / rows))
 
@@ -91,25 +87,22 @@ class FileFeatures:
         """Read the features of a frame."""
         path = self._files.of(frame)
         if path is None:
-            raise InputError(
-                f"expected features of every frame in {self._files.folder}, found none for "
-                f"frame {frame.frame_index}; make them from this sequence with minislam priors"
-            )
+            wanted = f"features of every frame in {self._files.folder}"
+            found = f"none for frame {frame.frame_index}"
+            raise InputError(f"expected {wanted}, found {found}; {_MAKE}")
         features = read_array(path, FEATURES).astype(np.float32)
         rows, cols, channels = features.shape
         is_finite = np.isfinite(features).all()
         if channels != self.dimension or not is_finite:
-            raise InputError(
-                f"expected finite features of {self.dimension} channels in {path}, found "
-                f"{channels if is_finite else 'NaN or infinity'}; write all with one network"
-            )
+            wanted = f"finite features of {self.dimension} channels in {path}"
+            found = channels if is_finite else "NaN or infinity"
+            raise InputError(f"expected {wanted}, found {found}; write all with one network")
         height, width = frame.image.shape[:2]
         # Whole patches are counted, so each side of the grid may lack up to one of them.
         if abs(rows - cols * height / width) > max(1, height / width):
-            raise InputError(
-                f"expected {path} to cover the image of {width}x{height}, found a grid of "
-                f"{cols}x{rows}, of another aspect ratio; crop it like the image"
-            )
+            wanted = f"{path} to cover the image of {width}x{height}"
+            found = f"a grid of {cols}x{rows}, of another aspect ratio; crop it like the image"
+            raise InputError(f"expected {wanted}, found {found}")
         return torch.from_numpy(features).to(frame.image.device)
 
 
@@ -152,16 +145,14 @@ def read_array(path: Path, kind: str) -> np.ndarray:
         with open(path, "rb") as file:
             array = np.lib.format.read_array(file)
     except Exception as error:  # damaged bytes fail inside numpy in many ways
-        raise InputError(
-            f"expected a numpy array of {kind}, found an unreadable file {path}; write it again"
-        ) from error
+        found = f"an unreadable file {path}; write it again"
+        raise InputError(f"expected a numpy array of {kind}, found {found}") from error
     array = np.squeeze(array) if kind == DEPTH else array
     axes, is_float = _AXES[kind], np.issubdtype(array.dtype, np.floating)
     if array.ndim != len(axes) or array.size == 0 or not is_float:
-        raise InputError(
-            f"expected floating-point {kind} of shape ({', '.join(axes)}) in {path}, found "
-            f"{array.dtype} of shape {array.shape}; store one such array per file"
-        )
+        wanted = f"floating-point {kind} of shape ({', '.join(axes)}) in {path}"
+        found = f"{array.dtype} of shape {array.shape}; store one such array per file"
+        raise InputError(f"expected {wanted}, found {found}")
     return array
 
 
@@ -171,7 +162,6 @@ def _read_index(path: Path) -> dict[float, int]:
         pairs = [row.split() for row in rows if row and not row.startswith("#")]
         return {round(float(timestamp), 6): int(number) for number, timestamp in pairs}
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"expected rows of frame index and timestamp in {path}, found something else "
-            f"({error}); write it again with minislam priors, or remove it"
-        ) from error
+        wanted = f"rows of frame index and timestamp in {path}"
+        found = f"something else ({error}); write it again with minislam priors, or remove it"
+        raise InputError(f"expected {wanted}, found {found}") from error

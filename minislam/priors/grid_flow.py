@@ -91,9 +91,8 @@ def match_exposure(warped: np.ndarray, windows: Windows) -> np.ndarray:
 def lucas_kanade(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndarray:
     """Return the displacement (h, w, 2) [px] that remains at each grid cell after the warp.
 
-    DIS blends overlapping patches. Its errors, some hundredths of a pixel, have the same direction
-    over large parts of an image and so rotate the estimated camera. A least-squares match of one
-    window per cell has independent errors, which average out.
+    DIS blends overlapping patches. Its errors, some hundredths of a pixel, have one direction over
+    large parts of an image and so rotate the camera. Those of one window per cell are independent.
     """
     cells = pixel_positions(source.shape)[::stride, ::stride]
     points = cells.reshape(-1, 1, 2)
@@ -113,10 +112,7 @@ def grid_matches(
     texture: np.ndarray,  # (h, w) in [0, 1)
     stride: int,  # px
 ) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
-    """Sample a flow at the grid cells; confidence is texture times forward-backward agreement.
-
-    Matches outside of the target have confidence 0.
-    """
+    """Sample a flow at the cells; confidence is texture times agreement both ways, 0 outside."""
     height, width = forward.shape[:2]
     moved = pixel_positions((height, width))[::stride, ::stride] + remainder
     flow = sample(forward, moved)

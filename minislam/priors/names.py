@@ -43,16 +43,13 @@ class PriorChoice:
             import torch  # only where a GPU is asked for
 
             if not torch.cuda.is_available():
-                raise InputError(
-                    "expected a GPU that this torch can use for --device cuda, found none; say "
-                    "--device cpu, or make the priors elsewhere with minislam priors"
-                )
+                advice = "say --device cpu, or make the priors elsewhere with minislam priors"
+                wanted = "a GPU that this torch can use for --device cuda"
+                raise InputError(f"expected {wanted}, found none; {advice}")
         usable = [name for name in PRECISIONS if (self.device, name) != ("cpu", "fp16")]
         if self.precision not in usable:
-            raise InputError(
-                f"expected --precision {' or '.join(usable)} with --device {self.device}, found "
-                f"{self.precision!r}; choose one"
-            )
+            wanted = f"--precision {' or '.join(usable)} with --device {self.device}"
+            raise InputError(f"expected {wanted}, found {self.precision!r}; choose one")
 
     def from_anywhere(self) -> "PriorChoice":
         """Return the same choice by absolute paths, which a run folder keeps."""
@@ -90,10 +87,7 @@ def published_files() -> dict[str, PublishedFile]:
 
 
 def find_weights(use: str, given: str | None) -> str | None:
-    """Return the path of what a flag like "--flow droid" reads, if it was given or fetched.
-
-    What was given is a path, or the name of a row.
-    """
+    """Return the path of what "--flow droid" reads: given (a path or a row's name), or fetched."""
     row = published_files().get(given or use.split()[-1])
     if row is None or row.use != use or not (given or row.path.exists()):
         return given
@@ -117,28 +111,25 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
     if name in learned:
         file = find_weights(f"--{kind} {name}", weights)
         if file is None or not Path(file).expanduser().is_file():
-            raise InputError(
-                f"expected --{kind}-weights FILE with --{kind} {name}, found "
-                f"{'none' if file is None else f'nothing at {file}'}; fetch it with minislam "
-                f"weights fetch {name}, or give the path of an official checkpoint"
-            )
+            wanted = f"--{kind}-weights FILE with --{kind} {name}"
+            found = "none" if file is None else f"nothing at {file}"
+            fetch = f"fetch it with minislam weights fetch {name}"
+            advice = f"{fetch}, or give the path of an official checkpoint"
+            raise InputError(f"expected {wanted}, found {found}; {advice}")
         return file
     if name.startswith(PYTHON) or name in plugins(kind):
         return weights
     if weights is not None:
-        raise InputError(
-            f"expected --{kind} {' or '.join(learned)} with --{kind}-weights, found --{kind} "
-            f"{name}; name the network of {weights}"
-        )
+        wanted = f"--{kind} {' or '.join(learned)} with --{kind}-weights"
+        found = f"--{kind} {name}; name the network of {weights}"
+        raise InputError(f"expected {wanted}, found {found}")
     if name.startswith(FILES) and FOLDER in BUILT_IN[kind]:
         folder = Path(name.removeprefix(FILES)).expanduser()
         if not folder.is_dir():
-            raise InputError(
-                f"expected a folder of {kind} files, found nothing at {folder}; check the path"
-            )
+            found = f"nothing at {folder}; check the path"
+            raise InputError(f"expected a folder of {kind} files, found {found}")
     elif name not in BUILT_IN[kind]:
         known = ", ".join([*BUILT_IN[kind], *learned, *plugins(kind)])
-        raise InputError(
-            f"expected --{kind} {known} or {PYTHON}MODULE:FUNCTION, found {name!r}; choose one"
-        )
+        wanted = f"--{kind} {known} or {PYTHON}MODULE:FUNCTION"
+        raise InputError(f"expected {wanted}, found {name!r}; choose one")
     return None

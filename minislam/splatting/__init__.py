@@ -14,9 +14,8 @@ Read the files in this order, the slow twin first:
     renderer.py     `render`: the whole chain as one differentiable function
 
 Layout: a map, and everything in the slow twin, has one row per Gaussian, (N, 3). Inside the fast
-renderer arrays are component-first, (3, N) and (3, 3, N): each component is one contiguous run
-of N numbers, and a formula per component is one fast pass over memory. `f_vjp`, right below `f`,
-pulls a gradient back through `f`.
+renderer arrays are component-first, (3, N) and (3, 3, N): a component is one run of N numbers, and
+its formula one fast pass over memory. `f_vjp`, right below `f`, pulls a gradient back through `f`.
 """
 
 from minislam.splatting.constants import Rendering

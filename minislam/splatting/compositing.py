@@ -53,10 +53,8 @@ class Workspace:
         # Kept for the next chunk: cutting it into slots takes as long as the arithmetic on two.
         if key not in self._blocks:
             flat = self._buffers[number, : slots * tiles * PIXELS]
-            if tile_major:
-                values = flat.view(tiles, slots, PIXELS).transpose(0, 1)
-            else:
-                values = flat.view(slots, tiles, PIXELS)
+            by_tile = flat.view(tiles, slots, PIXELS).transpose(0, 1)
+            values = by_tile if tile_major else flat.view(slots, tiles, PIXELS)
             self._blocks[key] = Block(values, values.unbind(0))
         return self._blocks[key]
 
@@ -142,10 +140,7 @@ def composite(
     inside: Tensor,  # (B, P) 1 on the image, 0 on pixels beyond its border
     workspace: Workspace,
 ) -> GroupOutput:
-    """Composite a group of tiles from front to back.
-
-    Slow twin: reference.composite. Eq. (2).
-    """
+    """Composite a group of tiles from front to back. Slow twin: reference.composite. Eq. (2)."""
     transmittance = inside.clone()  # T = 0 beyond the border: nothing is shown or counted there
     out = inside.new_zeros(len(inside), 4, PIXELS)
     f_before = channels.new_zeros(len(inside), 4)  # f_{k-1}
@@ -183,8 +178,7 @@ def composite_vjp(
 ) -> tuple[Tensor, Tensor]:  # (6, S), (S, 4)
     """Pull gradients of a group's pixels back to coefficients and channels. Eq. (2).
 
-    From back to front, let A_k be v_out . (what slot k and all slots behind it would show if
-    nothing stood in front of slot k):
+    From back to front, let A_k be v_out . (what slots k to K would show with none before them):
 
         A_K = f_background . v_out + v_T_K,
         A_k = A_{k+1} + g_k,   g_k = alpha_k (f_k . v_out - A_{k+1}),
@@ -226,20 +220,13 @@ def composite_vjp(
     return v_coefficients, v_channels
 
 
-def _gaussian_alphas(
-    coefficients: Tensor,  # (6, n * B)
-    workspace: Workspace,
-    out: Tensor,  # (n, B, P)
-) -> None:
-    """Evaluate alpha of n slots."""
+def _gaussian_alphas(coefficients: Tensor, workspace: Workspace, out: Tensor) -> None:
+    """Evaluate alpha (n, B, P) of n slots by their coefficients (6, n * B)."""
     torch.mm(coefficients.T, workspace.monomials_log2, out=out.view(-1, PIXELS))
     torch.nn.functional.threshold(out.exp2_(), MIN_ALPHA, 0.0, inplace=True)
 
 
-def _transmittances(
-    T: Block,  # (n + 1, B, P), the first slot given
-    alphas: tuple[Tensor, ...],  # n times (B, P)
-) -> None:
-    """Fill in T between and after n slots."""
+def _transmittances(T: Block, alphas: tuple[Tensor, ...]) -> None:
+    """Fill in T (n + 1, B, P) between and after n slots, by their alphas (B, P) and its first."""
     for T_k, alpha, T_next in zip(T.slots[:-1], alphas, T.slots[1:], strict=True):
         torch.addcmul(T_k, T_k, alpha, value=-1, out=T_next)

@@ -9,10 +9,7 @@ from torch import Tensor
 
 
 def rotations(quats: Tensor) -> Tensor:  # (4, N) w, x, y, z of any length -> (3, 3, N)
-    """Return the rotation of each quaternion q / |q|, the identity for zero.
-
-    Slow twin: geometry.se3.rotation_from_quaternion.
-    """
+    """Return the rotations of q, I for 0. Slow twin: geometry.se3.rotation_from_quaternion."""
     w, x, y, z = quats * _inverse_norms(quats)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -22,15 +19,11 @@ def rotations(quats: Tensor) -> Tensor:  # (4, N) w, x, y, z of any length -> (3
     return torch.stack(rows).unflatten(0, (3, 3))
 
 
-def rotations_vjp(
-    quats: Tensor,  # (4, N)
-    v_rotations: Tensor,  # (3, 3, N)  dL/dR
-) -> Tensor:  # (4, N)  dL/dq
+def rotations_vjp(quats: Tensor, v_rotations: Tensor) -> Tensor:  # (4, N), (3, 3, N) -> (4, N)
     """Pull a gradient back from rotation matrices to quaternions.
 
-    With D = dL/dR, the derivative by w collects the antisymmetric differences of D, those by
-    x, y, z the symmetric sums and two diagonal entries. The last line is the derivative of
-    q / |q|: only the part across q can change a direction.
+    With D = dL/dR, the derivative by w collects antisymmetric differences of D, those by x, y, z
+    symmetric sums and two diagonal entries. Only the part across q can change q / |q|.
     """
     inverse_norms = _inverse_norms(quats)
     unit = quats * inverse_norms

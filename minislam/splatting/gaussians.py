@@ -28,10 +28,9 @@ class GaussianMap:
         count = len(self.means)
         for (name, tensor), row in zip(vars(self).items(), ROWS, strict=True):
             if tensor.shape != (count, *row):
-                raise InputError(
-                    f"expected {name} of shape {(count, *row)} in a map of {count} Gaussians, "
-                    f"found {tuple(tensor.shape)}; give one row per Gaussian in every tensor"
-                )
+                wanted = f"{name} of shape {(count, *row)} in a map of {count} Gaussians"
+                found = f"{tuple(tensor.shape)}; give one row per Gaussian in every tensor"
+                raise InputError(f"expected {wanted}, found {found}")
 
     def __len__(self) -> int:
         return len(self.means)

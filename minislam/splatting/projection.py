@@ -20,10 +20,7 @@ def to_camera(
     factors: Tensor,  # (3, 3, N) L in the world frame
     T_camera_world: Tensor,  # (4, 4)
 ) -> tuple[Tensor, Tensor]:  # (3, N), (3, 3, N)
-    """Return the means and covariance factors in the camera frame, x = W mu + t and B = W L.
-
-    Slow twin: geometry.transform_points.
-    """
+    """Return x = W mu + t and B = W L in the camera frame. Slow twin: geometry.transform_points."""
     rotation, translation = T_camera_world[:3, :3], T_camera_world[:3, 3:]
     points_camera = torch.addmm(translation, rotation, means)
     return points_camera, (rotation @ factors.reshape(3, -1)).view_as(factors)
@@ -52,8 +49,7 @@ def to_camera_twist_vjp(
 
         v_rho = sum v_x,        v_phi = sum x x v_x + sum over columns of B x v_B.
 
-    A sum of cross products is the antisymmetric part of a sum of outer products: M = X v_X^T
-    takes one matrix product instead of N cross products.
+    The N cross products sum up to the antisymmetric part of one matrix product, M = X v_X^T.
     """
     outer = points_camera @ v_points_camera.T
     outer = outer + camera_factors.reshape(3, -1) @ v_camera_factors.reshape(3, -1).T
@@ -62,10 +58,7 @@ def to_camera_twist_vjp(
 
 
 def project_means(points_camera: Tensor, camera: Camera) -> Tensor:
-    """Return the projected means mu' (2, N) in px of points (3, N).
-
-    Slow twin: Camera.project.
-    """
+    """Return the projected means mu' (2, N) in px of points (3, N). Slow twin: Camera.project."""
     x, y, z = points_camera
     return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
@@ -77,8 +70,7 @@ def project_means_vjp(
 ) -> Tensor:  # (3, N)
     """Pull a pixel gradient back to the points: v_x = J^T v_mu'.
 
-    J is `Camera.project_jacobian`. It is not formed here, because the product alone takes fewer
-    operations; their order also fixes the rounding.
+    J, `Camera.project_jacobian`, is not formed: that takes more operations and rounds otherwise.
     """
     x, y, z = points_camera
     v_x = camera.fx * v_means2d[0] / z
@@ -116,8 +108,7 @@ def project_factors_vjp(
 ) -> tuple[Tensor, Tensor]:  # (3, N), (3, 3, N)
     """Return the gradients of points and factors from those of V; J depends on the points, too.
 
-    V depends on the point through the tangents h, unless they are limited, and through 1/z, in
-    which it is linear: dV/dz at fixed h is -V/z.
+    V depends on the point by the tangents h, unless limited, and by 1/z: dV/dz at fixed h is -V/z.
     """
     (tangent_x, tangent_y), inside = _limited_tangents(points_camera, camera)
     x, y, z = points_camera

@@ -1,8 +1,7 @@
 """The renderer as the paper writes it: dense, plain torch, differentiated by autograd.
 
 It evaluates every Gaussian at every pixel and is therefore slow. Read it first. The fast renderer
-is tested against its values and gradients. Where both compute the same thing, its functions have
-the names of their fast twins.
+is tested against its values and gradients; what both compute has the same name in both.
 """
 
 import torch
@@ -10,14 +9,8 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp, transform_points
 from minislam.geometry.se3 import rotation_from_quaternion
-from minislam.splatting.constants import (
-    LOW_PASS_VARIANCE,
-    MAX_OPACITY,
-    MIN_ALPHA,
-    NEAR_DEPTH,
-    Rendering,
-    tangent_limits,
-)
+from minislam.splatting import constants
+from minislam.splatting.constants import Rendering
 from minislam.splatting.gaussians import GaussianMap
 
 
@@ -29,10 +22,7 @@ def render_reference(
     twist: Tensor | None = None,  # (6,) left perturbation of the pose: T <- exp(twist) T
     screen_offsets: Tensor | None = None,  # (N, 2) px, added to the projected means
 ) -> Rendering:
-    """Render colour, depth and opacity of a map from a camera pose.
-
-    Fast twin: renderer.render.
-    """
+    """Render colour, depth and opacity of a map from a camera pose. Fast twin: renderer.render."""
     T_camera_world = T_camera_world.to(gaussians.means)
     if twist is not None:
         T_camera_world = se3_exp(twist) @ T_camera_world
@@ -40,9 +30,8 @@ def render_reference(
     if background is not None:
         behind = torch.cat([background, behind[3:]])
 
-    rows, points_camera, means2d, covariances2d = project_gaussians(
-        gaussians, camera, T_camera_world, screen_offsets
-    )
+    projected = project_gaussians(gaussians, camera, T_camera_world, screen_offsets)
+    rows, points_camera, means2d, covariances2d = projected
     alphas = gaussian_alphas(means2d, covariances2d, gaussians.opacities[rows], camera)
     channels = torch.cat([gaussians.colors[rows], points_camera[:, 2:]], 1)
     image, transmittance, weights = composite(alphas, channels, behind)
@@ -63,7 +52,7 @@ def project_gaussians(
     Fast twin: visible.project_gaussians, which also drops what lies outside the image.
     """
     points_camera = transform_points(T_camera_world, gaussians.means)
-    in_front = (points_camera[:, 2] > NEAR_DEPTH).nonzero()[:, 0]
+    in_front = (points_camera[:, 2] > constants.NEAR_DEPTH).nonzero()[:, 0]
     rows = in_front[points_camera[in_front, 2].argsort(stable=True)]
     points_camera = points_camera[rows]
     means2d = camera.project(points_camera)
@@ -75,10 +64,7 @@ def project_gaussians(
 
 
 def covariances(gaussians: GaussianMap) -> Tensor:  # (N, 3, 3) world units^2
-    """Return Sigma = R diag(s)^2 R^T of each Gaussian (Sec. 3.1).
-
-    Fast twin: covariance.covariance_factors, the L of Sigma = L L^T.
-    """
+    """Return Sigma = R diag(s)^2 R^T (Sec. 3.1). Fast twin: covariance.covariance_factors, L."""
     rotations = rotation_from_quaternion(gaussians.quats_wxyz)
     return rotations @ torch.diag_embed(gaussians.scales**2) @ rotations.transpose(-1, -2)
 
@@ -97,11 +83,11 @@ def project_covariances(
     """
     z = points_camera[:, 2:]
     tangents = points_camera[:, :2] / z
-    lower, upper = (tangents.new_tensor(limit) for limit in tangent_limits(camera))
+    lower, upper = (tangents.new_tensor(limit) for limit in constants.tangent_limits(camera))
     limited = torch.cat([torch.minimum(torch.maximum(tangents, lower), upper) * z, z], -1)
     to_pixels = camera.project_jacobian(limited) @ T_camera_world[:3, :3]  # J W, (N, 2, 3)
     projected = to_pixels @ covariances_world @ to_pixels.transpose(-1, -2)
-    return projected + LOW_PASS_VARIANCE * torch.eye(2, dtype=z.dtype, device=z.device)
+    return projected + constants.LOW_PASS_VARIANCE * torch.eye(2, dtype=z.dtype, device=z.device)
 
 
 def gaussian_alphas(
@@ -118,8 +104,9 @@ def gaussian_alphas(
     offsets = pixels - means2d[:, None, None, :]  # (N, H, W, 2)
     conics = torch.linalg.inv(covariances2d)
     distances = torch.einsum("nhwi,nij,nhwj->nhw", offsets, conics, offsets)
-    alphas = opacities.clamp(max=MAX_OPACITY)[:, None, None] * torch.exp(-0.5 * distances)
-    return torch.where(alphas > MIN_ALPHA, alphas, torch.zeros_like(alphas))
+    capped = opacities.clamp(max=constants.MAX_OPACITY)
+    alphas = capped[:, None, None] * torch.exp(-0.5 * distances)
+    return torch.where(alphas > constants.MIN_ALPHA, alphas, 0)
 
 
 def composite(

@@ -37,10 +37,8 @@ def render(
     Slow twin: reference.render_reference. Eq. (2).
     """
     if T_camera_world.shape != (4, 4):
-        raise InputError(
-            f"expected a camera pose of shape (4, 4), found {tuple(T_camera_world.shape)}; "
-            "give T_camera_world of one view"
-        )
+        found = f"{tuple(T_camera_world.shape)}; give T_camera_world of one view"
+        raise InputError(f"expected a camera pose of shape (4, 4), found {found}")
     like = gaussians.means
     channels_behind = like.new_zeros(4)  # of the background: at depth 0, which adds nothing
     if background is not None:

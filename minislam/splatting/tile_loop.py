@@ -1,7 +1,6 @@
 """The loop over the tiles of an image: from projected Gaussians to pixels, and back.
 
-Each turn processes one group of tiles: what one step writes is still in the cache when the next
-step reads it, and no array is as long as all lists together.
+Each turn takes one group of tiles: its arrays stay in the cache, and none is as long as all lists.
 """
 
 from typing import NamedTuple

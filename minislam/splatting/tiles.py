@@ -45,12 +45,8 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
 
 def tile_centres(camera: Camera, like: Tensor) -> Tensor:  # (2, tiles) px
     """Return the centre of every tile."""
-    rows, columns = tile_grid(camera)
-    u, v = (
-        torch.arange(count, dtype=like.dtype, device=like.device) * TILE + (TILE - 1) / 2
-        for count in (columns, rows)
-    )
-    return torch.stack([u.repeat(rows), v.repeat_interleave(columns)])
+    first_pixels = camera.pixel_grid(TILE, like.dtype, like.device).flatten(0, 1)
+    return first_pixels.T + (TILE - 1) / 2
 
 
 def to_tiles(image: Tensor, camera: Camera) -> Tensor:  # (C, H, W) -> (tiles, C, P)
@@ -115,9 +111,8 @@ def _entries(
 ) -> tuple[Tensor, Tensor]:  # (E,), (E,)
     """Return all pairs (Gaussian, tile) that overlap, ordered by Gaussian.
 
-    alpha reaches MIN_ALPHA on the ellipse d^T Q d = level, level = 2 ln(o / MIN_ALPHA). For each
-    row of tiles, a closed form gives the columns that this ellipse meets. A bounding box instead
-    would list every fifth tile in vain.
+    alpha reaches MIN_ALPHA on the ellipse d^T Q d = level, level = 2 ln(o / MIN_ALPHA). A closed
+    form gives its columns in each row of tiles; a bounding box lists every fifth tile in vain.
     """
     # The small constant keeps pairs that rounding may lift over the threshold.
     level = 2 * (opacities / MIN_ALPHA).log() + 1e-3

@@ -7,15 +7,9 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.splatting import projection
+from minislam.splatting import constants, projection
 from minislam.splatting.compositing import moments_vjp
-from minislam.splatting.constants import (
-    LOW_PASS_VARIANCE,
-    MAX_OPACITY,
-    MIN_ALPHA,
-    NEAR_DEPTH,
-    tangent_limits,
-)
+from minislam.splatting.constants import MAX_OPACITY, MIN_ALPHA
 from minislam.splatting.covariance import covariance_factors, covariance_factors_vjp
 from minislam.splatting.tiles import stable_argsort
 
@@ -58,10 +52,7 @@ def project_gaussians(
     T_camera_world: Tensor,  # (4, 4)
     camera: Camera,
 ) -> VisibleGaussians:
-    """Drop what cannot be seen, and project the rest in order of depth.
-
-    Slow twin: reference.project_gaussians.
-    """
+    """Project what can be seen, in order of depth. Slow twin: reference.project_gaussians."""
     rows = _visible_front_to_back(means, scales, opacities, T_camera_world, camera)
     # index_select throughout: it is several times faster than indexing with a tensor.
     means, quats, scales = (x.index_select(0, rows).T.contiguous() for x in (means, quats, scales))
@@ -94,15 +85,14 @@ def project_gaussians_vjp(
     v_opacities = v_log_opacities / g.opacities * (g.opacities < MAX_OPACITY)
 
     v_factors2d = projection.conics_from_factors2d_vjp(g.factors2d, g.conics, v_conics)
+    points, factors = g.points_camera, g.camera_factors
     v_points, v_camera_factors = projection.project_factors_vjp(
-        g.points_camera, g.camera_factors, g.factors2d, camera, v_factors2d
+        points, factors, g.factors2d, camera, v_factors2d
     )
-    v_points += projection.project_means_vjp(g.points_camera, camera, v_means2d)
+    v_points += projection.project_means_vjp(points, camera, v_means2d)
     v_points[2] += v_depths
 
-    v_twist = projection.to_camera_twist_vjp(
-        g.points_camera, g.camera_factors, v_points, v_camera_factors
-    )
+    v_twist = projection.to_camera_twist_vjp(points, factors, v_points, v_camera_factors)
     v_means, v_factors = projection.to_camera_vjp(T_camera_world, v_points, v_camera_factors)
     v_quats = v_scales = None
     if needs_shape:
@@ -115,7 +105,7 @@ def _visible_front_to_back(
 ) -> Tensor:  # (V,) int64
     """Return the rows that may be visible, nearest first; equal depths stay in map order."""
     x, y, z = torch.addmm(T_camera_world[:3, 3:], T_camera_world[:3, :3], means.T)
-    in_front = z > NEAR_DEPTH
+    in_front = z > constants.NEAR_DEPTH
     inverse_z = 1 / torch.where(in_front, z, 1)  # what is dropped must not divide by zero
     u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
     radius = _largest_radius(scales, inverse_z, camera)
@@ -136,9 +126,9 @@ def _largest_radius(scales: Tensor, inverse_z: Tensor, camera: Camera) -> Tensor
     |J| <= f/z sqrt(1 + h_x^2 + h_y^2) for tangents h within their limits, and the support ends
     at sqrt(2 ln(MAX_OPACITY / MIN_ALPHA)) = 3.33 standard deviations.
     """
-    lower, upper = tangent_limits(camera)
+    lower, upper = constants.tangent_limits(camera)
     h_x, h_y = (max(-low, high) for low, high in zip(lower, upper, strict=True))
     stretch = max(camera.fx, camera.fy) * math.sqrt(1 + h_x**2 + h_y**2)
     largest_scale = torch.maximum(torch.maximum(scales[:, 0], scales[:, 1]), scales[:, 2])
-    variance = (largest_scale * inverse_z * stretch) ** 2 + LOW_PASS_VARIANCE
+    variance = (largest_scale * inverse_z * stretch) ** 2 + constants.LOW_PASS_VARIANCE
     return (2 * math.log(MAX_OPACITY / MIN_ALPHA) * variance).sqrt() + 1  # 1 px for rounding

@@ -70,7 +70,5 @@ class UncertaintyConfig:
 
     def __post_init__(self) -> None:
         if self.median_size < 1 or self.median_size % 2 == 0:
-            raise InputError(
-                f"expected an odd median window of at least 1 cell, found {self.median_size}; "
-                "set uncertainty.median_size to 1, 3 or 5"
-            )
+            found = f"{self.median_size}; set uncertainty.median_size to 1, 3 or 5"
+            raise InputError(f"expected an odd median window of at least 1 cell, found {found}")

@@ -69,11 +69,8 @@ def depth_loss(
     return torch.where(known, (rendered_depth - reference_depth).abs(), 0)
 
 
-def median_filter(
-    values: Tensor,  # (h, w)
-    size: int,  # cells, odd
-) -> Tensor:  # (h, w)
-    """Return the median over size x size windows, mirrored at the border.
+def median_filter(values: Tensor, size: int) -> Tensor:  # both (h, w)
+    """Return the median over windows of size x size cells (odd), mirrored at the border.
 
     It removes thin lines of error: an edge rendered half a pixel off is not a dynamic object.
     """
@@ -118,9 +115,8 @@ def cell_loss(
 ) -> Tensor:  # (h', w')
     """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell.
 
-    Without L_reg_U = log beta an infinite beta would be the minimum. With lambda_3 = 0.5 and
-    rendering error L, the minimum is at beta = 2 sqrt(L). Cells that the map does not cover yet
-    give 0, because a hole is not a dynamic object.
+    Without L_reg_U = log beta an infinite beta would be the minimum. With lambda_3 = 0.5 and error
+    L it is at beta = 2 sqrt(L). Cells not covered yet give 0: a hole is not a dynamic object.
     """
     beta = clipped_beta(beta_raw)
     loss = error.detach() / beta**2 + config.lambda_log * beta.log()

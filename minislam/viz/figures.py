@@ -25,12 +25,8 @@ def trajectory_plot(
     return figure
 
 
-def ate_over_time(
-    timestamps: np.ndarray,  # (N,) second
-    errors: np.ndarray,  # (N,)
-    unit: str = "world units",
-) -> Figure:
-    """Draw the distance between estimated and true camera centre over time."""
+def ate_over_time(timestamps: np.ndarray, errors: np.ndarray, unit: str = "world units") -> Figure:
+    """Draw the distances (N,) between estimated and true camera centre over time (N,) [s]."""
     figure, axes = _one_panel("time [s]", f"position error [{unit}]")
     axes.plot(timestamps - timestamps[0], errors, color=ESTIMATE_STYLE["color"])
     rmse = float(np.sqrt(np.mean(np.square(errors))))

@@ -1,8 +1,7 @@
 """A flip book: pictures that a notebook plays, in one piece of HTML that needs nothing else.
 
 The player (flipbook.html beside this file) has neither ids nor a script of its own, only what its
-button and its slider do, so that many flip books on one page do not meet. Where a page runs no
-scripts, the first picture is seen.
+button and its slider do, so that many on one page do not meet. Without scripts the first is seen.
 """
 
 import json

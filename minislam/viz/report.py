@@ -60,12 +60,9 @@ def build_report(report: Report) -> str:
 
 
 def summary_html(
-    title: str,
-    lines: Series[tuple[str, ...]],  # as of a report
-    warnings: Series[str],
-    png: bytes,
+    title: str, lines: Series[tuple[str, ...]], warnings: Series[str], png: bytes
 ) -> str:
-    """Return the HTML of a small summary for a notebook: title, lines, warnings, one picture."""
+    """Return the HTML of a report's summary for a notebook: title, lines, warnings, one picture."""
     left = 'style="text-align: left"'
     rows = "".join(
         f"<tr><th {left}>{escape(what)}</th><td {left}>{escape(value)}</td>"
@@ -78,11 +75,9 @@ def summary_html(
 
 
 def _row(what: str, value: str, verdict: str, meaning: str, detail: str) -> str:
-    return (
-        f'<tr><th>{escape(what)}</th><td class="value">{escape(value)}</td>'
-        f'<td class="verdict"><span class="{verdict}">{verdict}</span></td>'
-        f'<td class="meaning dim">{escape(detail or meaning)}</td></tr>'
-    )
+    said = f'<th>{escape(what)}</th><td class="value">{escape(value)}</td>'
+    judged = f'<td class="verdict"><span class="{verdict}">{verdict}</span></td>'
+    return f'<tr>{said}{judged}<td class="meaning dim">{escape(detail or meaning)}</td></tr>'
 
 
 def _scale(colors: np.ndarray, values: np.ndarray, unit: str) -> str:
@@ -90,7 +85,5 @@ def _scale(colors: np.ndarray, values: np.ndarray, unit: str) -> str:
     stops = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * colors[0])
     shown = f"{values[0]:.2g}", f"{values[len(values) // 2]:.2g}", f"{values[-1]:.2g} {unit}"
     numbers = "".join(f"<span>{number}</span>" for number in shown)
-    return (
-        f'<div class="bar" style="background:linear-gradient(to right, {stops})"></div>'
-        f'<div class="numbers">{numbers}</div>'
-    )
+    bar = f'<div class="bar" style="background:linear-gradient(to right, {stops})"></div>'
+    return f'{bar}<div class="numbers">{numbers}</div>'

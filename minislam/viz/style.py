@@ -28,6 +28,8 @@ _LEAST_BETA = 0.1  # a smaller one counts as this, `uncertainty.weights.clipped_
 _LEAST_BETA_RATIO = 4.0
 _LEAST_DEPTH_RATIO = 1.1  # of the farthest to the nearest: a backdrop is one colour
 
+Limits = tuple[float, float]  # values of the first and the last colour; None: from all values
+
 
 def set_notebook_style() -> None:
     """Let the figures of pyplot look like those of `new_figure`, sharp enough to be projected."""
@@ -71,7 +73,7 @@ def show_map(
     values: np.ndarray,  # (h, w)
     kind: str,  # as of `colour_bar`
     title: str,
-    limits: tuple[float, float] | None = None,  # None: from the values
+    limits: Limits | None = None,  # None: from the values
     size: tuple[int, int] | None = None,  # (H, W) px to stretch a coarse grid to
     label: str | None = None,
 ) -> None:
@@ -94,7 +96,7 @@ def show_map(
 def colour_bar(
     axes: Axes | Series[Axes],  # beside which it stands
     kind: str,  # "beta", "depth", "weight", or "error", which has a sign
-    limits: tuple[float, float],
+    limits: Limits,
     label: str | None = None,  # None: the kind
 ) -> None:
     """Add the colour bar of pictures that stand in the colours of a kind."""
@@ -111,11 +113,8 @@ def colour_bar(
         bar.minorticks_off()
 
 
-def depth_to_rgb(
-    depth: np.ndarray,  # (H, W) world units, 0 where unknown
-    limits: tuple[float, float] | None = None,  # world units; None: from the values
-) -> np.ndarray:  # (H, W, 3) in [0, 1]
-    """Colour a depth map: viridis from near to far, grey where unknown."""
+def depth_to_rgb(depth: np.ndarray, limits: Limits | None = None) -> np.ndarray:  # RGB in [0, 1]
+    """Colour a depth map (H, W) [world units]: viridis from near to far, grey where unknown (0)."""
     depth = np.asarray(depth, dtype=np.float64)
     known = np.isfinite(depth) & (depth > 0)
     low, high = limits or depth_limits(depth)
@@ -124,24 +123,21 @@ def depth_to_rgb(
     return colored
 
 
-def depth_limits(depth: np.ndarray) -> tuple[float, float]:
+def depth_limits(depth: np.ndarray) -> Limits:
     """Return the nearest and the farthest depth of the colours, for maps of any shape."""
     known = depth[np.isfinite(depth) & (depth > 0)]
     low, high = np.quantile(known, _QUANTILES) if len(known) else (0.0, 1.0)
     return float(low), max(float(high), _LEAST_DEPTH_RATIO * float(low))
 
 
-def beta_to_rgb(
-    beta: np.ndarray,  # (h, w) > 0
-    limits: tuple[float, float] | None = None,  # None: from the values
-) -> np.ndarray:  # (h, w, 3) in [0, 1]
-    """Colour an uncertainty map: magma over log beta, dark is certain."""
+def beta_to_rgb(beta: np.ndarray, limits: Limits | None = None) -> np.ndarray:  # RGB in [0, 1]
+    """Colour an uncertainty map (h, w) > 0: magma over log beta, dark is certain."""
     beta = np.asarray(beta, dtype=np.float64)
     low, high = limits or beta_limits(beta)
     return _mapped(np.log(np.maximum(beta, low)), np.log(low), np.log(high), "beta")
 
 
-def beta_limits(beta: np.ndarray) -> tuple[float, float]:
+def beta_limits(beta: np.ndarray) -> Limits:
     """Return the beta drawn darkest, at least 0.1, and the beta drawn brightest."""
     least = np.maximum(np.asarray(beta, dtype=np.float64), _LEAST_BETA)
     low, high = map(float, np.quantile(least, _QUANTILES))

@@ -64,10 +64,8 @@ class Page:
 
     def _repr_html_(self) -> str:
         """Return the page in a frame of its own, so that its styles stay inside."""
-        return (
-            f'<iframe srcdoc="{escape(self.html)}" width="100%" height="{self.height}" '
-            'style="border: 0"></iframe>'
-        )
+        look = f'width="100%" height="{self.height}" style="border: 0"'
+        return f'<iframe srcdoc="{escape(self.html)}" {look}></iframe>'
 
 
 def template(name: str) -> str:

@@ -290,7 +290,6 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("runs/warnings.py", "runs/test_warnings.py"): [
         ("if since < len(tracked)", "if True"),
         ("since = 1 + max", "since = max"),
-        ("seen < LEAST_BEYOND_TURNS", "seen < 0"),
         ("2 * without >= len", "2 * without < len"),
         ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),
     ],

@@ -2,8 +2,7 @@
 
 The networks of this folder are plain functions over `Weights`, a dictionary of tensors under
 their official names. Sizes are read from the shapes, and each name is written where it is used.
-Therefore one run on a tiny image checks a file completely: a missing tensor is named, and a
-tensor that was never read is unexpected.
+So one run on a tiny image checks a file: a missing tensor is named, one never read is unexpected.
 """
 
 import re
@@ -37,10 +36,9 @@ class Weights:
         """Return one tensor by its name without the prefix."""
         full = self.prefix + name
         if full not in self._tensors:
-            raise InputError(
-                f"expected the tensor {full} in {self.file}, found {len(self._tensors)} others; "
-                "the file is not complete or belongs to another version of the network"
-            )
+            wanted, found = f"the tensor {full} in {self.file}", f"{len(self._tensors)} others"
+            advice = "the file is not complete or belongs to another version of the network"
+            raise InputError(f"expected {wanted}, found {found}; {advice}")
         self._used.add(full)
         return self._tensors[full]
 
@@ -91,11 +89,10 @@ class Weights:
         """Apply a convolution."""
         weight = self[f"{name}.weight"]
         if channels and len(weight) not in channels:
-            raise InputError(
-                f"expected {' or '.join(map(str, channels))} output channels of "
-                f"{self.prefix}{name}.weight in {self.file}, found {len(weight)}; it is another "
-                "version of the network"
-            )
+            known = " or ".join(map(str, channels))
+            wanted = f"{known} output channels of {self.prefix}{name}.weight in {self.file}"
+            found = f"{len(weight)}; it is another version of the network"
+            raise InputError(f"expected {wanted}, found {found}")
         padding = weight.shape[-1] // 2 if padding is None else padding
         return functional.conv2d(x, weight, self[f"{name}.bias"] if bias else None, stride, padding)
 
@@ -153,16 +150,14 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
                 f"which holds a {refused[1]}, and such a Python object can run code; it is read "
                 "with weights_only=True: if you trust its maker, save its tensors alone to a file"
             )
-        raise InputError(
-            f"expected a PyTorch checkpoint of plain tensors, found {path} "
-            f"({Path(path).stat().st_size} bytes), {problem}"
-        ) from error
+        found = f"{path} ({Path(path).stat().st_size} bytes), {problem}"
+        wanted = "a PyTorch checkpoint of plain tensors"
+        raise InputError(f"expected {wanted}, found {found}") from error
     if not tensors:
-        found = f"the entries {list(content)}" if isinstance(content, dict) else type(content)
-        raise InputError(
-            f"expected named tensors in {path}, found {str(found)[:300]}; give the file with "
-            "the weights, or save the dictionary of its tensors alone to a file"
-        )
+        found = f"the entries {list(content)}" if isinstance(content, dict) else str(type(content))
+        save = "save the dictionary of its tensors alone to a file"
+        advice = f"give the file with the weights, or {save}"
+        raise InputError(f"expected named tensors in {path}, found {found[:300]}; {advice}")
     _require_numbers(tensors, path)
     return Weights({name: tensor.float() for name, tensor in tensors.items()}, str(path))
 
@@ -192,6 +187,5 @@ def _require_numbers(tensors: dict[str, Tensor], path: Path | str) -> None:
     if 2 * zeros > len(tensors):
         found = f"{zeros} of {len(tensors)} tensors that are zero everywhere"
     if found:
-        raise InputError(
-            f"expected finite trained weights in {path}, found {found}; give the official file"
-        )
+        found = f"{found}; give the official file"
+        raise InputError(f"expected finite trained weights in {path}, found {found}")

@@ -93,8 +93,7 @@ def _limit_of_name(name: str) -> float:
     """
     limits = [limit for part, limit in _LIMIT_OF_NAME.items() if part in name]
     if not limits:
-        raise InputError(
-            f"expected {' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint, "
-            f"found {name}, whose output may be no metric depth; keep the official name"
-        )
+        wanted = f"{' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint"
+        found = f"{name}, whose output may be no metric depth; keep the official name"
+        raise InputError(f"expected {wanted}, found {found}")
     return limits[0]

@@ -38,6 +38,7 @@ class DroidFlowConfig:
     edges_per_batch: int = parameter(8, "edges in one pass, bounds the memory of correlations", 1)
 
 
+Edge = tuple[int, int]  # keyframe index of source and target
 EdgeState = tuple[Tensor, Tensor]  # of the recurrent unit (128, h, w), last target (h, w, 2) cells
 
 
@@ -66,7 +67,7 @@ class DroidFlow(Stateful):
         self.update, self.damping = partial(net.update, weights), partial(net.damping, weights)
         self.config = config
         self._frames: dict[int, EncodedFrame] = {}
-        self._edges: dict[tuple[int, int], EdgeState] = {}  # the last ones were used last
+        self._edges: dict[Edge, EdgeState] = {}  # the last ones were used last
         self._dampings: dict[int, Tensor] = {}  # (N,) px^2
         self._newest: EncodedFrame | None = None
 
@@ -74,10 +75,9 @@ class DroidFlow(Stateful):
     def encode(self, image: Tensor) -> EncodedFrame:
         """Return an image (H, W, 3) encoded; chain and keyframe share the newest one."""
         if min(image.shape[:2]) <= _TOO_SMALL:
-            raise InputError(
-                f"expected images of more than {_TOO_SMALL} px per side for DROID, found "
-                f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
-            )
+            wanted = f"images of more than {_TOO_SMALL} px per side for DROID"
+            found = f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
+            raise InputError(f"expected {wanted}, found {found}")
         if self._newest is None or not torch.equal(self._newest.image, image):
             self._newest = EncodedFrame(self.weights, image)
         return self._newest
@@ -111,7 +111,7 @@ class DroidFlow(Stateful):
         height, width = self._frames[edges_source[0]].features.shape[2:]
         expected = predicted_targets.to(self.weights.device, torch.float32) / net.STRIDE
         expected = expected.mT.reshape(-1, height, width, 2)
-        states: dict[tuple[int, int], EdgeState] = {}
+        states: dict[Edge, EdgeState] = {}
         confidences = []
         for start in range(0, len(edges), self.config.edges_per_batch):
             batch = slice(start, start + self.config.edges_per_batch)
@@ -132,23 +132,16 @@ class DroidFlow(Stateful):
         unknown = torch.zeros_like(next(iter(self._dampings.values())))
         return torch.stack([self._dampings.get(k, unknown) for k in range(keyframes)])
 
-    def _update_edges(
-        self, edges: list[tuple[int, int]], expected: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _update_edges(self, edges: list[Edge], expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Update a batch of edges once, each from its last state."""
         sources = [self._frames[source] for source, _ in edges]
-        known = [
-            self._edges.get(edge, (source.context[0][0], where))
-            for edge, source, where in zip(edges, sources, expected, strict=True)
-        ]
-        return self.update(
-            torch.cat([source.features for source in sources]),
-            torch.cat([self._frames[target].features for _, target in edges]),
-            torch.stack([hidden for hidden, _ in known]),
-            torch.cat([source.context[1] for source in sources]),
-            expected,
-            torch.stack([target for _, target in known]),
-        )
+        first_states = zip([source.context[0][0] for source in sources], expected, strict=True)
+        states = map(self._edges.get, edges, first_states)  # of new edges the first ones
+        hidden, last_target = map(torch.stack, zip(*states, strict=True))
+        features = torch.cat([source.features for source in sources])
+        of_targets = torch.cat([self._frames[target].features for _, target in edges])
+        context = torch.cat([source.context[1] for source in sources])
+        return self.update(features, of_targets, hidden, context, expected, last_target)
 
     def start_chain(self, image: Tensor) -> "DroidChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""

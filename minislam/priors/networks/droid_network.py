@@ -52,10 +52,7 @@ def _encode(weights: Weights, x: Tensor, normalised: bool) -> Tensor:
         return weights.conv("conv2", x, channels=(CHANNELS if normalised else 2 * CHANNELS,))
 
 
-def correlation_pyramid(
-    source: Tensor,  # (E, 128, h, w) features
-    target: Tensor,  # (E, 128, h, w) features
-) -> list[Tensor]:  # per level (E * h * w, 1, h / 2^l, w / 2^l)
+def correlation_pyramid(source: Tensor, target: Tensor) -> list[Tensor]:  # features (E, C, h, w)
     """Compare every source cell with every target cell; average the targets level by level."""
     edges, _, height, width = source.shape
     # Each side is divided by 4, so the product by 16: the scale the network was trained with.
@@ -63,7 +60,7 @@ def correlation_pyramid(
     pyramid = [volume.reshape(edges * height * width, 1, height, width)]
     for _ in range(LEVELS - 1):
         pyramid.append(functional.avg_pool2d(pyramid[-1], 2))
-    return pyramid
+    return pyramid  # per level l (E * h * w, 1, h / 2^l, w / 2^l)
 
 
 def look_up(

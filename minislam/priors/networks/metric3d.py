@@ -55,10 +55,9 @@ class Metric3DDepth:
 
     def __init__(self, weights: Weights, network_size: tuple[int, int] = NETWORK_SIZE) -> None:
         if any(side < _SIZE_STEP or side % _SIZE_STEP for side in network_size):
-            raise InputError(
-                f"expected a network size of multiples of {_SIZE_STEP} px, found {network_size}; "
-                f"the one of the training is {NETWORK_SIZE}"
-            )
+            found = f"{network_size}; the one of the training is {NETWORK_SIZE}"
+            wanted = f"a network size of multiples of {_SIZE_STEP} px"
+            raise InputError(f"expected {wanted}, found {found}")
         self.network_size = network_size
         self.device = weights.device
         # It has registers, yet resizes its positions like the networks without.

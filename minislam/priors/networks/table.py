@@ -1,8 +1,7 @@
 """The table of pretrained networks, read by `choice.py` and `minislam weights`.
 
-To add a network, write a class that is a `FlowEstimator`, a `FeatureExtractor`, or a `DepthPrior`
-with a method `network` behind its resizing. Then add its row to NETWORKS below and to weights.csv,
-and a field to NetworksConfig if it has settings.
+To add a network, write a `FlowEstimator`, a `FeatureExtractor`, or a `DepthPrior` with a method
+`network` behind its resizing; then rows in NETWORKS and weights.csv, settings in NetworksConfig.
 """
 
 import warnings
@@ -115,10 +114,9 @@ def load_network(
     weights = load_checkpoint(path, device)
     weights.precision = precision
     if recognise(weights) is not network:
-        raise InputError(
-            f"expected a {network.title} checkpoint, found {weights.file}, which looks like "
-            f"{describe(weights)}; give the file that belongs to this network"
-        )
+        found = f"{weights.file}, which looks like {describe(weights)}"
+        advice = "give the file that belongs to this network"
+        raise InputError(f"expected a {network.title} checkpoint, found {found}; {advice}")
     return build_checked(network, weights, config)
 
 
@@ -131,19 +129,16 @@ def build_checked(
             built = network.make(weights, config)
             _run_once(built, network.kind)
     except (RuntimeError, IndexError, ValueError) as error:
-        raise InputError(
-            f"expected the shapes of {network.title} in {weights.file}, found tensors that do "
-            f"not fit together ({str(error).splitlines()[0]}); it is another version"
-        ) from error
+        wanted = f"the shapes of {network.title} in {weights.file}"
+        found = f"tensors that do not fit together ({str(error).splitlines()[0]})"
+        raise InputError(f"expected {wanted}, found {found}; it is another version") from error
     extra = [n for n in weights.unused() if not any(part in n for part in network.unneeded)]
     if extra:
-        found = (
-            f"expected only the tensors of {network.title} in {weights.file}, found {len(extra)} "
-            f"more, such as {extra[0]}"
-        )
+        wanted = f"only the tensors of {network.title} in {weights.file}"
+        problem = f"expected {wanted}, found {len(extra)} more, such as {extra[0]}"
         if network.is_strict:
-            raise InputError(f"{found}; it is another version of the network")
-        warnings.warn(f"{found}; they are not used", stacklevel=2)
+            raise InputError(f"{problem}; it is another version of the network")
+        warnings.warn(f"{problem}; they are not used", stacklevel=2)
     return built
 
 

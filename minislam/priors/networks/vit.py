@@ -1,11 +1,9 @@
 """The vision transformer of DINOv2, and the features of the paper's uncertainty MLP.
 
-FiT3D is DINOv2 made consistent across views; its files come in the layout of the timm library. Both
-depth networks are built on the same transformer.
+FiT3D is DINOv2 made consistent across views, in timm's layout. Both depth networks are built on it.
 
 Patches of 14x14 px become tokens; one class token, and in some checkpoints four "registers", stand
-before them. A block adds to each token first what it reads from all tokens (attention), then the
-output of an MLP on the token itself:
+before them. A block adds to each token what it reads from all (attention), then an MLP's output:
 
     x <- x + ls1 * proj(attention(norm1(x)))
     x <- x + ls2 * fc2(gelu(fc1(norm2(x))))
@@ -53,10 +51,9 @@ class VisionTransformer:
         self._block = "blocks.0.{}." if "blocks.0.0.norm1.weight" in weights else "blocks.{}."
         self.width = weights["patch_embed.proj.weight"].shape[0]
         if self.width not in _BLOCKS:
-            raise InputError(
-                f"expected a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in "
-                f"{weights.file}, found one of width {self.width}; give another size of the network"
-            )
+            wanted = f"a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in {weights.file}"
+            found = f"one of width {self.width}; give another size of the network"
+            raise InputError(f"expected {wanted}, found {found}")
         self.depth = _BLOCKS[self.width]
         class_token, positions = weights["cls_token"], weights["pos_embed"]
         if positions.shape[1] == _TRAINED_GRID**2 + 1:

@@ -121,9 +121,8 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     """Return how a keyframe agrees with the keyframes before it, over the links between them.
 
     First the part of the flow from there, of what was static so far, that the geometry explains
-    [-]. Then the median relative difference of the depths that the two ends of a link see, over the
-    cells that count in the adjustment, near ones more: hardly anything tells how far the sky is.
-    None: no link.
+    [-]. Then the median relative difference of the depths that both ends of a link see, over cells
+    that count in the adjustment, near ones more: little tells how far the sky is. None: no link.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
     edges = graph.links.edges

@@ -76,8 +76,7 @@ def cost_of(found: Found) -> float:  # px^2
 def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) -> Found:
     """Return the result of lowest cost; what is usual decides between nearly equal ones.
 
-    Usual are the guessed focal length, and disparities that grow with those of the depth prior, or
-    without one towards the lower edge of the image.
+    Usual are the guessed focal length, and disparities that grow with the prior's, else downwards.
     """
     known = known_disparities > 0  # (K, N)
     usual, cells = grid.pixels[:, 1].expand_as(known), torch.ones_like(known)
@@ -105,8 +104,7 @@ def lowest_minimum(
     """Return the geometry of the warm-up that is most plausible, adjusted with its camera.
 
     The focal length stays as guessed if the motion does not tell it and it saves little, the
-    readout at zero if it saves too little: a global shutter would follow noise and dynamic objects.
-    Of few keyframes both stay.
+    readout at zero if it saves little: it would follow noise or movers. Of few keyframes both stay.
     """
     tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
     seeks_focal = graph.seeks_focal and tells_camera

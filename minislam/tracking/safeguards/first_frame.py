@@ -1,8 +1,7 @@
 """Which frame the warm-up begins with, and when it is over.
 
 After a black first frame, a slate or a jump cut, the warm-up begins anew with the first lost frame,
-once as many frames were lost as were followed before. If the sequence ends before any start has
-made enough keyframes, the best of all starts is repeated.
+once as many were lost as followed. If no start has made enough keyframes, the best is repeated.
 """
 
 from dataclasses import replace
@@ -40,10 +39,7 @@ class FirstFrame(Stateful):
 
 
 def has_warmed_up(tracker: Tracker) -> bool:
-    """Tell whether the warm-up has enough keyframes for the first geometry.
-
-    They are few, because motion is remembered only after it.
-    """
+    """Tell whether the warm-up has its keyframes: few, as motion is remembered only after it."""
     return len(tracker.keyframes) >= tracker.config.warmup_keyframes
 
 
@@ -51,9 +47,8 @@ def can_tell_depth(tracker: Tracker) -> bool:
     """Tell whether the warm-up knows depth: by a prior, or because enough of it moves."""
     graph = tracker.graph
     seen = [*graph.flow_to_next, *(tracker.last_non_keyframe or ())[1:]]
-    return graph.keyframes.has_prior or any(
-        mean_flow(graph, flow) >= graph.least_parallax for flow in seen
-    )
+    lengths = (mean_flow(graph, flow) for flow in seen)
+    return graph.keyframes.has_prior or any(px >= graph.least_parallax for px in lengths)
 
 
 def begin_anew(tracker: Tracker, first: int) -> None:

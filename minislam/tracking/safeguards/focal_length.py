@@ -19,7 +19,7 @@ import torch
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
-from minislam.tracking.safeguards.parts import of_cells, of_rows
+from minislam.tracking.safeguards.parts import Start, of_cells, of_rows
 from minislam.tracking.safeguards.robust import MIN_RESIDUAL
 from minislam.workers import Workers
 
@@ -89,34 +89,27 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
     return fit_focal_length(*among, workers)[0]
 
 
-def problem_among(
-    graph: KeyframeGraph, keyframes: range
-) -> tuple[BundleProblem, BundleState] | None:
+def problem_among(graph: KeyframeGraph, keyframes: range) -> Start | None:
     """Return problem and state of the links among some keyframes, at few cells; None: no link."""
     edges = enumerate(graph.links.edges)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return None
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
-    rows = torch.tensor(keyframes, device=problem.rays.device)
-    problem, state = _of_few_cells(graph, *of_rows(problem, graph.state, rows))
+    problem, state = _thinned(graph, problem, keyframes)
     problem.free_poses[0] = False  # the first of them is their world
     return problem, state
 
 
-def _of_few_cells(
-    graph: KeyframeGraph, problem: BundleProblem, state: BundleState
-) -> tuple[BundleProblem, BundleState]:
-    """Return problem and state of every EVERY-th cell along each side alone."""
-    cells = torch.arange(len(problem.rays), device=problem.rays.device).view(graph.grid.shape)
-    return of_cells(problem, state, cells[::EVERY, ::EVERY].flatten())
+def _thinned(graph: KeyframeGraph, problem: BundleProblem, keyframes: range) -> Start:
+    """Return problem and state of some keyframes, at every EVERY-th cell along each side."""
+    rows = torch.tensor(keyframes, device=problem.rays.device)
+    cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
+    return of_cells(*of_rows(problem, graph.state, rows), cells[::EVERY, ::EVERY].flatten())
 
 
 def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> None:
-    """Replace an unknown focal length by the one that the flow fits, if the motion tells it.
-
-    From then on the adjustments of all keyframes refine it.
-    """
+    """Set an unknown focal length as the flow fits, if motion tells it; adjustments refine it."""
     if not graph.seeks_focal or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
     problem = bundle_problem(graph, range(len(graph.links)), 0, lambda_prior=0.0)
@@ -161,9 +154,8 @@ def fit_focal_length(
 def seek_readouts(graph: KeyframeGraph) -> None:
     """Set the readout that the flow fits if it saves enough; poses and depths stay.
 
-    Without that condition the readout of a global shutter would follow noise and movers.
-    A sensor is read along one axis: the readout that displaces the flow more is set, and the
-    adjustments of all keyframes refine it from then on.
+    Else that of a global shutter would follow noise and movers. A sensor is read along one axis:
+    the readout that displaces the flow more is set, and all later adjustments refine it.
     """
     shutter, edges = graph.shutter, enumerate(graph.links.edges)
     if shutter.axis is not None or len(graph.keyframes) < LEAST_KEYFRAMES:
@@ -174,8 +166,8 @@ def seek_readouts(graph: KeyframeGraph) -> None:
         return
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
-    rows = torch.arange(min(MOST_KEYFRAMES, len(graph.keyframes)), device=columns.device)
-    problem, start = _of_few_cells(graph, *of_rows(problem, graph.state, rows))
+    first_ones = range(min(MOST_KEYFRAMES, len(graph.keyframes)))
+    problem, start = _thinned(graph, problem, first_ones)
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())

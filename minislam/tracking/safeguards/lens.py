@@ -26,12 +26,8 @@ from minislam.geometry import Camera
 from minislam.tracking.bundle_adjustment import BundleProblem
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing
-from minislam.tracking.safeguards.focal_length import (
-    ITERATIONS,
-    LEAST_KEYFRAMES,
-    WIDENINGS,
-    problem_among,
-)
+from minislam.tracking.safeguards import focal_length
+from minislam.tracking.safeguards.focal_length import ITERATIONS, WIDENINGS
 from minislam.tracking.safeguards.robust import MIN_RESIDUAL
 
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
@@ -94,7 +90,8 @@ def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
 def fit_lens(graph: KeyframeGraph) -> LensFit | None:
     """Fit k1 and k2 to the links of the first keyframes; None: too few. Nothing is changed."""
     keyframes = range(min(len(graph.keyframes), MOST_KEYFRAMES))
-    among = problem_among(graph, keyframes) if len(keyframes) >= LEAST_KEYFRAMES else None
+    is_enough = len(keyframes) >= focal_length.LEAST_KEYFRAMES
+    among = focal_length.problem_among(graph, keyframes) if is_enough else None
     if among is None:
         return None
     problem, state = replace(among[0], free_focal=True), among[1]

@@ -1,9 +1,8 @@
 """Motion memory: the motion weight of each cell, passed on along the flow.
 
 While a dynamic object is small, the robust weight alone excludes it. Once it fills half of the
-image, the pose follows it instead of the static scene, and beta learns from wrong poses. Therefore
-each cell has a motion weight: how well its flow has fitted the camera motion so far. The cell that
-it flows to inherits that weight.
+image, the pose follows it, not the static scene, and beta learns from wrong poses. So each cell has
+a motion weight: how well its flow has fitted the camera motion. The cell it flows to inherits it.
 
 What stands still in every image while the camera moves is no part of the scene either.
 """
@@ -153,8 +152,7 @@ def overlay_weights(flow_to_next: Sequence[FlowMatches], grid: Grid) -> Tensor |
 def without_overlay(matches: FlowMatches, overlay: Tensor | None) -> FlowMatches:
     """Return matches in which no cell of an overlay counts, by its `overlay_weights`.
 
-    Its flow would delay the next keyframe, and the memory would take it for a motion and hand it on
-    to the cells where wrong matches beside it lead.
+    Its flow would delay keyframes, and count as a motion that wrong matches beside it hand on.
     """
     if overlay is None:
         return matches

@@ -25,6 +25,8 @@ _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
 _OF_CELLS = "targets weights shutter prior_disparities prior_weights disparity_damping"
 
+Start = tuple["BundleProblem", "BundleState"]  # a problem, and the state it is adjusted from
+
 
 class SourceBlocks:
     """Couplings of disparities and poses by source frame; those of thousands of edges in a file."""
@@ -66,9 +68,7 @@ def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:
     return [torch.cat(column)[order] for column in columns]
 
 
-def of_rows(
-    problem: "BundleProblem", state: "BundleState", rows: Tensor
-) -> tuple["BundleProblem", "BundleState"]:
+def of_rows(problem: "BundleProblem", state: "BundleState", rows: Tensor) -> Start:
     """Return problem and state of some keyframes (K',) alone; all edges must be among them."""
     values = _chosen(problem, _OF_KEYFRAMES, rows)
     for name in ("edges_source", "edges_target"):
@@ -78,9 +78,7 @@ def of_rows(
     return replace(problem, **values), state
 
 
-def of_cells(
-    problem: "BundleProblem", state: "BundleState", cells: Tensor
-) -> tuple["BundleProblem", "BundleState"]:
+def of_cells(problem: "BundleProblem", state: "BundleState", cells: Tensor) -> Start:
     """Return problem and state of some cells (N',) of the grid alone."""
     values = _chosen(problem, _OF_CELLS, (..., cells))
     problem = replace(problem, rays=problem.rays[cells], **values)

@@ -1,7 +1,6 @@
 """Poses that little of the flow supports: other starts, or the frame is lost.
 
-In a wide gap between keyframes the interpolated pose may be too far off. The pose of a neighbouring
-frame is a nearer start, once that frame is right itself.
+In a wide gap between keyframes the interpolated pose may be far off; a good neighbour's is nearer.
 """
 
 from collections.abc import Callable

@@ -12,9 +12,8 @@ becomes that of a global shutter by
     p~ + rho c,    c = s(x) u_i(x) - s(p~) u_j(p~).
 
 The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
-rho, which is one more unknown with the column c. A phone held upright reads columns of the image.
-So there are two readouts, along x and y; the one that displaces the flow less is held at zero once
-a readout is found.
+rho, which is one more unknown with the column c. A phone held upright reads columns, so there are
+two readouts, along x and y; once one is found, the one that displaces the flow less is held at 0.
 """
 
 import math
@@ -171,13 +170,9 @@ def displacements(columns: Tensor, readout: Readout) -> Tensor:  # (E, 2, N) px
     return readout[0] * columns[:, 0] + readout[1] * columns[:, 1]
 
 
-def with_readout(
-    found: Linearisation,
-    columns: Tensor | None,  # c (E, 2, 2, N) px/s; None: the readouts are held
-    readout: Readout,
-) -> Linearisation:
-    """Return a reprojection as a rolling shutter sees it; its J_target gains their columns."""
-    if columns is None:
+def with_readout(found: Linearisation, columns: Tensor | None, readout: Readout) -> Linearisation:
+    """Return a reprojection as a rolling shutter sees it; J_target gains c (E, 2, 2, N) [px/s]."""
+    if columns is None:  # the readouts are held
         return found
     seen = found.positions - displacements(columns, readout)
     return replace(found, positions=seen, J_target=torch.cat([found.J_target, -columns], 1))

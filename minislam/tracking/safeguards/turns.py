@@ -6,14 +6,11 @@ from statistics import median
 
 import torch
 
+from minislam.tracking import pose_from_flow
 from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, residuals
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
-from minislam.tracking.pose_from_flow import (
-    POSE_ITERATIONS,
-    ROBUST_WIDENING,
-    motion_only_problem,
-)
+from minislam.tracking.pose_from_flow import POSE_ITERATIONS, ROBUST_WIDENING
 from minislam.tracking.reprojection import lengths, parallax
 from minislam.tracking.safeguards.robust import weighted_median
 
@@ -42,7 +39,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
     measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
-    problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
+    problem = pose_from_flow.motion_only_problem(grid, *ends, *measured, numbers > 0, None)
     problem = replace(problem, free_focal=graph.seeks_focal and not graph.focal_is_free)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
     turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
@@ -72,12 +69,8 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
     return most is None or most < graph.least_parallax
 
 
-def tells_no_depth(
-    beyond_turns: float | None,  # px, see `flow_beyond_turns`
-    resting: float,  # see `fraction_at_rest` [-]
-    confirmed: float,  # fraction of the cells that sweeps confirm [-]
-) -> bool:
-    """Tell whether hardly any flow is beyond turns, and poses or sweeps make no depth of it."""
+def tells_no_depth(beyond_turns: float | None, resting: float, confirmed: float) -> bool:
+    """Tell by numbers of a `Watch`: little flow is beyond turns, poses or sweeps see no depth."""
     if beyond_turns is None or beyond_turns >= LEAST_BEYOND_TURNS:
         return False
     return confirmed < LEAST_CONFIRMED or resting > MOST_RESTING
