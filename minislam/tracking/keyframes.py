@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from minislam.memory import Shelf
+from minislam.memory import Shelf, give_back_freed
 from minislam.records import Frame
 from minislam.state.stateful import FrameOf, Stateful, Tree
 
@@ -64,6 +64,7 @@ class KeyframeStore(Stateful):
     ) -> None:
         """Add one keyframe. Every cell starts with weight one."""
         self._shelve(frame, features, metric_depth)
+        give_back_freed()  # by the matching and adjusting of the keyframe before
         self.frames.append(frame)
         self.features.append(features)
         self.metric_depths.append(metric_depth)

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from minislam.errors import TrackingLost
 from minislam.geometry import Camera
-from minislam.memory import give_back_freed
 from minislam.priors.interfaces import (
     DepthPrior,
     FeatureExtractor,
@@ -212,7 +211,6 @@ class Tracker(Stateful):
         if is_due and not closed:
             seek_readouts(self.graph)
             online_global_ba(self.graph)
-            give_back_freed()
         if is_due or closed:
             self._last_global = count
 
