@@ -69,7 +69,11 @@ class RunFolder:
 
     @classmethod
     def create(
-        cls, path: Path | str, overwrite: bool = False, inputs: Sequence[Path] = ()
+        cls,
+        path: Path | str,
+        overwrite: bool = False,
+        inputs: Sequence[Path] = (),
+        keeps_log: bool = False,  # the same run begins anew
     ) -> "RunFolder":
         """Make a new run folder for a run that reads the images `inputs`.
 
@@ -78,7 +82,8 @@ class RunFolder:
         path = Path(path)
         files.require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():
-            file.unlink()
+            if not (keeps_log and file.name == LOG):
+                file.unlink()
         for folder in (KEYFRAMES, PLOTS):
             files.make_folder(path / folder)
         return cls(path)

@@ -105,9 +105,8 @@ def _run_once(
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
     threads = torch.get_num_threads()
     with names.locked(output), Workers(count, config.threads, observer.warn) as helpers:
-        folder = (
-            RunFolder(output) if resume else RunFolder.create(output, overwrite, sequence.files)
-        )
+        how = output, overwrite, sequence.files, bent is not None
+        folder = RunFolder(output) if resume else RunFolder.create(*how)
         try:
             torch.set_num_threads(config.threads)
             checkpoints = Checkpoints(folder, sequence, config, choice)

@@ -88,6 +88,8 @@ def test_a_run_begins_anew_on_straightened_images_if_an_unknown_lens_bends(
     given = RunFolder(out).read_config()["input"]
     assert (given["k1"], given["k2"], given["focal"]) == (-0.2, 0.05, "refine")
     assert read_json(out / "camera.json")["preparation"]["distortion"]["k1"] == -0.2
+    log = (out / "log.txt").read_text(encoding="utf-8")
+    assert log.index("synthetic sequence person") < log.index("begins anew on straightened images")
     facts = RunFolder(out).read_run()
     assert facts["began_anew"]["lens"]["radial"] == [-0.2, 0.05]
     assert any("begins anew on straightened images" in text for text in facts["warnings"])
