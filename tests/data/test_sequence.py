@@ -57,6 +57,17 @@ def test_an_unknown_focal_length_is_guessed_and_said(tmp_path: Path):
     assert sequence.ground_truth is None and sequence.sensor_depth(0) is None
 
 
+def test_the_focal_length_is_guessed_from_the_picture_between_black_bars(tmp_path: Path):
+    for number in range(3):
+        wide = np.zeros((96, 192, 3), np.uint8)  # an upright film of 64x96 in a wide one
+        wide[:, 64:128] = np.maximum(picture(number, 64, 96), 40)
+        save(tmp_path / f"{number}.png", wide)
+    sequence = open_sequence(str(tmp_path), InputOptions(size=(40, 64)))
+    assert "black bars cut to 60x96" in sequence.description
+    assert sequence.prepare.raw_camera.fx == pytest.approx(0.85 * 96)
+    assert sequence.camera.cx == pytest.approx(19.5, abs=0.51)
+
+
 def test_what_the_user_gives_wins(tmp_path: Path):
     folder = str(tum_folder(tmp_path / "a"))
     assert open_sequence(folder, InputOptions(fx=60.0)).camera == Camera(60, 60, 23, 16, 48, 32)

@@ -84,6 +84,12 @@ def test_the_same_figure_gives_the_same_bytes():
     assert png.startswith(b"\x89PNG") and b"Software" not in png
 
 
+def test_the_noise_of_a_backdrop_does_not_fill_the_colours_of_depth():
+    depth = 1 + 0.01 * np.random.default_rng(0).random((8, 8))
+    spread = np.ptp(depth_to_rgb(depth), axis=(0, 1)).max()
+    assert 0 < spread < 0.2 < np.ptp(depth_to_rgb(10 * depth**70), axis=(0, 1)).max()
+
+
 # Degenerate input
 
 
