@@ -120,6 +120,15 @@ def test_release_gives_the_memory_back() -> None:
     assert float(tensor.sum()) == total
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")
+def test_what_is_put_is_no_longer_in_memory() -> None:
+    shelf, before = Shelf(), resident()
+    tensor = noise(10_000_000)  # 40 MB
+    assert resident() > before + 30
+    shelf.put([tensor])
+    assert resident() < before + 10
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="mappings are listed as on Linux")
 def test_the_file_goes_with_the_last_tensor() -> None:
     def mapped() -> int:

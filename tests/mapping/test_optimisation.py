@@ -3,8 +3,10 @@ from dataclasses import replace
 
 import torch
 
+from minislam.mapping import Mapper
 from minislam.mapping.config import DensityConfig
 from minislam.mapping.views import view_gradients
+from minislam.memory import Shelf
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 
@@ -63,3 +65,12 @@ def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
     weight = mapper.static_weight(mapper.beta_of(mapper.keyframes[0]), CAMERA)
     assert torch.equal(weight, torch.ones(24, 32))
     assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
+
+
+def test_what_was_read_of_the_images_before_is_released_with_every_beta():
+    shelf, released = Shelf(), []
+    shelf.release = lambda: released.append(None)
+    mapper = Mapper(CAMERA, CONFIG, UncertaintyConfig(), 3, seed=0, shelf=shelf)
+    for count in (1, 2):
+        mapper.beta_of(wall_keyframe(count))
+        assert len(released) == count

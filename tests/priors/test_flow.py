@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
+from minislam.memory import Shelf
 from minislam.priors import flow as flow_module
 from minislam.priors.dense_flow import (
     composed_flow,
@@ -224,3 +225,12 @@ def test_a_forgotten_keyframe_cannot_be_matched():
     flow.add_frame(1, shifted(2, 0, SIZE))
     moved = (flow.match([0], [1], still()).targets - still())[:, 0].median()
     assert float(moved) == pytest.approx(2, abs=0.1)
+
+
+def test_what_was_read_of_old_flow_is_released_after_every_match(monkeypatch: pytest.MonkeyPatch):
+    released: list[Shelf] = []
+    flow = flow_of([shifted(0, 0, SIZE), shifted(2, 0, SIZE)])
+    flow.match([0, 1], [1, 0], still(2))
+    monkeypatch.setattr(Shelf, "release", lambda shelf: released.append(shelf))
+    flow.match([0, 1], [1, 0], still(2))  # nothing is measured anew
+    assert released == [flow._shelf]

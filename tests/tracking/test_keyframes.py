@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from minislam.records import Frame
+from minislam.tracking import keyframes
 from minislam.tracking.keyframes import KeyframeStore
 from tests.tracking.scene import normal, poses_on_an_arc, uniform
 
@@ -133,3 +134,10 @@ def test_images_lie_on_the_shelf_also_of_a_restored_store():
         images = known.frames[0].pixels, known.features[0], known.metric_depths[0]
         assert all(known.shelf.holds(image) for image in images)
         assert torch.equal(images[1], normal(0, 10, 10, 20))
+
+
+def test_freed_memory_is_given_back_with_every_keyframe(monkeypatch: pytest.MonkeyPatch):
+    given: list[None] = []
+    monkeypatch.setattr(keyframes, "give_back_freed", lambda: given.append(None))
+    filled(3)
+    assert len(given) == 3
