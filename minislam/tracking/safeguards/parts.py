@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from minislam.memory import Shelf
+from minislam.memory import Shelf, give_back_freed
 
 if TYPE_CHECKING:
     from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
@@ -34,6 +34,7 @@ class SourceBlocks:
     def __init__(self, problem: "BundleProblem") -> None:
         self._blocks: list[tuple[int, Tensor, Tensor]] = []
         self._shelf = Shelf() if problem.weights[:, 0].numel() > CELLS_COUPLED else None
+        self._tidy()
 
     def add(self, blocks: list[tuple[int, Tensor, Tensor]]) -> None:
         """Append the blocks of some source frames: k, rows (R,), E_k (R, N)."""
@@ -42,10 +43,15 @@ class SourceBlocks:
             self._shelf.put(E for _, _, E in blocks)
 
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor]]:
+        self._tidy()
         for block in self._blocks:
             yield block
             if self._shelf:
                 self._shelf.release()
+
+    def _tidy(self) -> None:
+        if self._shelf:  # linearising thousands of edges in parts leaves hundreds of MB of holes
+            give_back_freed()
 
 
 def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"]]:
