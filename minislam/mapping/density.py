@@ -73,7 +73,7 @@ def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
 
 
 def useful_rows(gaussians: GaussianMap, median_depth: float) -> Tensor:  # (N,) bool
-    """Tell which Gaussians stay: neither faint nor huge in median depths of the scene, finite."""
+    """Tell which Gaussians stay: finite, not faint, not huge beside the scene's median depth."""
     opaque = gaussians.opacities > PRUNE_OPACITY
     small = gaussians.scales.max(-1).values < PRUNE_SCALE * median_depth
     # One bad number would spread to every pixel that the Gaussian touches.

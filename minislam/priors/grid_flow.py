@@ -112,7 +112,7 @@ def grid_matches(
     texture: np.ndarray,  # (h, w) in [0, 1)
     stride: int,  # px
 ) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
-    """Sample a flow at the cells; confidence is texture times agreement both ways, 0 outside."""
+    """Sample a flow at the cells; confidence: texture times forward-backward agreement."""
     height, width = forward.shape[:2]
     moved = pixel_positions((height, width))[::stride, ::stride] + remainder
     flow = sample(forward, moved)

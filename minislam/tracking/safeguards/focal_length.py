@@ -109,7 +109,7 @@ def _thinned(graph: KeyframeGraph, problem: BundleProblem, keyframes: range) -> 
 
 
 def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> None:
-    """Set an unknown focal length as the flow fits, if motion tells it; adjustments refine it."""
+    """Set an unknown focal length to what the flow fits, if motion tells it; then it is free."""
     if not graph.seeks_focal or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
     problem = bundle_problem(graph, range(len(graph.links)), 0, lambda_prior=0.0)

@@ -70,7 +70,7 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
 
 
 def tells_no_depth(beyond_turns: float | None, resting: float, confirmed: float) -> bool:
-    """Tell by numbers of a `Watch`: little flow is beyond turns, poses or sweeps see no depth."""
+    """Tell whether nothing measures depth, by the numbers of a `Watch`: flow, poses, sweeps."""
     if beyond_turns is None or beyond_turns >= LEAST_BEYOND_TURNS:
         return False
     return confirmed < LEAST_CONFIRMED or resting > MOST_RESTING
