@@ -1,8 +1,10 @@
 """Votes on a wall: true depths are confirmed, wrong ones are not, near ones are refuted."""
 
 import numpy as np
+import pytest
 
 from minislam.geometry import Camera
+from minislam.stereo import votes
 from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, keep_what_stays, vote
 
 CAMERA = Camera(fx=60.0, fy=66.0, cx=19.5, cy=14.5, width=40, height=30)
@@ -129,6 +131,16 @@ def test_a_box_that_leaves_is_dropped_though_the_views_before_confirm_it():
         assert depth.confirmation[13:17, 13:17].max() == 0
         assert (depth.inverse_depth[22:, :] == np.float32(WALL)).all()
         np.testing.assert_allclose(depth.confirmation[24:], 1, atol=1e-6)
+
+
+def test_no_view_has_a_vote_on_itself(monkeypatch: pytest.MonkeyPatch):
+    asked: list[int] = []
+    none = np.zeros_like(view(0.0).cost)
+    monkeypatch.setattr(
+        votes, "count_votes", lambda camera, of, others: asked.append(len(others)) or (none, none)
+    )
+    kept([True] * 5)
+    assert asked == [4] * 5
 
 
 def test_the_wall_behind_a_box_that_leaves_is_kept():
