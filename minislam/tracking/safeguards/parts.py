@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
 CELLS_AT_ONCE = 50_000  # of all edges of a part: 200 bytes a cell
 CELLS_KEPT = 300_000  # of all edges of a problem whose derivatives are kept from cost to step
-CELLS_COUPLED = (
-    3_000_000  # of all edges of a problem whose couplings are in memory: 24 bytes a cell
-)
+CELLS_COUPLED = 3_000_000  # of all edges whose couplings are in memory: 24 bytes a cell
 _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
 _OF_CELLS = "targets weights shutter prior_disparities prior_weights disparity_damping"
