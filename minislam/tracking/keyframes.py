@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from minislam.memory import Shelf, give_back_freed
+from minislam.memory import SHELF, give_back_freed
 from minislam.records import Frame
 from minislam.state.stateful import FrameOf, Stateful, Tree
 
@@ -24,7 +24,6 @@ class KeyframeStore(Stateful):
 
     def __init__(self, like: Tensor) -> None:
         """Start empty, for as many cells as a tensor (N,) has, and on its device."""
-        self.shelf = Shelf()
         self.frames = []
         self.features = []
         self.metric_depths = []
@@ -77,12 +76,12 @@ class KeyframeStore(Stateful):
         self.motion_weights = torch.cat([self.motion_weights, ones])
 
     def _shelve(self, frame: Frame, features: Tensor, metric_depth: Tensor | None) -> None:
-        self.shelf.put([frame.pixels, features, metric_depth])
+        SHELF.put([frame.pixels, features, metric_depth])
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
         for column, rows in vars(self).items():
-            if column not in ("overlay", "shelf"):
+            if column != "overlay":
                 setattr(self, column, rows[:-1])
 
     def set_geometry(self, T_camera_world: Tensor, disparities: Tensor) -> None:
