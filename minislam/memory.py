@@ -57,6 +57,12 @@ class Shelf:
         self.put([tensor := torch.from_numpy(values)])
         return tensor.numpy()
 
+    def rows(self, whole: Tensor) -> list[Tensor]:
+        """Return copies of the rows of a tensor, each in a place of its own."""
+        rows = [row.clone() for row in whole]  # views would keep the whole tensor
+        self.put(rows)
+        return rows
+
     def holds(self, tensor: Tensor) -> bool:
         """Tell whether a tensor is here."""
         starts = [np.frombuffer(block, np.uint8).ctypes.data for block in self._blocks]

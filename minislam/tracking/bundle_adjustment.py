@@ -11,6 +11,7 @@ Disparities are marginalised (Schur complement), which leaves 6 unknowns per fre
     [ E^T C ] [ dd ] = [ s ]   =>   dd = C^-1 (s - E^T xi)
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -20,7 +21,7 @@ from torch import Tensor
 from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
 from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal, within_reach
-from minislam.tracking.safeguards.parts import CELLS_KEPT, SourceBlocks, in_parts, joined
+from minislam.tracking.safeguards.parts import SourceBlocks, in_parts, joined
 from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
 from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
 
@@ -85,6 +86,7 @@ class _Linearised:
 
 @dataclass(frozen=True)
 class _NormalEquations:
+    cost: float  # px^2, Eq. (5)
     of_edges: list[Tensor]  # J^T W J (E, 6 + G, 6 + G), J^T W r (E, 6 + G), Ad (E, 6, 6), float64
     disparity_diagonal: Tensor  # C (K, N)
     disparity_gradient: Tensor  # s (K, N)
@@ -103,18 +105,20 @@ def bundle_adjust(
     A step that fails or raises the cost is discarded and tried again with ten times the damping.
     If no step helps, the state is returned unchanged. Eq. (5).
     """
-    cost, current = _cost(problem, state)
-    cost_before, equations = cost, None
+    equations = _normal_equations(problem, state)
+    cost_before = cost = equations.cost
     accepted, level = 0, damping
     converged = True
     while accepted < iterations:
-        if equations is None:
-            equations = _normal_equations(problem, state, current)
         candidate = _damped_step(problem, state, equations, level, absolute_damping)
-        trial, there = (float("inf"), []) if candidate is None else _cost(problem, candidate)
+        there, trial = equations, math.inf
+        if candidate is not None:
+            is_last = accepted + 1 == iterations  # then the cost is enough
+            there = equations if is_last else _normal_equations(problem, candidate)
+            trial = _cost(problem, candidate) if is_last else there.cost
         if candidate is not None and trial <= cost:
             saved = cost - trial
-            state, cost, current, equations = candidate, trial, there, None
+            state, cost, equations = candidate, trial, there
             accepted, level = accepted + 1, max(level / 10, damping)
             if saved <= LEAST_SAVING * cost:
                 break
@@ -157,22 +161,23 @@ def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) fl
     return joined((at.edges, at.costs) for at in _linearised(problem, state))[0]
 
 
-def _cost(problem: BundleProblem, state: BundleState) -> tuple[float, list[_Linearised]]:
-    """Return the whole cost in px^2, Eq. (5), and the linearised edges if they are not too many."""
+def _prior_cost(problem: BundleProblem, state: BundleState) -> Tensor:  # () float64 px^2
     difference = state.disparities - problem.prior_disparities
-    prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
-    edges = _linearised(problem, state)
-    known = list(edges) if problem.weights[:, 0].numel() <= CELLS_KEPT else []
-    return float(torch.cat([at.costs for at in known or edges]).sum() + prior_cost), known
+    return (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
 
 
-def _normal_equations(
-    problem: BundleProblem, state: BundleState, known: list[_Linearised]
-) -> _NormalEquations:
+def _cost(problem: BundleProblem, state: BundleState) -> float:
+    """Return the whole cost in px^2, Eq. (5)."""
+    costs = [at.costs for at in _linearised(problem, state)]
+    return float(torch.cat(costs).sum() + _prior_cost(problem, state))
+
+
+def _normal_equations(problem: BundleProblem, state: BundleState) -> _NormalEquations:
     C = problem.prior_weights * problem.free_disparities[:, None]
     s = C * (problem.prior_disparities - state.disparities)
-    rows, blocks = [], SourceBlocks(problem)
-    for at in known or _linearised(problem, state):
+    costs, rows, blocks = [], [], SourceBlocks(problem)
+    for at in _linearised(problem, state):
+        costs.append(at.costs)
         residual, weight, J = at.residual, at.weight, at.reprojection.J_target
         weighted_J = (J * weight[:, None]).flatten(2)
         A = (weighted_J @ J.flatten(2).mT).double()  # (E, 6 + G, 6 + G)
@@ -189,7 +194,8 @@ def _normal_equations(
         C.index_add_(0, source, (weighted_Jd * J_disparity).sum(1))
         s.index_add_(0, source, (weighted_Jd * residual).sum(1))
         blocks.add(_source_blocks(at.problem, E_target, E_source))
-    return _NormalEquations(joined(rows), C, s, blocks)
+    cost = float(torch.cat(costs).sum() + _prior_cost(problem, state))
+    return _NormalEquations(cost, joined(rows), C, s, blocks)
 
 
 def _pose_slots(problem: BundleProblem) -> Tensor:

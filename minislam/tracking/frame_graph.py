@@ -1,7 +1,9 @@
 """The frame graph: its edges link covisible keyframes and hold the flow between them."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,12 +47,11 @@ class FrameGraph(Stateful):
         An edge keeps its old flow if the new one matches clearly less: flow that started from a
         wrong pose fails, and the old flow is needed to correct that pose.
         """
-        columns = list(matches.targets), [one.contiguous() for one in matches.confidences]
-        for column in columns:
-            SHELF.put(column)
+        flows = SHELF.rows(torch.cat([matches.targets, matches.confidences], 1))
         position_of = {edge: position for position, edge in enumerate(self.edges)}
-        measured = *columns, matches.matched_ratios.tolist()
-        for edge, target, confidence, ratio in zip(edges, *measured, strict=True):
+        ratios = matches.matched_ratios.tolist()
+        for edge, flow, ratio in zip(edges, flows, ratios, strict=True):
+            target, confidence = flow[:2], flow[2:]
             position = position_of.setdefault(edge, len(self))
             if position == len(self):
                 self.edges.append(edge)
@@ -75,6 +76,11 @@ def neighbourhood_edges(first: int, count: int, radius: int) -> list[tuple[int, 
     """Link every keyframe in [first, count) with its `radius` predecessors, in both directions."""
     pairs = [(i, j) for i in range(first, count) for j in range(max(0, i - radius), i)]
     return both_directions(pairs)
+
+
+def at_once(edges: Any) -> Iterator[Any]:
+    """Cut a list of edges, or a tensor with a row per edge: all at once would take gigabytes."""
+    return (edges[first : first + AT_ONCE] for first in range(0, len(edges), AT_ONCE))
 
 
 def both_directions(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -4,23 +4,21 @@ The links of a new keyframe lead to its predecessors (neighbourhood) and, if the
 both directions, to older keyframes that see the same place (covisibility, by the flow distance).
 """
 
-from collections.abc import Iterator
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_interpolate, se3_inverse
 from minislam.geometry.camera import pixel_scale
+from minislam.memory import give_back_freed
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import BundleReport, BundleState, bundle_adjust, residuals
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import (
-    AT_ONCE,
     FAR,
     FrameGraph,
+    at_once,
     both_directions,
     flow_distances,
     neighbourhood_edges,
@@ -185,8 +183,10 @@ class KeyframeGraph(Stateful):
 
     def match(self, edges: list[Edge]) -> None:
         """Measure the flow of these edges, started from the present geometry, and store it."""
-        for part in _in_parts(edges):
+        for part in at_once(edges):
             self.links.record(part, self._flow_from_geometry(part))
+            if len(part) < len(edges):  # many edges leave as many holes
+                give_back_freed()
 
     def match_composed(self, target: int) -> None:
         """Measure the flow between a keyframe and its predecessors, since the last loss.
@@ -213,7 +213,7 @@ class KeyframeGraph(Stateful):
         outweigh all right ones.
         """
         ratio: dict[Edge, float] = {}
-        for part in _in_parts(edges):
+        for part in at_once(edges):
             matches = self._flow_from_geometry(part)
             ratio |= zip(part, matches.matched_ratios.tolist(), strict=True)
         least = self.config.min_link_ratio
@@ -272,7 +272,7 @@ class KeyframeGraph(Stateful):
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""
-        parts = zip(_in_parts(sources), _in_parts(targets), strict=True)
+        parts = zip(at_once(sources), at_once(targets), strict=True)
         return torch.cat([mean_parallax(*self.geometry(*part)) for part in parts])
 
     def geometry(
@@ -282,8 +282,3 @@ class KeyframeGraph(Stateful):
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
         disparities = self.keyframes.disparities[sources]
         return transforms, disparities, self.grid.rays, self.grid.camera
-
-
-def _in_parts(edges: Any) -> Iterator[Any]:
-    """Cut a list of edges, or a tensor with a row per edge: all at once would take gigabytes."""
-    return (edges[first : first + AT_ONCE] for first in range(0, len(edges), AT_ONCE))

@@ -16,7 +16,7 @@ from minislam.tracking.bundle_adjustment import (
     residuals,
 )
 from minislam.tracking.disparity_prior import mask_priors
-from minislam.tracking.frame_graph import AT_ONCE
+from minislam.tracking.frame_graph import at_once
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 from minislam.tracking.reprojection import lengths
 from minislam.tracking.safeguards.parts import in_parts, joined, of_cells, of_rows
@@ -196,7 +196,7 @@ def _weigh_by_cells(
     object covers; a classical one does not, so the weight of the target counts as well.
     """
     of_cell, columns = graph.keyframes.cell_weights, (weights, sources, edges_target, targets)
-    for weight, source, target, position in zip(*(c.split(AT_ONCE) for c in columns), strict=True):
+    for weight, source, target, position in zip(*map(at_once, columns), strict=True):
         static = of_cell[source]
         if not graph.is_learned:
             static = static * graph.grid.sample(of_cell[target][..., None], position.mT)[..., 0]

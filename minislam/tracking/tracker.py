@@ -8,6 +8,7 @@ from torch import Tensor
 
 from minislam.errors import TrackingLost
 from minislam.geometry import Camera
+from minislam.memory import release
 from minislam.priors.interfaces import (
     DepthPrior,
     FeatureExtractor,
@@ -287,3 +288,4 @@ class Tracker(Stateful):
         for index in range(first, len(self.keyframes)):
             weight = self._predict_static_weight(index)
             self.keyframes.set_static_weight(index, weight.reshape(-1))
+            release()  # its features

@@ -27,7 +27,7 @@ class KnownProblem:
 
 
 def normal_equations(problem: BundleProblem, state: BundleState):
-    return bundle_adjustment._normal_equations(problem, state, [])
+    return bundle_adjustment._normal_equations(problem, state)
 
 
 def pose_equations(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:

@@ -174,7 +174,7 @@ def test_the_gradient_is_that_of_the_cost(robust):
         poses = start.T_camera_world.clone()
         poses[1:] = se3_exp(sign * step * xi) @ poses[1:]
         moved = BundleState(poses, start.disparities + sign * step * added)
-        costs.append(bundle_adjustment._cost(problem, moved)[0])
+        costs.append(bundle_adjustment._cost(problem, moved))
     slope = (costs[0] - costs[1]) / (2 * step)
     predicted = pose_equations(problem, start)[1] @ xi.reshape(-1)
     predicted = -2 * (predicted + (equations.disparity_gradient * added).sum())

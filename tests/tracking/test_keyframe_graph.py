@@ -6,7 +6,7 @@ import pytest
 
 from minislam import memory
 from minislam.memory import SHELF
-from minislam.tracking import keyframe_graph
+from minislam.tracking import frame_graph
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import FrameGraph
 from tests.tracking.wall import TrueFlow, true_graph
@@ -44,7 +44,7 @@ def test_many_links_are_measured_in_parts_as_all_at_once(monkeypatch: pytest.Mon
     sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
     whole.match(edges)
     parallaxes, confirmed = whole.parallaxes(sources, targets), whole.filter_confirmed(edges)
-    monkeypatch.setattr(keyframe_graph, "AT_ONCE", 2)
+    monkeypatch.setattr(frame_graph, "AT_ONCE", 2)
     parted.match(edges)
     assert parted.links.edges == whole.links.edges == edges
     pairs = zip(parted.links.targets, whole.links.targets, strict=True)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
-from minislam.tracking import optimisation
+from minislam.tracking import frame_graph
 from minislam.tracking.bundle_adjustment import BundleState, residuals
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
@@ -70,7 +70,7 @@ def test_weights_are_the_same_however_many_links_are_weighed_at_once(monkeypatch
     graph = matched()
     graph.keyframes.static_weights[2] = torch.linspace(0, 1, len(graph.grid.rays))
     whole = bundle_problem(graph, range(len(graph.links)), first_free=0)
-    monkeypatch.setattr(optimisation, "AT_ONCE", 3)
+    monkeypatch.setattr(frame_graph, "AT_ONCE", 3)
     split = bundle_problem(graph, range(len(graph.links)), first_free=0)
     assert torch.equal(split.weights, whole.weights)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
 
 CELLS_AT_ONCE = 50_000  # of all edges of a part: 200 bytes a cell
-CELLS_KEPT = 300_000  # of all edges of a problem whose derivatives are kept from cost to step
+PARTS_UNTIDIED = 16  # thousands of edges in parts would leave hundreds of MB of holes
 CELLS_COUPLED = 3_000_000  # of all edges whose couplings are in memory: 24 bytes a cell
 _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
@@ -32,7 +32,6 @@ class SourceBlocks:
     def __init__(self, problem: "BundleProblem") -> None:
         self._blocks: list[tuple[int, Tensor, Tensor]] = []
         self._shelf = Shelf() if problem.weights[:, 0].numel() > CELLS_COUPLED else None
-        self._tidy()
 
     def add(self, blocks: list[tuple[int, Tensor, Tensor]]) -> None:
         """Append the blocks of some source frames: k, rows (R,), E_k (R, N)."""
@@ -41,15 +40,10 @@ class SourceBlocks:
             self._shelf.put(E for _, _, E in blocks)
 
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor]]:
-        self._tidy()
         for block in self._blocks:
             yield block
             if self._shelf:
                 release()
-
-    def _tidy(self) -> None:
-        if self._shelf:  # linearising thousands of edges in parts leaves hundreds of MB of holes
-            give_back_freed()
 
 
 def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"]]:
@@ -59,13 +53,14 @@ def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"
     """
     counts = torch.bincount(problem.edges_source).cumsum(0)
     number = ((counts - 1) * len(problem.rays) // CELLS_AT_ONCE)[problem.edges_source]
-    for part in number.unique():
+    for part in (parts := number.unique()):
+        if len(parts) > PARTS_UNTIDIED and part % PARTS_UNTIDIED == 0:
+            give_back_freed()
         edges = (number == part).nonzero()[:, 0]
         if len(edges) == len(number):
             yield edges, problem
         else:
             yield edges, replace(problem, **_chosen(problem, _OF_EDGES, edges))
-            release()
 
 
 def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:
@@ -94,5 +89,9 @@ def of_cells(problem: "BundleProblem", state: "BundleState", cells: Tensor) -> S
 
 def _chosen(problem: "BundleProblem", names: str, index: Any) -> dict[str, Any]:
     """Return these columns of a problem at an index; one that is None stays None."""
-    columns = {name: getattr(problem, name) for name in names.split()}
-    return {name: None if column is None else column[index] for name, column in columns.items()}
+    chosen = {}
+    for name in names.split():
+        column = getattr(problem, name)
+        chosen[name] = None if column is None else column[index]
+        release()
+    return chosen

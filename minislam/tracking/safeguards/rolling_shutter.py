@@ -24,12 +24,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.memory import SHELF
+from minislam.memory import SHELF, stack
 from minislam.priors.dense_flow import dense_from_grid, grayscale, residual_flow, warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
-from minislam.tracking.frame_graph import AT_ONCE, FrameGraph
+from minislam.tracking.frame_graph import FrameGraph, at_once
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import Linearisation
@@ -131,12 +131,14 @@ class RollingShutter(Stateful):
         """Return c of the links at these positions in the graph, None if nothing is estimated."""
         if not (self.is_on and positions):
             return None
-        edges = self._links.edges
-        targets = torch.stack([self._links.targets[position] for position in positions])
-        columns = self.columns([edges[position] for position in positions], targets)
-        if self.axis is not None:
-            columns[:, 1 - self.axis] = 0
-        return columns
+        rows: list[Tensor] = []
+        for part in at_once(positions):
+            targets = torch.stack([self._links.targets[position] for position in part])
+            columns = self.columns([self._links.edges[position] for position in part], targets)
+            if self.axis is not None:
+                columns[:, 1 - self.axis] = 0
+            rows += SHELF.rows(columns)
+        return stack(rows)
 
     def take(self, found: Readout, columns: Tensor) -> None:  # columns (E, 2, 2, N) px/s
         """Set the readout that displaces the flow more: a sensor is read along one axis."""
@@ -152,13 +154,13 @@ class RollingShutter(Stateful):
         before, longest = self.readout, self.motion.shortest_step
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
-        edges, links = self._links.edges, self._links.targets
-        for part in (slice(first, first + AT_ONCE) for first in range(0, len(links), AT_ONCE)):
-            targets = torch.stack(links[part])
-            columns = self.columns(edges[part], targets)
-            moved = displacements(columns, self.readout) - displacements(columns, before)
-            links[part] = targets + moved
-            SHELF.put(links[part])
+        moved: list[Tensor] = []
+        links = zip(at_once(self._links.edges), at_once(self._links.targets), strict=True)
+        for edges, targets in links:
+            columns = self.columns(edges, positions := torch.stack(targets))
+            change = displacements(columns, self.readout) - displacements(columns, before)
+            moved += SHELF.rows(positions + change)
+        self._links.targets = moved
 
     def undone(self, frame: Frame) -> Frame:
         """Return a frame as a global shutter would have seen it."""

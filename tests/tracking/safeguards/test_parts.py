@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from minislam import memory
-from minislam.tracking import bundle_adjustment, optimisation
+from minislam.tracking import optimisation
 from minislam.tracking.bundle_adjustment import (
     _normal_equations,
     bundle_adjust,
@@ -44,12 +44,10 @@ def test_an_adjustment_in_parts_is_that_of_all_edges(monkeypatch: pytest.MonkeyP
     whole, report = bundle_adjust(problem, start, 4)
     costs, rest = edge_costs(problem, start), residuals(problem, start)
     monkeypatch.setattr(parts, "CELLS_AT_ONCE", 4 * CELLS)
-    for kept in (parts.CELLS_KEPT, 0):  # derivatives kept from cost to step, and computed anew
-        monkeypatch.setattr(bundle_adjustment, "CELLS_KEPT", kept)
-        split, again = bundle_adjust(problem, start, 4)
-        torch.testing.assert_close(split.T_camera_world, whole.T_camera_world, rtol=0, atol=1e-12)
-        torch.testing.assert_close(split.disparities, whole.disparities, rtol=0, atol=1e-12)
-        assert again.cost_after == pytest.approx(report.cost_after, rel=1e-12)
+    split, again = bundle_adjust(problem, start, 4)
+    torch.testing.assert_close(split.T_camera_world, whole.T_camera_world, rtol=0, atol=1e-12)
+    torch.testing.assert_close(split.disparities, whole.disparities, rtol=0, atol=1e-12)
+    assert again.cost_after == pytest.approx(report.cost_after, rel=1e-12)
     assert torch.equal(edge_costs(problem, start), costs)
     assert all(torch.equal(a, b) for a, b in zip(residuals(problem, start), rest, strict=True))
 
@@ -60,13 +58,13 @@ def test_couplings_in_a_file_are_those_in_memory(monkeypatch: pytest.MonkeyPatch
     whole, _ = bundle_adjust(problem, start, 4)
     monkeypatch.setattr(parts, "CELLS_COUPLED", 12 * CELLS - 1)
     monkeypatch.setattr(memory, "SMALLEST", 1)
-    blocks = _normal_equations(problem, start, []).source_blocks
+    blocks = _normal_equations(problem, start).source_blocks
     assert len(list(blocks)) == 4 and all(blocks._shelf.holds(E) for _, _, E in blocks)
     in_file, _ = bundle_adjust(problem, start, 4)
     assert torch.equal(in_file.T_camera_world, whole.T_camera_world)
     assert torch.equal(in_file.disparities, whole.disparities)
     monkeypatch.setattr(parts, "CELLS_COUPLED", 12 * CELLS)
-    assert _normal_equations(problem, start, []).source_blocks._shelf is None
+    assert _normal_equations(problem, start).source_blocks._shelf is None
 
 
 def test_rows_that_nothing_touches_stay_and_the_others_move_as_in_the_whole(
