@@ -71,8 +71,7 @@ def rerendering_loss(
     The opacity is a constant, as in the official code. With its gradient the camera would turn to
     where the map is empty, because the loss is 0 there.
     """
-    residual = rendering.color - image
-    absolute = (residual.square() + ROUNDING**2).sqrt().mean(-1)
+    absolute = ((rendering.color - image).square() + ROUNDING**2).sqrt().mean(-1)
     return (weight * rendering.opacity.detach() * absolute).mean()
 
 

@@ -50,8 +50,9 @@ def with_swept_depth(
     judging: dict[int, votes.SweptView] = {}
 
     def view(keyframe: Keyframe, depth: Tensor, cost: np.ndarray) -> votes.SweptView:
-        pose = keyframe.T_camera_world.cpu().numpy()
-        return votes.SweptView(_inverse(_nearest(depth, small)), cost, 0.0, pose)
+        pose, known = keyframe.T_camera_world.cpu().numpy(), _nearest(depth, small)
+        inverse_depth = np.where(known > 0, 1 / np.maximum(known, 1e-6), np.nan)
+        return votes.SweptView(inverse_depth, cost, 0.0, pose)
 
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
         shelf.put([depth])
@@ -88,11 +89,6 @@ def _nearest(image: Tensor, camera: Camera) -> np.ndarray:
     """Return the nearest pixels of an image (H, W) at the size of a camera."""
     size = camera.width, camera.height
     return cv2.resize(image.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST_EXACT)
-
-
-def _inverse(depth: np.ndarray) -> np.ndarray:
-    """Return the inverse of a depth, nan where unknown."""
-    return np.where(depth > 0, 1 / np.maximum(depth, 1e-6), np.nan)
 
 
 def _small(camera: Camera, width: int) -> Camera:

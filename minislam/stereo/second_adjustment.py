@@ -109,9 +109,7 @@ def adjust_confirmed(
     keyframes, stride = graph.keyframes, graph.grid.stride
     cells = [torch.stack(images)[:, ::stride, ::stride].flatten(1) for images in swept]
     depth, confirmation = torch.stack(cells, 1)
-    weights = keyframes.static_weights * confirmation.clamp_min(UNCONFIRMED_WEIGHT)
-    for index, weight in enumerate(weights):
-        keyframes.set_static_weight(index, weight)
+    keyframes.static_weights *= confirmation.clamp_min(UNCONFIRMED_WEIGHT)
     disparities = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), keyframes.disparities)
     keyframes.set_geometry(keyframes.T_camera_world, disparities)
     final_global_ba(graph, progress)

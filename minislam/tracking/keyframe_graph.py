@@ -34,7 +34,7 @@ from minislam.tracking.pose_from_flow import (
     start_pose,
     warp_disparities,
 )
-from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
+from minislam.tracking.reprojection import parallax, relative_transforms, reproject
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.tracking.safeguards.rolling_shutter import RollingShutter
 
@@ -272,8 +272,11 @@ class KeyframeGraph(Stateful):
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""
-        parts = zip(_in_parts(sources), _in_parts(targets), strict=True)
-        return torch.cat([mean_parallax(*self.geometry(*part)) for part in parts])
+        means = []
+        for part in zip(_in_parts(sources), _in_parts(targets), strict=True):
+            shift, _, valid = parallax(*self.geometry(*part))
+            means.append((shift * valid).sum(1) / valid.sum(1).clamp_min(1))
+        return torch.cat(means)
 
     def geometry(
         self, sources: Tensor | list[int], targets: Tensor | list[int]

@@ -9,7 +9,7 @@ from minislam.state.stateful import FrameOf, Stateful, Tree
 
 
 class KeyframeStore(Stateful):
-    """All data of the tracker's keyframes. Only the methods of this class change the columns."""
+    """All data of the tracker's keyframes: every column has one row per keyframe."""
 
     frames: list[Frame]
     features: list[Tensor]  # (h', w', C); saved, because a network takes long to compute them
@@ -89,18 +89,6 @@ class KeyframeStore(Stateful):
         """Replace the poses (K, 4, 4) and disparities (K, N) of all keyframes."""
         self.T_camera_world = T_camera_world
         self.disparities = disparities
-
-    def set_prior_mask(self, index: int, mask: Tensor) -> None:
-        """Replace the mask M (N,) bool of a keyframe."""
-        self.prior_masks[index] = mask
-
-    def set_static_weight(self, index: int, weight: Tensor) -> None:
-        """Replace the static weight (N,) of a keyframe, after beta was predicted again."""
-        self.static_weights[index] = weight
-
-    def set_motion_weight(self, index: int, weight: Tensor) -> None:
-        """Replace the motion weight (N,) of a keyframe."""
-        self.motion_weights[index] = weight
 
     def start_from_prior(self) -> None:
         """Take the newest keyframe's prior for its disparities; the first prior gives the unit."""

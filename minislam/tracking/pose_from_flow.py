@@ -53,8 +53,7 @@ def motion_only_problem(
     robust: RobustKernel | None,
 ) -> BundleProblem:
     """Return a bundle problem in which only poses move: disparities held, no prior."""
-    count = len(free_poses)
-    no_prior = grid.rays.new_zeros(count, len(grid.rays))
+    no_prior = grid.rays.new_zeros(len(free_poses), len(grid.rays))
     return BundleProblem(
         camera=grid.camera, rays=grid.rays,
         edges_source=edges_source, edges_target=edges_target, targets=targets, weights=weights,

@@ -90,18 +90,6 @@ def parallax(
     return lengths(positions - turned), positions, valid & still_seen
 
 
-def mean_parallax(
-    T_target_source: Tensor,  # (E, 4, 4)
-    disparities: Tensor,  # (E, N)
-    rays: Tensor,  # (N, 3)
-    camera: Camera,
-) -> Tensor:  # (E,) px
-    """Return the mean parallax of each edge."""
-    shift, _, valid = parallax(T_target_source, disparities, rays, camera)
-    counted = valid.to(shift.dtype)
-    return (shift * counted).sum(1) / counted.sum(1).clamp_min(1)
-
-
 def reproject_with_jacobians(
     T_target_source: Tensor,  # (E, 4, 4)
     disparities: Tensor,  # (E, N)
@@ -123,5 +111,4 @@ def reproject_with_jacobians(
     J_u = camera.fx * (tx - tz * ray_x) * inverse_z
     J_v = camera.fy * (ty - tz * ray_y) * inverse_z
     positions = torch.stack([camera.fx * ray_x + camera.cx, camera.fy * ray_y + camera.cy], 1)
-    J_disparity = torch.stack([J_u, J_v], 1)
-    return Linearisation(positions, valid, J_target, J_disparity)
+    return Linearisation(positions, valid, J_target, torch.stack([J_u, J_v], 1))

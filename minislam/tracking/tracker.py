@@ -177,8 +177,7 @@ class Tracker(Stateful):
         matches = self.graph.shutter.corrected(matches, [edge], frame.frame_index)
         if self.initialised:  # before, initialise() will estimate all poses together
             information = self._settling.information()
-            trust = self._settling.certainty(information)
-            pose = self.graph.start_pose(matches, trust)
+            pose = self.graph.start_pose(matches, self._settling.certainty(information))
             if self.graph.is_learned:
                 pose, _ = self.graph.fit_pose(frame, [len(self.keyframes) - 1], pose)
             disparities = self._settling.hand_on(information, pose)
@@ -197,8 +196,7 @@ class Tracker(Stateful):
     def _add_keyframe(
         self, frame: Frame, features: Tensor, pose: Tensor, disparities: Tensor
     ) -> None:
-        metric_depth = self._depth_prior(frame)
-        self.graph.append(frame, features, metric_depth, pose, disparities)
+        self.graph.append(frame, features, self._depth_prior(frame), pose, disparities)
         if self.initialised:
             self._update_static_weights(first=len(self.keyframes) - 1)
 
@@ -285,5 +283,4 @@ class Tracker(Stateful):
     def _update_static_weights(self, first: int = 0) -> None:
         """Predict the static weights of the keyframes from `first` on, by the present beta."""
         for index in range(first, len(self.keyframes)):
-            weight = self._predict_static_weight(index)
-            self.keyframes.set_static_weight(index, weight.reshape(-1))
+            self.keyframes.static_weights[index] = self._predict_static_weight(index).reshape(-1)

@@ -87,8 +87,7 @@ def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) ->
         state, report = result
         if abs(state.log_focal) > FARTHEST:
             return math.inf
-        disparities = state.disparities.log()
-        agrees = torch.corrcoef(torch.stack([usual[cells], disparities[cells]]))[0, 1]
+        agrees = torch.corrcoef(torch.stack([usual[cells], state.disparities.log()[cells]]))[0, 1]
         doublings = abs(state.log_focal) / math.log(2)
         unusual = FOCAL_WORTH_SAVING * doublings - RELIEF_WORTH_SAVING * float(agrees.nan_to_num())
         return report.cost_after * (1 + unusual)

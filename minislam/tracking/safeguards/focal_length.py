@@ -128,8 +128,7 @@ def fit_focal_length(
 ) -> tuple[FocalLengthFit, BundleState]:
     """Return the focal length at which the adjusted cost is lowest, and the state there."""
     workers, free = workers or Workers(), replace(problem, free_focal=True)
-    pairs = (problem, state), (free, start or state)
-    starts = [(*pair, WIDENINGS, ITERATIONS) for pair in pairs]
+    starts = [(*pair, WIDENINGS, ITERATIONS) for pair in ((problem, state), (free, start or state))]
     (_, present), (found, best) = workers.map(adjust_narrowing, starts)
     for _ in range(MAX_TRIES):
         ends = [replace(found, log_focal=found.log_focal + step) for step in (-STEP, STEP)]
@@ -166,8 +165,7 @@ def seek_readouts(graph: KeyframeGraph) -> None:
         return
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
-    first_ones = range(min(MOST_KEYFRAMES, len(graph.keyframes)))
-    problem, start = _thinned(graph, problem, first_ones)
+    problem, start = _thinned(graph, problem, range(min(MOST_KEYFRAMES, len(graph.keyframes))))
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())

@@ -39,7 +39,7 @@ def judge_all(graph: KeyframeGraph) -> None:
     keyframes = graph.keyframes
     for index, matches in enumerate([None, *graph.flow_to_next]):
         if matches is None:
-            keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
+            keyframes.motion_weights[index] = 1
         else:
             remember(graph, matches, keyframes.T_camera_world[index], index - 1)
             inherit(graph, matches, index)
@@ -64,14 +64,13 @@ def remember(
     known = keyframes.disparities[index], motion, before, scale
     after = update_motion_weight(graph.grid, matches, *known)
     weight = after if settled is None else torch.where(settled, after, before)
-    keyframes.set_motion_weight(index, weight)
+    keyframes.motion_weights[index] = weight
 
 
 def inherit(graph: KeyframeGraph, matches: FlowMatches, index: int = -1) -> None:
     """Set the motion weights of a keyframe from those of the keyframe before it."""
-    before = graph.keyframes.motion_weights[index - 1]
-    weight = inherit_motion_weight(graph.grid, matches, before)
-    graph.keyframes.set_motion_weight(index, weight)
+    weights = graph.keyframes.motion_weights
+    weights[index] = inherit_motion_weight(graph.grid, matches, weights[index - 1])
 
 
 def update_motion_weight(
