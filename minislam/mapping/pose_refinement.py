@@ -1,7 +1,7 @@
 """Refine a pose by re-rendering: move the camera until the map looks like its image (supplement).
 
 The official code lets Adam descend along the pose gradient, 100 renderings per frame. Here the
-same gradient is divided by the curvature of the loss, and two or three steps suffice. Only the
+same gradient is divided by the curvature of the loss, and a few steps suffice. Only the
 gradient must be exact, because it defines the minimum; the curvature sets the length of a step.
 """
 

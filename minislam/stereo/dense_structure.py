@@ -28,7 +28,7 @@ BETWEEN = 2  # most frames between two keyframes that are swept as well
 RESTING = 8  # but at least one of so many: a camera at rest makes no keyframes
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
-LARGEST_QUANTILE = 0.98
+LARGEST_QUANTILE = 0.98  # of the inverse depths: the few beyond it are taken for outliers [-]
 PLANES = (48, 96)  # fewest and most
 FARTHEST = 0.5  # planes: what matches farther away, even at infinity, is put here
 LEAST_COMMON = 100  # px that have both depths; with fewer their scales are not compared
@@ -196,7 +196,7 @@ class SweepPlanner:
     def _views(self, frame: int, inverse_depth: float) -> dict[int, float]:
         """Choose the frames to sweep against, spread evenly over those of moderate parallax.
 
-        Each comes with its distance [world unit].
+        If fewer than two are, the nearest in time. Each comes with its distance [world unit].
         """
         here, near = self._centres[frame], [k for k in self._poses if 0 < abs(k - frame) <= REACH]
         distances = {k: float(np.linalg.norm(here - self._centres[k])) for k in near}

@@ -35,9 +35,9 @@ def adjust_again(
     on_progress: Callable[[str], Progress | None] = lambda stage: None,
     workers: Workers | None = None,  # sweep side by side
 ) -> None:
-    """Adjust the keyframes on what sweeps confirm, and judge them; lost frames are told later.
+    """Adjust the keyframes on what sweeps confirm, and judge them.
 
-    Frames between keyframes are posed and swept as well, to vote.
+    Frames between keyframes are posed and swept as well, to vote. None is called lost here.
     """
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]

@@ -141,7 +141,7 @@ class KeyframeGraph(Stateful):
 
     def fit_pose(
         self,
-        frame: Frame,  # no keyframe
+        frame: Frame,  # not among the keyframes
         around: list[int],  # keyframes that may show the same
         start: Tensor,  # (4, 4)
     ) -> tuple[Tensor, float]:
@@ -167,7 +167,8 @@ class KeyframeGraph(Stateful):
             matches = self.shutter.corrected(matches, edges, frame.frame_index)
             measured = *ends, matches.targets, matches.confidences * weights[:, None]
             problem = motion_only_problem(grid, *measured, numbers == count, robust)
-            if count == 1 and not self.is_learned:  # then it may follow a dynamic object
+            # One keyframe alone: a narrow robust weight may hold on to a dynamic object.
+            if count == 1 and not self.is_learned:
                 poses = known[0], list(state.T_camera_world[1:])
                 pose = start_pose(grid, matches, disparities[0], weights[0], *poses, self.robust)
                 state = BundleState(torch.cat([known, pose[None]]), disparities)
@@ -207,7 +208,7 @@ class KeyframeGraph(Stateful):
         self.links.record(edges, self.shutter.corrected(matches, edges))
 
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
-        """Return those of these new edges whose flow is matched in both directions.
+        """Return those of these new edges, each with its reverse, that flow matches both ways.
 
         The flow of a far link starts from poses that may have drifted, and one wrong link can
         outweigh all right ones.

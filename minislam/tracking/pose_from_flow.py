@@ -99,7 +99,8 @@ def warp_disparities(
 ) -> Tensor:  # (N,) of the target
     """Warp the disparities (N,) of a source to the target.
 
-    A cell that no point reaches takes the nearest cell's value; disparity zero is not warped.
+    A cell that no point reaches takes the nearest cell's value; if points reach none, all cells
+    take the median. Disparity zero is not warped.
     """
     warped = splat_disparities(grid, T_target_source, disparities).reshape(grid.shape)
     if not warped.any():

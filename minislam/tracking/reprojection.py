@@ -71,7 +71,7 @@ def reproject(
 
 
 def lengths(vectors: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) px
-    """Return the lengths of image vectors; norm(dim=1) would take three hundred times as long."""
+    """Return the lengths of image vectors; norm(dim=1) would be many times slower."""
     return torch.hypot(vectors[:, 0], vectors[:, 1])
 
 

@@ -36,8 +36,8 @@ from minislam.tracking.safeguards.turns import adjust_turns
 from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
-LONGEST_TAIL = 2  # frames after the last keyframe
-LEAST_GROWTH = 5  # online all keyframes are adjusted again once a fifth of them is new
+LONGEST_TAIL = 2  # frames after the last keyframe that need none behind them
+GROWTH_SHARE = 5  # online all keyframes are adjusted again once one in so many is new
 
 
 class Mode(Enum):
@@ -124,7 +124,7 @@ class Tracker(Stateful):
         return len(self.keyframes) > count
 
     def end(self) -> None:
-        """Make the last frame a keyframe, unless it follows one closely: poses lie between two."""
+        """End with a keyframe, unless the last one is near: other frames are posed between two."""
         if self.last_non_keyframe is not None:
             last = self.last_non_keyframe[0].frame_index
             if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:
@@ -204,7 +204,7 @@ class Tracker(Stateful):
         """Close loops; run online global BA if `global_interval` keyframes and a fifth are new."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
-        least = max(config.global_interval, count // LEAST_GROWTH)
+        least = max(config.global_interval, count // GROWTH_SHARE)
         is_due = config.global_interval > 0 and count - self._last_global >= least
         if is_due and not closed:
             seek_readouts(self.graph)
