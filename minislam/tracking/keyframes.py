@@ -36,8 +36,8 @@ class KeyframeStore(Stateful):
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
         super().restore_state(state, frame_of)
-        for images in zip(self.frames, self.features, self.metric_depths, strict=True):
-            self._shelve(*images)
+        for frame, *images in zip(self.frames, self.features, self.metric_depths, strict=True):
+            self.shelf.put([frame.pixels, *images])
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -63,7 +63,7 @@ class KeyframeStore(Stateful):
         prior_disparities: Tensor,  # (N,)
     ) -> None:
         """Add one keyframe. Every cell starts with weight one."""
-        self._shelve(frame, features, metric_depth)
+        self.shelf.put([frame.pixels, features, metric_depth])
         give_back_freed()  # by the matching and adjusting of the keyframe before
         self.frames.append(frame)
         self.features.append(features)
@@ -75,9 +75,6 @@ class KeyframeStore(Stateful):
         self.prior_masks = torch.cat([self.prior_masks, ones.bool()])
         self.static_weights = torch.cat([self.static_weights, ones])
         self.motion_weights = torch.cat([self.motion_weights, ones])
-
-    def _shelve(self, frame: Frame, features: Tensor, metric_depth: Tensor | None) -> None:
-        self.shelf.put([frame.pixels, features, metric_depth])
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
