@@ -145,15 +145,15 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 
 
 def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
-    """Return what holds a keyframe and has held the one before it, too.
+    """Return continuity and agreement [-]: does what held the camera before hold this keyframe?
 
     A cell of a keyframe before this one is known if its flow to the next keyframe fits. Of the
     keyframe just before, the cells are known to which known ones flow: what comes into view is not.
 
-    First what is known, matched and fits this keyframe, in the best link into it, weighed by
-    motion, too: all that holds the pose, over all that the keyframe just before matches [-]. In a
-    fast turn both are small. Then how much of what is known and matched fits [-], in the worst
-    link, moving or not. None: a link is missing, or the camera was.
+    Continuity is what is known, matched and fits, weighed by motion, too, in the best link into
+    this keyframe, over all that the keyframe just before matches: in a fast turn both are small.
+    Agreement is the part that fits of what is known and matched, moving or not, in the worst link.
+    None: a link is missing, the camera was lost, or no link knows enough to agree.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
