@@ -16,7 +16,7 @@ from minislam.config import with_settings
 from minislam.data.options import InputOptions, default_depth
 from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
-from minislam.parameters import with_values
+from minislam.parameters import user_path, with_values
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run
 from minislam.runs.run import default_output, run_in_folder
@@ -52,12 +52,12 @@ def run(
     config = with_settings(preset_of(preset), from_files | dict(settings or {}))
     choice = with_values(PriorChoice(depth=default_depth(str(source))), priors)
     sequence = open_sequence(str(source), with_values(InputOptions(), inputs))
-    output = output or default_output(sequence)
+    output = user_path(output or default_output(sequence))
     progress = SilentProgress() if quiet else ProgressLine()
     progress.plan = plan_of(config, choice, sequence)
     with ending_signals(progress.interrupt):
         run_in_folder(
-            sequence, config, choice, Path(output), progress, overwrite=overwrite, workers=workers
+            sequence, config, choice, output, progress, overwrite=overwrite, workers=workers
         )
     return Run(output)
 

@@ -1,6 +1,6 @@
 """The memory of a run: what is seldom read lies in a file, and what was freed is given back.
 
-Images, features, depths and flow of old keyframes are put on a `Shelf`, so the memory of a long run
+Images, features, depths and flow of keyframes are put on the `SHELF`, so the memory of a long run
 does not grow by them. Whoever holds such a tensor notices nothing.
 """
 
@@ -22,6 +22,7 @@ SMALLEST = 1 << 12  # bytes, a page: smaller tensors stay in memory
 FIRST_BLOCK, LARGEST_BLOCK = 1 << 24, 1 << 28  # bytes: each block is as large as all before it
 PIECE = 1 << 20  # bytes, written at once
 Place = tuple[mmap.mmap, int]  # a block, and the first byte in it
+_BLOCKS: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()  # of all shelves
 ALIGNMENT = 64  # bytes, that of tensors in memory: another one can change the last bits of sums
 
 
@@ -47,9 +48,9 @@ class Shelf:
                 continue
             if tensor.nbytes >= SMALLEST and not self.holds(tensor):
                 with suppress(OSError):
-                    place = torch.from_numpy(self._room(tensor.nbytes))
+                    place = torch.from_numpy(self.room(tensor.nbytes))
                     tensor.data = place.view(tensor.dtype).view(tensor.shape).copy_(tensor)
-        self.release()
+        release()
 
     def array(self, values: np.ndarray) -> np.ndarray:
         """Return an array as `put` leaves a tensor of its values; the given one stays in memory."""
@@ -62,13 +63,7 @@ class Shelf:
         ranges = zip(starts, map(len, self._blocks), strict=True)
         return any(start <= tensor.data_ptr() < start + length for start, length in ranges)
 
-    def release(self) -> None:
-        """Give back the memory of what was read or put since; the file has it."""
-        for block in self._blocks:
-            if hasattr(mmap, "MADV_DONTNEED"):
-                block.madvise(mmap.MADV_DONTNEED)
-
-    def _room(self, length: int) -> np.ndarray:  # (length,) uint8
+    def room(self, length: int) -> np.ndarray:  # (length,) uint8
         """Return bytes that are free until the array is gone; OSError: the disk is full."""
         size = -(-length // ALIGNMENT) * ALIGNMENT
         spare = self._spare.setdefault(size, [])
@@ -95,7 +90,32 @@ def _block(length: int) -> mmap.mmap:
             for first in range(0, length, PIECE):
                 file.write(bytes(min(PIECE, length - first)))
             file.flush()
-        return mmap.mmap(file.fileno(), 0)
+        _BLOCKS.add(block := mmap.mmap(file.fileno(), 0))
+    return block
+
+
+SHELF = Shelf()  # for all that a run keeps of its keyframes
+
+
+def release() -> None:
+    """Give back the memory of what was read from any shelf, or put there; the files have it."""
+    for block in _BLOCKS:
+        if hasattr(mmap, "MADV_DONTNEED"):
+            block.madvise(mmap.MADV_DONTNEED)
+
+
+def stack(rows: list[Tensor]) -> Tensor:
+    """Return `torch.stack` of equal tensors; that of many lies in a file, which goes with it."""
+    size, step = len(rows) * rows[0].nbytes, max(1, PIECE // rows[0].nbytes)
+    if size > FIRST_BLOCK and rows[0].device.type == "cpu":
+        with suppress(OSError):
+            place = torch.from_numpy(Shelf().room(size)).view(rows[0].dtype)
+            whole = place.view(len(rows), *rows[0].shape)
+            for first in range(0, len(rows), step):
+                torch.stack(rows[first : first + step], out=whole[first : first + step])
+                release()
+            return whole
+    return torch.stack(rows)
 
 
 def give_back_freed() -> None:

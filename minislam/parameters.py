@@ -35,10 +35,14 @@ def require_bounds(name: str, value: Any, least: float, most: float) -> None:
             )
 
 
+def user_path(path: Path | str) -> Path:
+    """Return a path with ~ as the home of the user; a home that nobody has is left as it is."""
+    return Path(os.path.expanduser(path))
+
+
 def absolute_path(name: str) -> str:
     """Return a path, or files:FOLDER, by which what it names is found from any folder."""
-    path = os.path.expanduser(name.removeprefix(FILES))
-    return FILES * name.startswith(FILES) + str(Path(path).absolute())
+    return FILES * name.startswith(FILES) + str(user_path(name.removeprefix(FILES)).absolute())
 
 
 def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any, Field[Any]]]:

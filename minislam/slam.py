@@ -22,6 +22,7 @@ from minislam.errors import MinislamError
 from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
+from minislam.memory import SHELF
 from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory, required_mask
@@ -112,7 +113,7 @@ class Slam(Stateful):
         config, dimension = self.config, self._features.dimension
         camera = self.tracker.grid.camera
         parts = camera, config.mapping, config.uncertainty, dimension, config.seed
-        mapper = Mapper(*parts, self.device, self.workers, self.tracker.keyframes.shelf)
+        mapper = Mapper(*parts, self.device, self.workers)
         mapper.cell = cell
         return mapper
 
@@ -183,8 +184,7 @@ class Slam(Stateful):
         if self.tracker.knows_depth:
             parts = graph, self.sequence, self.poses, frames, frames
             swept = sweep_frames(*parts, progress, self.workers)
-            shelf = graph.keyframes.shelf
-            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, shelf)
+            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
         else:
             keyframes = on_backdrop(keyframes)
         exposures = keyframe_exposures(graph)
@@ -260,7 +260,7 @@ class Slam(Stateful):
             unknown = torch.zeros((), device=self.device).expand(pixels.shape[:2])
             seen = pixels, features, unknown if depth is None else depth, pose, mask
             result.append(Keyframe(frame.frame_index, *seen, inserts=position < len(store)))
-            store.shelf.put([pixels, features])
+            SHELF.put([pixels, features])
         return sorted(result, key=lambda keyframe: keyframe.frame_index)
 
     def trajectory(self) -> Trajectory:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +15,7 @@ from minislam.config import (
     with_settings,
 )
 from minislam.errors import InputError
-from minislam.parameters import flattened, leaves
+from minislam.parameters import absolute_path, flattened, leaves, user_path
 
 CHANGED = {
     "seed": 7,
@@ -211,3 +212,13 @@ def test_every_preset_lies_within_the_bounds(name: str):
 def test_settings_that_are_no_object_are_an_error(tree: object):
     with pytest.raises(InputError, match="as a JSON object"):
         flattened(tree)
+
+
+def test_a_path_of_the_user_is_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert user_path("~/a") == tmp_path / "a" and user_path("~nobodyhere/a") == Path(
+        "~nobodyhere/a"
+    )
+    assert absolute_path("~/a") == absolute_path("a") == str(tmp_path / "a")
+    assert absolute_path("files:a") == f"files:{tmp_path / 'a'}"

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from minislam import memory
-from minislam.memory import Shelf, give_back_freed, peak_memory_mb
+from minislam.memory import Shelf, give_back_freed, peak_memory_mb, release, stack
 
 
 def noise(*shape: int) -> torch.Tensor:
@@ -31,7 +31,7 @@ def test_values_stay_for_all_that_hold_them(dtype: torch.dtype) -> None:
     other, wanted = given, given.clone()
     shelf = Shelf()
     shelf.put([given])
-    shelf.release()
+    release()
     assert other.dtype == dtype and torch.equal(other, wanted)
 
 
@@ -74,7 +74,7 @@ def test_many_tensors_take_many_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     shelf = Shelf()
     tensors = [noise(100_000 + n) for n in range(40)]  # .4 MB each
     shelf.put(tensors)
-    shelf.release()
+    release()
     assert all(torch.equal(t, noise(len(t))) for t in tensors)
 
 
@@ -94,7 +94,7 @@ def test_the_place_of_a_tensor_that_is_gone_is_taken_again() -> None:
 def test_an_array_is_kept() -> None:
     shelf, given = Shelf(), np.arange(5000.0).reshape(50, 100)
     kept = shelf.array(given)
-    shelf.release()
+    release()
     assert np.array_equal(kept, given) and kept.dtype == given.dtype
     assert not np.shares_memory(kept, given)
 
@@ -115,9 +115,36 @@ def test_release_gives_the_memory_back() -> None:
     shelf, tensor = Shelf(), noise(10_000_000)  # 40 MB
     shelf.put([tensor])
     total, read = float(tensor.sum()), resident()
-    shelf.release()
+    release()
     assert resident() < read - 30
     assert float(tensor.sum()) == total
+
+
+@pytest.mark.parametrize("count", [10, 2000])
+def test_a_stack_has_the_rows_in_their_order(count: int) -> None:
+    rows = [noise(3000) + index for index in range(count)]
+    found = stack([rows[0].expand(3, 3000), *(row.expand(3, 3000) for row in rows[1:])])
+    assert found.shape == (count, 3, 3000) and found.is_contiguous()
+    assert all(torch.equal(one, row.expand(3, 3000)) for one, row in zip(found, rows, strict=True))
+
+
+def test_without_room_on_the_disk_a_large_stack_is_in_memory(monkeypatch: pytest.MonkeyPatch):
+    def full(length: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(memory, "_block", full)
+    assert stack([noise(3_000_000)] * 2).equal(noise(3_000_000).expand(2, -1))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")
+def test_a_large_stack_is_not_in_memory() -> None:
+    rows, before = [noise(500_000)] * 40, resident()  # 80 MB stacked
+    found = stack(rows)
+    assert resident() < before + 10
+    found *= 2
+    assert resident() > before + 60
+    release()
+    assert resident() < before + 10 and torch.equal(found[39], 2 * rows[0])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")

@@ -15,6 +15,7 @@ from minislam.data.options import InputOptions
 from minislam.data.sequence import open_sequence
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.images import psnr
+from minislam.memory import SHELF
 from minislam.priors.depth import SensorDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.networks.droid import DroidFlowConfig
@@ -71,4 +72,6 @@ def test_what_a_run_keeps_of_old_images_lies_on_the_shelf(slam: Slam):
     assert len(slam.mapper.keyframes) > len(slam.tracker.keyframes)
     for keyframe in slam.mapper.keyframes:
         for images in (keyframe.pixels, keyframe.features, keyframe.depth):
-            assert slam.tracker.keyframes.shelf.holds(images)
+            assert SHELF.holds(images)
+    links = slam.tracker.graph.links
+    assert all(map(SHELF.holds, (*links.targets, *links.confidences)))

@@ -9,6 +9,7 @@ from pathlib import Path
 import minislam
 from minislam.data.files import atomic_write, make_folder, read_bytes
 from minislam.errors import InputError
+from minislam.parameters import user_path
 
 SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
 
@@ -26,7 +27,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def _notebooks(args: argparse.Namespace) -> None:
     """Copy all notebooks and what they name, never over a file."""
     # A wheel holds the notebooks inside the package, the repository beside it.
-    folder, package = Path(args.folder).expanduser(), Path(minislam.__file__).parent
+    folder, package = user_path(args.folder), Path(minislam.__file__).parent
     sources = [package / "notebooks", package.parent / "notebooks"]
     source = next((path for path in sources if any(path.glob("*.ipynb"))), None)
     if source is None:

@@ -16,7 +16,7 @@ from minislam.cli.help import UsageError, unknown_option
 from minislam.data.files import read_json
 from minislam.data.options import InputOptions
 from minislam.errors import InputError
-from minislam.parameters import flattened, kind_of, with_values
+from minislam.parameters import flattened, kind_of, user_path, with_values
 from minislam.priors.names import BUILT_IN, PriorChoice, find_weights, require_prior
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def lpips_of(args: argparse.Namespace) -> Lpips | None:
     from minislam.evaluation.lpips import Lpips
     from minislam.priors.networks.checkpoints import load_checkpoint
 
-    paths = [Path(str(find_weights(flag, file))).expanduser() for flag, file in files.items()]
+    paths = [user_path(str(find_weights(flag, file))) for flag, file in files.items()]
     return Lpips(*(load_checkpoint(path).as_dict() for path in paths))
 
 

@@ -19,6 +19,7 @@ from minislam.cli.progress import ProgressLine
 from minislam.data.files import atomic_file, make_folder, read_text, write_text
 from minislam.data.options import require_source
 from minislam.errors import InputError
+from minislam.parameters import user_path
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -59,7 +60,7 @@ def _priors(args: argparse.Namespace) -> None:
     torch.set_num_threads(config.threads)
     sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
     print(sequence.description)
-    out = Path(args.out).expanduser()
+    out = user_path(args.out)
     kinds = list(_kinds(choice, args.features is not None, sequence, config))
     for kind, origin, compute in kinds:
         _write_kind(out / kind, origin, sequence, compute, progress)

@@ -134,6 +134,9 @@ class ProgressLine:
         """
         if not self.plan:
             return "", ""
+        if self._stage and name == next(iter(self.plan[0])):  # the run has begun anew
+            self._stage, self._start = 0, None
+            self._done.clear()
         for index in range(self._stage, len(self.plan)):
             if name in self.plan[index] and self._done[index, name] < 1:
                 self._stage = index

@@ -4,6 +4,7 @@ import argparse
 import shlex
 from contextlib import closing
 from functools import partial
+from os.path import expanduser
 from pathlib import Path
 
 from minislam.cli import options
@@ -22,7 +23,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Add `demo` and `run` to the commands."""
     what = "make a synthetic clip with moving people and run everything on it"
     demo = add_command(commands, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
-    demo.add_argument("-o", "--output", metavar="DIR", help="run folder, output/demo")
+    where = partial(demo.add_argument, "-o", "--output", type=expanduser, metavar="DIR")
+    where(help="run folder, output/demo")
     demo.add_argument("--overwrite", action="store_true", help="replace an earlier run there")
     options.add_talk(demo)
     options.add_settings(demo)
@@ -30,7 +32,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
     what = "run SLAM on a video, an image folder or a benchmark"
     run = add_command(commands, "run", what, "SEQUENCE [-o OUTPUT]", RUN_EPILOG)
-    run.add_argument("-o", "--output", metavar="DIR", help="run folder, default output/NAME_TIME")
+    where = partial(run.add_argument, "-o", "--output", type=expanduser, metavar="DIR")
+    where(help="run folder, default output/NAME_TIME")
     earlier = run.add_mutually_exclusive_group()
     earlier.add_argument("--overwrite", action="store_true", help="replace an earlier run")
     earlier.add_argument(

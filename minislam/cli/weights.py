@@ -8,6 +8,7 @@ from pathlib import Path
 from minislam.cli.help import nearest
 from minislam.cli.progress import ProgressLine
 from minislam.errors import InputError, MinislamError
+from minislam.parameters import user_path
 from minislam.priors.names import PublishedFile, published_files
 
 CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
@@ -56,7 +57,7 @@ def _fetch(args: argparse.Namespace) -> None:
 
 def _check(args: argparse.Namespace) -> None:
     rows = {row.file: row for row in published_files().values()}
-    folder = Path(args.folder or rows["droid.pth"].path.parent).expanduser()
+    folder = user_path(args.folder or rows["droid.pth"].path.parent)
     found = folder.iterdir() if folder.is_dir() else ()
     files = sorted(path for path in found if path.suffix.lower() in CHECKPOINT_ENDINGS)
     if not files:

@@ -3,10 +3,9 @@
 import os
 import re
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 from minislam.errors import InputError
-from minislam.parameters import parameter, require_bounds
+from minislam.parameters import parameter, require_bounds, user_path
 
 SYNTHETIC = "synth:"  # before the name of a synthetic sequence
 PHONE = "?phone"  # behind one that a phone films
@@ -73,7 +72,7 @@ def require_source(source: str) -> None:
                 f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"
             )
         return
-    path = Path(source).expanduser()
+    path = user_path(source)
     if not (os.path.isfile(path) or os.path.isdir(path)):  # these know names of any length
         raise InputError(
             f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "

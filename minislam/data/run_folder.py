@@ -15,6 +15,7 @@ from minislam.data import files
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError
+from minislam.parameters import user_path
 from minislam.records import Trajectory
 
 CONFIG, RUN, METRICS, CAMERA = "config.json", "run.json", "metrics.json", "camera.json"
@@ -60,8 +61,8 @@ class RunFolder:
 
     def __init__(self, path: Path | str) -> None:
         """Refer to an existing run folder."""
-        self.path = Path(path)
-        if not os.path.isdir(path):
+        self.path = user_path(path)
+        if not os.path.isdir(self.path):
             raise InputError(
                 f"expected a run folder, but {self.path} does not exist or is no folder; give the "
                 "--output of an earlier run"

@@ -16,7 +16,7 @@ from minislam.data.preparation import ImagePreparation, KeptImages, Window, pict
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
-from minislam.parameters import absolute_path
+from minislam.parameters import absolute_path, user_path
 from minislam.records import Frame, GroundTruth, Progress
 
 _SYNTHETIC_SIZE = (320, 240)  # px
@@ -33,7 +33,7 @@ def open_sequence(
     require_source(source)
     if source.startswith(SYNTHETIC):
         return _open_synthetic(source, options, progress)
-    path = Path(source).expanduser()
+    path = user_path(source)
     if path.is_file():
         last = None
         if options.max_frames is not None:
@@ -129,7 +129,10 @@ class RecordedSequence:
         options = replace(
             self._options, fx=zoom * raw.fx, fy=zoom * raw.fy, k1=k1, k2=k2, focal="refine"
         )
-        return RecordedSequence(self._recording, options, self._source)
+        straight = RecordedSequence(self._recording, options, self._source)
+        told = f"a lens of {fx:.0f} px, k1 {k1:.3f}, k2 {k2:.3f} found"
+        straight.description = straight.description.replace("intrinsics given", told)
+        return straight
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
         """Return one frame undistorted, at the size of the source: `prepare.full_camera`."""

@@ -14,7 +14,7 @@ from minislam.data.calibration import Calibration, read_calibration
 from minislam.data.images import is_image, list_images, read_color
 from minislam.data.metadata import noted_focal_length
 from minislam.errors import InputError, MinislamError
-from minislam.parameters import FILES
+from minislam.parameters import FILES, user_path
 from minislam.records import Trajectory
 
 _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
@@ -277,7 +277,7 @@ def _found(folder: Path) -> str:
 
 def mask_files(images: ImageSource, masks: str, chosen: range) -> dict[int, Path]:
     """Return the mask of each chosen image in files:FOLDER: of its name, or of its number."""
-    folder = Path(masks.removeprefix(FILES)).expanduser()
+    folder = user_path(masks.removeprefix(FILES))
     if not masks.startswith(FILES) or not folder.is_dir():
         raise InputError(
             f"expected --masks {FILES}FOLDER with a folder that exists, found {masks}; check it"

@@ -18,6 +18,7 @@ from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
+from minislam.memory import release
 from minislam.records import Keyframe, Progress
 from minislam.splatting import GaussianMap, Rendering
 
@@ -41,7 +42,7 @@ class Mapper(JointOptimisation):
             means = []
             for keyframe in self.keyframes:
                 means.append(keyframe.levelled.mean((0, 1)))
-                self._shelf.release()
+                release()
             self.background = torch.stack(means).mean(0)
         count = len(self.keyframes)
         if self.uncertainty.is_learnt:

@@ -13,7 +13,7 @@ from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
 from minislam.mapping.views import Comparison, ViewGradients, view_gradients, view_of
 from minislam.mapping.window import in_turn
-from minislam.memory import Shelf
+from minislam.memory import SHELF, release
 from minislam.records import Keyframe, MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.stateful import FrameOf, Stateful, Tree
@@ -55,7 +55,6 @@ class JointOptimisation(Stateful):
         seed: int,
         device: str = "cpu",  # of all tensors; keyframes must be there, too
         workers: Workers | None = None,  # render the views of a step
-        shelf: Shelf | None = None,  # where the images of the keyframes are
     ) -> None:
         self.camera = camera
         self.config = config
@@ -66,7 +65,7 @@ class JointOptimisation(Stateful):
         self.window, self.shown = [], []
         self.background = torch.zeros(3, device=device)
         self.history = MappingHistory()
-        self._workers, self._shelf = workers or Workers(), shelf or Shelf()
+        self._workers = workers or Workers()
         self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed, device)
         self._generator = torch.Generator().manual_seed(seed + 1)
         self._optimizer = MapOptimizer(GaussianMap.empty(device=device), LearningRates())
@@ -76,7 +75,7 @@ class JointOptimisation(Stateful):
         """Take up a saved state."""
         super().restore_state(state, frame_of)
         for keyframe in self.keyframes:
-            self._shelf.put([keyframe.pixels, keyframe.features, keyframe.depth])
+            SHELF.put([keyframe.pixels, keyframe.features, keyframe.depth])
 
     @property
     def gaussians(self) -> GaussianMap:
@@ -111,7 +110,7 @@ class JointOptimisation(Stateful):
 
     def beta_of(self, keyframe: Keyframe) -> Tensor:
         """Return the raw beta (h', w') of a keyframe: from its mask or from the MLP."""
-        self._shelf.release()  # all that goes from keyframe to keyframe passes here
+        release()  # all that goes from keyframe to keyframe passes here
         if keyframe.moving_mask is not None:
             return beta_of_mask(keyframe.moving_mask)
         return confirmed_beta(self.predict_beta(keyframe.features), keyframe.confirmation)

@@ -16,6 +16,7 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.parameters import user_path
 from minislam.priors import conformance, names
 from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeatures
@@ -77,7 +78,7 @@ def _choose(kind: str, choice: PriorChoice, networks: NetworksConfig, makers: Ma
     weights = require_prior(kind, name, getattr(choice, f"{kind}_weights"))
     network = find_network(kind, name)
     if network is not None:
-        path, precision = Path(str(weights)).expanduser(), names.PRECISIONS[choice.precision]
+        path, precision = user_path(str(weights)), names.PRECISIONS[choice.precision]
         return load_network(network, path, choice.device, networks, getattr(torch, precision))
     maker = makers.get(FOLDER if name.startswith(FILES) else name)
     return maker() if maker else load_plugin(kind, name, choice.device, weights)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from minislam.errors import InputError
 from minislam.geometry import Camera
+from minislam.parameters import user_path
 from minislam.priors.depth import as_depth
 from minislam.priors.names import FILES
 from minislam.records import Frame, Sequence
@@ -129,7 +130,7 @@ class FileDepth:
 
 def folder_of(name: str, kind: str) -> Path:
     """Return where the files of a kind are: in the subfolder of that name, or in the folder."""
-    folder = Path(name.removeprefix(FILES)).expanduser()
+    folder = user_path(name.removeprefix(FILES))
     return next((folder / sub for sub in _FOLDERS[kind] if (folder / sub).is_dir()), folder)
 
 

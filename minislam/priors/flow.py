@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from minislam.memory import Shelf
+from minislam.memory import SHELF, release
 from minislam.priors import grid_flow
 from minislam.priors.dense_flow import composed_flow, dense_from_grid, grayscale, reverse_flow
 from minislam.priors.interfaces import FlowMatches
@@ -41,7 +41,6 @@ class ClassicalFlow(Stateful):
         cv2.setNumThreads(1)
         self.config = config or grid_flow.ClassicalFlowConfig()
         self.stride = self.config.stride
-        self._shelf = Shelf()
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[int, np.ndarray] = {}
         self._measured: dict[Edge, MeasuredEdge] = {}
@@ -57,7 +56,7 @@ class ClassicalFlow(Stateful):
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
         gray = grayscale(image)
-        self._images[keyframe_index] = self._shelf.array(gray)
+        self._images[keyframe_index] = SHELF.array(gray)
         self._textures[keyframe_index] = grid_flow.texture_confidence(gray, self.stride)
 
     def remove_frame(self, keyframe_index: int) -> None:
@@ -80,7 +79,7 @@ class ClassicalFlow(Stateful):
         _, targets, confidences = zip(*(self._measured[edge] for edge in edges), strict=True)
         textures = [self._textures[source] for source in edges_source]
         matches = grid_flow.as_matches(targets, confidences, textures, predicted_targets)
-        self._shelf.release()
+        release()
         return matches
 
     def disparity_damping(self, keyframes: int) -> None:
@@ -111,7 +110,7 @@ class ClassicalFlow(Stateful):
         return measured
 
     def _kept(self, *parts: np.ndarray) -> MeasuredEdge:
-        return MeasuredEdge(*map(self._shelf.array, parts))
+        return MeasuredEdge(*map(SHELF.array, parts))
 
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""

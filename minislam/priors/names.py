@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from minislam.errors import InputError
-from minislam.parameters import FILES, absolute_path
+from minislam.parameters import FILES, absolute_path, user_path
 
 PYTHON = "python:"  # before MODULE:FACTORY
 FOLDER = f"{FILES}FOLDER"
@@ -110,7 +110,7 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
     learned = [use.split()[1] for use in uses if use.startswith(f"--{kind} ")]
     if name in learned:
         file = find_weights(f"--{kind} {name}", weights)
-        if file is None or not Path(file).expanduser().is_file():
+        if file is None or not user_path(file).is_file():
             wanted = f"--{kind}-weights FILE with --{kind} {name}"
             found = "none" if file is None else f"nothing at {file}"
             fetch = f"fetch it with minislam weights fetch {name}"
@@ -124,7 +124,7 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
         found = f"--{kind} {name}; name the network of {weights}"
         raise InputError(f"expected {wanted}, found {found}")
     if name.startswith(FILES) and FOLDER in BUILT_IN[kind]:
-        folder = Path(name.removeprefix(FILES)).expanduser()
+        folder = user_path(name.removeprefix(FILES))
         if not folder.is_dir():
             found = f"nothing at {folder}; check the path"
             raise InputError(f"expected a folder of {kind} files, found {found}")

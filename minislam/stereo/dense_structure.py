@@ -13,7 +13,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.images import resample
-from minislam.memory import Shelf
+from minislam.memory import SHELF
 from minislam.records import Frame, Keyframe, Progress
 from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
@@ -39,7 +39,6 @@ def with_swept_depth(
     camera: Camera,  # of the images
     keyframes: list[Keyframe],
     swept: Iterable[tuple[Tensor, Tensor]],  # of each, depth (H, W) and confirmation (H, W)
-    shelf: Shelf,  # takes the depths
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth and confirmation.
 
@@ -55,7 +54,7 @@ def with_swept_depth(
         return votes.SweptView(inverse_depth, cost, 0.0, pose)
 
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
-        shelf.put([depth])
+        SHELF.put([depth])
         if index in judges:
             judging[index] = view(keyframe, depth, 1 - _nearest(confirmation, small))
         confirmation = resample(confirmation, *keyframe.features.shape[:2])
@@ -72,7 +71,7 @@ def with_swept_depth(
             moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
             moves = resample(moves, *depth.shape) > 0.5
             depth = torch.where((depth > 0) | moves, depth, guess)
-        shelf.put([depth])
+        SHELF.put([depth])
         result[index] = replace(found, depth=depth)
     return result
 
@@ -111,14 +110,14 @@ def dense_depths(
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
     planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
     known_frames, known = list(disparities), list(disparities.values())
-    shelf, swept = Shelf(), []
+    swept = []
 
     def plan(frame: int) -> tuple[Any, ...]:
         nearest = int(np.argmin([abs(frame - index) for index in known_frames]))
         return planner.plan(frame, np.concatenate(known[max(0, nearest - 1) : nearest + 2]))
 
     for view in workers.stream(swept_view, map(plan, frames)):
-        images = {name: shelf.array(getattr(view, name)) for name in ("inverse_depth", "cost")}
+        images = {name: SHELF.array(getattr(view, name)) for name in ("inverse_depth", "cost")}
         swept.append(replace(view, **images))
         if progress:
             progress(len(swept), len(frames))
@@ -126,7 +125,7 @@ def dense_depths(
     for at, view in enumerate(swept):
         others = swept[max(0, at - VOTERS) : at] + swept[at + 1 : at + 1 + VOTERS]
         found = votes.confirm(planner.camera, view, others)
-        depths.append(votes.ConfirmedDepth(*map(shelf.array, vars(found).values())))
+        depths.append(votes.ConfirmedDepth(*map(SHELF.array, vars(found).values())))
     positions = [frames.index(frame) for frame in wanted]
     kept = votes.keep_what_stays(planner.camera, swept, depths, positions)
     return (full_size(depth, camera) for depth in kept)

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from minislam.memory import release
 from minislam.records import Frame, Keyframe
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.robust import weighted_median
@@ -39,7 +40,7 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
 
     @lru_cache(maxsize=KEPT)
     def blurred(keyframe: int) -> np.ndarray:  # (H, W, 3)
-        graph.keyframes.shelf.release()
+        release()
         return cv2.GaussianBlur(frames[keyframe].image.cpu().numpy(), (0, 0), BLUR)
 
     for link, (source, target) in enumerate(links.edges):

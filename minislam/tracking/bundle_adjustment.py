@@ -85,8 +85,7 @@ class _Linearised:
 
 @dataclass(frozen=True)
 class _NormalEquations:
-    pose_pose: Tensor  # H (6P, 6P) float64
-    pose_gradient: Tensor  # g (6P,) float64
+    of_edges: list[Tensor]  # J^T W J (E, 6 + G, 6 + G), J^T W r (E, 6 + G), Ad (E, 6, 6), float64
     disparity_diagonal: Tensor  # C (K, N)
     disparity_gradient: Tensor  # s (K, N)
     source_blocks: SourceBlocks  # per source k: k, rows (R,), E_k (R, N)
@@ -190,8 +189,7 @@ def _normal_equations(
         C.index_add_(0, source, (weighted_Jd * J_disparity).sum(1))
         s.index_add_(0, source, (weighted_Jd * residual).sum(1))
         blocks.add(_source_blocks(at.problem, E_target, E_source))
-    H, g = _assemble_poses(problem, *joined(rows))
-    return _NormalEquations(H, g, C, s, blocks)
+    return _NormalEquations(joined(rows), C, s, blocks)
 
 
 def _pose_slots(problem: BundleProblem) -> Tensor:
@@ -269,7 +267,7 @@ def _damped_step(
         typical = problem.disparity_damping * (problem.prior_weights == 0)
     C = C * (1 + damping) + typical
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
-    S, b = equations.pose_pose.clone(), equations.pose_gradient.clone()
+    S, b = _assemble_poses(problem, *equations.of_edges)
     for source, rows, E in equations.source_blocks:
         scaled = E * inverse_C[source]
         S.index_put_((rows[:, None], rows[None, :]), -(scaled @ E.mT).double(), accumulate=True)

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
+from minislam.memory import SHELF
 from minislam.priors.interfaces import FlowMatches
-from minislam.state.stateful import Stateful
+from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
 # Fraction of cells that must lie in front of the other camera, inside its image or not, else a pair
@@ -18,6 +19,7 @@ FAR = math.inf  # px, the distance of a pair below this fraction
 COARSE, COARSE_MARGIN = 16, 2.0  # one cell in so many tells a distance to such a factor
 # New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8
+AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
 
 
 @dataclass
@@ -29,6 +31,11 @@ class FrameGraph(Stateful):
     confidences: list[Tensor] = field(default_factory=list)  # per edge (2, N) in [0, 1]
     matched_ratios: list[float] = field(default_factory=list)  # per edge, in [0, 1]
 
+    def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
+        """Take up a saved state."""
+        super().restore_state(state, frame_of)
+        SHELF.put([*self.targets, *self.confidences])
+
     def __len__(self) -> int:
         return len(self.edges)
 
@@ -38,8 +45,11 @@ class FrameGraph(Stateful):
         An edge keeps its old flow if the new one matches clearly less: flow that started from a
         wrong pose fails, and the old flow is needed to correct that pose.
         """
-        measured = matches.targets, matches.confidences, matches.matched_ratios.tolist()
+        columns = list(matches.targets), [one.contiguous() for one in matches.confidences]
+        for column in columns:
+            SHELF.put(column)
         position_of = {edge: position for position, edge in enumerate(self.edges)}
+        measured = *columns, matches.matched_ratios.tolist()
         for edge, target, confidence, ratio in zip(edges, *measured, strict=True):
             position = position_of.setdefault(edge, len(self))
             if position == len(self):

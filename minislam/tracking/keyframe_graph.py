@@ -18,6 +18,7 @@ from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import BundleReport, BundleState, bundle_adjust, residuals
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import (
+    AT_ONCE,
     FAR,
     FrameGraph,
     both_directions,
@@ -48,7 +49,6 @@ GLOBAL_EDGES = 6  # further links per keyframe in a global BA
 GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
 ROBUST_NARROWING = 0.5  # between keyframes, because the structure is known by then [-]
 LEAST_WEIGHT = 0.01  # mean weight of cells, below which little is known of a pose between them [-]
-AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
 FULL_FLOW_WEIGHT = 0.75  # eta of the flow distance [-]
 
 

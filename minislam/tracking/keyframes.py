@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from minislam.memory import Shelf, give_back_freed
+from minislam.memory import SHELF, give_back_freed
 from minislam.records import Frame
 from minislam.state.stateful import FrameOf, Stateful, Tree
 
@@ -24,7 +24,6 @@ class KeyframeStore(Stateful):
 
     def __init__(self, like: Tensor) -> None:
         """Start empty, for as many cells as a tensor (N,) has, and on its device."""
-        self.shelf = Shelf()
         self.frames = []
         self.features = []
         self.metric_depths = []
@@ -37,7 +36,7 @@ class KeyframeStore(Stateful):
         """Take up a saved state."""
         super().restore_state(state, frame_of)
         for frame, *images in zip(self.frames, self.features, self.metric_depths, strict=True):
-            self.shelf.put([frame.pixels, *images])
+            SHELF.put([frame.pixels, *images])
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -63,7 +62,7 @@ class KeyframeStore(Stateful):
         prior_disparities: Tensor,  # (N,)
     ) -> None:
         """Add one keyframe. Every cell starts with weight one."""
-        self.shelf.put([frame.pixels, features, metric_depth])
+        SHELF.put([frame.pixels, features, metric_depth])
         give_back_freed()  # by the matching and adjusting of the keyframe before
         self.frames.append(frame)
         self.features.append(features)
@@ -79,7 +78,7 @@ class KeyframeStore(Stateful):
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
         for column, rows in vars(self).items():
-            if column not in ("overlay", "shelf"):
+            if column != "overlay":
                 setattr(self, column, rows[:-1])
 
     def set_geometry(self, T_camera_world: Tensor, disparities: Tensor) -> None:

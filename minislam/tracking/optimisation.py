@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from minislam.memory import release, stack
 from minislam.records import Progress
 from minislam.tracking.bundle_adjustment import (
     BundleProblem,
@@ -15,9 +16,10 @@ from minislam.tracking.bundle_adjustment import (
     residuals,
 )
 from minislam.tracking.disparity_prior import mask_priors
-from minislam.tracking.keyframe_graph import AT_ONCE, Edge, KeyframeGraph
+from minislam.tracking.frame_graph import AT_ONCE
+from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 from minislam.tracking.reprojection import lengths
-from minislam.tracking.safeguards.parts import of_cells, of_rows
+from minislam.tracking.safeguards.parts import in_parts, joined, of_cells, of_rows
 from minislam.tracking.safeguards.robust import weighted_median
 
 # Times the robust width: else the cells of a new keyframe, whose error is large, are outliers.
@@ -109,8 +111,11 @@ def adjust(
 def typical_residual(problem: BundleProblem, state: BundleState) -> float | None:
     """Return the median length of the residuals [px] by weight; None if nothing is weighed."""
     cells = torch.arange(0, len(problem.rays), EVERY, device=problem.rays.device)
-    residual, weights = residuals(*of_cells(replace(problem, robust=None), state, cells))
-    return weighted_median(lengths(residual), weights[:, 0])
+    problem, found = replace(problem, robust=None), []
+    for edges, part in in_parts(problem):
+        residual, weights = residuals(*of_cells(part, state, cells))
+        found.append((edges, lengths(residual), weights[:, 0]))
+    return weighted_median(*joined(found))
 
 
 def adjust_touched(
@@ -157,8 +162,8 @@ def bundle_problem(
     keyframes, links, grid = graph.keyframes, graph.links, graph.grid
     ends = [links.edges[p] for p in positions]
     sources, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
-    targets = torch.stack([links.targets[p] for p in positions])
-    weights = torch.stack([links.confidences[p] for p in positions])
+    targets = stack([links.targets[p] for p in positions])
+    weights = stack([links.confidences[p] for p in positions])
     _weigh_by_cells(graph, weights, sources, edges_target, targets)
     prior = keyframes.prior_disparities
     if lambda_prior is None:
@@ -196,6 +201,7 @@ def _weigh_by_cells(
         if not graph.is_learned:
             static = static * graph.grid.sample(of_cell[target][..., None], position.mT)[..., 0]
         weight *= static[:, None]
+        release()
 
 
 def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool

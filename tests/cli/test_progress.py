@@ -149,6 +149,18 @@ def test_a_part_that_is_not_planned_is_shown_in_the_present_stage(capsys):
     assert starts == ["stage 1 of 2, walking", "stage 1 of 2, looking", "stage 2 of 2, resting"]
 
 
+def test_a_run_that_begins_anew_is_in_its_first_stage_again(capsys):
+    progress = ProgressLine(is_verbose=True)
+    progress.plan = [{"walking": 20.0, "looking": 1.0}, {"resting": 10.0, "looking": 1.0}]
+    for name in ("walking", "resting", "looking"):
+        progress.show(name, 1, 1)
+    progress.show("walking", 0, 1)
+    progress.show("resting", 1, 1)
+    lines = capsys.readouterr().err.splitlines()
+    assert [int(line[len("stage ")]) for line in lines] == [1, 2, 2, 1, 2]
+    assert lines[3].endswith("about 30 s in all")
+
+
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("has_prior", [True, False])
 def test_every_run_has_a_plan(name: str, has_prior: bool):

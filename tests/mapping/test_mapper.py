@@ -5,9 +5,8 @@ import torch
 
 from minislam.errors import InputError
 from minislam.geometry import se3_exp
-from minislam.mapping import Mapper
 from minislam.mapping.views import view_of
-from minislam.memory import Shelf
+from minislam.memory import SHELF
 from minislam.records import Frame
 from minislam.splatting.constants import MIN_ALPHA
 from minislam.uncertainty import UncertaintyConfig
@@ -159,13 +158,12 @@ def test_a_restored_mapper_has_the_images_that_it_was_given():
     def never(index: int) -> Frame:
         raise AssertionError(index)
 
-    mapper, shelf = make_mapper(replace(CONFIG, init_iterations=10)), Shelf()
-    restored = Mapper(CAMERA, CONFIG, UncertaintyConfig(), 3, seed=0, shelf=shelf)
+    mapper, restored = make_mapper(replace(CONFIG, init_iterations=10)), make_mapper()
     mapper.initialise([wall_keyframe(0), replace(wall_keyframe(1), exposure=torch.ones(3))])
     restored.restore_state(mapper.saved_state(), never)
     for found, known in zip(restored.keyframes, mapper.keyframes, strict=True):
         assert torch.equal(found.pixels, known.pixels) and found.frame_index == known.frame_index
-        assert shelf.holds(found.pixels)
+        assert SHELF.holds(found.pixels)
     assert list(restored.exposures) == [5]
 
 

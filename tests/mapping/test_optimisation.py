@@ -1,12 +1,12 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 
-from minislam.mapping import Mapper
+from minislam.mapping import optimisation
 from minislam.mapping.config import DensityConfig
 from minislam.mapping.views import view_gradients
-from minislam.memory import Shelf
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 
@@ -67,10 +67,11 @@ def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
     assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
 
 
-def test_what_was_read_of_the_images_before_is_released_with_every_beta():
-    shelf, released = Shelf(), []
-    shelf.release = lambda: released.append(None)
-    mapper = Mapper(CAMERA, CONFIG, UncertaintyConfig(), 3, seed=0, shelf=shelf)
+def test_what_was_read_of_the_images_before_is_released_with_every_beta(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    mapper, released = make_mapper(), []
+    monkeypatch.setattr(optimisation, "release", lambda: released.append(None))
     for count in (1, 2):
         mapper.beta_of(wall_keyframe(count))
         assert len(released) == count

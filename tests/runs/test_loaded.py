@@ -48,6 +48,11 @@ def test_every_keyframe_is_rendered_again_within_one_grey_level(run: minislam.Ru
         assert np.abs(rendered - stored).max() <= 1
 
 
+def test_a_run_is_found_below_the_home_of_the_user(run: minislam.Run, monkeypatch):
+    monkeypatch.setenv("HOME", str(run.folder.path.parent))
+    assert minislam.load(f"~/{run.folder.path.name}").folder.path == run.folder.path
+
+
 def test_depth_is_that_of_the_surface_and_a_camera_can_be_given(run: minislam.Run):
     pose = run.poses[run.keyframes[0]]
     depth = run.render_depth(pose)

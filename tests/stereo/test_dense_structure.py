@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.memory import Shelf
 from minislam.records import Keyframe
 from minislam.stereo import dense_structure
 from minislam.stereo.dense_structure import (
@@ -186,7 +185,7 @@ def test_swept_depth_comes_first_and_a_prior_of_another_scale_fills_the_rest():
     guesses = [1.3 * depth + (depth == 0) * 7.0 for depth, _ in swept]  # of a network, all known
     keyframes = [keyframe(8 + 8 * k, guess) for k, guess in enumerate(guesses)]
     for found_there, (depth, _) in zip(
-        with_swept_depth(camera(), keyframes, swept, Shelf()), swept, strict=True
+        with_swept_depth(camera(), keyframes, swept), swept, strict=True
     ):
         known = depth > 0
         assert 0 < float(known.float().mean()) < 1
@@ -202,7 +201,7 @@ def test_swept_depth_comes_first_and_a_prior_of_another_scale_fills_the_rest():
 def test_where_nothing_was_swept_the_prior_stays_as_it_is():
     guess = torch.full(SIZE[::-1], 7.0)
     guess[0] = 0  # and an unknown depth stays unknown
-    [after] = with_swept_depth(camera(), [keyframe(8, guess)], [(0 * guess, 0 * guess)], Shelf())
+    [after] = with_swept_depth(camera(), [keyframe(8, guess)], [(0 * guess, 0 * guess)])
     assert torch.equal(after.depth, guess)
 
 
@@ -213,6 +212,6 @@ def test_a_guess_that_other_keyframes_look_through_is_left_out():
     keyframes = [keyframe(8, depth) for depth in (unknown, guess, unknown)]
     seen = wall, torch.ones_like(wall)
     swept = [seen, (unknown, unknown), seen]  # all three from one place
-    _, after, _ = with_swept_depth(camera(), keyframes, swept, Shelf())
+    _, after, _ = with_swept_depth(camera(), keyframes, swept)
     inside = after.depth[2:-2, 2:-2]
     assert not inside[:, :76].any() and (inside[:, 78:] == 4).all()

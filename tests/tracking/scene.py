@@ -30,6 +30,11 @@ def normal_equations(problem: BundleProblem, state: BundleState):
     return bundle_adjustment._normal_equations(problem, state, [])
 
 
+def pose_equations(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
+    """Return H and g of the poses."""
+    return bundle_adjustment._assemble_poses(problem, *normal_equations(problem, state).of_edges)
+
+
 def normal(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
 

@@ -1,9 +1,14 @@
 """Links of the keyframe graph on exact flow: what is linked, and what is confirmed."""
 
+from copy import deepcopy
+
 import pytest
 
+from minislam import memory
+from minislam.memory import SHELF
 from minislam.tracking import keyframe_graph
 from minislam.tracking.config import TrackingConfig
+from minislam.tracking.frame_graph import FrameGraph
 from tests.tracking.wall import TrueFlow, true_graph
 
 # What is refused
@@ -46,3 +51,16 @@ def test_many_links_are_measured_in_parts_as_all_at_once(monkeypatch: pytest.Mon
     assert all(a.equal(b) for a, b in pairs)
     assert parted.parallaxes(sources, targets).equal(parallaxes)
     assert parted.filter_confirmed(edges) == confirmed == edges
+
+
+def test_the_flow_of_links_lies_on_the_shelf_also_when_it_is_restored(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(memory, "SMALLEST", 1)
+    graph = true_graph([0, 1, 2])
+    graph.match([(0, 1), (1, 0), (1, 2)])
+    again = FrameGraph()
+    again.restore_state(deepcopy(graph.links.saved_state()), lambda index: None)
+    for links in (graph.links, again):
+        assert all(map(SHELF.holds, (*links.targets, *links.confidences)))
+    assert all(a.equal(b) for a, b in zip(again.targets, graph.links.targets, strict=True))

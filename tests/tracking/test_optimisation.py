@@ -19,6 +19,8 @@ from minislam.tracking.optimisation import (
     local_ba,
     typical_residual,
 )
+from minislam.tracking.safeguards import parts
+from minislam.tracking.safeguards.parts import in_parts
 from minislam.tracking.safeguards.robust import RobustKernel
 from tests.tracking.scene import CAMERA, assert_same_bits
 from tests.tracking.wall import true_graph, true_poses
@@ -69,8 +71,8 @@ def test_weights_are_the_same_however_many_links_are_weighed_at_once(monkeypatch
     graph.keyframes.static_weights[2] = torch.linspace(0, 1, len(graph.grid.rays))
     whole = bundle_problem(graph, range(len(graph.links)), first_free=0)
     monkeypatch.setattr(optimisation, "AT_ONCE", 3)
-    parts = bundle_problem(graph, range(len(graph.links)), first_free=0)
-    assert torch.equal(parts.weights, whole.weights)
+    split = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    assert torch.equal(split.weights, whole.weights)
 
 
 def test_the_typical_residual_is_that_of_the_cells_that_weigh():
@@ -84,6 +86,17 @@ def test_the_typical_residual_is_that_of_the_cells_that_weigh():
     assert typical_residual(problem, graph.state) == pytest.approx(0.5, abs=1e-3)
     problem.weights.zero_()
     assert typical_residual(problem, graph.state) is None
+
+
+def test_the_typical_residual_of_links_in_parts_is_that_of_all(monkeypatch: pytest.MonkeyPatch):
+    graph = matched()
+    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    noise = torch.randn(problem.targets.shape, generator=torch.Generator().manual_seed(0))
+    problem = replace(problem, targets=problem.targets + noise)
+    whole = typical_residual(problem, graph.state)
+    monkeypatch.setattr(parts, "CELLS_AT_ONCE", 1)
+    assert len(list(in_parts(problem))) == 4
+    assert typical_residual(problem, graph.state) == whole
 
 
 def test_the_first_pose_never_moves_and_older_keyframes_stay():

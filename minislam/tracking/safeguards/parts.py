@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from minislam.memory import Shelf, give_back_freed
+from minislam.memory import Shelf, give_back_freed, release
 
 if TYPE_CHECKING:
     from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
@@ -45,7 +45,7 @@ class SourceBlocks:
         for block in self._blocks:
             yield block
             if self._shelf:
-                self._shelf.release()
+                release()
 
     def _tidy(self) -> None:
         if self._shelf:  # linearising thousands of edges in parts leaves hundreds of MB of holes
@@ -61,8 +61,11 @@ def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"
     number = ((counts - 1) * len(problem.rays) // CELLS_AT_ONCE)[problem.edges_source]
     for part in number.unique():
         edges = (number == part).nonzero()[:, 0]
-        is_whole = len(edges) == len(number)
-        yield edges, problem if is_whole else replace(problem, **_chosen(problem, _OF_EDGES, edges))
+        if len(edges) == len(number):
+            yield edges, problem
+        else:
+            yield edges, replace(problem, **_chosen(problem, _OF_EDGES, edges))
+            release()
 
 
 def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:

@@ -24,11 +24,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from minislam.memory import SHELF
 from minislam.priors.dense_flow import dense_from_grid, grayscale, residual_flow, warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.state.stateful import Stateful
-from minislam.tracking.frame_graph import FrameGraph
+from minislam.tracking.frame_graph import AT_ONCE, FrameGraph
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reprojection import Linearisation
@@ -148,13 +149,16 @@ class RollingShutter(Stateful):
         """Make the readouts longer, at most a frame's time, and correct the flow of all links."""
         if not any(seconds):
             return
-        targets = torch.stack(self._links.targets)
-        columns = self.columns(self._links.edges, targets)
         before, longest = self.readout, self.motion.shortest_step
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
-        moved = displacements(columns, self.readout) - displacements(columns, before)
-        self._links.targets = list(targets + moved)
+        edges, links = self._links.edges, self._links.targets
+        for part in (slice(first, first + AT_ONCE) for first in range(0, len(links), AT_ONCE)):
+            targets = torch.stack(links[part])
+            columns = self.columns(edges[part], targets)
+            moved = displacements(columns, self.readout) - displacements(columns, before)
+            links[part] = targets + moved
+            SHELF.put(links[part])
 
     def undone(self, frame: Frame) -> Frame:
         """Return a frame as a global shutter would have seen it."""
