@@ -91,7 +91,7 @@ class Run:
     @property
     def results(self) -> list[np.ndarray]:
         slam, poses = self.slam, self.slam.trajectory().T_world_camera
-        gaussians = list(slam.mapper.gaussians.to_arrays().values())
+        gaussians = [t.cpu().numpy() for t in vars(slam.mapper.gaussians).values()]
         return [poses, *gaussians, slam.render(poses[0]), slam.beta_image(0)]
 
 

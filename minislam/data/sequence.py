@@ -75,8 +75,7 @@ class RecordedSequence:
         picture = picture_window(recording.images.brightest())
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
-        how = options.size, options.pixels, picture
-        self.prepare = ImagePreparation(camera, distortion, *how)
+        self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels, picture)
         self.name = recording.name
         self.camera = self.prepare.camera
         self.preparation = self.prepare.steps

@@ -120,5 +120,5 @@ class Camera:
 
 
 def pixel_scale(camera: Camera) -> float:
-    """Return how many pixels are as much as one of a 320x240 image, of which thresholds speak."""
+    """Return how many px equal one of a 320x240 image, for which thresholds in px are given."""
     return math.hypot(camera.width, camera.height) / REFERENCE_DIAGONAL

@@ -93,8 +93,8 @@ class Mapper(JointOptimisation):
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all keyframes, the last part at full image size.
 
-        Half way, what is now known to move is excluded; at the end, what nothing static shows. A
-        resumed run goes on after what is done.
+        Half way, what is now known to move is excluded; at the end, Gaussians that no static pixel
+        shows are removed. A resumed run goes on after what is done.
         """
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full

@@ -84,6 +84,7 @@ class JointOptimisation(Stateful):
 
     @property
     def _online_camera(self) -> Camera:
+        """Return the camera of images of `image_scale`: all online, most in the refinement."""
         sides = (self.camera.width, self.camera.height)
         return self.camera.resized(*(max(1, round(self.config.image_scale * s)) for s in sides))
 

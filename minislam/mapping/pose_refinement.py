@@ -1,7 +1,7 @@
 """Refine a pose by re-rendering: move the camera until the map looks like its image (supplement).
 
 The official code lets Adam descend along the pose gradient, 100 renderings per frame. Here the
-same gradient is divided by the curvature of the loss, and two or three steps suffice. Only the
+same gradient is divided by the curvature of the loss, and a few steps suffice. Only the
 gradient must be exact, because it defines the minimum; the curvature sets the length of a step.
 """
 
@@ -71,8 +71,7 @@ def rerendering_loss(
     The opacity is a constant, as in the official code. With its gradient the camera would turn to
     where the map is empty, because the loss is 0 there.
     """
-    residual = rendering.color - image
-    absolute = (residual.square() + ROUNDING**2).sqrt().mean(-1)
+    absolute = ((rendering.color - image).square() + ROUNDING**2).sqrt().mean(-1)
     return (weight * rendering.opacity.detach() * absolute).mean()
 
 

@@ -103,8 +103,7 @@ def view_gradients(
     rendering = render(gaussians, camera, T_camera_world, background, screen_offsets=offsets)
     if view.exposure is not None:  # as the camera shows it, at most white
         rendering = rendering._replace(color=(rendering.color * view.exposure).clamp_max(1))
-    reference = view.image, view.depth, weight, median_depth, config
-    loss = render_loss(gaussians, rendering, *reference)
+    loss = render_loss(gaussians, rendering, view.image, view.depth, weight, median_depth, config)
     *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.weight_sums, camera)

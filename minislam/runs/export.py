@@ -102,8 +102,7 @@ def static_mask(run: Run, frame: int, camera: Camera) -> np.ndarray:  # (H, W) u
     """Return where a frame is static, for another image size of the same view."""
     beta = sample(run.beta(frame), _working_pixels(run, camera))
     raw = torch.from_numpy(np.asarray(beta, np.float32))
-    weight = mapping_weight(raw, camera, run.least_weight)
-    return np.where(weight > 0, 255, 0).astype(np.uint8)
+    return np.where(mapping_weight(raw, camera, run.least_weight) > 0, 255, 0).astype(np.uint8)
 
 
 def _write_images(run: Run, folder: Path, frames: Iterable[int]) -> tuple[Camera, list[int]]:

@@ -172,8 +172,7 @@ def _write_keyframes(
         pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
         pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
         for kind, picture in pictures.items():
-            name = f"{KEYFRAMES}/{frame_index:06d}_{kind}.png"
-            folder.write_picture(name, encode_png(picture))
+            folder.write_picture(f"{KEYFRAMES}/{frame_index:06d}_{kind}.png", encode_png(picture))
         if number in shown:
             jpegs[frame_index] = [encode_jpeg(p, LONGEST_SIDE) for p in pictures.values()]
     return jpegs, of_depth, of_beta

@@ -209,8 +209,8 @@ def _write_trajectories(folder: RunFolder, slam: Slam) -> None:
 
 def _write_estimates(folder: RunFolder, slam: Slam) -> None:
     _write_trajectories(folder, slam)
-    arrays = slam.mapper.gaussians.to_arrays()
-    arrays.pop("anchor_keyframe")
-    atomic_write(folder.path / names.MAP, encode_ply(GaussianArrays(**arrays)))
+    parameters = slam.mapper.gaussians.parameters.items()
+    arrays = GaussianArrays(**{name: values.cpu().numpy() for name, values in parameters})
+    atomic_write(folder.path / names.MAP, encode_ply(arrays))
     folder.write_mlp(slam.mapper.mlp.state_dict())
     write_json(folder.path / names.CAMERA, scene_of(slam))

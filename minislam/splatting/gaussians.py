@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.errors import InputError
-from minislam.parameters import parameter
 from minislam.state.stateful import FrameOf, Stateful, Tree
 
 ROWS = [(3,), (4,), (3,), (), (3,), ()]  # shape of a Gaussian's row in each tensor of a map
@@ -70,10 +68,6 @@ class GaussianMap:
         """Return the same values cut from any graph."""
         return GaussianMap(*(tensor.detach() for tensor in vars(self).values()))
 
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return copies of all six tensors as numpy arrays, by name."""
-        return {name: t.detach().cpu().numpy().copy() for name, t in vars(self).items()}
-
 
 @dataclass(frozen=True)
 class LearningRates:
@@ -83,11 +77,11 @@ class LearningRates:
     Its colours are c = 0.28209 f + 0.5 with a step of 2.5e-3 for f; ours is the step of c.
     """
 
-    means: float = parameter(9.6e-4, "step of the means [world units per iteration]")
-    quats_wxyz: float = parameter(1e-3, "step of the quaternions [per iteration]")
-    log_scales: float = parameter(6e-3, "step of the log-scales [per iteration]")
-    opacity_logits: float = parameter(5e-2, "step of the opacity logits [per iteration]")
-    colors: float = parameter(7.05e-4, "step of the colours [per iteration]")
+    means: float = 9.6e-4  # world units
+    quats_wxyz: float = 1e-3
+    log_scales: float = 6e-3
+    opacity_logits: float = 5e-2
+    colors: float = 7.05e-4
 
 
 class MapOptimizer(Stateful):

@@ -28,7 +28,7 @@ BETWEEN = 2  # most frames between two keyframes that are swept as well
 RESTING = 8  # but at least one of so many: a camera at rest makes no keyframes
 VOTERS = 6  # swept frames on either side that vote
 DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the sparse structure [-]
-LARGEST_QUANTILE = 0.98
+LARGEST_QUANTILE = 0.98  # of the inverse depths: the few beyond it are taken for outliers [-]
 PLANES = (48, 96)  # fewest and most
 FARTHEST = 0.5  # planes: what matches farther away, even at infinity, is put here
 LEAST_COMMON = 100  # px that have both depths; with fewer their scales are not compared
@@ -49,8 +49,9 @@ def with_swept_depth(
     judging: dict[int, votes.SweptView] = {}
 
     def view(keyframe: Keyframe, depth: Tensor, cost: np.ndarray) -> votes.SweptView:
-        pose = keyframe.T_camera_world.cpu().numpy()
-        return votes.SweptView(_inverse(_nearest(depth, small)), cost, 0.0, pose)
+        pose, known = keyframe.T_camera_world.cpu().numpy(), _nearest(depth, small)
+        inverse_depth = np.where(known > 0, 1 / np.maximum(known, 1e-6), np.nan)
+        return votes.SweptView(inverse_depth, cost, 0.0, pose)
 
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
         SHELF.put([depth])
@@ -87,11 +88,6 @@ def _nearest(image: Tensor, camera: Camera) -> np.ndarray:
     """Return the nearest pixels of an image (H, W) at the size of a camera."""
     size = camera.width, camera.height
     return cv2.resize(image.cpu().numpy(), size, None, 0, 0, cv2.INTER_NEAREST_EXACT)
-
-
-def _inverse(depth: np.ndarray) -> np.ndarray:
-    """Return the inverse of a depth, nan where unknown."""
-    return np.where(depth > 0, 1 / np.maximum(depth, 1e-6), np.nan)
 
 
 def _small(camera: Camera, width: int) -> Camera:
@@ -199,7 +195,7 @@ class SweepPlanner:
     def _views(self, frame: int, inverse_depth: float) -> dict[int, float]:
         """Choose the frames to sweep against, spread evenly over those of moderate parallax.
 
-        Each comes with its distance [world unit].
+        If fewer than two are, the nearest in time. Each comes with its distance [world unit].
         """
         here, near = self._centres[frame], [k for k in self._poses if 0 < abs(k - frame) <= REACH]
         distances = {k: float(np.linalg.norm(here - self._centres[k])) for k in near}

@@ -87,7 +87,7 @@ def _levels(
 
 
 def with_exposure(frame: Shot, exposures: dict[int, Tensor]) -> Shot:
-    """Return a frame exposed as between the nearest frames whose exposures are known."""
+    """Return a frame with its exposure, interpolated between the nearest known ones in time."""
     if not exposures:
         return frame
     levels = torch.stack(list(exposures.values())).log()

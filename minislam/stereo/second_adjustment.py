@@ -35,9 +35,9 @@ def adjust_again(
     on_progress: Callable[[str], Progress | None] = lambda stage: None,
     workers: Workers | None = None,  # sweep side by side
 ) -> None:
-    """Adjust the keyframes on what sweeps confirm, and judge them; lost frames are told later.
+    """Adjust the keyframes on what sweeps confirm, and judge them.
 
-    Frames between keyframes are posed and swept as well, to vote.
+    Frames between keyframes are posed and swept as well, to vote. None is called lost here.
     """
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
@@ -109,9 +109,7 @@ def adjust_confirmed(
     keyframes, stride = graph.keyframes, graph.grid.stride
     cells = [torch.stack(images)[:, ::stride, ::stride].flatten(1) for images in swept]
     depth, confirmation = torch.stack(cells, 1)
-    weights = keyframes.static_weights * confirmation.clamp_min(UNCONFIRMED_WEIGHT)
-    for index, weight in enumerate(weights):
-        keyframes.set_static_weight(index, weight)
+    keyframes.static_weights *= confirmation.clamp_min(UNCONFIRMED_WEIGHT)
     disparities = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), keyframes.disparities)
     keyframes.set_geometry(keyframes.T_camera_world, disparities)
     final_global_ba(graph, progress)

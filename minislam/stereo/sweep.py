@@ -125,7 +125,7 @@ def _mean_of_better_half(
     half = np.maximum((number + 1) // 2, 1)
     rest = [np.where(s, cost, np.float32(2)) for cost, s in zip(costs, seen, strict=True)]
     total = np.zeros_like(rest[0])
-    for rank in range((len(costs) + 1) // 2):
+    for rank in range((len(costs) + 1) // 2):  # each pass takes the lowest cost of each pixel out
         lowest = rest.pop()
         for view, cost in enumerate(rest):
             lowest, rest[view] = np.minimum(lowest, cost), np.maximum(lowest, cost)

@@ -44,7 +44,7 @@ class ConfirmedDepth:
 
 
 def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> ConfirmedDepth:
-    """Keep the depths of a view on which enough other views agree."""
+    """Keep the depths of a view on which enough other views agree, and which few refute."""
     agreeing, refuting = count_votes(camera, view, others)
     needed = min(MIN_AGREEING, len(others))
     known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)

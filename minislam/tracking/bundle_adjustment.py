@@ -161,15 +161,14 @@ def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) fl
     return joined((at.edges, at.costs) for at in _linearised(problem, state))[0]
 
 
-def _prior_cost(problem: BundleProblem, state: BundleState) -> Tensor:  # () float64 px^2
+def _cost(
+    problem: BundleProblem, state: BundleState, of_edges: list[Tensor] | None = None
+) -> float:
+    """Return the whole cost in px^2, Eq. (5); those of the edges, (E',) each, may be known."""
+    of_edges = of_edges or [at.costs for at in _linearised(problem, state)]
     difference = state.disparities - problem.prior_disparities
-    return (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
-
-
-def _cost(problem: BundleProblem, state: BundleState) -> float:
-    """Return the whole cost in px^2, Eq. (5)."""
-    costs = [at.costs for at in _linearised(problem, state)]
-    return float(torch.cat(costs).sum() + _prior_cost(problem, state))
+    prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
+    return float(torch.cat(of_edges).sum() + prior_cost)
 
 
 def _normal_equations(problem: BundleProblem, state: BundleState) -> _NormalEquations:
@@ -194,8 +193,7 @@ def _normal_equations(problem: BundleProblem, state: BundleState) -> _NormalEqua
         C.index_add_(0, source, (weighted_Jd * J_disparity).sum(1))
         s.index_add_(0, source, (weighted_Jd * residual).sum(1))
         blocks.add(_source_blocks(at.problem, E_target, E_source))
-    cost = float(torch.cat(costs).sum() + _prior_cost(problem, state))
-    return _NormalEquations(cost, joined(rows), C, s, blocks)
+    return _NormalEquations(_cost(problem, state, costs), joined(rows), C, s, blocks)
 
 
 def _pose_slots(problem: BundleProblem) -> Tensor:

@@ -56,7 +56,7 @@ def mask_priors(
         if index >= first:
             targets = dict.fromkeys(target for source, target in edges if source == index)
             others = [views[target] for target in targets if target in views]
-            keyframes.set_prior_mask(index, prior_mask(grid, view, others, config))
+            keyframes.prior_masks[index] = prior_mask(grid, view, others, config)
 
 
 def prior_mask(

@@ -4,6 +4,8 @@ The links of a new keyframe lead to its predecessors (neighbourhood) and, if the
 both directions, to older keyframes that see the same place (covisibility, by the flow distance).
 """
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -33,7 +35,7 @@ from minislam.tracking.pose_from_flow import (
     start_pose,
     warp_disparities,
 )
-from minislam.tracking.reprojection import mean_parallax, relative_transforms, reproject
+from minislam.tracking.reprojection import parallax, relative_transforms, reproject
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.tracking.safeguards.rolling_shutter import RollingShutter
 
@@ -139,7 +141,7 @@ class KeyframeGraph(Stateful):
 
     def fit_pose(
         self,
-        frame: Frame,  # no keyframe
+        frame: Frame,  # not among the keyframes
         around: list[int],  # keyframes that may show the same
         start: Tensor,  # (4, 4)
     ) -> tuple[Tensor, float]:
@@ -165,7 +167,8 @@ class KeyframeGraph(Stateful):
             matches = self.shutter.corrected(matches, edges, frame.frame_index)
             measured = *ends, matches.targets, matches.confidences * weights[:, None]
             problem = motion_only_problem(grid, *measured, numbers == count, robust)
-            if count == 1 and not self.is_learned:  # then it may follow a dynamic object
+            # One keyframe alone: a narrow robust weight may hold on to a dynamic object.
+            if count == 1 and not self.is_learned:
                 poses = known[0], list(state.T_camera_world[1:])
                 pose = start_pose(grid, matches, disparities[0], weights[0], *poses, self.robust)
                 state = BundleState(torch.cat([known, pose[None]]), disparities)
@@ -183,10 +186,8 @@ class KeyframeGraph(Stateful):
 
     def match(self, edges: list[Edge]) -> None:
         """Measure the flow of these edges, started from the present geometry, and store it."""
-        for part in at_once(edges):
-            self.links.record(part, self._flow_from_geometry(part))
-            if len(part) < len(edges):  # many edges leave as many holes
-                give_back_freed()
+        for part, matches in self._flow_from_geometry(edges):
+            self.links.record(part, matches)
 
     def match_composed(self, target: int) -> None:
         """Measure the flow between a keyframe and its predecessors, since the last loss.
@@ -207,26 +208,31 @@ class KeyframeGraph(Stateful):
         self.links.record(edges, self.shutter.corrected(matches, edges))
 
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
-        """Return those of these new edges whose flow is matched in both directions.
+        """Return those of these new edges, each with its reverse, that flow matches both ways.
 
         The flow of a far link starts from poses that may have drifted, and one wrong link can
         outweigh all right ones.
         """
         ratio: dict[Edge, float] = {}
-        for part in at_once(edges):
-            matches = self._flow_from_geometry(part)
+        for part, matches in self._flow_from_geometry(edges):
             ratio |= zip(part, matches.matched_ratios.tolist(), strict=True)
         least = self.config.min_link_ratio
         return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= least]
 
-    def _flow_from_geometry(self, edges: list[Edge]) -> FlowMatches:
-        """Return the flow of these edges, started from what the present geometry predicts."""
-        sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
-        predicted, _ = reproject(*self.geometry(sources, targets))
-        # Points near the camera plane project to anywhere; a flow started there finds nothing.
-        size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
-        predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
-        return self.shutter.corrected(self.flow.match(sources, targets, predicted), edges)
+    def _flow_from_geometry(self, edges: list[Edge]) -> Iterator[tuple[list[Edge], FlowMatches]]:
+        """Yield some of the edges and their flow, started from what the present geometry predicts.
+
+        Points near the camera plane project to anywhere; a flow started there finds nothing.
+        """
+        for part in at_once(edges):
+            sources, targets = ([edge[end] for edge in part] for end in (0, 1))
+            predicted, _ = reproject(*self.geometry(sources, targets))
+            size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
+            predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
+            matches = self.flow.match(sources, targets, predicted)
+            yield part, self.shutter.corrected(matches, part)
+            if len(part) < len(edges):
+                give_back_freed()  # many edges leave as many holes
 
     def neighbour_edges(self, keyframe: int) -> list[Edge]:
         """Return the edges to the predecessors since the camera was last lost."""
@@ -272,8 +278,11 @@ class KeyframeGraph(Stateful):
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""
-        parts = zip(at_once(sources), at_once(targets), strict=True)
-        return torch.cat([mean_parallax(*self.geometry(*part)) for part in parts])
+        means = []
+        for part in zip(at_once(sources), at_once(targets), strict=True):
+            shift, _, valid = parallax(*self.geometry(*part))
+            means.append((shift * valid).sum(1) / valid.sum(1).clamp_min(1))
+        return torch.cat(means)
 
     def geometry(
         self, sources: Tensor | list[int], targets: Tensor | list[int]

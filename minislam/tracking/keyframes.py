@@ -9,7 +9,7 @@ from minislam.state.stateful import FrameOf, Stateful, Tree
 
 
 class KeyframeStore(Stateful):
-    """All data of the tracker's keyframes. Only the methods of this class change the columns."""
+    """All data of the tracker's keyframes: every column has one row per keyframe."""
 
     frames: list[Frame]
     features: list[Tensor]  # (h', w', C); saved, because a network takes long to compute them
@@ -35,8 +35,8 @@ class KeyframeStore(Stateful):
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
         super().restore_state(state, frame_of)
-        for images in zip(self.frames, self.features, self.metric_depths, strict=True):
-            self._shelve(*images)
+        for frame, *images in zip(self.frames, self.features, self.metric_depths, strict=True):
+            SHELF.put([frame.pixels, *images])
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -62,7 +62,7 @@ class KeyframeStore(Stateful):
         prior_disparities: Tensor,  # (N,)
     ) -> None:
         """Add one keyframe. Every cell starts with weight one."""
-        self._shelve(frame, features, metric_depth)
+        SHELF.put([frame.pixels, features, metric_depth])
         give_back_freed()  # by the matching and adjusting of the keyframe before
         self.frames.append(frame)
         self.features.append(features)
@@ -75,9 +75,6 @@ class KeyframeStore(Stateful):
         self.static_weights = torch.cat([self.static_weights, ones])
         self.motion_weights = torch.cat([self.motion_weights, ones])
 
-    def _shelve(self, frame: Frame, features: Tensor, metric_depth: Tensor | None) -> None:
-        SHELF.put([frame.pixels, features, metric_depth])
-
     def remove_newest(self) -> None:
         """Forget the newest keyframe."""
         for column, rows in vars(self).items():
@@ -88,18 +85,6 @@ class KeyframeStore(Stateful):
         """Replace the poses (K, 4, 4) and disparities (K, N) of all keyframes."""
         self.T_camera_world = T_camera_world
         self.disparities = disparities
-
-    def set_prior_mask(self, index: int, mask: Tensor) -> None:
-        """Replace the mask M (N,) bool of a keyframe."""
-        self.prior_masks[index] = mask
-
-    def set_static_weight(self, index: int, weight: Tensor) -> None:
-        """Replace the static weight (N,) of a keyframe, after beta was predicted again."""
-        self.static_weights[index] = weight
-
-    def set_motion_weight(self, index: int, weight: Tensor) -> None:
-        """Replace the motion weight (N,) of a keyframe."""
-        self.motion_weights[index] = weight
 
     def start_from_prior(self) -> None:
         """Take the newest keyframe's prior for its disparities; the first prior gives the unit."""

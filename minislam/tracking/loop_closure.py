@@ -1,7 +1,8 @@
 """Loop closure: when the camera is back at a place, the drift since then is corrected.
 
 A loop is searched where the present geometry predicts it, as in the paper. Its flow must match in
-both directions, and the global BA must bring its residuals down; otherwise the BA is undone.
+both directions. If it fits already, it waits for the next adjustment of all keyframes. Else that
+follows at once; a loop that does not fit afterwards is removed, and the adjustment is undone.
 """
 
 import torch
@@ -14,7 +15,7 @@ from minislam.tracking.optimisation import FIRST_WIDENING, adjust, bundle_proble
 from minislam.tracking.reprojection import lengths
 
 LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code
-FITTING_LOOP_RESIDUAL = 1.5  # px at 320x240: hardly anything has drifted (measured: .1 to 4)
+FITTING_LOOP_RESIDUAL = 1.5  # px at 320x240: a loop that is better fits already (RESULTS.md, Loops)
 MAX_LOOP_RESIDUAL = 3.0  # px at 320x240: a loop that stays worse than this is undone
 
 

@@ -31,8 +31,8 @@ FEW_KEYFRAMES = 100  # so few are not worth a selection
 def local_ba(graph: KeyframeGraph) -> None:
     """Link the newest keyframe, then adjust the newest `window` keyframes together.
 
-    First comes a BA on flow that was found without its pose, because that pose may be wrong. Then
-    further edges are added, and flow and BA take turns.
+    Its pose may be wrong. So a classical flow is measured without that pose first, and adjusted on.
+    Then further edges are added, and flow and BA take turns.
     """
     config, newest = graph.config, len(graph.keyframes) - 1
     first_free = max(0, newest + 1 - config.window)

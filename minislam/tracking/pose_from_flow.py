@@ -53,8 +53,7 @@ def motion_only_problem(
     robust: RobustKernel | None,
 ) -> BundleProblem:
     """Return a bundle problem in which only poses move: disparities held, no prior."""
-    count = len(free_poses)
-    no_prior = grid.rays.new_zeros(count, len(grid.rays))
+    no_prior = grid.rays.new_zeros(len(free_poses), len(grid.rays))
     return BundleProblem(
         camera=grid.camera, rays=grid.rays,
         edges_source=edges_source, edges_target=edges_target, targets=targets, weights=weights,
@@ -100,7 +99,8 @@ def warp_disparities(
 ) -> Tensor:  # (N,) of the target
     """Warp the disparities (N,) of a source to the target.
 
-    A cell that no point reaches takes the nearest cell's value; disparity zero is not warped.
+    A cell that no point reaches takes the nearest cell's value; if points reach none, all cells
+    take the median. Disparity zero is not warped.
     """
     warped = splat_disparities(grid, T_target_source, disparities).reshape(grid.shape)
     if not warped.any():

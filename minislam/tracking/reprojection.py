@@ -71,7 +71,7 @@ def reproject(
 
 
 def lengths(vectors: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) px
-    """Return the lengths of image vectors; norm(dim=1) would take three hundred times as long."""
+    """Return the lengths of image vectors; norm(dim=1) would be many times slower."""
     return torch.hypot(vectors[:, 0], vectors[:, 1])
 
 
@@ -88,18 +88,6 @@ def parallax(
     turned, still_seen = reproject(T_target_source, torch.zeros_like(disparities), rays, camera)
     positions, valid = reproject(T_target_source, disparities, rays, camera)
     return lengths(positions - turned), positions, valid & still_seen
-
-
-def mean_parallax(
-    T_target_source: Tensor,  # (E, 4, 4)
-    disparities: Tensor,  # (E, N)
-    rays: Tensor,  # (N, 3)
-    camera: Camera,
-) -> Tensor:  # (E,) px
-    """Return the mean parallax of each edge."""
-    shift, _, valid = parallax(T_target_source, disparities, rays, camera)
-    counted = valid.to(shift.dtype)
-    return (shift * counted).sum(1) / counted.sum(1).clamp_min(1)
 
 
 def reproject_with_jacobians(
@@ -123,5 +111,4 @@ def reproject_with_jacobians(
     J_u = camera.fx * (tx - tz * ray_x) * inverse_z
     J_v = camera.fy * (ty - tz * ray_y) * inverse_z
     positions = torch.stack([camera.fx * ray_x + camera.cx, camera.fy * ray_y + camera.cy], 1)
-    J_disparity = torch.stack([J_u, J_v], 1)
-    return Linearisation(positions, valid, J_target, J_disparity)
+    return Linearisation(positions, valid, J_target, torch.stack([J_u, J_v], 1))

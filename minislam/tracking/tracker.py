@@ -37,8 +37,8 @@ from minislam.tracking.safeguards.turns import adjust_turns
 from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
-LONGEST_TAIL = 2  # frames after the last keyframe
-LEAST_GROWTH = 5  # online all keyframes are adjusted again once a fifth of them is new
+LONGEST_TAIL = 2  # frames after the last keyframe that need none behind them
+GROWTH_SHARE = 5  # online all keyframes are adjusted again once one in so many is new
 
 
 class Mode(Enum):
@@ -125,7 +125,7 @@ class Tracker(Stateful):
         return len(self.keyframes) > count
 
     def end(self) -> None:
-        """Make the last frame a keyframe, unless it follows one closely: poses lie between two."""
+        """End with a keyframe, unless the last one is near: other frames are posed between two."""
         if self.last_non_keyframe is not None:
             last = self.last_non_keyframe[0].frame_index
             if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:
@@ -178,8 +178,7 @@ class Tracker(Stateful):
         matches = self.graph.shutter.corrected(matches, [edge], frame.frame_index)
         if self.initialised:  # before, initialise() will estimate all poses together
             information = self._settling.information()
-            trust = self._settling.certainty(information)
-            pose = self.graph.start_pose(matches, trust)
+            pose = self.graph.start_pose(matches, self._settling.certainty(information))
             if self.graph.is_learned:
                 pose, _ = self.graph.fit_pose(frame, [len(self.keyframes) - 1], pose)
             disparities = self._settling.hand_on(information, pose)
@@ -198,8 +197,7 @@ class Tracker(Stateful):
     def _add_keyframe(
         self, frame: Frame, features: Tensor, pose: Tensor, disparities: Tensor
     ) -> None:
-        metric_depth = self._depth_prior(frame)
-        self.graph.append(frame, features, metric_depth, pose, disparities)
+        self.graph.append(frame, features, self._depth_prior(frame), pose, disparities)
         if self.initialised:
             self._update_static_weights(first=len(self.keyframes) - 1)
 
@@ -207,7 +205,7 @@ class Tracker(Stateful):
         """Close loops; run online global BA if `global_interval` keyframes and a fifth are new."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
-        least = max(config.global_interval, count // LEAST_GROWTH)
+        least = max(config.global_interval, count // GROWTH_SHARE)
         is_due = config.global_interval > 0 and count - self._last_global >= least
         if is_due and not closed:
             seek_readouts(self.graph)
@@ -286,6 +284,5 @@ class Tracker(Stateful):
     def _update_static_weights(self, first: int = 0) -> None:
         """Predict the static weights of the keyframes from `first` on, by the present beta."""
         for index in range(first, len(self.keyframes)):
-            weight = self._predict_static_weight(index)
-            self.keyframes.set_static_weight(index, weight.reshape(-1))
+            self.keyframes.static_weights[index] = self._predict_static_weight(index).reshape(-1)
             release()  # its features

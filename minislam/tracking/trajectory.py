@@ -19,9 +19,9 @@ def pose_all_frames(
 ) -> dict[int, Tensor]:
     """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
 
-    A keyframe keeps its pose. Another frame starts from the interpolated pose and is adjusted on
-    the flow from the keyframes around it; with little support it starts again from its neighbours,
-    and a frame that stays without support is lost.
+    A keyframe keeps its pose; an image that repeats the one before takes its pose. Another frame
+    starts from the interpolated pose and is adjusted on the flow from the keyframes around it; with
+    little support it starts again from its neighbours, and is lost if it stays without support.
     """
     graph, frames = tracker.graph, tracker.keyframes.frames
     poses = tracker.keyframes.T_camera_world
@@ -48,7 +48,7 @@ def pose_all_frames(
 
 
 def _around(graph: KeyframeGraph, tracked: TrackedFrame) -> list[int]:
-    """Return the keyframes before and after a frame; one, if the camera was lost between them."""
+    """Return the keyframes before and after a frame; one after the last, or before a loss."""
     frames = graph.keyframes.frames
     following = sum(frame.frame_index < tracked.frame_index for frame in frames)
     is_between = following < len(frames) and not graph.follows_a_loss(following)

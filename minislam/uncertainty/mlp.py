@@ -49,7 +49,7 @@ class UncertaintyMLP(nn.Module):
 
     def _dropout_mask(self, hidden: Tensor, generator: torch.Generator) -> Tensor:
         """Return 0 for dropped units and 1 / (1 - p) for the others, so that the mean stays."""
-        # A byte for each unit, because bytes are drawn five times as fast as floats: p is n / 256.
+        # A byte for each unit, because bytes are drawn faster than floats: p is n / 256.
         dropped, eights = round(256 * self.dropout), (-(-hidden.numel() // 8),)
         # Drawn on the generator's device, so that every device drops the same units.
         place, ends = generator.device, (-(2**63), 2**63 - 1)

@@ -113,7 +113,7 @@ class UncertaintyTrainer(Stateful):
 
     @torch.no_grad()
     def _descend(self, gradients: tuple[Tensor, ...], rate: float) -> None:
-        """Take a step of Adam. Not torch.optim.Adam: that loads a compiler, 2.4 s and 72 MB."""
+        """Take a step of Adam. Not torch.optim.Adam: that loads torch's compiler, 72 MB."""
         self._steps += 1
         rate, norm = rate / (1 - DECAYS[0] ** self._steps), math.sqrt(1 - DECAYS[1] ** self._steps)
         moved = zip(self.mlp.parameters(), gradients, self._first, self._second, strict=True)

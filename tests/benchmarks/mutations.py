@@ -244,7 +244,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("A[-tiles:], gains", "A[:tiles], gains"),
     ],
     ("tracking/bundle_adjustment.py", "tracking/safeguards/test_parts.py"): [
-        ("known or edges", "known"),
+        ("_cost(problem, state, costs)", "_cost(problem, state, costs[:1])"),
         ("if slots[source] >= 0 else []", "if True else []"),
     ],
     ("stereo/votes.py", "stereo/test_votes.py"): [

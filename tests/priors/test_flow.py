@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from minislam import memory
 from minislam.geometry import Camera
-from minislam.memory import Shelf
+from minislam.memory import SHELF
 from minislam.priors import flow as flow_module
 from minislam.priors.dense_flow import (
     composed_flow,
@@ -228,9 +229,13 @@ def test_a_forgotten_keyframe_cannot_be_matched():
 
 
 def test_what_was_read_of_old_flow_is_released_after_every_match(monkeypatch: pytest.MonkeyPatch):
-    released: list[Shelf] = []
+    monkeypatch.setattr(memory, "SMALLEST", 1)
+    released: list[None] = []
     flow = flow_of([shifted(0, 0, SIZE), shifted(2, 0, SIZE)])
     flow.match([0, 1], [1, 0], still(2))
-    monkeypatch.setattr(Shelf, "release", lambda shelf: released.append(shelf))
+    monkeypatch.setattr("minislam.priors.flow.release", lambda: released.append(None))
     flow.match([0, 1], [1, 0], still(2))  # nothing is measured anew
-    assert released == [flow._shelf]
+    assert len(released) == 1
+    places = [part.ctypes.data for part in flow._measured[0, 1]]
+    assert all(SHELF.holds(torch.from_numpy(part)) for part in flow._measured[0, 1])
+    assert places == sorted(places) and places[2] - places[0] < 4 * 5 * flow._measured[0, 1][2].size

@@ -51,7 +51,7 @@ def test_what_moves_has_no_say():
         graph.keyframes.frames[index] = replace(frame, pixels=dark)
         static = torch.ones(graph.grid.shape)
         static[:, : graph.grid.shape[1] // 2 + 2] = 0
-        graph.keyframes.set_static_weight(index, static.reshape(-1))
+        graph.keyframes.static_weights[index] = static.reshape(-1)
     torch.testing.assert_close(factors(keyframe_exposures(graph)), FACTORS, rtol=0.02, atol=0)
 
 
@@ -69,13 +69,13 @@ def test_a_frame_between_keyframes_is_exposed_as_between_them():
 def test_links_of_little_weight_tell_as_much():
     graph = exposed_graph(FACTORS)
     for index in range(len(FRAMES)):
-        graph.keyframes.set_static_weight(index, torch.full_like(graph.grid.rays[:, 0], 0.02))
+        graph.keyframes.static_weights[index] = torch.full_like(graph.grid.rays[:, 0], 0.02)
     torch.testing.assert_close(factors(keyframe_exposures(graph)), FACTORS, rtol=0.01, atol=0)
 
 
 def test_chance_matches_tell_nothing():
     graph = exposed_graph(torch.tensor([1.0, 1.0, 1.0, 0.7])[:, None].expand(4, 3))
-    graph.keyframes.set_static_weight(3, torch.full_like(graph.grid.rays[:, 0], 0.001))
+    graph.keyframes.static_weights[3] = torch.full_like(graph.grid.rays[:, 0], 0.001)
     assert keyframe_exposures(graph) == {}
 
 

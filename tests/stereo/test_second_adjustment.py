@@ -78,7 +78,7 @@ def test_what_is_not_confirmed_no_longer_bends_the_poses():
 
 def test_confirmation_becomes_the_weight_and_swept_depth_the_start(monkeypatch):
     graph = linked_graph()
-    graph.keyframes.set_static_weight(1, torch.full_like(graph.keyframes.static_weights[1], 0.5))
+    graph.keyframes.static_weights[1] = torch.full_like(graph.keyframes.static_weights[1], 0.5)
     images = swept(graph)
     expected = graph.keyframes.disparities.clone()
     right = GRID.pixels[:, 0] >= HALF

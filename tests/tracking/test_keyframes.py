@@ -51,7 +51,7 @@ def test_poses_are_float64_and_cells_float32():
 
 def test_a_new_keyframe_has_full_weights_and_leaves_the_others_alone():
     store = filled(2)
-    store.set_static_weight(0, torch.full((CELLS,), 0.25))
+    store.static_weights[0] = torch.full((CELLS,), 0.25)
     frame = Frame(9, 1.0, torch.zeros(6, 8, 3))
     row = torch.ones(CELLS)
     store.append(frame, normal(0, 2, 2, 5), None, torch.eye(4), row, row)
@@ -60,8 +60,8 @@ def test_a_new_keyframe_has_full_weights_and_leaves_the_others_alone():
 
 def test_the_weight_of_a_cell_is_the_product_of_appearance_and_motion():
     store = filled(2)
-    store.set_static_weight(1, torch.full((CELLS,), 0.5))
-    store.set_motion_weight(1, torch.full((CELLS,), 0.25))
+    store.static_weights[1] = torch.full((CELLS,), 0.5)
+    store.motion_weights[1] = torch.full((CELLS,), 0.25)
     assert (store.cell_weights[0] == 1).all() and (store.cell_weights[1] == 0.125).all()
 
 

@@ -14,5 +14,5 @@ focal_length     estimates an unknown focal length, tells whether a given one wa
 focal_column     the focal length as one more unknown of the bundle adjustment
 lens             finds a lens that bends straight lines although no calibration says so
 scale_drift      undoes a drift of the scale that a depth prior tells
-rolling_shutter  the time to read an image as two more, and images as a global shutter sees them
+rolling_shutter  the time to read an image, as unknowns too; images as a global shutter sees them
 """

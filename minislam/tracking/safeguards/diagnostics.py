@@ -1,11 +1,11 @@
 """How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
 
 With a low matched ratio or little parallax the scale can drift while all residuals stay small.
-Where everything is matched, four measurements tell broken keyframes from healthy ones
-(tests/benchmarks/bench_broken.py has the table): a wrong pose does not explain the flow of the
-keyframes before it; after a wrong scale two keyframes see a thing at different depths; and where a
-large dynamic object takes the place of the scene, hardly anything that held the keyframes before
-holds this one, or what is left of it does not fit.
+Where everything is matched, four measurements tell broken keyframes from healthy ones (RESULTS.md,
+"Broken runs"): a wrong pose does not explain the flow of the keyframes before it; after a wrong
+scale two keyframes see a thing at different depths; and where a large dynamic object takes the
+place of the scene, hardly anything that held the keyframes before holds this one, or what is left
+of it does not fit.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_re
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
 # Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .88 to 1, two in a
-# row on fast real video .68 and .82; broken ones .3 to .4, the worse of many in a row .6 to .84.
+# row on fast real video .68 and .82; broken ones .24 to .4, the worst of many in a row .6 to .84.
 MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
 LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
@@ -105,7 +105,7 @@ class Watch(Stateful):
 
 
 def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
-    """Return the diagnostics of a keyframe by its links and by its predecessors."""
+    """Judge a keyframe by its links and by its predecessors."""
     frame_index = graph.keyframes.frames[keyframe].frame_index
     edges = graph.links.edges
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]
@@ -122,7 +122,8 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 
     First the part of the flow from there, of what was static so far, that the geometry explains
     [-]. Then the median relative difference of the depths that both ends of a link see, over cells
-    that count in the adjustment, near ones more: little tells how far the sky is. None: no link.
+    that count in the adjustment, near ones more: little tells how far the sky is. None: no link, or
+    no cell that both see.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
     edges = graph.links.edges
@@ -144,15 +145,15 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 
 
 def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
-    """Return what holds a keyframe and has held the one before it, too.
+    """Return continuity and agreement [-]: does what held the camera before hold this keyframe?
 
     A cell of a keyframe before this one is known if its flow to the next keyframe fits. Of the
     keyframe just before, the cells are known to which known ones flow: what comes into view is not.
 
-    First what is known, matched and fits this keyframe, in the best link into it, weighed by
-    motion, too: all that holds the pose, over all that the keyframe just before matches [-]. In a
-    fast turn both are small. Then how much of what is known and matched fits [-], in the worst
-    link, moving or not. None: a link is missing, or the camera was.
+    Continuity is what is known, matched and fits, weighed by motion, too, in the best link into
+    this keyframe, over all that the keyframe just before matches: in a fast turn both are small.
+    Agreement is the part that fits of what is known and matched, moving or not, in the worst link.
+    None: a link is missing, the camera was lost, or no link knows enough to agree.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
@@ -215,8 +216,8 @@ def is_unexplained(newest: KeyframeDiagnostics) -> bool:
 def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
-    One keyframe is a break if it explains very little, sees other depths or is held by
-    something new; LONG in a row are one if they explain a little too little.
+    One keyframe is a break if it explains very little, sees other depths, is held by something new
+    or contradicts what held before; LONG in a row are one if they explain a little too little.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little

@@ -28,6 +28,7 @@ class FirstFrame(Stateful):
             start, is_over = tracker.keyframes.frames[0].frame_index, len(tracked) == count
             followed = [t.frame_index for t in tracked[start:] if t.status.is_followed]
             worth, lost = (can_tell_depth(tracker), len(followed)), len(tracked) - 1 - followed[-1]
+            # Behind the last frame, the lost ones are tried if they may be worth more.
             if lost and (lost >= len(followed) or (is_over and (True, lost) > worth)):
                 if worth > self.worth:
                     self.best, self.worth = start, worth

@@ -2,13 +2,13 @@
 
 A focal length is estimated where it is unknown and checked where it is given.
 
-It is one more unknown of the bundle adjustment (focal_column.py), which converges from 0.7 to 1.4
+It is one more unknown of the bundle adjustment (focal_column.py), which converges from 0.75 to 1.3
 times the truth. A camera that does not turn fits its flow with any focal length. So an estimate
 counts only if the cost of the adjusted keyframes rises on both sides of it, and either rises much
 or is much lower than with the present focal length.
 
-If the lens zooms while it films, each half of the keyframes fits another focal length than the
-whole: where all say 1.04, the halves say 1.00 and 1.40.
+If the lens zooms while it films, a half of the keyframes fits another focal length than the whole:
+where all say 1.04, the second half says 1.40.
 """
 
 import math
@@ -30,11 +30,10 @@ MOST_KEYFRAMES = 100  # from the first on, that a check adjusts, dozens of times
 EVERY = 2  # cells of a check along each side: it adjusts so often, and few unknowns ask for few
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
-# Smallest mean rise of the cost. In six pieces of real video, two seconds each, the cost rose by
-# 1.3 % to 3.7 % and the estimate was right to 2.2 %; synthetic clips rise by 12 % and more. [-]
+# Smallest mean rise of the cost: with two seconds of real video it rose by 1.3 % and more where the
+# estimate was right, on synthetic clips by 12 % and more. [-]
 MIN_RISE = 0.012
-# A warning needs a larger difference, and a larger saving of cost, than was ever measured with
-# the right focal length (5.4 %, saving 1.3 %, in two seconds of real video). [-]
+# A warning needs both: a right focal length has looked 5.4 % off, but the other saved 1.3 %. [-]
 WORTH_SAYING, WORTH_SAVING = 0.05, 0.02
 # In warm-ups and whole runs of rolling shutters the readout saved 3 to 37 % of the cost, of clips
 # with a global shutter or with hardly any turn at most 1.2 %. [-]
@@ -128,8 +127,7 @@ def fit_focal_length(
 ) -> tuple[FocalLengthFit, BundleState]:
     """Return the focal length at which the adjusted cost is lowest, and the state there."""
     workers, free = workers or Workers(), replace(problem, free_focal=True)
-    pairs = (problem, state), (free, start or state)
-    starts = [(*pair, WIDENINGS, ITERATIONS) for pair in pairs]
+    starts = [(*pair, WIDENINGS, ITERATIONS) for pair in ((problem, state), (free, start or state))]
     (_, present), (found, best) = workers.map(adjust_narrowing, starts)
     for _ in range(MAX_TRIES):
         ends = [replace(found, log_focal=found.log_focal + step) for step in (-STEP, STEP)]
@@ -166,8 +164,7 @@ def seek_readouts(graph: KeyframeGraph) -> None:
         return
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
     problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
-    first_ones = range(min(MOST_KEYFRAMES, len(graph.keyframes)))
-    problem, start = _thinned(graph, problem, first_ones)
+    problem, start = _thinned(graph, problem, range(min(MOST_KEYFRAMES, len(graph.keyframes))))
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())

@@ -79,7 +79,7 @@ class BentLens(MinislamError):
 
 
 def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
-    """Return the lens that fits, None if there are too few keyframes. Raises `BentLens`."""
+    """Return the lens that fits; None: too few keyframes. `BentLens`: an unknown one bends much."""
     lens = fit_lens(graph)
     if is_unknown and lens is not None and lens.is_worth_undoing:
         if lens.focal > LEAST_FOCAL * graph.grid.camera.width:
@@ -123,15 +123,15 @@ def _without_fold(camera: Camera, radial: Radial, step: Radial) -> Radial:
 
 
 def straightened(problem: BundleProblem, radial: Radial) -> BundleProblem:
-    """Return the problem of the pinhole whose rays the lens has bent, what k lacks being free.
+    """Return the problem with rays and targets straightened; what k1 and k2 still lack is free.
 
     Where straightening spreads the image, errors of the flow spread with it and weigh less.
     """
     camera, dtype = problem.camera, problem.targets.dtype
     centre = problem.targets.new_tensor([[camera.cx], [camera.cy]])
     focal = problem.targets.new_tensor([[camera.fx], [camera.fy]])
-    source = ray_seen(problem.rays[:, :2].mT, radial)  # (2, N)
-    target = ray_seen((problem.targets - centre) / focal, radial)  # (E, 2, N)
+    source = true_rays(problem.rays[:, :2].mT, radial)  # (2, N)
+    target = true_rays((problem.targets - centre) / focal, radial)  # (E, 2, N)
     rays = torch.cat([source, torch.ones_like(source[:1])]).mT.to(dtype)
     columns = bends(camera, source, radial) - bends(camera, target, radial)
     positions = centre + focal * target
@@ -140,10 +140,9 @@ def straightened(problem: BundleProblem, radial: Radial) -> BundleProblem:
     return replace(problem, rays=rays, targets=targets, weights=weights, shutter=columns)
 
 
-def ray_seen(u: Tensor, radial: Radial) -> Tensor:  # (..., 2, N) float64
-    """Return the rays that the lens shows at the seen ones u (..., 2, N)."""
-    seen = u.double()
-    u = seen
+def true_rays(seen: Tensor, radial: Radial) -> Tensor:  # (..., 2, N) float64
+    """Return the true rays of what the lens shows in the directions `seen` (..., 2, N)."""
+    u = seen = seen.double()
     for _ in range(INVERSION_STEPS):
         u = seen / stretch(u, radial)
     return u
@@ -166,4 +165,4 @@ def bends(camera: Camera, u: Tensor, radial: Radial) -> Tensor:  # (..., 2, 2, N
 def bend_of(camera: Camera, radial: Radial) -> float:
     """Return how far the lens moves a corner of the image, over its distance from the centre."""
     corner = torch.tensor([[camera.cx / camera.fx], [camera.cy / camera.fy]], device="cpu")
-    return float(stretch(ray_seen(corner, radial), radial)) - 1
+    return float(stretch(true_rays(corner, radial), radial)) - 1

@@ -30,7 +30,7 @@ STANDS, MOVES = 0.3, 5.0  # px: flow of a cell that stands, median flow where th
 CONFIRMED = 0.2  # confidence of a flow that counts [-]
 ALWAYS = 0.8  # of the pairs in which a cell of an overlay stands [-]
 MIN_PAIRS = 2  # pairs of keyframes in which the camera moves; fewer tell nothing
-MIN_CELLS = 4
+MIN_CELLS = 4  # of an overlay; fewer stand still by chance
 REACH = 2  # cells around an overlay, whose flow is that of neither
 
 
@@ -39,7 +39,7 @@ def judge_all(graph: KeyframeGraph) -> None:
     keyframes = graph.keyframes
     for index, matches in enumerate([None, *graph.flow_to_next]):
         if matches is None:
-            keyframes.set_motion_weight(index, torch.ones_like(keyframes.disparities[index]))
+            keyframes.motion_weights[index] = 1
         else:
             remember(graph, matches, keyframes.T_camera_world[index], index - 1)
             inherit(graph, matches, index)
@@ -64,14 +64,13 @@ def remember(
     known = keyframes.disparities[index], motion, before, scale
     after = update_motion_weight(graph.grid, matches, *known)
     weight = after if settled is None else torch.where(settled, after, before)
-    keyframes.set_motion_weight(index, weight)
+    keyframes.motion_weights[index] = weight
 
 
 def inherit(graph: KeyframeGraph, matches: FlowMatches, index: int = -1) -> None:
     """Set the motion weights of a keyframe from those of the keyframe before it."""
-    before = graph.keyframes.motion_weights[index - 1]
-    weight = inherit_motion_weight(graph.grid, matches, before)
-    graph.keyframes.set_motion_weight(index, weight)
+    weights = graph.keyframes.motion_weights
+    weights[index] = inherit_motion_weight(graph.grid, matches, weights[index - 1])
 
 
 def update_motion_weight(
@@ -97,7 +96,8 @@ def update_motion_weight(
 def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> Tensor:  # (N,)
     """Return the motion weight of the target cells: that of the source cells that flow there.
 
-    Of several source cells the lowest weight counts; without any, that of the nearest cell.
+    Of several source cells the lowest weight counts. A target cell without any takes the weight of
+    the nearest one; if no flow arrives at all, every weight is 1.
     """
     inherited = _inherited(grid, matches, weight)
     if bool(inherited.isinf().all()):
@@ -106,14 +106,14 @@ def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> T
 
 
 def arrived(grid: Grid, matches: FlowMatches, marks: Tensor) -> Tensor:  # (N,) 0 or 1
-    """Return the marks of the target cells, 0 where no source cell flows to the 3 x 3 around."""
+    """Return the marks of the target cells; one without takes the largest of 3 x 3, or 0."""
     marked = _inherited(grid, matches, marks)
     marked[marked.isinf()] = -1
     beside = max_pool2d(marked[None, None], 3, 1, 1)[0, 0]
     return torch.where(marked < 0, beside.clamp_min(0), marked).reshape(-1)
 
 
-def _inherited(grid: Grid, matches: FlowMatches, values: Tensor) -> Tensor:  # (H, W), inf: none
+def _inherited(grid: Grid, matches: FlowMatches, values: Tensor) -> Tensor:  # (h, w), inf: none
     """Return the lowest value of the source cells that flow to each target cell."""
     cells = (matches.targets[0].mT / grid.stride).round().long()
     height, width = grid.shape

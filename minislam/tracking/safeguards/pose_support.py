@@ -18,8 +18,9 @@ from minislam.tracking.reprojection import lengths, relative_transforms, reproje
 # Support of a pose, relative to the median of all frames between keyframes: [-]
 DOUBTFUL_SUPPORT = 0.5  # with less, other starts are tried
 LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
-# Residuals of a flow that a pose explains: the first updates go a part of the way, but that way.
-EXPLAINED = 3.0, 0.25  # px at 320x240, and part of the flow
+# The largest residual of a flow that a pose explains: so many px at 320x240, plus this part of the
+# flow, because the first updates of a network fall short, but in the right direction.
+EXPLAINED = 3.0, 0.25
 CHANCE = 0.25  # of the weight of a random flow is explained as well; .95 and more of a good one [-]
 REPEATED = 0.001  # mean difference of an image from the one that it repeats, encoded again [-]
 

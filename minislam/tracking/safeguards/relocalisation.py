@@ -99,8 +99,7 @@ def _summary(features: Tensor) -> Tensor:  # (h', w', C) -> (C,)
 def _keypoints(image: Tensor) -> Keypoints:
     """Return SIFT positions (P, 2) [px] and descriptors (P, 128) of an image (H, W, 3)."""
     keypoints, descriptors = cv2.SIFT.create().detectAndCompute(grayscale(image), None)
-    positions = np.array([keypoint.pt for keypoint in keypoints], np.float32)
-    return positions.reshape(-1, 2), descriptors
+    return np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2), descriptors
 
 
 def _keypoint_matches(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.ndarray]:

@@ -72,7 +72,7 @@ class ImageMotion(Stateful):
         return torch.stack(around).mean(0) if around else torch.zeros_like(self._grid.pixels.T)
 
     def displacement(self, frame_index: int, readout: Readout) -> np.ndarray | None:  # (H, W, 2)
-        """Return how far each pixel is from where a global shutter shows it; None: negligible."""
+        """Return how far from each pixel of a global shutter a frame shows it; None: negligible."""
         grid, camera = self._grid, self._grid.camera
         late = grid.pixels.T / grid.pixels.new_tensor([[camera.width], [camera.height]]) - 0.5
         moved = self.velocity(frame_index) * (grid.pixels.new_tensor(readout) @ late)
@@ -148,7 +148,7 @@ class RollingShutter(Stateful):
         self.lengthen((0.0, found[1]) if is_down else (found[0], 0.0))
 
     def lengthen(self, seconds: Readout) -> None:
-        """Make the readouts longer, and correct the flow along all links accordingly."""
+        """Make the readouts longer, at most a frame's time, and correct the flow of all links."""
         if not any(seconds):
             return
         before, longest = self.readout, self.motion.shortest_step

@@ -33,7 +33,7 @@ def undo_scale_drift(keyframes: KeyframeStore) -> None:
 def told_drift(keyframes: KeyframeStore) -> Tensor:  # (K,) float64
     """Return ln(length by the prior / length as estimated) of each keyframe, 0 in the mean.
 
-    What the prior may err itself is taken off the variance: it is 0 if that explains all.
+    The prior's own error is taken off the drift's variance: if it explains all, the drift is 0.
     """
     known = (keyframes.prior_disparities > 0) & (keyframes.disparities > 0)
     told = known.any(1)

@@ -63,7 +63,7 @@ class Settling(Stateful):
         """Return the disparities of the next keyframe, warped from settled cells of the newest.
 
         Those with a depth prior are warped, too; if there is none of either, all are. The camera
-        moves on to `T_camera_world` (4, 4). A cell is handed the information (N,) of what it sees.
+        moves on to `T_camera_world` (4, 4). The new cells inherit a part of the information (N,).
         """
         grid, keyframes = self._graph.grid, self._graph.keyframes
         settled = information > SETTLED

@@ -20,9 +20,9 @@ from minislam.tracking.safeguards.lens import (
     bends,
     check_lens,
     fit_lens,
-    ray_seen,
     straightened,
     stretch,
+    true_rays,
 )
 from tests.tracking.scene import CAMERA, RAYS, known_problem, normal
 from tests.tracking.wall import GRID, disparities_at, true_graph, true_poses
@@ -46,7 +46,7 @@ def bent_graph(noise: float = 0.02):
     """Return the graph of a wall that is filmed through the lens, linked by its flow [px]."""
     graph, poses = true_graph(NUMBERS), true_poses()
     graph.match(neighbourhood_edges(0, len(NUMBERS), 3))
-    u = ray_seen(tangents(GRID.pixels).mT, (K1, K2)).mT
+    u = true_rays(tangents(GRID.pixels).mT, (K1, K2)).mT
     rays = torch.cat([u, torch.ones_like(u[:, :1])], 1)
     sources, targets = torch.tensor(graph.links.edges).unbind(1)
     disparities = torch.stack([disparities_at(poses[k], rays) for k in NUMBERS])
@@ -103,7 +103,7 @@ def test_what_k_lacks_moves_the_flow_along_the_columns():
 
 def test_the_seen_ray_is_inverted():
     seen = tangents(GRID.pixels.double())
-    u = ray_seen(seen.mT, (K1, K2)).mT
+    u = true_rays(seen.mT, (K1, K2)).mT
     torch.testing.assert_close(u * stretch(u.mT, (K1, K2)).mT, seen, atol=1e-9, rtol=0)
     assert bend_of(CAMERA, (0.0, 0.0)) == 0 and abs(bend_of(CAMERA, (K1, K2)) - BEND) < 1e-6
 
@@ -128,7 +128,7 @@ def test_flow_that_fits_no_lens_does_not_fold_the_image():
     fit = fit_lens(bent_graph(noise=4.0))
     assert fit.bend > -0.7 and not fit.is_bent
     corner = torch.tensor([[0.9], [0.7]])
-    assert ray_seen(corner, (-3.0, 0.0)).isfinite().all() and bend_of(CAMERA, (-9.0, 0.0)) <= -0.5
+    assert true_rays(corner, (-3.0, 0.0)).isfinite().all() and bend_of(CAMERA, (-9.0, 0.0)) <= -0.5
     assert bends(CAMERA, corner, (-1 / (3 * 1.3), 0.0)).isfinite().all()
 
 

@@ -113,7 +113,7 @@ def store_of(count: int) -> KeyframeStore:
     pose = torch.eye(4, dtype=torch.float64)
     for index in range(count):
         store.append(wall_frame(index), torch.zeros(1), None, pose, DISPARITIES, DISPARITIES)
-        store.set_motion_weight(index, torch.full((CELLS,), 0.5))
+        store.motion_weights[index] = torch.full((CELLS,), 0.5)
         pose = MOTION @ pose
     return store
 
