@@ -184,7 +184,8 @@ class Slam(Stateful):
         if self.tracker.knows_depth:
             parts = graph, self.sequence, self.poses, frames, frames
             swept = sweep_frames(*parts, progress, self.workers)
-            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept)
+            how = {"fills": self.tracker.watch.hardly_walked}
+            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, **how)
         else:
             keyframes = on_backdrop(keyframes)
         exposures = keyframe_exposures(graph)

@@ -9,7 +9,6 @@ from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
 from minislam.slam import Slam
 from minislam.tracking.safeguards.lens import BentLens
-from minislam.tracking.safeguards.turns import LEAST_BEYOND_TURNS
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
 # that hangs together badly .65.
@@ -70,7 +69,6 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             "is missing from the map and from the figures; look at the pictures of beta"
         )
     yield from _camera_warnings(slam)
-    seen = watch.beyond_turns
     without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
     if without and 2 * without >= len(diagnostics):
         yield (
@@ -79,9 +77,9 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             "crop what is fixed to it, such as a bonnet or a windscreen)"
             + ("" if slam.tracker.knows_depth else ", and all that the map shows is at one depth")
         )
-    elif seen is not None and seen < LEAST_BEYOND_TURNS and not keyframes.has_prior:
+    elif watch.hardly_walked and not keyframes.has_prior:
         yield (
-            f"between neighbouring keyframes only {seen:.2f} px of the flow, in the "
+            f"between neighbouring keyframes only {watch.beyond_turns:.2f} px of the flow, in the "
             "median and in an image of 320x240, are more than a turn of the camera: depth is "
             "hardly determined, and near and far may be exchanged; look at the pictures of the "
             "depth, and film while you walk sideways"

@@ -31,6 +31,7 @@ DEPTH_RANGE = 1.5  # nearest plane, times the largest inverse depth of the spars
 LARGEST_QUANTILE = 0.98  # of the inverse depths: the few beyond it are taken for outliers [-]
 PLANES = (48, 96)  # fewest and most
 FARTHEST = 0.5  # planes: what matches farther away, even at infinity, is put here
+LEAST_KNOWN = 0.5  # fraction of the pixels of all keyframes: with less, a pan has its holes filled
 LEAST_COMMON = 100  # px that have both depths; with fewer their scales are not compared
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
 
@@ -39,11 +40,13 @@ def with_swept_depth(
     camera: Camera,  # of the images
     keyframes: list[Keyframe],
     swept: Iterable[tuple[Tensor, Tensor]],  # of each, depth (H, W) and confirmation (H, W)
+    fills: bool = False,  # the camera hardly did more than turn
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth and confirmation.
 
     Where nothing was swept their own depth fills in, scaled to what was swept in the same image,
-    because a network errs image by image. What other views look through moves, and stays empty.
+    because a network errs image by image. What other views look through moves, and stays empty,
+    but for a camera that hardly did more than turn: a wrong depth costs it no picture, a hole does.
     """
     small, judges, result = _small(camera, WIDTH), votes.judges(len(keyframes)), []
     judging: dict[int, votes.SweptView] = {}
@@ -73,7 +76,21 @@ def with_swept_depth(
             depth = torch.where((depth > 0) | moves, depth, guess)
         SHELF.put([depth])
         result[index] = replace(found, depth=depth)
-    return result
+    known = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
+    return list(map(_filled, result)) if fills and np.mean(known) < LEAST_KNOWN else result
+
+
+def _filled(keyframe: Keyframe) -> Keyframe:
+    """Return a keyframe whose unknown depth is that of the nearest pixel that has one."""
+    depth = keyframe.depth.cpu().numpy()
+    unknown = (depth == 0).astype(np.uint8)
+    if unknown.all() or not unknown.any():
+        return keyframe
+    how = cv2.DIST_L2, cv2.DIST_MASK_5
+    _, nearest = cv2.distanceTransformWithLabels(unknown, *how, labelType=cv2.DIST_LABEL_PIXEL)
+    filled = torch.from_numpy(depth[unknown == 0][nearest - 1])  # labels count the known pixels
+    SHELF.put([filled])
+    return replace(keyframe, depth=filled.to(keyframe.depth))
 
 
 def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:

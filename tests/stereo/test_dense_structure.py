@@ -215,3 +215,17 @@ def test_a_guess_that_other_keyframes_look_through_is_left_out():
     _, after, _ = with_swept_depth(camera(), keyframes, swept)
     inside = after.depth[2:-2, 2:-2]
     assert not inside[:, :76].any() and (inside[:, 78:] == 4).all()
+
+
+def test_after_a_pan_the_nearest_known_depth_fills_what_is_unknown_if_that_is_most():
+    column, unknown = torch.arange(160).expand(SIZE[::-1]), torch.zeros(SIZE[::-1])
+    few = torch.where(column < 30, 2.0, 0.0) + torch.where(column >= 120, 5.0, 0.0)
+    swept = [(few, few), (unknown, unknown)]
+    keyframes = [keyframe(8, unknown), keyframe(16, unknown)]
+    filled, empty = with_swept_depth(camera(), keyframes, swept, fills=True)
+    assert torch.equal(filled.depth, torch.where(column < 75, 2.0, 5.0))
+    assert not empty.depth.any()
+    assert torch.equal(with_swept_depth(camera(), keyframes, swept)[0].depth, few)
+    most = torch.where(column < 100, 2.0, 0.0)
+    [after] = with_swept_depth(camera(), keyframes[:1], [(most, most)], fills=True)
+    assert torch.equal(after.depth, most)

@@ -22,7 +22,12 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
-from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_rest, tells_no_depth
+from minislam.tracking.safeguards.turns import (
+    LEAST_BEYOND_TURNS,
+    flow_beyond_turns,
+    fraction_at_rest,
+    tells_no_depth,
+)
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -92,6 +97,11 @@ class Watch(Stateful):
         """Tell whether the camera stood still or only turned, so that nothing measures depth."""
         no_parallax = all(k.parallax < self._graph.least_parallax for k in self.diagnostics)
         return no_parallax or tells_no_depth(self.beyond_turns, self.resting, self.confirmed)
+
+    @property
+    def hardly_walked(self) -> bool:
+        """Tell whether hardly any flow is more than a turn explains."""
+        return self.beyond_turns is not None and self.beyond_turns < LEAST_BEYOND_TURNS
 
     @property
     def segments(self) -> list[tuple[int, int]]:

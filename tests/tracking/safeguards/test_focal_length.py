@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from minislam.geometry import se3_exp
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleReport, BundleState
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import warm_up_ba
@@ -104,6 +104,25 @@ def test_a_focal_length_out_of_reach_is_no_estimate():
     known = known_problem()
     fit, _ = fit_focal_length(seen_through(noisy(known, NOISE), 2.5), known.truth)
     assert fit.factor is None
+
+
+@pytest.mark.parametrize(
+    ("saved", "rise", "tells"),
+    [(0.01, 0.013, True), (0.01, 0.011, False), (0.03, 0.004, True), (0.06, 0.0014, False)],
+)
+def test_in_a_flat_valley_a_focal_length_needs_to_save_much(saved: float, rise: float, tells: bool):
+    known, lowest = known_problem(), 1e6  # px^2
+
+    class Made(Workers):
+        def map(self, function, calls):
+            is_beside = calls[0][2] == [1.0]
+            costs = [1 + rise, 1 + rise] if is_beside else [1 / (1 - saved), 1]
+            reports = [BundleReport(True, 0.0, lowest * cost, 1, 1e-4) for cost in costs]
+            states = known.truth, replace(known.truth, log_focal=-0.4)
+            return list(zip(states, reports, strict=True))
+
+    fit, _ = fit_focal_length(known.problem, known.truth, Made())
+    assert fit.factor == (pytest.approx(math.exp(-0.4)) if tells else None)
 
 
 def turned_graph(factor: float) -> KeyframeGraph:

@@ -69,8 +69,9 @@ def test_a_turn_whose_poses_claim_parallax_may_show_a_flat_scene():
     watch.conclude()
     assert watch.diagnostics[1].parallax > graph.least_parallax
     assert watch.resting == 1 and watch.only_turned
+    assert watch.hardly_walked
     watch.beyond_turns = LEAST_BEYOND_TURNS
-    assert not watch.only_turned
+    assert not watch.only_turned and not watch.hardly_walked
 
 
 def test_a_keyframe_rests_unless_some_link_that_sees_its_cells_shows_parallax():
@@ -92,7 +93,7 @@ def test_parallax_that_no_sweep_confirms_is_none():
     assert watch.only_turned
     watch = Watch(true_graph([0, 1]))  # without links no pose claims parallax
     watch.conclude()
-    assert watch.beyond_turns is None and watch.only_turned
+    assert watch.beyond_turns is None and watch.only_turned and not watch.hardly_walked
 
 
 def test_weak_parallax_is_depth_only_if_poses_and_sweeps_make_depth_of_it():
