@@ -38,7 +38,8 @@ def finished(**parts: object) -> SimpleNamespace:
         knows_depth=parts.pop("knows_depth", True),
         watch=SimpleNamespace(
             diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
-            beyond_turns=parts.pop("beyond_turns", 3.0),
+            beyond_turns=0.41,
+            hardly_walked=parts.pop("hardly_walked", False),
             breaks=parts.pop("breaks", []),
             segments=[(0, 1), (3, 3)],
         ),

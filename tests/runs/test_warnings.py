@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from minislam.runs.warnings import LEAST_BEYOND_TURNS, warnings
+from minislam.runs.warnings import warnings
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.safeguards.diagnostics import Break
 from minislam.tracking.safeguards.focal_length import FocalLengthFit
@@ -78,11 +78,11 @@ def test_a_truth_that_frames_match_is_not_warned_of():
 
 
 def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_depth():
-    weak = {"beyond_turns": 0.9 * LEAST_BEYOND_TURNS}
+    weak = {"hardly_walked": True}
     assert not list(warnings(finished(**weak)))
+    assert len(list(warnings(finished(has_prior=False)))) == 1
     warning, _ = warnings(finished(**weak, has_prior=False))
     assert "only 0.41 px of the flow, in the median" in warning
-    assert len(list(warnings(finished(beyond_turns=None, has_prior=False)))) == 1
     warning, _ = warnings(finished(**weak, has_prior=False, parallax=[0.1]))  # said once
     assert "hardly any parallax" in warning
 
