@@ -69,6 +69,13 @@ def test_what_does_not_fit_the_shelf_is_left_alone(tensor: torch.Tensor) -> None
     assert (tensor.data_ptr(), tensor.stride()) == (place, strides)
 
 
+def test_rows_are_copies_that_let_the_whole_go() -> None:
+    whole, shelf = noise(6, 2000), Shelf()
+    rows = shelf.rows(whole)
+    assert all(torch.equal(row, one) for row, one in zip(rows, whole, strict=True))
+    assert all(shelf.holds(row) and row._base is None for row in rows)
+
+
 def test_many_tensors_take_many_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "FIRST_BLOCK", 1 << 20)
     shelf = Shelf()

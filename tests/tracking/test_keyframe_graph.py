@@ -6,7 +6,7 @@ import pytest
 
 from minislam import memory
 from minislam.memory import SHELF
-from minislam.tracking import frame_graph
+from minislam.tracking import frame_graph, keyframe_graph
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import FrameGraph
 from tests.tracking.wall import TrueFlow, true_graph
@@ -44,13 +44,16 @@ def test_many_links_are_measured_in_parts_as_all_at_once(monkeypatch: pytest.Mon
     sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
     whole.match(edges)
     parallaxes, confirmed = whole.parallaxes(sources, targets), whole.filter_confirmed(edges)
+    given: list[None] = []
     monkeypatch.setattr(frame_graph, "AT_ONCE", 2)
+    monkeypatch.setattr(keyframe_graph, "give_back_freed", lambda: given.append(None))
     parted.match(edges)
     assert parted.links.edges == whole.links.edges == edges
     pairs = zip(parted.links.targets, whole.links.targets, strict=True)
     assert all(a.equal(b) for a, b in pairs)
     assert parted.parallaxes(sources, targets).equal(parallaxes)
     assert parted.filter_confirmed(edges) == confirmed == edges
+    assert len(given) >= len(edges) // 2
 
 
 def test_the_flow_of_links_lies_on_the_shelf_also_when_it_is_restored(

@@ -32,6 +32,16 @@ def test_each_edge_is_in_one_part_with_all_edges_of_its_source(monkeypatch: pyte
         assert torch.equal(part.targets, problem.targets[edges])
 
 
+def test_between_many_parts_memory_is_given_back(monkeypatch: pytest.MonkeyPatch):
+    given: list[None] = []
+    monkeypatch.setattr(parts, "give_back_freed", lambda: given.append(None))
+    monkeypatch.setattr(parts, "CELLS_AT_ONCE", 4 * CELLS)
+    for untidied, times in ((3, 0), (2, 2)):  # of three parts, the first and the third
+        monkeypatch.setattr(parts, "PARTS_UNTIDIED", untidied)
+        list(in_parts(known_problem(4).problem))
+        assert len(given) == times
+
+
 def test_few_edges_are_not_copied():
     problem = known_problem(4).problem
     ((edges, part),) = in_parts(problem)

@@ -10,6 +10,7 @@ from torch import Tensor
 from minislam.geometry import se3_exp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
+from minislam.tracking import frame_graph
 from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
 from minislam.tracking.frame_graph import FrameGraph
 from minislam.tracking.keyframes import KeyframeStore
@@ -199,6 +200,16 @@ def test_a_longer_readout_moves_the_targets_of_all_links():
     assert shutter.readout == (0.01, -0.02)
     moved = torch.stack(links.targets) - before
     torch.testing.assert_close(moved, displacements(columns, (0.01, -0.02)), rtol=0, atol=1e-4)
+
+
+def test_links_in_parts_are_corrected_like_all_at_once(monkeypatch: pytest.MonkeyPatch):
+    (shutter, links), (other, split) = linked(), linked()
+    whole = shutter.link_columns([1, 0])
+    shutter.lengthen((0.01, -0.02))
+    monkeypatch.setattr(frame_graph, "AT_ONCE", 1)
+    assert torch.equal(other.link_columns([1, 0]), whole)
+    other.lengthen((0.01, -0.02))
+    assert all(map(torch.equal, split.targets, links.targets))
 
 
 def test_once_an_axis_is_found_the_other_readout_is_held():
