@@ -30,6 +30,7 @@ from minislam.records import Trajectory
 from minislam.runs.facts import unit_of
 from minislam.runs.resume import way_on
 from minislam.runs.summary import Line, summarise
+from minislam.runs.warnings import BROKEN
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.tracking.grid import Grid
@@ -122,6 +123,11 @@ class Run:
     def keyframes(self) -> list[int]:
         """Return the frame indices of the keyframes."""
         return [frame.index for frame in self.frames if frame.keyframe]
+
+    @property
+    def warnings_of_breaks(self) -> list[str]:
+        """Return which parts of the run do not belong together, in its own words."""
+        return [text for text in self.folder.read_run()["warnings"] if text.startswith(BROKEN)]
 
     def render(
         self,

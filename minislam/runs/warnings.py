@@ -17,6 +17,7 @@ LEAST_SHOWN = 0.75
 # Of the images, in their mean [-]: where movers are gone and the room is whole, beta leaves out .02
 # to .23; of a night crowd in rain, whose map has holes, .36.
 MOST_LEFT_OUT = 0.3
+BROKEN = "the trajectory is broken"  # how a warning of breaks begins
 
 
 def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name of the prior
@@ -46,7 +47,7 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
         pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
         yield (
-            f"the trajectory is broken at frames {where}: motion or depth contradicts the images, "
+            f"{BROKEN} at frames {where}: motion or depth contradicts the images, "
             "or the camera follows something that came into view. "
             "Before and after, scale and direction do not belong together; look at each piece "
             f"(frames {pieces or 'none'}) by itself. If the images lie far apart, give more frames "
