@@ -172,7 +172,9 @@ class Run:
             raise InputError(f"expected a frame with a pose, found {index}; see lost_frames.txt")
         image = self.sequence.frame(index).image.numpy()
         color = self.render(self.poses[index])
-        return overview(image, self.beta(index), color, self.trajectory, unit=self.unit)
+        stamps, breaks = [f.timestamp for f in self.frames], self.folder.read_run()["breaks"]
+        broken = [(stamps[b["first_frame"]], stamps[b["last_frame"]]) for b in breaks]
+        return overview(image, self.beta(index), color, self.trajectory, None, self.unit, broken)
 
     def view(self, height: int = 620) -> Page:  # px
         """Return the map to turn with the mouse, as the output of a notebook's cell."""

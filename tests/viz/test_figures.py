@@ -75,6 +75,20 @@ def test_figures_do_not_touch_the_state_of_pyplot():
     assert pyplot.get_fignums() == []
 
 
+def test_a_break_is_red_from_the_pose_before_to_the_pose_after():
+    whole, cuts = path(9), [(3.0, 4.0), (8.0, 8.0)]
+    both = trajectory_plot(whole, None, "m", cuts), overview(IMAGE, BETA, IMAGE, whole, broken=cuts)
+    for figure in both:
+        _, first, last = figure.axes[-1 if figure is both[0] else 3].lines
+        second = 1 if figure is both[0] else 2
+        for line, part in ((first, slice(2, 6)), (last, slice(7, 9))):
+            places = whole.T_world_camera[part, :3, 3]
+            np.testing.assert_array_equal(line.get_xydata(), places[:, [0, second]])
+            assert line.get_color() == "tab:red"
+        legend = first.axes.get_legend().get_texts()
+        assert [text.get_text() for text in legend] == ["estimate", "broken"]
+
+
 def test_a_path_of_no_length_is_a_point():
     still = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     for estimate, marker, label in (
