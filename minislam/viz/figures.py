@@ -151,5 +151,6 @@ def _draw_path(
         axes.plot(x, places[axis], **ESTIMATE_STYLE | how | {"color": "tab:red"})
     axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[axis]} [{unit}]")
     axes.set_aspect("equal", adjustable="datalim")
+    axes.locator_params(nbins=5)  # labels of short paths are long
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=8)

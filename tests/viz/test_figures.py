@@ -1,5 +1,7 @@
 """Every kind of figure is drawn, says its units, and leaves no window behind."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -68,6 +70,16 @@ def test_losses_of_both_signs_have_a_linear_panel_of_their_own():
     assert [axes.get_yscale() for axes in figure.axes] == ["log", "linear"]
     mean = figure.axes[1].lines[1]
     np.testing.assert_allclose(mean.get_xydata(), [[0, 0.5], [2, -0.25]])  # the pause is left out
+
+
+def test_labels_of_a_short_path_do_not_overlap():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :2, 3] = np.linspace(0, -0.01, 9)[:, None]
+    figure = trajectory_plot(Trajectory(np.arange(9.0), poses))
+    figure_png(figure)  # places the labels
+    for axes in figure.axes:
+        boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
 
 
 def test_figures_do_not_touch_the_state_of_pyplot():
