@@ -84,6 +84,7 @@ class VideoImages:
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
         self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
         self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]
+        self.is_whole = not self._capture.grab()  # no image follows
         self._rewind()
 
     def __len__(self) -> int:
@@ -193,8 +194,7 @@ class Recording:
 
 def read_image_folder(folder: Path) -> Recording:
     """Read a folder of images, in natural order; they may lie in `images/` or `rgb/`."""
-    candidates = [folder, *(folder / name for name in ("images", "rgb"))]
-    paths = next(filter(None, map(list_images, candidates)), [])
+    paths = next(filter(None, map(list_images, (folder, folder / "images", folder / "rgb"))), [])
     if not paths:
         raise InputError(f"expected PNG or JPEG images in {folder}, found {_found(folder)}")
     stamps, source = stamps_of_names(paths)
@@ -232,7 +232,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
         )
     return Recording(
         name=folder_name(path.with_suffix("")),
-        kind="video",
+        kind="video" if images.is_whole else f"first {limit} images of a video",
         images=images,
         timestamps=stamps,
         lost=[(stamp, f"{path.name} is damaged there") for stamp in lost.tolist()],
