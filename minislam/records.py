@@ -83,6 +83,7 @@ class TrackingStatus(Enum):
     INITIALISING = "initialising"  # followed, but there is no map yet
     OK = "ok"
     LOST = "lost"  # without a pose
+    GIVEN_UP = "start given up"  # followed from a start that another replaced, without a pose
 
     @property
     def is_followed(self) -> bool:
@@ -98,6 +99,12 @@ class TrackedFrame:
     timestamp: float  # second
     status: TrackingStatus
     matched_ratio: float  # of the last keyframe, [-]
+
+    @property
+    def reason(self) -> str:
+        """Return why the frame has no pose."""
+        ratio = f", matched ratio {self.matched_ratio:.3f}"
+        return self.status.value + (ratio if self.status is TrackingStatus.LOST else "")
 
 
 class GroundTruth(Protocol):

@@ -292,8 +292,5 @@ class Slam(Stateful):
 
     def lost_frames(self) -> list[tuple[int, float, str]]:
         """Return frame index, timestamp and reason of every frame without a pose."""
-        return [
-            (t.frame_index, t.timestamp, f"{t.status.value}, matched ratio {t.matched_ratio:.3f}")
-            for t in self.tracker.tracked
-            if not t.status.is_followed
-        ]
+        lost = [frame for frame in self.tracker.tracked if not frame.status.is_followed]
+        return [(frame.frame_index, frame.timestamp, frame.reason) for frame in lost]

@@ -55,6 +55,8 @@ def _export(args: argparse.Namespace) -> None:
     from minislam.runs import export
 
     run, progress = minislam.load(args.folder), ProgressLine()
+    for warning in run.warnings_of_breaks:
+        progress.warn(warning)
     wanted = run.keyframes if args.keyframes else run.poses
     frames = [frame for frame in sorted(run.poses) if frame in wanted]
     writers = [export.export_colmap, export.export_nerfstudio, export.export_depth]

@@ -42,7 +42,9 @@ def _render(args: argparse.Namespace) -> None:
     inputs = [run.folder.read_config()["sequence"]] if args.overwrite else []  # a video, or none
     require_new([args.output], args.overwrite, inputs)
     camera = run.camera.resized(*args.size) if args.size else run.camera
-    rate, count = flythrough.frame_rate(run), len(run.poses)
+    rate, count, progress = flythrough.frame_rate(run), len(run.poses), ProgressLine()
+    for warning in run.warnings_of_breaks:
+        progress.warn(warning)
     if args.path == "trajectory":
         images = flythrough.fly_along(run, camera)
     elif args.path == "side-by-side":
@@ -50,5 +52,5 @@ def _render(args: argparse.Namespace) -> None:
     else:
         images = flythrough.fly_around(run, camera)
         rate, count = flythrough.ORBIT_RATE, flythrough.ORBIT_IMAGES
-    write_animation(args.output, ProgressLine().over("rendering", images, count), rate)
+    write_animation(args.output, progress.over("rendering", images, count), rate)
     say(f"{count} images at {rate:.0f} per second in {args.output}")

@@ -49,6 +49,11 @@ class Calibration:
         return abs(made_for[0] * height / (made_for[1] * width) - 1) <= _ASPECT_TOLERANCE
 
 
+def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibration | None:
+    """Return the calibration that lies beside the images, if there is one."""
+    return read_calibration(folder / name) if (folder / name).is_file() else None
+
+
 def rough_calibration(
     picture: tuple[int, int, int, int],  # left, top, width, height [px] between black bars
     noted: tuple[float, str] | None = None,

@@ -10,9 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from minislam.data.calibration import Calibration, read_calibration
+from minislam.data.calibration import Calibration, calibration_beside
 from minislam.data.images import is_image, list_images, read_color
 from minislam.data.metadata import noted_focal_length
+from minislam.data.trajectory import truth_beside
 from minislam.errors import InputError, MinislamError
 from minislam.parameters import FILES, user_path
 from minislam.records import Trajectory
@@ -21,6 +22,8 @@ _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .ne
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
 _ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
+_COUNTED = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
+_MOST_COUNTED = 1e6  # larger whole numbers in names are times
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
 _TEXT = cv2.VideoWriter.fourcc(*"ansi")  # FFmpeg films a text file on a terminal
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
@@ -81,6 +84,7 @@ class VideoImages:
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
         self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
         self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]
+        self.is_whole = not self._capture.grab()  # no image follows
         self._rewind()
 
     def __len__(self) -> int:
@@ -190,11 +194,12 @@ class Recording:
 
 def read_image_folder(folder: Path) -> Recording:
     """Read a folder of images, in natural order; they may lie in `images/` or `rgb/`."""
-    candidates = [folder, *(folder / name for name in ("images", "rgb"))]
-    paths = next(filter(None, map(list_images, candidates)), [])
+    paths = next(filter(None, map(list_images, (folder, folder / "images", folder / "rgb"))), [])
     if not paths:
         raise InputError(f"expected PNG or JPEG images in {folder}, found {_found(folder)}")
     stamps, source = stamps_of_names(paths)
+    if _are_counts(paths, stamps) and not truth_beside(folder):  # whose times are the numbers
+        stamps, source = stamps / _ASSUMED_FRAME_RATE, _COUNTED
     return Recording(
         name=folder_name(folder),
         kind="image folder",
@@ -215,8 +220,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
     images = VideoImages(path, limit)
     if len(images) == 0:
         raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")
-    warnings = []
-    rate, stamps, lost = images.frame_rate, images.timestamps, images.lost()
+    rate, stamps, lost, warnings = images.frame_rate, images.timestamps, images.lost(), list[str]()
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         if not (math.isfinite(rate) and rate > 0):
             rate = _ASSUMED_FRAME_RATE
@@ -228,7 +232,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
         )
     return Recording(
         name=folder_name(path.with_suffix("")),
-        kind="video",
+        kind="video" if images.is_whole else f"first {limit} images of a video",
         images=images,
         timestamps=stamps,
         lost=[(stamp, f"{path.name} is damaged there") for stamp in lost.tolist()],
@@ -245,14 +249,15 @@ def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
     Names that are all numbers are the timestamps; otherwise the images are counted.
     """
     if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
-        note = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
-        return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, note
+        return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, _COUNTED
     return np.array([float(path.stem) for path in paths]), "timestamps from the file names"
 
 
-def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibration | None:
-    """Return the calibration that lies beside the images, if there is one."""
-    return read_calibration(folder / name) if (folder / name).is_file() else None
+def _are_counts(paths: list[Path], numbers: np.ndarray) -> bool:
+    """Tell whether names count images: whole numbers, not too large, in multiples of a step."""
+    least = (steps := np.diff(numbers)).min(initial=_MOST_COUNTED)
+    is_even = least >= 1 and not (steps % least).any() and numbers[-1] < _MOST_COUNTED
+    return is_even and all(path.stem.isdecimal() for path in paths)
 
 
 def folder_name(path: Path) -> str:

@@ -10,10 +10,16 @@ from minislam.data.files import data_rows, finite_numbers, read_text, write_text
 from minislam.errors import InputError
 from minislam.records import Trajectory
 
+_TRUTHS = ("groundtruth.txt", "pose.txt")  # TUM and Bonn; Wild-SLAM
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 # Ground-truth files round to four decimals; farther off is not a rotation but a wrong column.
 _QUATERNION_NORM_TOLERANCE = 0.05
+
+
+def truth_beside(folder: Path) -> Path | None:
+    """Return the file of the ground truth in the folder of a recording, if there is one."""
+    return next((folder / name for name in _TRUTHS if (folder / name).is_file()), None)
 
 
 def read_trajectory(path: Path | str) -> Trajectory:

@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from minislam.data import sources
-from minislam.data.calibration import Calibration
+from minislam.data.calibration import Calibration, calibration_beside
 from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
 from minislam.data.images import list_images, read_color
-from minislam.data.trajectory import read_trajectory
+from minislam.data.trajectory import read_trajectory, truth_beside
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion
 from minislam.records import Trajectory
 
-_TRUTH_NAMES = ("groundtruth.txt", "pose.txt")  # TUM and Bonn; Wild-SLAM
 _DEPTH_MAX_DIFFERENCE = 0.02  # second between a colour and its depth image, as TUM's associate.py
 
 # Intrinsics and distortion of images of 640x480 px, given by the makers of the TUM RGB-D benchmark
@@ -58,7 +57,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
     if len(paths) == 0:
         raise InputError(f"expected images in {folder}/rgb.txt, found none; check the list")
     depth_stamps, depths = _images(folder, "depth")
-    truth_path = next((folder / name for name in _TRUTH_NAMES if (folder / name).is_file()), None)
+    truth_path = truth_beside(folder)
     trajectory = None
     notes = [f"{len(depths)} depth"] if depths else []
     if truth_path is not None:
@@ -72,7 +71,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
         kind="TUM RGB-D folder",
         images=sources.FileImages(paths),
         timestamps=stamps,
-        calibration=sources.calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
+        calibration=calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
         trajectory=trajectory,
         depth_paths=_nearest(stamps, depth_stamps, depths),
         mask_paths=_beside(folder / "masks", paths),

@@ -102,7 +102,8 @@ def doubt_of_units(estimate: Trajectory, truth: Trajectory) -> str:
     """Return what to do if the times of one are probably no seconds, "" if nothing says so."""
     paths = estimate.timestamps, truth.timestamps
     found, true = (float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in paths)
-    if max(found, true) <= max(MOST_SECONDS, MOST_RATIO * min(found, true)):
+    counts = len(truth) > 1 and not (paths[1] % 1).any() and (paths[0] % 1).any()  # images
+    if not counts and max(found, true) <= max(MOST_SECONDS, MOST_RATIO * min(found, true)):
         return ""
     return (
         f"check that the times of both are in seconds: poses of the estimate are {found:.3g} s "

@@ -64,7 +64,6 @@ def run_facts(
         | (asdict(fit) | {"is_doubtful": fit.is_doubtful} if fit else {}),
         "began_anew": {"lens": asdict(slam.undone_lens)} if slam.undone_lens else None,
         "readout_seconds": list(graph.shutter.readout),
-        # Numbered images are a second apart.
         "frame_seconds": float(np.median(np.diff(stamps))) if len(stamps) > 1 else None,
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
         "segments": slam.tracker.watch.segments,

@@ -30,6 +30,7 @@ from minislam.records import Trajectory
 from minislam.runs.facts import unit_of
 from minislam.runs.resume import way_on
 from minislam.runs.summary import Line, summarise
+from minislam.runs.warnings import BROKEN
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.tracking.grid import Grid
@@ -123,6 +124,11 @@ class Run:
         """Return the frame indices of the keyframes."""
         return [frame.index for frame in self.frames if frame.keyframe]
 
+    @property
+    def warnings_of_breaks(self) -> list[str]:
+        """Return which parts of the run do not belong together, in its own words."""
+        return [text for text in self.folder.read_run()["warnings"] if text.startswith(BROKEN)]
+
     def render(
         self,
         T_world_camera: np.ndarray,
@@ -166,7 +172,9 @@ class Run:
             raise InputError(f"expected a frame with a pose, found {index}; see lost_frames.txt")
         image = self.sequence.frame(index).image.numpy()
         color = self.render(self.poses[index])
-        return overview(image, self.beta(index), color, self.trajectory, unit=self.unit)
+        stamps, breaks = [f.timestamp for f in self.frames], self.folder.read_run()["breaks"]
+        broken = [(stamps[b["first_frame"]], stamps[b["last_frame"]]) for b in breaks]
+        return overview(image, self.beta(index), color, self.trajectory, None, self.unit, broken)
 
     def view(self, height: int = 620) -> Page:  # px
         """Return the map to turn with the mouse, as the output of a notebook's cell."""

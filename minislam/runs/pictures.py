@@ -76,7 +76,9 @@ def write_pictures(
         estimate, true_path, unit = error.estimate, error.truth, "m"
         over_time = viz.ate_over_time(estimate.timestamps, error.errors, unit)
         plots += [("ate_over_time", "Error of the camera's position over time", over_time)]
-    path = viz.trajectory_plot(estimate, true_path, unit)
+    stamps, breaks = [t.timestamp for t in slam.tracker.tracked], slam.tracker.watch.breaks
+    broken = [(stamps[found.first_frame], stamps[found.last_frame]) for found in breaks]
+    path = viz.trajectory_plot(estimate, true_path, unit, broken)
     curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
     plots += [
         ("trajectory", "Path of the camera, in the planes x-z and x-y", path),
@@ -91,7 +93,7 @@ def write_pictures(
     jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
     middle = _pictures(slam, len(slam.mapper.keyframes) // 2)
     parts = middle["input"], middle["beta"], middle["render"]
-    overview = figure_png(viz.overview(*parts, estimate, true_path, unit))
+    overview = figure_png(viz.overview(*parts, estimate, true_path, unit, broken))
     folder.write_picture(f"{PLOTS}/overview.png", overview)
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}

@@ -16,6 +16,8 @@ LEAST_SHOWN = 0.75
 # Of the images, in their mean [-]: where movers are gone and the room is whole, beta leaves out .02
 # to .23; of a night crowd in rain, whose map has holes, .36.
 MOST_LEFT_OUT = 0.3
+BROKEN = "the trajectory is broken"  # how a warning of breaks begins
+_FAR_APART = "If the images lie far apart, give more frames per second (a smaller --stride)"
 
 
 def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name of the prior
@@ -36,20 +38,19 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
     if lost:
         tracked = slam.tracker.tracked
         since = 1 + max((t.frame_index for t in tracked if t.status.is_followed), default=-1)
-        rest = f". If the film is cut at frame {since}, run the rest by itself (--start)"
+        rest = f"If the film is cut at frame {since}, run the rest by itself (--start). "
         yield (
             f"{lost} of {len(tracked)} frames could not be tracked and have no pose; "
-            f"lost_frames.txt lists them{rest if since < len(tracked) else ''}"
+            f"lost_frames.txt lists them. {rest if since < len(tracked) else ''}{_FAR_APART}"
         )
     if watch.breaks:
         where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
         pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
         yield (
-            f"the trajectory is broken at frames {where}: motion or depth contradicts the images, "
+            f"{BROKEN} at frames {where}: motion or depth contradicts the images, "
             "or the camera follows something that came into view. "
             "Before and after, scale and direction do not belong together; look at each piece "
-            f"(frames {pieces or 'none'}) by itself. If the images lie far apart, give more frames "
-            "per second (a smaller --stride)"
+            f"(frames {pieces or 'none'}) by itself. {_FAR_APART}"
         )
     if graph.failed_adjustments:
         yield (

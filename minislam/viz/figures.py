@@ -11,17 +11,21 @@ from matplotlib.figure import Figure
 from minislam.records import Trajectory
 from minislam.viz.style import ESTIMATE_STYLE, TRUTH_STYLE, beta_to_rgb, new_figure, show_image
 
+Breaks = Series[tuple[float, float]]  # first and last time of each [s]
 _NO_LENGTH = 1e-9  # units of the path; a shorter line cannot be seen
 _AVERAGED = 30  # iterations in the running mean of a loss
 
 
 def trajectory_plot(
-    estimate: Trajectory, truth: Trajectory | None = None, unit: str = "world units"
+    estimate: Trajectory,
+    truth: Trajectory | None = None,
+    unit: str = "world units",
+    broken: Breaks = (),
 ) -> Figure:
     """Draw camera centres in the planes x-z and x-y; the estimate must be aligned already."""
     figure = new_figure()
     for axes, second in zip(figure.subplots(1, 2), (2, 1), strict=True):
-        _draw_path(axes, estimate, truth, second, unit)
+        _draw_path(axes, estimate, truth, second, unit, broken)
     return figure
 
 
@@ -109,6 +113,7 @@ def overview(
     estimate: Trajectory,
     truth: Trajectory | None = None,
     unit: str = "world units",
+    broken: Breaks = (),
 ) -> Figure:
     """Draw a run in one picture: input, uncertainty, static render, trajectory."""
     figure = new_figure((12.0, 2.6))
@@ -116,7 +121,7 @@ def overview(
     show_image(axes[0], image, "input frame")
     show_image(axes[1], beta_to_rgb(beta), "uncertainty beta", image.shape[:2])
     show_image(axes[2], render, "static map, same view")
-    _draw_path(axes[3], estimate, truth, 2, unit)
+    _draw_path(axes[3], estimate, truth, 2, unit, broken)
     return figure
 
 
@@ -129,17 +134,23 @@ def _one_panel(xlabel: str, ylabel: str, height: float = 3.0) -> tuple[Figure, A
 
 
 def _draw_path(
-    axes: Axes, estimate: Trajectory, truth: Trajectory | None, second: int, unit: str
+    axes: Axes, estimate: Trajectory, truth: Trajectory | None, axis: int, unit: str, broken: Breaks
 ) -> None:
-    """Draw coordinate x against y (second = 1) or z (second = 2), both at one scale."""
+    """Draw x against y (axis 1) or z (axis 2) at one scale; breaks, with ends, are red."""
     paths = [(truth, "ground truth", TRUTH_STYLE), (estimate, "estimate", ESTIMATE_STYLE)]
     for path, label, style in paths:
         if path is not None:
             centres = path.T_world_camera[:, :3, 3]
             stands = len(centres) > 0 and bool((np.ptp(centres, axis=0) < _NO_LENGTH).all())
             how = {"marker": "o", "label": f"{label} (stands)"} if stands else {"label": label}
-            axes.plot(centres[:, 0], centres[:, second], **style | how)
-    axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[second]} [{unit}]")
+            axes.plot(centres[:, 0], centres[:, axis], **style | how)
+    for position, (first, last) in enumerate(broken):
+        times, how = estimate.timestamps, {"label": "" if position else "broken"}
+        part = slice(max(0, np.sum(times < first) - 1), np.sum(times <= last) + 1)
+        x, _, _ = places = estimate.T_world_camera[part, :3, 3].T
+        axes.plot(x, places[axis], **ESTIMATE_STYLE | how | {"color": "tab:red"})
+    axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[axis]} [{unit}]")
     axes.set_aspect("equal", adjustable="datalim")
+    axes.locator_params(nbins=5)  # labels of short paths are long
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=8)

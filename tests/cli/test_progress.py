@@ -5,7 +5,8 @@ import re
 import signal
 import sys
 import threading
-from itertools import pairwise
+import time
+from itertools import count, pairwise
 from unittest.mock import MagicMock
 
 import pytest
@@ -16,7 +17,8 @@ from minislam.geometry import Camera
 from minislam.priors.names import PriorChoice
 
 
-def test_off_a_terminal_a_stage_prints_a_line_every_tenth(capsys):
+def test_off_a_terminal_a_stage_prints_a_line_every_tenth(monkeypatch, capsys):
+    monkeypatch.setattr("time.perf_counter", count().__next__)
     progress = ProgressLine()
     for done in range(1, 201):
         progress.show("walking", done, 200)
@@ -27,6 +29,16 @@ def test_off_a_terminal_a_stage_prints_a_line_every_tenth(capsys):
     assert len(walking) == 10 and "resting: 1/1 (0 s)" in lines
     assert re.fullmatch(r"walking: 40/200 \([\d.]+/s, \d+ s left\)", walking[1])
     assert re.fullmatch(r"walking: 200/200 \(\d+ s\)", walking[-1])
+
+
+def test_steps_that_are_reported_at_once_tell_no_rate(monkeypatch, capsys):
+    clock = iter((0.0, 0.001, 0.002, 5.0))
+    monkeypatch.setattr("time.perf_counter", clock.__next__)
+    progress = ProgressLine(is_verbose=True)
+    for done in (1, 3, 4, 11):
+        progress.show("coarse depth", done, 34)
+    rates = [line.partition("/34")[2] for line in capsys.readouterr().err.splitlines()]
+    assert rates == ["", "", "", " (2.0/s, 12 s left)"]
 
 
 def test_a_warning_has_a_line_of_its_own(capsys):
@@ -45,9 +57,11 @@ def test_on_a_terminal_an_open_line_is_ended_once_and_a_signal_takes_its_place(m
     progress.close()  # nothing is open
     stopping = "\r\033[Kstopping after this step; Ctrl-C again stops at once\n"
     assert capsys.readouterr().err == stopping
+    later = time.perf_counter() + 1
+    monkeypatch.setattr("time.perf_counter", lambda: later)
     progress.show("walking", 2, 10)
     progress.close()
-    assert capsys.readouterr().err.endswith("/s, 0 s left)\n")
+    assert capsys.readouterr().err.endswith("/s, 8 s left)\n")
     progress.show("walking", 10, 10)
     assert capsys.readouterr().err.endswith(" s)\n")
     progress.close()

@@ -8,6 +8,7 @@ import pytest
 from minislam.cli.main import main
 from minislam.data.run_folder import RunFolder
 from minislam.runs import flythrough
+from minislam.runs.warnings import BROKEN
 
 pytestmark = pytest.mark.slow
 
@@ -33,6 +34,17 @@ def test_paths(folder: str, tmp_path: Path, capsys, path: str, count: int, width
 def test_a_run_leaves_its_clip(folder: str):
     _, animation = cv2.imreadanimation(str(Path(folder) / "clip.webp"))
     assert len(animation.frames) == 5
+
+
+def test_breaks_of_the_run_are_warned_of(folder: str, tmp_path: Path, monkeypatch, capsys):
+    said = [f"{BROKEN} at frames 2 to 3", "without a depth prior the unit of length is arbitrary"]
+    facts = RunFolder(folder).read_run() | {"warnings": said}
+    monkeypatch.setattr(RunFolder, "read_run", lambda self: facts)
+    to_film = ["render", folder, "--size", "32x24", "-o", str(tmp_path / "fly.webp")]
+    for command in (to_film, ["export", folder, "--points", str(tmp_path / "points.ply")]):
+        assert main(command) == 0
+        warned = [line for line in capsys.readouterr().err.splitlines() if "WARNING" in line]
+        assert warned == [f"WARNING: {said[0]}"]
 
 
 def test_nonsense_is_one_sentence(folder: str, tmp_path: Path, capsys):

@@ -11,7 +11,7 @@ import pytest
 
 from minislam.data import sources
 from minislam.data.options import InputOptions
-from minislam.data.sequence import RecordedSequence
+from minislam.data.sequence import RecordedSequence, open_sequence
 from minislam.data.sources import VideoImages, read_image_folder, read_video
 from minislam.errors import InputError
 from tests.recordings import picture, save, video
@@ -24,6 +24,18 @@ def test_frames_are_counted_and_stamped_by_their_rate(tmp_path: Path):
     assert len(recording.images) == 12 and recording.name == "walk_in_park"
     np.testing.assert_allclose(recording.timestamps, np.arange(12) / 10)
     assert recording.images.read(3).shape == (64, 96, 3)
+
+
+@pytest.mark.parametrize(
+    ("stride", "most", "said"),
+    [(2, 3, "first 5 images of a video: 3 of 5 images,"), (1, 12, "video: 12 of 12 images,")],
+)
+def test_of_a_video_that_is_not_read_to_its_end_no_total_is_said(
+    tmp_path: Path, stride, most, said
+):
+    options = InputOptions(stride=stride, max_frames=most)
+    sequence = open_sequence(str(video(tmp_path / "walk.mp4", count=12)), options)
+    assert sequence.description.startswith(said)
 
 
 def test_a_name_with_a_colon_is_no_protocol(tmp_path: Path, monkeypatch):

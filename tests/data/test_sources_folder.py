@@ -29,6 +29,22 @@ def test_numeric_names_are_the_timestamps(tmp_path: Path):
     np.testing.assert_array_equal(read_image_folder(tmp_path).timestamps, [7.5, 12, 101])
 
 
+@pytest.mark.parametrize(
+    "names",
+    ["0 1 2 9", "00020 00022 00028", "10 15 20", "0 33 67", "5 900000 1800000", "1.0 2.0", "7"],
+)
+def test_whole_numbers_count_images_unless_a_truth_has_them_as_times(tmp_path: Path, names: str):
+    for name in names.split():
+        save(tmp_path / f"images/{name}.png", picture(0))
+    numbers = np.array(list(map(float, names.split())))
+    is_counted = "67" not in names and "900000" not in names and "." not in names
+    found = read_image_folder(tmp_path)
+    np.testing.assert_allclose(found.timestamps, numbers / 30 if is_counted else numbers)
+    assert ("counted at 30" in found.notes[0]) is is_counted
+    (tmp_path / "groundtruth.txt").touch()
+    np.testing.assert_array_equal(read_image_folder(tmp_path).timestamps, numbers)
+
+
 def test_a_calibration_beside_the_images_is_used(tmp_path: Path):
     save(tmp_path / "images/a.png", picture(0))
     (tmp_path / "calibration.txt").write_text("50 50 20 16")

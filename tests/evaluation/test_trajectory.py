@@ -208,7 +208,10 @@ def test_times_in_milliseconds_are_told_from_a_truth_of_few_poses():
         with pytest.raises(InputError, match=words):
             absolute_trajectory_error(truth, other)
         assert doubt_of_units(truth, other) and doubt_of_units(other, truth)
-        assert not doubt_of_units(other, other)  # numbered images are a second apart
+        assert not doubt_of_units(other, other)
+    for step in (1, 2, 5):  # the truth counts images, of which every second or fifth was taken
+        estimate = Trajectory(np.arange(10) * step / 30, truth.T_world_camera)
+        assert doubt_of_units(estimate, Trajectory(np.arange(10.0), truth.T_world_camera))
     rare = Trajectory(truth.timestamps[[0, 9]], truth.T_world_camera[[0, 9]])
     assert not doubt_of_units(truth, rare) and not doubt_of_units(truth, spiral(1))
 

@@ -18,7 +18,9 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.mapping import Mapper
 from minislam.tracking.grid import Grid
+from minislam.tracking.safeguards import diagnostics
 from minislam.tracking.safeguards.rolling_shutter import ImageMotion
+from minislam.viz import figures
 
 pytestmark = pytest.mark.slow
 
@@ -51,6 +53,15 @@ def test_every_keyframe_is_rendered_again_within_one_grey_level(run: minislam.Ru
 def test_a_run_is_found_below_the_home_of_the_user(run: minislam.Run, monkeypatch):
     monkeypatch.setenv("HOME", str(run.folder.path.parent))
     assert minislam.load(f"~/{run.folder.path.name}").folder.path == run.folder.path
+
+
+def test_breaks_are_drawn_in_every_picture_of_the_path(tmp_path: Path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(diagnostics, "find_breaks", lambda _: [diagnostics.Break(3, 6)])
+    monkeypatch.setattr(figures, "_draw_path", lambda *args: drawn.append(args[-1]))
+    options = {"stride": 3, "max_frames": 8, "size": (96, 72), "preset": "test", "quiet": True}
+    minislam.run("synth:person", tmp_path / "run", **options).plot()
+    assert drawn == 4 * [[(0.3, 0.6)]]  # two planes, overview.png, plot()
 
 
 def test_depth_is_that_of_the_surface_and_a_camera_can_be_given(run: minislam.Run):

@@ -20,6 +20,7 @@ WARNINGS = [
         "1 of 4 frames could not be tracked and have no pose; lost_frames.txt lists them",
     ),
     ({"lost": 2, "ends_lost": True}, "If the film is cut at frame 2, run the rest by itself"),
+    ({"lost": 2, "ends_lost": True}, "(--start). If the images lie far apart, give more frames"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
     ({"breaks": [Break(2, 2)]}, "look at each piece (frames 0 to 1, 3 to 3) by itself"),
     (

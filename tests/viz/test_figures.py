@@ -1,5 +1,7 @@
 """Every kind of figure is drawn, says its units, and leaves no window behind."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -70,9 +72,33 @@ def test_losses_of_both_signs_have_a_linear_panel_of_their_own():
     np.testing.assert_allclose(mean.get_xydata(), [[0, 0.5], [2, -0.25]])  # the pause is left out
 
 
+def test_labels_of_a_short_path_do_not_overlap():
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :2, 3] = np.linspace(0, -0.01, 9)[:, None]
+    figure = trajectory_plot(Trajectory(np.arange(9.0), poses))
+    figure_png(figure)  # places the labels
+    for axes in figure.axes:
+        boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
+
+
 def test_figures_do_not_touch_the_state_of_pyplot():
     FIGURES["overview"]()
     assert pyplot.get_fignums() == []
+
+
+def test_a_break_is_red_from_the_pose_before_to_the_pose_after():
+    whole, cuts = path(9), [(3.0, 4.0), (8.0, 8.0)]
+    both = trajectory_plot(whole, None, "m", cuts), overview(IMAGE, BETA, IMAGE, whole, broken=cuts)
+    for figure in both:
+        _, first, last = figure.axes[-1 if figure is both[0] else 3].lines
+        second = 1 if figure is both[0] else 2
+        for line, part in ((first, slice(2, 6)), (last, slice(7, 9))):
+            places = whole.T_world_camera[part, :3, 3]
+            np.testing.assert_array_equal(line.get_xydata(), places[:, [0, second]])
+            assert line.get_color() == "tab:red"
+        legend = first.axes.get_legend().get_texts()
+        assert [text.get_text() for text in legend] == ["estimate", "broken"]
 
 
 def test_a_path_of_no_length_is_a_point():

@@ -53,12 +53,14 @@ def can_tell_depth(tracker: Tracker) -> bool:
 
 
 def begin_anew(tracker: Tracker, first: int) -> None:
-    """Forget all keyframes of the warm-up: the frames before `first` are lost, it comes next."""
-    tracked, start = tracker.tracked, tracker.keyframes.frames[0].frame_index
+    """Forget all keyframes of the warm-up: frames before `first` have no pose, it comes next."""
+    tracked = tracker.tracked
     while len(tracker.keyframes) > 1:
         tracker.graph.remove_newest()
     tracker.keyframes.remove_newest()
     tracker.graph.flow.remove_frame(0)
     tracker.mode, tracker.last_non_keyframe = Mode.WAITING, None
     del tracked[first:]
-    tracked[start:] = [replace(frame, status=TrackingStatus.LOST) for frame in tracked[start:]]
+    for index, frame in enumerate(tracked):
+        if frame.status.is_followed:
+            tracked[index] = replace(frame, status=TrackingStatus.GIVEN_UP)

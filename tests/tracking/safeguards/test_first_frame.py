@@ -46,7 +46,7 @@ def test_an_unusable_start_is_lost_and_the_rest_is_followed(start, lost):
     tracker = new_tracker(with_depth=True, shown=shown)
     run(tracker, renumbered(start + images))
     assert lost_frames(tracker) == lost
-    assert {tracker.tracked[index].status for index in lost} == {TrackingStatus.LOST}
+    assert {tracker.tracked[index].reason for index in lost} == {"start given up"}
     assert tracker.keyframes.frames[0].frame_index == lost[-1] + 1
     estimate, truth = centres(tracker, shown)
     error = (torch.from_numpy(estimate - truth)).norm(dim=1).max()
@@ -145,6 +145,8 @@ def test_of_two_scenes_the_longer_is_kept(first: int, second: int):
     kept = range(first) if first > second else range(first, first + second)
     assert followed == list(kept)
     assert tracker.keyframes.frames[0].frame_index == kept[0]
+    reasons = {"lost, matched ratio 0.000"} if first > second else {"start given up"}
+    assert {t.reason for t in tracker.tracked if t.frame_index not in kept} <= reasons
 
 
 def test_a_start_that_was_given_up_is_repeated_if_none_was_better():
