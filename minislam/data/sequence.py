@@ -129,10 +129,7 @@ class RecordedSequence:
         options = replace(
             self._options, fx=zoom * raw.fx, fy=zoom * raw.fy, k1=k1, k2=k2, focal="refine"
         )
-        straight = RecordedSequence(self._recording, options, self._source)
-        told = f"a lens of {fx:.0f} px, k1 {k1:.3f}, k2 {k2:.3f} found"
-        straight.description = straight.description.replace("intrinsics given", told)
-        return straight
+        return RecordedSequence(self._recording, options, self._source)
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
         """Return one frame undistorted, at the size of the source: `prepare.full_camera`."""
