@@ -20,7 +20,7 @@ class LearnedFlowConfig:
     warmup_iterations: int = parameter(2, "Gauss-Newton steps per turn of the warm-up", 1)
     window: int = parameter(10, "newest keyframes that the local BA moves", 1)
     rounds: int = parameter(4, "turns per keyframe", 1)
-    active_edges: int = parameter(0, "edges that take turns, those of the newest keyframe too, at most")
+    active_edges: int = parameter(0, "edges that take turns, the newest keyframe's too, at most")
     iterations: int = parameter(2, "Gauss-Newton steps per turn", 1)
     global_iterations: int = parameter(2, "Gauss-Newton steps per turn of a global BA", 1)
     robust_scale: float = parameter(0.0, "as tracking.robust_scale: none is needed [px]")
