@@ -1,6 +1,7 @@
-"""A whole test run executes the notebooks in a second process, on the second core.
+"""A whole test run has two processes, each about half of the work, for two cores.
 
-Plain `pytest` does so, on a machine with two cores. A run of chosen tests or files does not.
+Plain `pytest` starts the second one, on a machine with two cores. A run of chosen tests or files
+does not.
 """
 
 import os
@@ -11,16 +12,19 @@ from pathlib import Path
 
 import pytest
 
-NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+ROOT = Path(__file__).parent.parent
+BESIDE = ("notebooks", "tests/cli", "tests/runs")  # what the second process runs
 
 
-class NotebooksBeside:
-    """The plugin of a whole run: leaves the notebooks to a second process, reports it."""
+class HalfBeside:
+    """The plugin of a whole run: leaves `BESIDE` to a second process, and reports it."""
 
     def __init__(self, config: pytest.Config) -> None:
-        config.args = [folder for folder in config.args if Path(folder).name != NOTEBOOKS.name]
+        beside = [str(ROOT / folder) for folder in BESIDE]
+        config.option.ignore = [*(config.option.ignore or []), *beside]
+        config.args = [folder for folder in config.args if folder not in BESIDE]
         self._output = tempfile.TemporaryFile(mode="w+", encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", str(NOTEBOOKS), "-q"]
+        command = [sys.executable, "-m", "pytest", *beside, "-q"]
         self._process = subprocess.Popen(command, stdout=self._output, stderr=subprocess.STDOUT)
 
     @pytest.hookimpl(tryfirst=True)
@@ -35,7 +39,7 @@ class NotebooksBeside:
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """Print what the other process has printed."""
         self._output.seek(0)
-        terminalreporter.section("notebooks, in a process of their own")
+        terminalreporter.section(f"{', '.join(BESIDE)}, in a second process")
         terminalreporter.write(self._output.read())
 
 

@@ -36,10 +36,10 @@ def pytest_configure(config) -> None:
         number = getattr(signal, name, None)  # no SIGHUP on Windows
         if number is not None and signal.getsignal(number) == signal.SIG_IGN:
             signal.signal(number, handler)
-    from tests.beside import NotebooksBeside, is_whole
+    from tests.beside import HalfBeside, is_whole
 
     if is_whole(config):
-        config.pluginmanager.register(NotebooksBeside(config))
+        config.pluginmanager.register(HalfBeside(config))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
