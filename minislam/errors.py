@@ -12,5 +12,14 @@ class InputError(MinislamError):
     """What was given cannot be used. The sentence says what was expected, found, and what to do."""
 
 
+def require(is_right: bool, wanted: str, found: object) -> None:
+    """Raise InputError unless that is right: "expected WANTED, found FOUND".
+
+    After the finding, and a semicolon, stands what to do.
+    """
+    if not is_right:
+        raise InputError(f"expected {wanted}, found {found}")
+
+
 class TrackingLost(MinislamError):
     """The camera could not be followed through any usable part of the sequence."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 
 Tree = TypeVar("Tree")  # a dataclass whose fields are values or again dataclasses
 
@@ -28,11 +28,9 @@ def parameter(default: Any, meaning: str, least: float = 0, most: float = MOST) 
 def require_bounds(name: str, value: Any, least: float, most: float) -> None:
     """Refuse a number, or a tuple of numbers, out of bounds; anything else passes."""
     for number in value if isinstance(value, tuple) else (value,):
-        if isinstance(number, int | float) and not least <= number <= most:
-            raise InputError(
-                f"expected {name} of at least {least:g} and at most {most:g}, found {value}; "
-                "choose a value between"
-            )
+        is_within = not isinstance(number, int | float) or least <= number <= most
+        wanted = f"{name} of at least {least:g} and at most {most:g}"
+        require(is_within, wanted, f"{value}; choose a value between")
 
 
 def user_path(path: Path | str) -> Path:
@@ -91,31 +89,34 @@ def _converted(name: str, value: Any, present: Any, entry: Field[Any]) -> Any:
     if value is None and kind is not entry.type:
         return None
     try:
-        if kind is bool:
-            words = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
-            return value if isinstance(value, bool) else words[str(value).lower()]
-        if get_origin(kind) is tuple:
-            parts = value.split(",") if isinstance(value, str) else value
-            return tuple(of(part) for of, part in zip(get_args(kind), parts, strict=True))
-        converted = kind(value)
-        # int(2.5) and float("nan") succeed, but are always mistakes.
-        is_wrong = isinstance(value, bool) or (kind is not str and not math.isfinite(converted))
-        if is_wrong or (not isinstance(value, str) and converted != value):
-            raise ValueError
-        return converted
+        if get_origin(kind) is not tuple:
+            return _plain(kind, value)
+        parts = value.split(",") if isinstance(value, str) else value
+        return tuple(_plain(of, part) for of, part in zip(get_args(kind), parts, strict=True))
     except (KeyError, OverflowError, TypeError, ValueError):
         wanted = "a finite number" if kind is float else f"of type {kind.__name__}"
         like = "" if present is None else f" like {present!r}"
         raise InputError(f"expected {name} to be {wanted}{like}, found {value!r}") from None
 
 
+def _plain(kind: Any, value: Any) -> Any:
+    """Convert a value to bool, int, float or str; raises what `_converted` knows."""
+    if kind is bool:
+        words = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
+        return value if isinstance(value, bool) else words[str(value).lower()]
+    converted = kind(value)
+    # int(2.5) and float("nan") succeed, but are always mistakes.
+    is_wrong = isinstance(value, bool) or (kind is not str and not math.isfinite(converted))
+    if is_wrong or (not isinstance(value, str) and converted != value):
+        raise ValueError
+    return converted
+
+
 def flattened(tree: Any, prefix: str = "") -> dict[str, Any]:
     """Return nested dictionaries as a single one, with names that contain dots."""
-    if not isinstance(tree, dict):
-        raise InputError(
-            f"expected settings as a JSON object, found {type(tree).__name__}; write "
-            '{"tracking": {"window": 8}} or {"tracking.window": 8}'
-        )
+    like = '{"tracking": {"window": 8}} or {"tracking.window": 8}'
+    found = f"{type(tree).__name__}; write {like}"
+    require(isinstance(tree, dict), "settings as a JSON object", found)
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, dict) and value:

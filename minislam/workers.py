@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.records import Frame
 from minislam.state.stateful import Tree, from_tree, to_tree
 
@@ -41,7 +41,7 @@ _START = "import sys; sys.path[:] = sys.argv[2:]; from minislam.workers import s
 def idle_cores() -> int:
     """Return how many workers the idle cores can feed, at most 4; MINISLAM_WORKERS replaces it."""
     given = os.environ.get("MINISLAM_WORKERS", "")
-    if given.isdigit():
+    if given.isdecimal():
         return max(1, int(given))
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
@@ -58,8 +58,7 @@ class Workers(AbstractContextManager["Workers"]):
         threads: int = 1,  # of torch in each helper, as many as here: the bytes depend on it
         warn: Callable[[str], None] = lambda text: None,  # told when helpers are lost
     ) -> None:
-        if count < 1:
-            raise InputError(f"expected at least 1 worker, found {count}; give --workers 1 or more")
+        require(count >= 1, "at least 1 worker", f"{count}; give --workers 1 or more")
         if count > (most := os.cpu_count() or count):
             warn(f"{count} workers on {most} processors are slower; give --workers {most} or fewer")
         self._warn = warn

@@ -173,6 +173,8 @@ def test_an_unknown_preset_is_answered_with_all():
         ("uncertainty.enabled", "maybe"),
         ("networks.metric3d.size", "one,two"),
         ("networks.metric3d.size", 3),
+        ("networks.metric3d.size", [616.5, 1064]),
+        ("networks.metric3d.size", [616, True]),
     ],
 )
 def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):

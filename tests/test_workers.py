@@ -172,6 +172,8 @@ def test_one_worker_per_idle_core(monkeypatch):
         assert idle_cores() == expected
     monkeypatch.setenv("MINISLAM_WORKERS", "3")
     assert idle_cores() == 3
+    monkeypatch.setenv("MINISLAM_WORKERS", "3²")
+    assert idle_cores() == 1  # as if it were not set
 
 
 # Errors

@@ -45,5 +45,6 @@ def drawn(draw: Callable[[int], Case]) -> list[Case]:
     `minislam grade` sets it. `draw` makes a case of a seed.
     """
     hidden = os.environ.get("MINISLAM_SEED", "")
-    seeds = [1000 * (int(hidden) + 1) + n for n in range(DRAWN_CASES)] if hidden else []
+    first = 1000 * (int(hidden) + 1) if hidden.isdecimal() else 0
+    seeds = range(first, first + DRAWN_CASES) if first else ()
     return [draw(seed) for seed in [*range(DRAWN_CASES), *seeds]]

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,11 @@ from minislam.checks.cases import Case
 PASSED, NOT_YET, WRONG = "passed", "not yet", "wrong"
 SINGLE = (torch.float32, torch.float16, torch.bfloat16)
 ARRAYS = (np.float64, np.float32, np.float16)  # torch knows no other real numbers
+NO_NUMBERS = (TypeError, ValueError, OverflowError)  # of `as_numbers`
 SMALLEST = 1e-3  # an expected number below this counts as this: it may be a rounded zero
 SECONDS = 10.0  # of the student's function, all cases together
 
 Function = Callable[..., Any]  # answers with numbers in any form, or with a tuple of such
-# A known mistake, or the `flaw` with which the reference makes it, and what explains it.
-Mistakes = Sequence[tuple[Any, str]]
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,19 @@ def check_function(
     reference: Function,
     cases: list[Case],
     tolerance: float = 1e-6,  # relative to the largest expected number; 1e-5 in float32
-    mistakes: Mistakes = (),
+    mistakes: Sequence[tuple[Any, str]] = (),  # a function, or a `flaw` of the reference; a hint
     returns: tuple[str, ...] = (),  # the names of the values, where there are several
+    outcome: Callable[..., Any] | None = None,  # of (function, *inputs), to be compared instead
 ) -> Verdict:
     """Compare a student's function with the reference on all cases, up to the first difference.
 
     MINISLAM_STRICT=1 raises WrongAnswer where it has not passed, so that nbmake and nbgrader see.
     """
-    seconds = SECONDS
+
+    def observed(function: Function) -> Function:
+        return partial(outcome, function) if outcome else function
+
+    student, right, seconds = observed(student), observed(reference), SECONDS
     for case in cases:
         begin = time.process_time()
         try:
@@ -65,16 +70,15 @@ def check_function(
             return _verdict(WRONG, f"for {case.description} it {stop}.")
         if answer is None:
             return _verdict(NOT_YET, f"for {case.description} the function returns nothing.")
-        expected, smallest, allowed = reference(*case.arguments), SMALLEST, tolerance
+        expected, smallest, allowed = right(*case.arguments), SMALLEST, tolerance
         if any(x.dtype in SINGLE for x in real_tensors((answer, given))):
             # Rounding errors are those of the largest number.
             allowed, smallest = max(tolerance, 1e-5), max(1.0, largest(given))
         if found := difference(answer, expected, allowed, returns, smallest):
             smallest = max(smallest, largest(expected))
-            inputs = case.arguments
             others = (
-                (mistake(*inputs) if callable(mistake) else reference(*inputs, flaw=mistake), hint)
-                for mistake, hint in mistakes
+                (observed(m if callable(m) else partial(reference, flaw=m))(*case.arguments), hint)
+                for m, hint in mistakes
             )
             named = (h for x, h in others if not difference(answer, x, allowed, (), smallest))
             hint = next(named, "") or relation(answer, expected, allowed)
@@ -118,7 +122,7 @@ def largest(value: Any) -> float:
 
 
 def as_numbers(answer: Any) -> Tensor:
-    """Return numbers in float64. Raises TypeError where they are none, ValueError if ragged."""
+    """Return numbers in float64. Raises NO_NUMBERS: not a number, ragged, too large."""
     if isinstance(answer, np.ndarray | np.generic):
         answer = torch.from_numpy(np.array(answer))  # a copy: also of what runs backwards
     if isinstance(answer, Tensor):
@@ -154,7 +158,7 @@ def difference(
         return ""
     try:
         numbers, right = as_numbers(answer), as_numbers(expected)
-    except (TypeError, ValueError) as error:
+    except NO_NUMBERS as error:
         return f"it returns {error}, expected a tensor"
     if numbers.shape != right.shape:
         if numbers.numel() != 1 or right.numel() != 1:
@@ -175,7 +179,7 @@ def relation(answer: Any, expected: Any, tolerance: float) -> str:
     """Return a sentence where one simple change makes the answer right, else ""."""
     try:
         numbers, right = as_numbers(answer), as_numbers(expected)
-    except (TypeError, ValueError):
+    except NO_NUMBERS:
         return ""
     if not numbers.isfinite().all():
         return "A number is NaN or infinite: what is divided by zero, or has no root?"

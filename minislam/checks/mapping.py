@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from minislam.checks.cases import CAMERA, Case, doubles, drawn, normals
-from minislam.checks.grading import Function, Mistakes, Verdict, check_function
+from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 from minislam.mapping import pose_refinement
 from minislam.mapping.config import InsertionConfig, MappingConfig, PoseRefinementConfig
@@ -199,21 +199,19 @@ def check_map_loss(student: Function) -> Verdict:
         Case((color, depth, image, holes, weight, scales), "depth that is unknown in places"),
         Case((color, depth, image, holes, weight, needles), "thin Gaussians"),
     ]
-    mistakes: Mistakes = [
+    mistakes = [
         (lambda *a: reference(*a[:4], one, a[5]), "Each pixel has its weight."),
         (lambda *a: reference(*a[:4], a[4] / a[4].mean(), a[5]), "Divide by the number of pixels."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 1)), "L_iso is multiplied by 10."),
         (lambda *a: reference(*a, shares=(0.2, 0.8, 10)), "0.8 is for colour, 0.2 for depth."),
-        (partial(reference, flaw="one mean"), "Each Gaussian has its own mean scale."),
-        (partial(reference, flaw="of known"), "The mean is over all pixels: unknown ones count 0."),
-        (partial(reference, flaw="with unknown"), "Depth 0 is unknown and costs nothing."),
+        ("one mean", "Each Gaussian has its own mean scale."),
+        ("of known", "The mean is over all pixels: unknown ones count 0."),
+        ("with unknown", "Depth 0 is unknown and costs nothing."),
         (lambda *a: reference(*a).detach(), "Return a tensor that autograd can differentiate."),
     ]
-    mistakes = [(partial(outcome, mistake), hint) for mistake, hint in mistakes]
-    answered, right = partial(outcome, student), partial(outcome, reference)
     returns = "the loss", "its derivative by the colour"
-    return check_function(answered, right, cases, 1e-7, mistakes, returns)
+    return check_function(student, reference, cases, 1e-7, mistakes, returns, outcome)
 
 
 def check_followed_pose(student: Function) -> Verdict:
@@ -289,7 +287,5 @@ def check_followed_pose(student: Function) -> Verdict:
         (one_step, "Repeat the step, each time from the pose of the last one."),
         (unweighted, "The camera follows the dynamic object: each pixel has its weight."),
     ]
-    mistakes = [(partial(pixels_of, mistake), hint) for mistake, hint in mistakes]
-    cases = [case for case, _ in pairs]
-    answered, right = partial(pixels_of, student), partial(pixels_of, true_pose)
-    return check_function(answered, right, cases, 0.02, mistakes, ("the Gaussians' pixels",))
+    cases, returns = [case for case, _ in pairs], ("the Gaussians' pixels",)
+    return check_function(student, true_pose, cases, 0.02, mistakes, returns, pixels_of)

@@ -1,9 +1,6 @@
 """Choose flow, features and depth by their names on the command line; load and check them.
 
-Priors may also be made elsewhere. `--depth python:MODULE:FACTORY` imports MODULE, also from the
-current folder, and calls FACTORY(device), or FACTORY(device, FILE) with `--depth-weights FILE`. An
-installed package gives its factory a name of its own by an entry point in the group
-`minislam.depth`. The same holds for features and flow.
+How to write one, and name it by `python:MODULE:FACTORY` or an entry point: networks/README.md.
 """
 
 import sys
@@ -14,7 +11,7 @@ from typing import Any
 
 import torch
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import Camera
 from minislam.parameters import user_path
 from minislam.priors import conformance, names
@@ -121,8 +118,8 @@ def _depth_files(sequence: Sequence, folder: Path) -> FileDepth:
 
 def _require_some(depths: Iterable[Any], what: str, advice: str) -> None:
     """Refuse depths that are unknown everywhere; the first that is known ends the search."""
-    if not any(depth is not None and bool((depth > 0).any()) for depth in depths):
-        raise InputError(f"expected {what}, found none; {advice}")
+    is_known = any(depth is not None and bool((depth > 0).any()) for depth in depths)
+    require(is_known, what, f"none; {advice}")
 
 
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import Camera
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
@@ -47,7 +47,7 @@ def check_depth_prior(prior: Any, name: str = "the depth prior") -> None:
         _expect_tensor(name, depth, (CAMERA.height, CAMERA.width))
         low, high = map(float, depth.aminmax())
         found = f"{low:g} to {high:g}; return z in world units"
-        _expect(low >= 0 and high > 0, f"{name} to return depths > 0 and 0 where unknown", found)
+        require(low >= 0 and high > 0, f"{name} to return depths > 0 and 0 where unknown", found)
 
 
 def check_feature_extractor(features: Any, name: str = "the features") -> None:
@@ -56,14 +56,14 @@ def check_feature_extractor(features: Any, name: str = "the features") -> None:
     found = _same_answer(name, features)
     _expect_tensor(name, found, (CAMERA.height // stride, CAMERA.width // stride, dimension))
     differ = bool((found != found[0, 0]).any())
-    _expect(differ, f"{name} to tell places apart", "the same vector everywhere")
+    require(differ, f"{name} to tell places apart", "the same vector everywhere")
 
 
 def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
     """Refuse an object that is no `FlowEstimator`; it is shown an image moved by SHIFT."""
     stride, images = _count(name, flow, "stride"), shifted_images()
     learned = getattr(flow, "learned_confidence", None)
-    _expect(isinstance(learned, bool), f"{name} to say learned_confidence: True or False", learned)
+    require(isinstance(learned, bool), f"{name} to say learned_confidence: True or False", learned)
     edges = [0, 1], [1, 0], CAMERA.pixel_grid(stride).flatten(0, 1).T.repeat(2, 1, 1)
     for index, image in enumerate(images):
         _call(name, flow, "add_frame", index, image)
@@ -73,7 +73,7 @@ def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
     _call(name, flow, "restore_state", state, None)
     again = _call(name, flow, "match", *edges)
     wanted = f"{name} to match as before after restore_state(saved_state())"
-    _expect(torch.equal(first.targets, again.targets), wanted, "other targets; save all it changes")
+    require(torch.equal(first.targets, again.targets), wanted, "other targets; save all it changes")
     damping = _call(name, flow, "disparity_damping", len(images))
     if damping is not None:
         _expect_tensor(f"{name} (disparity_damping)", damping, (len(images), edges[2].shape[2]))
@@ -86,14 +86,9 @@ def check_flow_estimator(flow: Any, name: str = "the flow") -> None:
     are_equal = all(torch.equal(answer.targets, answers[0].targets) for answer in answers)
     wanted = f"{of_chain} to stay as it is, and restore_chain to return it"
     found = "another answer to the same image; let advance and restart return new chains"
-    _expect(are_equal, wanted, found)
+    require(are_equal, wanted, found)
     for index in (0, 1):
         _call(name, flow, "remove_frame", index)
-
-
-def _expect(is_right: bool, wanted: str, found: object) -> None:
-    if not is_right:
-        raise InputError(f"expected {wanted}, found {found}")
 
 
 def _expect_tensor(name: str, value: Any, shape: tuple[int, ...]) -> None:
@@ -102,26 +97,26 @@ def _expect_tensor(name: str, value: Any, shape: tuple[int, ...]) -> None:
         found = f"{tuple(value.shape)} {value.dtype} on {value.device}"
         if found == wanted and (value.requires_grad or not value.isfinite().all()):
             found += " with gradients" if value.requires_grad else ", not all finite"
-    _expect(found == wanted, f"{name} to return a finite tensor {wanted} like the image", found)
+    require(found == wanted, f"{name} to return a finite tensor {wanted} like the image", found)
 
 
 def _expect_matches(name: str, matches: Any, edges: int, stride: int) -> None:
     """Refuse matches of another form, and targets that are not where the second image shows."""
     is_right = isinstance(matches, FlowMatches)
-    _expect(is_right, f"{name} to return FlowMatches", type(matches).__name__)
+    require(is_right, f"{name} to return FlowMatches", type(matches).__name__)
     shape = (edges, 2, CAMERA.pixel_grid(stride)[..., 0].numel())
     _expect_tensor(f"{name} (targets)", matches.targets, shape)
     _expect_tensor(f"{name} (confidences)", matches.confidences, shape)
     _expect_tensor(f"{name} (matched_ratios)", matches.matched_ratios, shape[:1])
     for part in (matches.confidences, matches.matched_ratios):
         low, high = map(float, part.aminmax())
-        _expect(low >= 0 and high <= 1, f"{name} to return 0 to 1", f"{low:g} to {high:g}")
+        require(low >= 0 and high <= 1, f"{name} to return 0 to 1", f"{low:g} to {high:g}")
     u, v = SHIFT
     mistakes = {"(v, u)": (v, u), "the way back": (-u, -v), "cells": (u / stride, v / stride)}
     near = [text for text, it in mistakes.items() if flow_error(matches, stride, it) < 1]
     error, hint = flow_error(matches, stride), f" which fits {near[0]}," if near else ""
     found = f"targets off by {error:.1f} px,{hint} return the pixel (u, v) in the target"
-    _expect(error <= stride / 2, f"{name} to find an image moved by {SHIFT} px", found)
+    require(error <= stride / 2, f"{name} to find an image moved by {SHIFT} px", found)
 
 
 def _same_answer(name: str, function: Any, *more: Any) -> Any:
@@ -129,10 +124,10 @@ def _same_answer(name: str, function: Any, *more: Any) -> Any:
     frames = [Frame(k, float(k), image) for k, image in enumerate(shifted_images())]
     first, _, again = (_call(name, function, "__call__", frames[k], *more) for k in (0, 1, 0))
     is_kept = torch.equal(frames[0].image, shifted_images()[0])
-    _expect(is_kept, f"{name} to leave the image as it is", "it changed; copy it first")
+    require(is_kept, f"{name} to leave the image as it is", "it changed; copy it first")
     is_same = not isinstance(first, Tensor) or torch.equal(first, torch.as_tensor(again))
     hint = "others the second time; switch off dropout, and seed what is random"
-    _expect(is_same, f"{name} to answer the same frame with the same numbers", hint)
+    require(is_same, f"{name} to answer the same frame with the same numbers", hint)
     return first
 
 
@@ -149,7 +144,7 @@ def _call(name: str, thing: Any, method: str, *arguments: Any) -> Any:
 def _count(name: str, thing: Any, field: str) -> int:
     value = getattr(thing, field, None)
     is_count = isinstance(value, int) and value >= 1
-    _expect(is_count, f"{name} to have a whole number {field} >= 1", repr(value))
+    require(is_count, f"{name} to have a whole number {field} >= 1", repr(value))
     return int(value or 0)
 
 
@@ -160,5 +155,5 @@ def _saved_state(name: str, thing: Any) -> Tree:
     parts = [state]
     for part in parts:  # grows while it is walked through
         parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
-        _expect(isinstance(part, _STORED), wanted, f"a {type(part).__name__}")
+        require(isinstance(part, _STORED), wanted, f"a {type(part).__name__}")
     return state

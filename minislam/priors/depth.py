@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import Camera
 from minislam.parameters import parameter
 from minislam.records import Frame
@@ -99,10 +99,9 @@ def as_depth(depth: np.ndarray, frame: Frame, name: str) -> Tensor:
     """Return depth as (H, W) float32 of the frame's size, with 0 for everything unusable."""
     height, width = frame.image.shape[:2]
     aspect = (depth.shape[1] / depth.shape[0]) / (width / height)
-    if abs(aspect - 1) > _ASPECT_TOLERANCE:
-        wanted = f"{name} to show what the image of {width}x{height} shows"
-        found = f"{depth.shape[1]}x{depth.shape[0]} of another aspect ratio; crop it like the image"
-        raise InputError(f"expected {wanted}, found {found}")
+    wanted = f"{name} to show what the image of {width}x{height} shows"
+    found = f"{depth.shape[1]}x{depth.shape[0]} of another aspect ratio; crop it like the image"
+    require(abs(aspect - 1) <= _ASPECT_TOLERANCE, wanted, found)
     depth = np.asarray(depth, np.float32)
     if depth.shape != (height, width):
         # Not bilinear: a mean over an object's edge is a depth where nothing is.

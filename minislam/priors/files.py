@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import Camera
 from minislam.parameters import user_path
 from minislam.priors.depth import as_depth
@@ -38,10 +38,9 @@ class FrameFiles:
         # Sorted, so that of 17.npy and 17.png the same one wins on every machine.
         files = sorted(p for p in self.folder.glob("*") if p.suffix.lower() in endings)
         self._files = {int(path.stem): path for path in files if path.stem.isdecimal()}
-        if not self._files:
-            wanted = f"{' or '.join(endings)} files named by frame index in {self.folder}"
-            found = f"{len(files)} such files and none that fits; name them like 00017.npy"
-            raise InputError(f"expected {wanted}, found {found}")
+        wanted = f"{' or '.join(endings)} files named by frame index in {self.folder}"
+        found = f"{len(files)} such files and none that fits; name them like 00017.npy"
+        require(bool(self._files), wanted, found)
         self.first = self._files[min(self._files)]
         index = self.folder / INDEX
         self._number_of = _read_index(index) if index.is_file() else None
@@ -78,9 +77,8 @@ class FileFeatures:
     def __init__(self, folder: Path | str, camera: Camera, frames: int = 0) -> None:
         """Open a folder; raises InputError where it has fewer files than there are `frames`."""
         self._files = FrameFiles(folder, "features", (".npy",))
-        if len(self._files) < frames:
-            wanted = f"features of every frame in {folder}, {frames} files"
-            raise InputError(f"expected {wanted}, found {len(self._files)}; {_MAKE}")
+        wanted = f"features of every frame in {folder}, {frames} files"
+        require(len(self._files) >= frames, wanted, f"{len(self._files)}; {_MAKE}")
         rows, _, self.dimension = read_array(self._files.first, FEATURES).shape
         self.stride = max(1, round(camera.height / rows))
 
@@ -93,17 +91,15 @@ class FileFeatures:
             raise InputError(f"expected {wanted}, found {found}; {_MAKE}")
         features = read_array(path, FEATURES).astype(np.float32)
         rows, cols, channels = features.shape
-        is_finite = np.isfinite(features).all()
-        if channels != self.dimension or not is_finite:
-            wanted = f"finite features of {self.dimension} channels in {path}"
-            found = channels if is_finite else "NaN or infinity"
-            raise InputError(f"expected {wanted}, found {found}; write all with one network")
+        is_finite = bool(np.isfinite(features).all())
+        wanted = f"finite features of {self.dimension} channels in {path}"
+        found = f"{channels if is_finite else 'NaN or infinity'}; write all with one network"
+        require(is_finite and channels == self.dimension, wanted, found)
         height, width = frame.image.shape[:2]
         # Whole patches are counted, so each side of the grid may lack up to one of them.
-        if abs(rows - cols * height / width) > max(1, height / width):
-            wanted = f"{path} to cover the image of {width}x{height}"
-            found = f"a grid of {cols}x{rows}, of another aspect ratio; crop it like the image"
-            raise InputError(f"expected {wanted}, found {found}")
+        covers = abs(rows - cols * height / width) <= max(1, height / width)
+        found = f"a grid of {cols}x{rows}, of another aspect ratio; crop it like the image"
+        require(covers, f"{path} to cover the image of {width}x{height}", found)
         return torch.from_numpy(features).to(frame.image.device)
 
 
@@ -150,10 +146,9 @@ def read_array(path: Path, kind: str) -> np.ndarray:
         raise InputError(f"expected a numpy array of {kind}, found {found}") from error
     array = np.squeeze(array) if kind == DEPTH else array
     axes, is_float = _AXES[kind], np.issubdtype(array.dtype, np.floating)
-    if array.ndim != len(axes) or array.size == 0 or not is_float:
-        wanted = f"floating-point {kind} of shape ({', '.join(axes)}) in {path}"
-        found = f"{array.dtype} of shape {array.shape}; store one such array per file"
-        raise InputError(f"expected {wanted}, found {found}")
+    wanted = f"floating-point {kind} of shape ({', '.join(axes)}) in {path}"
+    found = f"{array.dtype} of shape {array.shape}; store one such array per file"
+    require(is_float and array.ndim == len(axes) and array.size > 0, wanted, found)
     return array
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import FILES, absolute_path, user_path
 
 PYTHON = "python:"  # before MODULE:FACTORY
@@ -37,19 +37,17 @@ class PriorChoice:
 
     def __post_init__(self) -> None:
         """Refuse a device that is not there, and a precision that it has not."""
-        if self.device not in ("cpu", "cuda"):
-            raise InputError(f"expected --device cpu or cuda, found {self.device!r}; choose one")
+        known = self.device in ("cpu", "cuda")
+        require(known, "--device cpu or cuda", f"{self.device!r}; choose one")
         if self.device == "cuda":
             import torch  # only where a GPU is asked for
 
-            if not torch.cuda.is_available():
-                advice = "say --device cpu, or make the priors elsewhere with minislam priors"
-                wanted = "a GPU that this torch can use for --device cuda"
-                raise InputError(f"expected {wanted}, found none; {advice}")
+            advice = "say --device cpu, or make the priors elsewhere with minislam priors"
+            wanted = "a GPU that this torch can use for --device cuda"
+            require(torch.cuda.is_available(), wanted, f"none; {advice}")
         usable = [name for name in PRECISIONS if (self.device, name) != ("cpu", "fp16")]
-        if self.precision not in usable:
-            wanted = f"--precision {' or '.join(usable)} with --device {self.device}"
-            raise InputError(f"expected {wanted}, found {self.precision!r}; choose one")
+        wanted = f"--precision {' or '.join(usable)} with --device {self.device}"
+        require(self.precision in usable, wanted, f"{self.precision!r}; choose one")
 
     def from_anywhere(self) -> "PriorChoice":
         """Return the same choice by absolute paths, which a run folder keeps."""
@@ -76,8 +74,8 @@ class PublishedFile:
     @property
     def path(self) -> Path:
         """Return where this file is, or would be, below $MINISLAM_CACHE or ~/.cache/minislam."""
-        root = Path(os.environ.get("MINISLAM_CACHE") or Path.home() / ".cache" / "minislam")
-        return root / "weights" / self.file
+        root = os.environ.get("MINISLAM_CACHE") or "~/.cache/minislam"
+        return user_path(root) / "weights" / self.file
 
 
 def published_files() -> dict[str, PublishedFile]:
@@ -110,24 +108,20 @@ def require_prior(kind: str, name: str, weights: str | None) -> str | None:
     learned = [use.split()[1] for use in uses if use.startswith(f"--{kind} ")]
     if name in learned:
         file = find_weights(f"--{kind} {name}", weights)
-        if file is None or not user_path(file).is_file():
-            wanted = f"--{kind}-weights FILE with --{kind} {name}"
-            found = "none" if file is None else f"nothing at {file}"
-            fetch = f"fetch it with minislam weights fetch {name}"
-            advice = f"{fetch}, or give the path of an official checkpoint"
-            raise InputError(f"expected {wanted}, found {found}; {advice}")
+        wanted = f"--{kind}-weights FILE with --{kind} {name}"
+        found = "none" if file is None else f"nothing at {file}"
+        fetch = f"fetch it with minislam weights fetch {name}"
+        advice = f"{fetch}, or give the path of an official checkpoint"
+        require(file is not None and user_path(file).is_file(), wanted, f"{found}; {advice}")
         return file
     if name.startswith(PYTHON) or name in plugins(kind):
         return weights
-    if weights is not None:
-        wanted = f"--{kind} {' or '.join(learned)} with --{kind}-weights"
-        found = f"--{kind} {name}; name the network of {weights}"
-        raise InputError(f"expected {wanted}, found {found}")
+    wanted = f"--{kind} {' or '.join(learned)} with --{kind}-weights"
+    require(weights is None, wanted, f"--{kind} {name}; name the network of {weights}")
     if name.startswith(FILES) and FOLDER in BUILT_IN[kind]:
         folder = user_path(name.removeprefix(FILES))
-        if not folder.is_dir():
-            found = f"nothing at {folder}; check the path"
-            raise InputError(f"expected a folder of {kind} files, found {found}")
+        found = f"nothing at {folder}; check the path"
+        require(folder.is_dir(), f"a folder of {kind} files", found)
     elif name not in BUILT_IN[kind]:
         known = ", ".join([*BUILT_IN[kind], *learned, *plugins(kind)])
         wanted = f"--{kind} {known} or {PYTHON}MODULE:FUNCTION"

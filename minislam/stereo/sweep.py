@@ -18,9 +18,9 @@ import numpy as np
 from minislam.geometry import Camera
 from minislam.geometry.distortion import camera_matrix
 
-NCC_WINDOW = 5  # px, side of the window that is correlated
+NCC_WINDOW = (5, 5)  # px, that are correlated
 NCC_VARIANCE = 4e-4  # of grey values in [0, 1]: contrast below its root does not count
-COLOUR_WINDOW = 3  # px, side of the window of the absolute difference
+COLOUR_WINDOW = (3, 3)  # px, of the absolute difference
 COLOUR_SCALE = 0.06  # grey values: a larger difference counts no more
 COLOUR_WEIGHT = 0.15  # of the absolute difference beside the correlation [-]
 MIN_SEEN = 0.25  # of the views that must see a pixel's plane [-]
@@ -90,12 +90,8 @@ def warp(gray: np.ndarray, H: np.ndarray) -> np.ndarray:  # (h, w)
 
 def _moments(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and variance (h, w) of the window around each pixel."""
-    mean = _window_mean(image, NCC_WINDOW)
-    return mean, np.maximum(_window_mean(image * image, NCC_WINDOW) - mean * mean, 0)
-
-
-def _window_mean(image: np.ndarray, size: int) -> np.ndarray:
-    return cv2.blur(image, (size, size))
+    mean = cv2.blur(image, NCC_WINDOW)
+    return mean, np.maximum(cv2.blur(image * image, NCC_WINDOW) - mean * mean, 0)
 
 
 def _dissimilarity(
@@ -109,9 +105,9 @@ def _dissimilarity(
     One view at a time, because its images stay in the cache.
     """
     mean_warped, variance_warped = _moments(warped)
-    covariance = _window_mean(gray * warped, NCC_WINDOW) - mean * mean_warped
+    covariance = cv2.blur(gray * warped, NCC_WINDOW) - mean * mean_warped
     ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))
-    difference = _window_mean(np.abs(gray - warped), COLOUR_WINDOW)
+    difference = cv2.blur(np.abs(gray - warped), COLOUR_WINDOW)
     colour = np.minimum(difference / COLOUR_SCALE, 1)
     return (1 - COLOUR_WEIGHT) * (1 - ncc.clip(0, 1)) + COLOUR_WEIGHT * colour
 

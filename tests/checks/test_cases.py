@@ -24,3 +24,5 @@ def test_cases_are_drawn_and_others_under_a_seed(monkeypatch):
     monkeypatch.setenv("MINISLAM_SEED", "5")
     assert "7 of 7 cases" in verdict().sentence
     assert seen[:4] == seen[4:8] and len(set(seen)) == 7
+    monkeypatch.setenv("MINISLAM_SEED", "a word")
+    assert "4 of 4 cases" in verdict().sentence

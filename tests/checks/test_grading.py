@@ -20,6 +20,7 @@ def test_shapes_types_nan_and_exceptions_are_answered_in_words():
 
     assert "the shape is (2,), expected (3,)" in check(lambda x: x[:2])
     assert "returns a str" in check(lambda x: "three")
+    assert "returns int too large to convert to float" in check(lambda x: 10**400)
     assert "element [0] is nan, expected 1" in check(lambda x: x * float("nan"))
     assert "stops with ZeroDivisionError" in check(lambda x: 1 / 0)
 

@@ -50,6 +50,17 @@ def test_other_cells_keep_imports_definitions_constants_and_the_dtype():
     assert part.text.count("except Exception:") == 4
 
 
+def test_an_assignment_with_a_type_is_kept_like_one_without():
+    [part, exercise] = parts_of(notebook("K: float = 3.0\nL: int = slow()", EXERCISE), TWO)
+    assert "K: float = 3.0" in part.text and "slow" not in part.text
+    assert "SCALE" not in exercise.text  # it has no value
+
+
+def test_a_line_may_begin_with_a_remainder():
+    [part] = parts_of(notebook("def f(n):\n    return (\n        n\n        % 3\n    )\n"), TWO)
+    assert "n % 3" in part.text
+
+
 def test_a_cell_that_python_cannot_read_is_told():
     broken = EXERCISE.replace("def mine(", "def mine[")
     parts = parts_of(notebook("a = (", broken, "checks.check_twist_vjp(lambda *a: 0)"), TWO)

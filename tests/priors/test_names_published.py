@@ -1,5 +1,6 @@
 """The list of published files: complete, and found where `minislam weights` puts them."""
 
+import os
 import re
 from pathlib import Path
 
@@ -28,6 +29,15 @@ def test_every_network_has_a_file_that_is_called_like_it():
     for network in NETWORKS:
         assert ROWS[network.name].use == f"--{network.kind} {network.name}"
     assert len({row.file for row in ROWS.values()}) == len(ROWS)
+
+
+def test_the_cache_may_be_named_from_the_home_and_needs_none(monkeypatch: pytest.MonkeyPatch):
+    row = ROWS["dinov2"]
+    monkeypatch.setenv("MINISLAM_CACHE", "~/weights of mine")
+    assert row.path == Path.home() / "weights of mine" / "weights" / row.file
+    monkeypatch.delenv("MINISLAM_CACHE")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # nobody's process has no home
+    assert row.path == Path("~/.cache/minislam/weights") / row.file
 
 
 def test_a_network_finds_what_was_fetched_and_what_is_named(cache: Path):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 
 # What trainers put the weights into: an entry of the file, or the first part of every name.
 _WRAPPERS = "model_state_dict state_dict model module _orig_mod teacher net model_ema".split()
@@ -137,8 +137,7 @@ def resize(x: Tensor, size: Sequence[int]) -> Tensor:
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Weights:
     """Read a checkpoint file of plain tensors to a device; nothing in it is executed."""
-    if not Path(path).is_file():
-        raise InputError(f"expected a checkpoint file, found nothing at {path}; check the path")
+    require(Path(path).is_file(), "a checkpoint file", f"nothing at {path}; check the path")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
         tensors = _tensors_in(content)
@@ -153,11 +152,10 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
         found = f"{path} ({Path(path).stat().st_size} bytes), {problem}"
         wanted = "a PyTorch checkpoint of plain tensors"
         raise InputError(f"expected {wanted}, found {found}") from error
-    if not tensors:
-        found = f"the entries {list(content)}" if isinstance(content, dict) else str(type(content))
-        save = "save the dictionary of its tensors alone to a file"
-        advice = f"give the file with the weights, or {save}"
-        raise InputError(f"expected named tensors in {path}, found {found[:300]}; {advice}")
+    found = f"the entries {list(content)}" if isinstance(content, dict) else str(type(content))
+    save = "save the dictionary of its tensors alone to a file"
+    advice = f"give the file with the weights, or {save}"
+    require(bool(tensors), f"named tensors in {path}", f"{found[:300]}; {advice}")
     _require_numbers(tensors, path)
     return Weights({name: tensor.float() for name, tensor in tensors.items()}, str(path))
 
@@ -186,6 +184,4 @@ def _require_numbers(tensors: dict[str, Tensor], path: Path | str) -> None:
     zeros = sum(not tensor.any() for tensor in tensors.values())
     if 2 * zeros > len(tensors):
         found = f"{zeros} of {len(tensors)} tensors that are zero everywhere"
-    if found:
-        found = f"{found}; give the official file"
-        raise InputError(f"expected finite trained weights in {path}, found {found}")
+    require(not found, f"finite trained weights in {path}", f"{found}; give the official file")

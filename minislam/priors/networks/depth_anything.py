@@ -13,7 +13,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.geometry import Camera
 from minislam.parameters import parameter
 from minislam.priors.networks.checkpoints import Weights, resize
@@ -92,8 +92,7 @@ def _limit_of_name(name: str) -> float:
     The file itself states neither this depth nor whether its output is metric.
     """
     limits = [limit for part, limit in _LIMIT_OF_NAME.items() if part in name]
-    if not limits:
-        wanted = f"{' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint"
-        found = f"{name}, whose output may be no metric depth; keep the official name"
-        raise InputError(f"expected {wanted}, found {found}")
+    wanted = f"{' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint"
+    found = f"{name}, whose output may be no metric depth; keep the official name"
+    require(bool(limits), wanted, found)
     return limits[0]

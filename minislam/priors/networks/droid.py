@@ -10,7 +10,7 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.parameters import parameter
 from minislam.priors.interfaces import FlowMatches
 from minislam.priors.networks import droid_network as net
@@ -74,10 +74,9 @@ class DroidFlow(Stateful):
     @torch.no_grad()
     def encode(self, image: Tensor) -> EncodedFrame:
         """Return an image (H, W, 3) encoded; chain and keyframe share the newest one."""
-        if min(image.shape[:2]) <= _TOO_SMALL:
-            wanted = f"images of more than {_TOO_SMALL} px per side for DROID"
-            found = f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
-            raise InputError(f"expected {wanted}, found {found}")
+        wanted = f"images of more than {_TOO_SMALL} px per side for DROID"
+        found = f"{image.shape[1]}x{image.shape[0]}; give a larger working size"
+        require(min(image.shape[:2]) > _TOO_SMALL, wanted, found)
         if self._newest is None or not torch.equal(self._newest.image, image):
             self._newest = EncodedFrame(self.weights, image)
         return self._newest

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.geometry import Camera
 from minislam.images import resample
 from minislam.parameters import parameter
@@ -54,10 +54,9 @@ class Metric3DDepth:
     """Metric depth by Metric3D v2: a `DepthPrior`."""
 
     def __init__(self, weights: Weights, network_size: tuple[int, int] = NETWORK_SIZE) -> None:
-        if any(side < _SIZE_STEP or side % _SIZE_STEP for side in network_size):
-            found = f"{network_size}; the one of the training is {NETWORK_SIZE}"
-            wanted = f"a network size of multiples of {_SIZE_STEP} px"
-            raise InputError(f"expected {wanted}, found {found}")
+        is_whole = all(side >= _SIZE_STEP and side % _SIZE_STEP == 0 for side in network_size)
+        found = f"{network_size}; the one of the training is {NETWORK_SIZE}"
+        require(is_whole, f"a network size of multiples of {_SIZE_STEP} px", found)
         self.network_size = network_size
         self.device = weights.device
         # It has registers, yet resizes its positions like the networks without.
@@ -96,11 +95,8 @@ class Metric3DDepth:
             fused = level.conv("out_conv", fused)
         return _refine(self._decoder, fused, [fine, middle, coarse], self._rounds)
 
-    def maps(
-        self,
-        image: Tensor,  # (B, 3, H, W) normalised
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # (B, C_l, H/s, W/s), s = 3.5, 7, 14 and 14 px
-        """Return maps at three resolutions, all from the last tokens; the fusion starts at two."""
+    def maps(self, image: Tensor) -> tuple[Tensor, ...]:  # 4 x (B, C_l, H/s, W/s)
+        """Return maps at s = 3.5, 7, 14 and 14 px, all from the last tokens of (B, 3, H, W)."""
         tokens = self._transformer(image)[0]
         weights = self._decoder.below("token2feature.")
         readings = []

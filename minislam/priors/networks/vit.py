@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.priors.networks.checkpoints import Weights
 from minislam.records import Frame
 
@@ -50,10 +50,9 @@ class VisionTransformer:
         # Metric3D stores all blocks in one chunk.
         self._block = "blocks.0.{}." if "blocks.0.0.norm1.weight" in weights else "blocks.{}."
         self.width = weights["patch_embed.proj.weight"].shape[0]
-        if self.width not in _BLOCKS:
-            wanted = f"a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in {weights.file}"
-            found = f"one of width {self.width}; give another size of the network"
-            raise InputError(f"expected {wanted}, found {found}")
+        wanted = f"a ViT of width {', '.join(map(str, _BLOCKS))} (S, B, L) in {weights.file}"
+        found = f"one of width {self.width}; give another size of the network"
+        require(self.width in _BLOCKS, wanted, found)
         self.depth = _BLOCKS[self.width]
         class_token, positions = weights["cls_token"], weights["pos_embed"]
         if positions.shape[1] == _TRAINED_GRID**2 + 1:
@@ -145,7 +144,7 @@ def is_antialiased(weights: Weights) -> bool:
     is_fit3d = "mask_token" not in weights
     has_registers = "register_tokens" in weights or "reg_token" in weights
     lacks_mask = is_fit3d and ("dinov2_vit" in name or "register_tokens" in weights)
-    if lacks_mask or ("_reg" in name and not has_registers):
-        lost = "mask_token" if lacks_mask else "register tokens"
-        raise InputError(f"expected {lost} in {weights.file}, found none; the file is not complete")
+    is_whole = not lacks_mask and ("_reg" not in name or has_registers)
+    lost = "mask_token" if lacks_mask else "register tokens"
+    require(is_whole, f"{lost} in {weights.file}", "none; the file is not complete")
     return is_fit3d or has_registers
