@@ -112,6 +112,8 @@ def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
     given: dict[str, str] = {}
     todo = iter(arguments)
     for argument in todo:
+        if argument == "--":
+            return [*rest, argument, *todo], given
         name, equals, value = argument.partition("=")
         if name.startswith("--") and "." in name:
             if not equals and re.match("--?[a-z]|$", value := next(todo, "")):

@@ -41,11 +41,13 @@ def say(text: str, stream: str = "stdout", end: str = "\n") -> None:
 def ending_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
     """Handle what asks a program to end; what is ignored already (`nohup`) stays so.
 
-    Python lets only the main thread do so; in another one nothing is handled.
+    Python lets only the main thread do so; in another one nothing is handled. What a program around
+    Python handles (None) stays so, too, because it could not be given back.
     """
     is_main = threading.current_thread() is threading.main_thread()
     numbers = [getattr(signal, name) for name in ENDING if is_main and hasattr(signal, name)]
-    before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
+    before = {number: signal.getsignal(number) for number in numbers}
+    before = {n: earlier for n, earlier in before.items() if earlier not in (signal.SIG_IGN, None)}
     for number in before:
         signal.signal(number, handler)
     try:
@@ -98,7 +100,8 @@ class ProgressLine:
         self._done: dict[tuple[int, str], float] = defaultdict(float)  # of each part of a stage
         self._start: tuple[float, float] | None = None  # time [s] and planned seconds done then
         self._stream = "stdout" if is_quiet else "stderr"  # a quiet stdout still reaches log.txt
-        self._terminal = sys.stderr.isatty() and not (is_quiet or is_verbose)
+        is_terminal = sys.stderr is not None and sys.stderr.isatty()  # None: no console at all
+        self._terminal = is_terminal and not (is_quiet or is_verbose)
         self._plain_step = 0.0 if is_verbose else PLAIN_STEP
         self._should_stop = False
         self._is_open = False  # on a terminal: the line has no end yet

@@ -44,14 +44,17 @@ def _fetch(args: argparse.Namespace) -> None:
         hint = nearest(unknown[0], known, "see which there are")
         raise InputError(f"expected names of minislam weights list, found {unknown[0]!r}; {hint}")
     rows, progress = [known[name] for name in args.names], ProgressLine()
+
+    def show(file: str, done: int, total: int) -> None:  # bytes
+        progress.show(f"fetching {file} [kB]", done // 1000, total // 1000)
+
     for row in rows:
         print(f"{row.name}: {row.megabytes} MB, licence {row.licence}, from {row.url}", flush=True)
     for row in rows:
         if row.path.exists():
             require_published(row, row.path)
         else:
-            show = partial(progress.show, f"fetching {row.file} [kB]")
-            download(row.url, row.path, partial(require_published, row), show)
+            download(row.url, row.path, partial(require_published, row), partial(show, row.file))
         print(f"{row.path}: complete, use it with {row.use}")
 
 

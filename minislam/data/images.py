@@ -168,7 +168,8 @@ def _is_complete(content: bytes) -> bool:
 def _standard_error() -> Iterator[list[bytes]]:
     """Keep what C libraries write to standard error off the screen; afterwards yield its lines."""
     reader, writer = os.pipe()
-    os.set_blocking(writer, False)  # what does not fit is dropped, rather than waited for
+    if hasattr(os, "set_blocking"):  # Windows has it from Python 3.12 on
+        os.set_blocking(writer, False)  # what does not fit is dropped, rather than waited for
     before, said = os.dup(2), list[bytes]()
     os.dup2(writer, 2)
     try:

@@ -31,7 +31,7 @@ def noted_focal_length(path: Path) -> tuple[float, str] | None:
             content = memoryview(mmap(file.fileno(), 0, access=ACCESS_READ))
         is_photo = content[:2] == b"\xff\xd8"
         found = _of_exif(_exif_segment(content)) if is_photo else _of_video(content)
-    except (OSError, struct.error, LookupError, ValueError, ArithmeticError):
+    except (OSError, struct.error, LookupError, ValueError, ArithmeticError, RecursionError):
         return None  # Damaged notes are no reason to refuse whole images.
     if found is None or not POSSIBLE[0] < found < POSSIBLE[1]:
         return None

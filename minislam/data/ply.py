@@ -4,6 +4,7 @@ The values are raw, and colours are the zeroth coefficient of spherical harmonic
 would make viewers show fog, or nothing.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -117,7 +118,7 @@ def _parse_header(header: bytes, name: str) -> tuple[int, list[str]]:
     plain = all(len(field) == 3 and field[:2] == ["property", "float"] for field in fields)
     names = [field[2] for field in fields] if plain else []
     missing = sorted(set(PROPERTIES) - {"nx", "ny", "nz"} - set(names))
-    counted = len(element) == 3 and element[:2] == ["element", "vertex"] and element[2].isdecimal()
+    counted = re.fullmatch(r"element vertex \d{1,18}", " ".join(element)) is not None
     if missing or not counted or len(set(names)) != len(names):
         raise InputError(
             "expected 'element vertex N' and the float properties of 3D Gaussians, found a header "

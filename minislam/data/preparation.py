@@ -1,10 +1,8 @@
 """From the raw image to the working image: undistort, cut unseen borders, resize, crop, keep."""
 
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
-from typing import IO
 
 import cv2
 import numpy as np
@@ -12,6 +10,7 @@ import numpy as np
 from minislam.data.options import MINIMUM_SIDE
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
+from minislam.memory import Shelf, release
 
 Window = tuple[int, int, int, int]  # left, top, width, height px
 
@@ -179,30 +178,23 @@ def seen_window(
 
 
 class KeptImages:
-    """Keeps prepared images of one shape in a temporary file; none more when the disk is full.
+    """Keeps prepared images in a temporary file; none more when the disk is full.
 
     A run looks at every frame about six times, and not in order. In a video a step back takes ten
     times as long as a step on, because decoding starts again at an earlier complete image.
     """
 
     def __init__(self) -> None:
-        self._slots: dict[int, int] = {}  # image number: place in the file
-        self._shape: tuple[int, ...] = ()
-        self._file: IO[bytes] | None = None  # the system removes it, however the program ends
+        self._shelf = Shelf()
+        self._images: dict[int, np.ndarray] = {}  # by number, on the shelf
 
     def get(self, number: int, prepare: Callable[[], np.ndarray]) -> np.ndarray:
         """Return image `number` (H, W, 3) uint8; `prepare` makes it when it is asked for first."""
-        if number in self._slots and self._file is not None:
-            image = np.empty(self._shape, np.uint8)
-            self._file.seek(self._slots[number] * image.nbytes)
-            image.data.cast("B")[:] = self._file.read(image.nbytes)
-            return image
-        image = prepare()
-        self._shape = image.shape
-        with suppress(OSError):  # the image is prepared again next time
-            self._file = self._file or tempfile.TemporaryFile()
-            self._file.seek(len(self._slots) * image.nbytes)
-            self._file.write(image.tobytes())
-            self._file.flush()
-            self._slots[number] = len(self._slots)
+        image = self._images[number].copy() if number in self._images else prepare()
+        if number not in self._images:
+            with suppress(OSError):  # the image is prepared again next time
+                place = self._shelf.room(image.nbytes).reshape(image.shape)
+                place[:] = image
+                self._images[number] = place
+        release()
         return image

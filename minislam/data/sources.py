@@ -67,7 +67,7 @@ class VideoImages:
         self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self._brightest: np.ndarray | None = None
+        self._brightest = np.zeros((), np.uint8)  # of each pixel, in some of the images
         stamps: list[float] = []
         last = 0  # A failed call is the end of the file, or damage with more frames behind it.
         while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
@@ -76,7 +76,9 @@ class VideoImages:
                 last = self._grabbed
                 self._calls.append(self._grabbed)
                 if _is_looked_at(len(stamps)):
-                    self._look()
+                    decoded, image = self._capture.retrieve()
+                    if decoded:
+                        self._brightest = np.maximum(self._brightest, image.max(2))
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         # Of as many frames as were read, 0 or less if unknown: the container tells it of all.
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -105,15 +107,7 @@ class VideoImages:
 
     def brightest(self) -> np.ndarray:  # (H, W) uint8
         """Return the largest value of each pixel in some of the images."""
-        assert self._brightest is not None, "the first image was read"
         return self._brightest
-
-    def _look(self) -> None:
-        decoded, image = self._capture.retrieve()
-        if decoded:
-            image = image.max(2)
-            seen = image if self._brightest is None else self._brightest
-            self._brightest = np.maximum(seen, image)
 
     def lost(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing: gaps of a constant rate, or calls that failed."""

@@ -75,9 +75,10 @@ def measure_run(
         if view.beta is not None and moving is not None:
             betas.append((view.beta, moving))
     metrics |= {name: float(np.mean(found)) for name, found in values.items()}
-    if any(mask.any() for _, mask in betas):  # over all images of the map
-        beta, masks = zip(*betas, strict=True)
-        metrics["beta_auroc"] = auroc(np.stack(beta), np.stack(masks))
+    if betas:  # over all images of the map
+        beta, masks = (np.stack(parts) for parts in zip(*betas, strict=True))
+        if masks.any() and not masks.all():  # else there is nothing to separate
+            metrics["beta_auroc"] = auroc(beta, masks)
     return metrics
 
 

@@ -23,13 +23,12 @@ from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
 from minislam.records import Sequence, required_mask
-from minislam.runs.alarms import alarms
 from minislam.runs.facts import measure, run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
 from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints, way_on
-from minislam.runs.warnings import has_large_holes
+from minislam.runs.warnings import alarms, has_large_holes
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer
 from minislam.tracking.safeguards.lens import BentLens
@@ -66,6 +65,7 @@ def run_in_folder(
     overwrite: bool = False,  # replace an earlier run
     resume: bool = False,  # go on with an interrupted one
     workers: int | None = None,  # processes; as many as there are idle cores, at most 4
+    bent: BentLens | None = None,  # with which the run has begun anew
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Check everything that may be wrong, then run SLAM into a folder; return metrics and run.json.
 
@@ -73,29 +73,8 @@ def run_in_folder(
     they were. If an unknown lens turns out to bend straight lines, the run begins anew with it.
     """
     choice = choice.from_anywhere()
-    rest = config, choice, output, observer, lpips
     if choice.features.startswith(FILES) or choice.depth.startswith(FILES):
         sequence.seeks_lens = False  # the files belong to the images as they are
-    try:
-        return _run_once(sequence, *rest, overwrite, resume, workers)
-    except BentLens as bent:
-        observer.warn(str(bent))
-        straight = sequence.through_lens(bent.lens.focal, *bent.lens.radial)
-        return _run_once(straight, *rest, True, False, workers, bent)
-
-
-def _run_once(
-    sequence: Sequence,
-    config: SlamConfig,
-    choice: PriorChoice,
-    output: Path | str,
-    observer: Observer,
-    lpips: Lpips | None,
-    overwrite: bool,
-    resume: bool,
-    workers: int | None,
-    bent: BentLens | None = None,  # with which the run has begun anew
-) -> tuple[dict[str, Any], dict[str, Any]]:
     for index in range(len(sequence)):
         if config.uncertainty.takes_masks:
             required_mask(sequence, index)
@@ -104,10 +83,10 @@ def _run_once(
     priors = choose_priors(choice, sequence, config)
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
     threads = torch.get_num_threads()
-    with names.locked(output), Workers(count, config.threads, observer.warn) as helpers:
-        how = output, overwrite, sequence.files, bent is not None
-        folder = RunFolder(output) if resume else RunFolder.create(*how)
-        try:
+    try:
+        with names.locked(output), Workers(count, config.threads, observer.warn) as helpers:
+            how = output, overwrite, sequence.files, bent is not None
+            folder = RunFolder(output) if resume else RunFolder.create(*how)
             torch.set_num_threads(config.threads)
             checkpoints = Checkpoints(folder, sequence, config, choice)
             preview, said = Preview(folder), set[str]()
@@ -132,8 +111,13 @@ def _run_once(
             write_json(folder.path / names.CONFIG, settings)
             write_json(folder.path / names.RUN, facts_of("running", None))
             return _run(slam, folder, facts_of, lpips)
-        finally:
-            torch.set_num_threads(threads)
+    except BentLens as found:
+        observer.warn(str(found))
+        straight = sequence.through_lens(found.lens.focal, *found.lens.radial)
+        anew = lpips, True, False, workers, found
+        return run_in_folder(straight, config, choice, output, observer, *anew)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _run(

@@ -1,4 +1,4 @@
-"""What the user must know of a run at its end."""
+"""What the user must know of a run: at once when something goes wrong, and all of it at its end."""
 
 from collections.abc import Iterator
 
@@ -8,6 +8,7 @@ from minislam.errors import InputError
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
 from minislam.slam import Slam
+from minislam.tracking.safeguards.diagnostics import is_unexplained
 from minislam.tracking.safeguards.lens import BentLens
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
@@ -18,6 +19,22 @@ LEAST_SHOWN = 0.75
 MOST_LEFT_OUT = 0.3
 BROKEN = "the trajectory is broken"  # how a warning of breaks begins
 _FAR_APART = "If the images lie far apart, give more frames per second (a smaller --stride)"
+
+
+def alarms(slam: Slam) -> Iterator[str]:
+    """Yield that the camera is lost since the newest frame, and what contradicts a keyframe."""
+    tracked, diagnostics = slam.tracker.tracked, slam.tracker.watch.diagnostics
+    followed = [frame.status.is_followed for frame in tracked[-2:]]
+    if slam.tracker.initialised and followed == [True, False]:
+        yield (
+            f"frame {tracked[-1].frame_index}: the camera is lost; it is looked for among the "
+            "keyframes"
+        )
+    if diagnostics and is_unexplained(diagnostics[-1]):
+        yield (
+            f"frame {diagnostics[-1].frame_index}: the estimated motion explains only "
+            f"{diagnostics[-1].explained:.0%} of the optical flow; the trajectory may break here"
+        )
 
 
 def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name of the prior

@@ -55,7 +55,11 @@ def flipbook(
             small = cv2.resize(images[len(urls)], None, None, scale, scale, cv2.INTER_AREA)
             webp = cv2.imencode(".webp", small[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])[1]
             urls.append(picture_url(webp.tobytes()))
-        html = _player(urls, texts, max(images[0].shape[1], _LEAST_WIDTH), frames_per_second)
+        book = json.dumps({"pictures": urls, "captions": texts}, separators=(",", ":"))
+        html = Template(template("flipbook.html")).substitute(
+            book=escape(book), width=max(images[0].shape[1], _LEAST_WIDTH), picture=urls[0],
+            caption=escape(texts[0]), last=len(urls) - 1, interval=round(1000 / frames_per_second),
+        )  # fmt: skip
         if len(urls) == count and len(html.encode()) < LARGEST:
             return FlipBook(html)
     raise InputError(f"expected pictures that fit into 400 kB, found {count}: show fewer of them")
@@ -68,11 +72,3 @@ def _bytes_of(picture: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
     if picture.dtype == np.uint8:
         return picture
     return np.round(255 * np.clip(np.nan_to_num(picture), 0, 1)).astype(np.uint8)
-
-
-def _player(urls: list[str], captions: list[str], width: int, rate: float) -> str:
-    book = json.dumps({"pictures": urls, "captions": captions}, separators=(",", ":"))
-    return Template(template("flipbook.html")).substitute(
-        book=escape(book), width=width, picture=urls[0], caption=escape(captions[0]),
-        last=len(urls) - 1, interval=round(1000 / rate),
-    )  # fmt: skip

@@ -68,7 +68,8 @@ def test_names_with_a_dot_are_settings_wherever_they_stand():
 
 
 def test_behind_two_dashes_there_is_one_name():
-    assert take_settings(["-q", "--", "-dash.mp4"]) == (["-q", "--", "-dash.mp4"], {})
+    for name in ("-dash.mp4", "--dash.mp4"):
+        assert take_settings(["-q", "--", name]) == (["-q", "--", name], {})
     with pytest.raises(UsageError, match="one name after --, found also --preset; put options fi"):
         take_settings(["--", "-dash.mp4", "--preset", "test"])
 

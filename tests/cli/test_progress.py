@@ -102,6 +102,20 @@ def test_what_is_ignored_stays_ignored():
         signal.signal(signal.SIGHUP, before)
 
 
+def test_what_a_program_around_python_handles_stays_so(monkeypatch):
+    asked = signal.getsignal  # None stands for a handler that Python did not set
+    monkeypatch.setattr(signal, "getsignal", lambda n: None if n == signal.SIGTERM else asked(n))
+    before = asked(signal.SIGTERM)
+    with ending_signals(lambda *_: None):
+        assert asked(signal.SIGTERM) is before
+    assert asked(signal.SIGTERM) is before
+
+
+def test_without_a_console_nothing_is_shown_and_nothing_fails(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    ProgressLine().show("walking", 1, 1)
+
+
 def test_in_another_thread_nothing_is_handled_and_nothing_fails():
     before, seen = signal.getsignal(signal.SIGINT), []
 

@@ -181,6 +181,12 @@ def test_what_a_decoder_says_stays_off_the_screen(tmp_path: Path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_images_are_read_where_a_pipe_always_waits(tmp_path: Path, monkeypatch):
+    monkeypatch.delattr("os.set_blocking", raising=False)  # as in Python 3.11 on Windows
+    jpeg(tmp_path)
+    assert read_color(tmp_path / "0.jpg").dtype == np.uint8
+
+
 def png_chunk(kind: bytes, data: bytes, checksum: int | None = None) -> bytes:
     checksum = zlib.crc32(kind + data) if checksum is None else checksum
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)

@@ -111,6 +111,7 @@ def test_what_is_cut_short_or_damaged_says_nothing(tmp_path: Path):
         exif({0x920A: (RATIONAL, (35, 1))}),
         exif({0xA405: (SHORT, 60_000)}),
         box(b"ftyp", b"isom") + box(b"moov", box(b"mvhd", bytes(100))),
+        b"".join(struct.pack(">I4s", 8 * left, b"moov") for left in range(3000, 0, -1)),  # nested
     ],
 )
 def test_a_file_without_a_possible_focal_length_says_nothing(content: bytes, tmp_path: Path):

@@ -150,6 +150,7 @@ def test_wrong_files_are_named(tmp_path: Path):
         "is_cut.ply": content[:-1],
         "is_long.ply": content + b"\0",
         "is_negative.ply": content.replace(b"vertex 3", b"vertex -3"),
+        "is_endless.ply": content.replace(b"vertex 3", b"vertex " + b"3" * 5000),
         "is_twice.ply": content.replace(b"float nx", b"float x"),
         "is_empty.ply": b"",
     }

@@ -202,7 +202,9 @@ def test_beta_is_judged_over_all_keyframes_together(sign: int, expected: float):
 def test_without_beta_or_movers_there_is_no_auroc():
     assert measured(Truth(masks={0: left_part(4)}), [view(0)])["beta_auroc"] is None
     beta = np.ones((HEIGHT, WIDTH))
-    assert measured(Truth(masks={0: left_part(0)}), [view(0, beta)])["beta_auroc"] is None
+    for columns in (0, WIDTH):  # nothing moves, and all does
+        truth = Truth(masks={0: left_part(columns)})
+        assert measured(truth, [view(0, beta)])["beta_auroc"] is None
 
 
 def test_depth_is_compared_in_the_units_of_the_truth_and_not_on_movers():

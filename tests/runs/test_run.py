@@ -101,10 +101,14 @@ def test_a_run_begins_anew_on_straightened_images_if_an_unknown_lens_bends(
 @pytest.mark.parametrize("given", [{"depth": "files:d"}, {"features": "files:f"}, {}])
 def test_images_that_files_belong_to_are_not_straightened(given: dict[str, str], monkeypatch):
     sequence, sought = open_sequence("synth:person?phone", InputOptions(max_frames=2)), []
-    monkeypatch.setattr(
-        run, "_run_once", lambda sequence, *rest: sought.append(sequence.seeks_lens)
-    )
-    run.run_in_folder(sequence, SlamConfig(), PriorChoice(**given), "folder", SilentObserver())
+
+    def refuse(*rest: object) -> None:
+        sought.append(sequence.seeks_lens)
+        raise InputError("far enough")
+
+    monkeypatch.setattr(run, "choose_priors", refuse)
+    with pytest.raises(InputError, match="far enough"):
+        run.run_in_folder(sequence, SlamConfig(), PriorChoice(**given), "folder", SilentObserver())
     assert sought == [not given]
 
 

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from minislam.records import TrackedFrame, TrackingStatus
-from minislam.runs.alarms import alarms
+from minislam.runs.warnings import alarms
 from minislam.tracking.safeguards.diagnostics import KeyframeDiagnostics
 
 
