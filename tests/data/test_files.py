@@ -135,7 +135,10 @@ def test_only_new_files_are_written_unless_asked_and_inputs_never(tmp_path: Path
     old.write_text("mine")
     link.symlink_to("old")
     require_new([None, new, ""], False, [old, tmp_path / "nowhere"])
-    require_new([old, link], True, [new])
+    require_new([old], True, [new])
+    require_new([link], True, [new])
+    with pytest.raises(InputError, match=r"of different names, found .*old twice"):
+        require_new([old, link], True, [])
     with pytest.raises(InputError, match="old exists; choose another name or add --overwrite"):
         require_new([new, old], False, [])
     for overwrite in (True, False):
