@@ -64,8 +64,8 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
         pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
         yield (
-            f"{BROKEN} at frames {where}: motion or depth contradicts the images, "
-            "or the camera follows something that came into view. "
+            f"{BROKEN} at frames {where}: motion or depth contradicts the images, too little "
+            "parallax hands the scale on, or the camera follows something that came into view. "
             "Before and after, scale and direction do not belong together; look at each piece "
             f"(frames {pieces or 'none'}) by itself. {_FAR_APART}"
         )

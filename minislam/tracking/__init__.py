@@ -5,6 +5,7 @@ Reading order:
     grid                the cells of the image on which everything is measured
     reprojection        where a cell of one keyframe is seen in another, with derivatives
     bundle_adjustment   dense bundle adjustment, Eq. (5); reference.py is its slow twin
+    schur               its normal equations, assembled and freed of the disparities
     disparity_prior     the mask M of the disparity prior, Eq. (8)
     keyframes           the store: all that is known of each keyframe
     frame_graph         the edges between keyframes and the flow along them; the flow distance

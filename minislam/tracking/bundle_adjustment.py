@@ -3,12 +3,8 @@
     sum_edges || p~_ij - proj(T_j T_i^-1, d_i) ||^2_(Sigma_ij / beta_i^2)
         + sum_i lambda_4 M_i (d_i - 1 / D~_i)^2
 
-Gauss-Newton with Levenberg-Marquardt damping; the slow twin is reference.py. Each disparity
-appears in one source frame only, so the disparity block C of the normal equations is diagonal.
-Disparities are marginalised (Schur complement), which leaves 6 unknowns per free pose:
-
-    [ H   E ] [ xi ]   [ g ]        (H - E C^-1 E^T) xi = g - E C^-1 s
-    [ E^T C ] [ dd ] = [ s ]   =>   dd = C^-1 (s - E^T xi)
+Gauss-Newton with Levenberg-Marquardt damping; the slow twin is reference.py. Disparities are
+marginalised (schur.py), which leaves 6 unknowns per free pose.
 """
 
 import math
@@ -24,6 +20,7 @@ from minislam.tracking.safeguards.focal_column import reproject_with_focal, with
 from minislam.tracking.safeguards.parts import SourceBlocks, in_parts, joined
 from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
 from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
+from minislam.tracking.schur import NormalEquations, marginalised, source_blocks
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
@@ -84,15 +81,6 @@ class _Linearised:
     transforms: Tensor  # (E, 4, 4) T_target_source
 
 
-@dataclass(frozen=True)
-class _NormalEquations:
-    cost: float  # px^2, Eq. (5)
-    of_edges: list[Tensor]  # J^T W J (E, 6 + G, 6 + G), J^T W r (E, 6 + G), Ad (E, 6, 6), float64
-    disparity_diagonal: Tensor  # C (K, N)
-    disparity_gradient: Tensor  # s (K, N)
-    source_blocks: SourceBlocks  # per source k: k, rows (R,), E_k (R, N)
-
-
 def bundle_adjust(
     problem: BundleProblem,
     state: BundleState,
@@ -105,7 +93,7 @@ def bundle_adjust(
     A step that fails or raises the cost is discarded and tried again with ten times the damping.
     If no step helps, the state is returned unchanged. Eq. (5).
     """
-    equations = _normal_equations(problem, state)
+    equations = normal_equations(problem, state)
     cost_before = cost = equations.cost
     accepted, level = 0, damping
     converged = True
@@ -114,7 +102,7 @@ def bundle_adjust(
         there, trial = equations, math.inf
         if candidate is not None:
             is_last = accepted + 1 == iterations  # then the cost is enough
-            there = equations if is_last else _normal_equations(problem, candidate)
+            there = equations if is_last else normal_equations(problem, candidate)
             trial = _cost(problem, candidate) if is_last else there.cost
         if candidate is not None and trial <= cost:
             saved = cost - trial
@@ -171,7 +159,8 @@ def _cost(
     return float(torch.cat(of_edges).sum() + prior_cost)
 
 
-def _normal_equations(problem: BundleProblem, state: BundleState) -> _NormalEquations:
+def normal_equations(problem: BundleProblem, state: BundleState) -> NormalEquations:
+    """Return the normal equations of Eq. (5) about a state: blocks of edges and of disparities."""
     C = problem.prior_weights * problem.free_disparities[:, None]
     s = C * (problem.prior_disparities - state.disparities)
     costs, rows, blocks = [], [], SourceBlocks(problem)
@@ -192,73 +181,14 @@ def _normal_equations(problem: BundleProblem, state: BundleState) -> _NormalEqua
         E_source = -adjoint.mT.to(J.dtype) @ E_target[:, :6]
         C.index_add_(0, source, (weighted_Jd * J_disparity).sum(1))
         s.index_add_(0, source, (weighted_Jd * residual).sum(1))
-        blocks.add(_source_blocks(at.problem, E_target, E_source))
-    return _NormalEquations(_cost(problem, state, costs), joined(rows), C, s, blocks)
-
-
-def _pose_slots(problem: BundleProblem) -> Tensor:
-    """Return the position of every keyframe among the free poses, -1 for a fixed one."""
-    return torch.where(problem.free_poses, torch.cumsum(problem.free_poses.long(), 0) - 1, -1)
-
-
-def _assemble_poses(
-    problem: BundleProblem, A: Tensor, b: Tensor, adjoint: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Sum J^T W J = A and J^T W r = b of all edges over the free poses, targets and sources.
-
-    With J_source = -J_target Ad: H_st = -Ad^T A, H_ss = Ad^T A Ad, g_s = -Ad^T b. The columns
-    after the poses (G) are common to all edges: rows of A beyond the sixth are just summed.
-    """
-    width = int(problem.free_poses.sum()) + 1  # the first slot is that of all fixed poses
-    slots = _pose_slots(problem) + 1
-    source, target = slots[problem.edges_source], slots[problem.edges_target]
-    common, border, A = A[:, 6:, 6:].sum(0), A[:, :6, 6:], A[:, :6, :6]
-    A_source = -adjoint.mT @ A  # rows of the source, columns of the target
-    poses = 6 * width
-    H = A.new_zeros(poses + len(common), poses + len(common))
-    blocks = H[:poses, :poses].unflatten(1, (-1, 6)).unflatten(0, (-1, 6)).transpose(1, 2)
-    blocks.index_put_((target, target), A, accumulate=True)
-    blocks.index_put_((source, target), A_source, accumulate=True)
-    blocks.index_put_((target, source), A_source.mT, accumulate=True)
-    blocks.index_put_((source, source), -A_source @ adjoint, accumulate=True)
-    right = torch.cat([border, b[:, :6, None]], 2)  # the border and g are summed alike
-    B = right.new_zeros(width, 6, right.shape[2])
-    B.index_add_(0, target, right)
-    B.index_add_(0, source, -adjoint.mT @ right)
-    border, g = B.flatten(0, 1).tensor_split([-1], 1)
-    H[:poses, poses:], H[poses:, :poses], H[poses:, poses:] = border, border.T, common
-    return H[6:, 6:], torch.cat([g[6:, 0], b[:, 6:].sum(0)])  # without the first slot
-
-
-def _source_blocks(
-    problem: BundleProblem, E_target: Tensor, E_source: Tensor
-) -> list[tuple[int, Tensor, Tensor]]:
-    """Collect for each source frame the coupling of its disparities with the free poses.
-
-    The rows of E_k belong to frame k itself (summed over its edges), to its targets and to the
-    common columns, so the Schur complement is one small matrix product per source frame.
-    """
-    slots, targets = _pose_slots(problem).tolist(), problem.edges_target.tolist()
-    edges_of: dict[int, list[int]] = {}
-    for edge, source in enumerate(problem.edges_source.tolist()):
-        edges_of.setdefault(source, []).append(edge)
-    common = [6 * (max(slots) + 1) + column for column in range(E_target.shape[1] - 6)]
-    blocks, is_free = [], problem.free_disparities.tolist()
-    for source in sorted(source for source in edges_of if is_free[source]):
-        edges = edges_of[source]
-        free = [edge for edge in edges if slots[targets[edge]] >= 0]
-        own = [E_source[edges].sum(0)] if slots[source] >= 0 else []
-        ends = [slots[source]] * len(own) + [slots[targets[edge]] for edge in free]
-        rows = [6 * end + row for end in ends for row in range(6)] + common
-        E = torch.cat([*own, *(E_target[edge, :6] for edge in free), E_target[edges, 6:].sum(0)])
-        blocks.append((source, torch.tensor(rows, dtype=torch.long, device=E.device), E))
-    return blocks
+        blocks.add(source_blocks(at.problem, E_target, E_source))
+    return NormalEquations(_cost(problem, state, costs), joined(rows), C, s, blocks)
 
 
 def _damped_step(
     problem: BundleProblem,
     state: BundleState,
-    equations: _NormalEquations,
+    equations: NormalEquations,
     damping: float,
     absolute_damping: float,
 ) -> BundleState | None:
@@ -271,11 +201,7 @@ def _damped_step(
         typical = problem.disparity_damping * (problem.prior_weights == 0)
     C = C * (1 + damping) + typical
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
-    S, b = _assemble_poses(problem, *equations.of_edges)
-    for source, rows, E in equations.source_blocks:
-        scaled = E * inverse_C[source]
-        S.index_put_((rows[:, None], rows[None, :]), -(scaled @ E.mT).double(), accumulate=True)
-        b.index_add_(0, rows, -(scaled @ equations.disparity_gradient[source]).double())
+    S, b = marginalised(problem, equations, inverse_C)
     S.diagonal().mul_(1 + damping).add_(absolute_damping)
     factor, failure = torch.linalg.cholesky_ex(S)
     # Not `cholesky_solve`, which copies the factor: with hundreds of keyframes it has 100 MB.

@@ -57,7 +57,7 @@ def moved(problem: BundleProblem, state: BundleState, step: Tensor) -> BundleSta
 def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseNormalEquations:
     """Return the weighted normal equations of all unknowns at once.
 
-    Fast twin: the blocks of bundle_adjustment._normal_equations. Eq. (5).
+    Fast twin: the blocks of bundle_adjustment.normal_equations. Eq. (5).
     """
     more = problem.free_focal, problem.shutter, problem.disparity_damping
     assert more == (False, None, None), "the twin has no such terms"

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
-from minislam.tracking import bundle_adjustment
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, normal_equations
 from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.schur import assemble_poses
 from tests.helpers import generator
 
 STRIDE = 8
@@ -26,13 +26,9 @@ class KnownProblem:
     truth: BundleState
 
 
-def normal_equations(problem: BundleProblem, state: BundleState):
-    return bundle_adjustment._normal_equations(problem, state)
-
-
 def pose_equations(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
     """Return H and g of the poses."""
-    return bundle_adjustment._assemble_poses(problem, *normal_equations(problem, state).of_edges)
+    return assemble_poses(problem, *normal_equations(problem, state).of_edges)
 
 
 def normal(seed: int, *shape: int) -> Tensor:
@@ -107,6 +103,13 @@ def distance(a: BundleState, b: BundleState) -> float:
 def assert_same_bits(a: BundleState, b: BundleState) -> None:
     assert torch.equal(a.T_camera_world, b.T_camera_world)
     assert torch.equal(a.disparities, b.disparities)
+
+
+def scaled(state: BundleState, factor: float) -> BundleState:
+    """Return the same views of a world that is `factor` times as large."""
+    poses = state.T_camera_world.clone()
+    poses[:, :3, 3] *= factor
+    return BundleState(poses, state.disparities / factor)
 
 
 def two_fixed_poses(known: KnownProblem) -> KnownProblem:

@@ -12,6 +12,7 @@ from minislam.tracking.bundle_adjustment import (
     BundleState,
     bundle_adjust,
     edge_costs,
+    normal_equations,
     residuals,
 )
 from minislam.tracking.reference import dense_normal_equations, dense_step
@@ -23,9 +24,9 @@ from tests.tracking.scene import (
     known_problem,
     noisy,
     normal,
-    normal_equations,
     perturbed,
     pose_equations,
+    scaled,
     two_fixed_poses,
     uniform,
     with_prior,
@@ -40,13 +41,6 @@ def one_step(problem: BundleProblem, state: BundleState, damping: float, absolut
     after = bundle_adjustment._damped_step(problem, state, equations, damping, absolute)
     assert after is not None
     return after
-
-
-def scaled(state: BundleState, factor: float) -> BundleState:
-    """Return the same views of a world that is `factor` times as large."""
-    poses = state.T_camera_world.clone()
-    poses[:, :3, 3] *= factor
-    return BundleState(poses, state.disparities / factor)
 
 
 # Known answers

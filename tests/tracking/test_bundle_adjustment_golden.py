@@ -22,12 +22,13 @@ from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleState,
     bundle_adjust,
+    normal_equations,
     residuals,
 )
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
 from tests.helpers import assert_gradients_close
 from tests.tracking import golden
-from tests.tracking.scene import normal_equations, pose_equations
+from tests.tracking.scene import pose_equations
 
 
 def damped_diagonal(problem: BundleProblem, diagonal: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ turns            tells a camera that stands or only turns, and adjusts its turns
 focal_length     estimates an unknown focal length, tells whether a given one was wrong; the readout
 focal_column     the focal length as one more unknown of the bundle adjustment
 lens             finds a lens that bends straight lines although no calibration says so
+scale_certainty  how exactly the flow hands the scale on, by the covariance of the poses
 scale_drift      undoes a drift of the scale that a depth prior tells
 rolling_shutter  the time to read an image, as unknowns too; images as a global shutter sees them
 """

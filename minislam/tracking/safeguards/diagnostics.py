@@ -1,11 +1,12 @@
 """How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
 
 With a low matched ratio or little parallax the scale can drift while all residuals stay small.
-Where everything is matched, four measurements tell broken keyframes from healthy ones (RESULTS.md,
+Where everything is matched, five measurements tell broken keyframes from healthy ones (RESULTS.md,
 "Broken runs"): a wrong pose does not explain the flow of the keyframes before it; after a wrong
-scale two keyframes see a thing at different depths; and where a large dynamic object takes the
-place of the scene, hardly anything that held the keyframes before holds this one, or what is left
-of it does not fit.
+scale two keyframes see a thing at different depths; where too little hands the scale on, lengths
+before and after are not told (scale_certainty.py); and where a large dynamic object takes the place
+of the scene, hardly anything that held the keyframes before holds this one, or what is left of it
+does not fit.
 """
 
 from collections.abc import Sequence
@@ -22,12 +23,8 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
-from minislam.tracking.safeguards.turns import (
-    LEAST_BEYOND_TURNS,
-    flow_beyond_turns,
-    fraction_at_rest,
-    tells_no_depth,
-)
+from minislam.tracking.safeguards.scale_certainty import scale_deviations
+from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_rest
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
@@ -39,8 +36,14 @@ MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .003 to .15, broken .5
 MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
+MAX_SCALE_DEVIATION = 0.1  # of a length, relative; healthy .004 to .044, broken .13 to .35
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
+
+# A camera that walks; the tables stand in RESULTS.md, "Clips that nobody had tuned to".
+LEAST_BEYOND_TURNS = 0.45  # px of a 320x240 image
+MOST_RESTING = 0.75  # fraction of the keyframes: cameras that stand .88 to 1, pans 0 to .16 [-]
+LEAST_CONFIRMED = 0.15  # fraction of the cells: a hand-held camera .05, pans .24 and more [-]
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class KeyframeDiagnostics:
     depth_error: float | None  # median relative difference from them; None: they see other things
     continuity: float | None  # of the match: known before, holds it still [-]; None: no such links
     agreement: float | None  # of what was known before, in the link that agrees least
+    scale_deviation: float | None = None  # of ln(length after / before), at the end [-]
 
 
 @dataclass(frozen=True)
@@ -85,18 +89,29 @@ class Watch(Stateful):
     def conclude(self) -> None:
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
-        self.beyond_turns = flow_beyond_turns(self._graph)
-        self.resting = fraction_at_rest(self._graph)
+        graph = self._graph
+        self.beyond_turns, self.resting = flow_beyond_turns(graph), fraction_at_rest(graph)
         judged = self.diagnostics
         if self.only_turned:  # it may see other depths, and be held by something new
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
+        elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
+            problem = bundle_problem(graph, range(len(graph.links)), 0, 0.0)
+            told = scale_deviations(problem, graph.state)
+            judged = [replace(k, scale_deviation=told.get(i)) for i, k in enumerate(judged)]
+            self.diagnostics = judged
         self.breaks = find_breaks(judged)
 
     @property
     def only_turned(self) -> bool:
-        """Tell whether the camera stood still or only turned, so that nothing measures depth."""
-        no_parallax = all(k.parallax < self._graph.least_parallax for k in self.diagnostics)
-        return no_parallax or tells_no_depth(self.beyond_turns, self.resting, self.confirmed)
+        """Tell whether the camera stood still or only turned, so that nothing measures depth.
+
+        Either no pose claims parallax, or hardly any flow shows it and poses or sweeps make no
+        depth of that.
+        """
+        if all(k.parallax < self._graph.least_parallax for k in self.diagnostics):
+            return True
+        no_depth = self.confirmed < LEAST_CONFIRMED or self.resting > MOST_RESTING
+        return self.hardly_walked and no_depth
 
     @property
     def hardly_walked(self) -> bool:
@@ -226,8 +241,9 @@ def is_unexplained(newest: KeyframeDiagnostics) -> bool:
 def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
-    One keyframe is a break if it explains very little, sees other depths, is held by something new
-    or contradicts what held before; LONG in a row are one if they explain a little too little.
+    One keyframe is a break if it explains very little, sees other depths, does not know the scale,
+    is held by something new or contradicts what held before; LONG in a row are one if they explain
+    a little too little.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little
@@ -247,4 +263,5 @@ def _is_broken(keyframe: KeyframeDiagnostics) -> bool:
     ties = keyframe.explained, keyframe.continuity, keyframe.agreement
     explained, held, agreement = (1.0 if tie is None else tie for tie in ties)
     is_tied = explained >= MIN_EXPLAINED and (keyframe.depth_error or 0.0) <= MAX_DEPTH_ERROR
-    return not is_tied or held < MIN_CONTINUITY or agreement < MIN_AGREEMENT
+    has_scale = (keyframe.scale_deviation or 0.0) <= MAX_SCALE_DEVIATION
+    return not (is_tied and has_scale) or held < MIN_CONTINUITY or agreement < MIN_AGREEMENT

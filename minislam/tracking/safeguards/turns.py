@@ -14,10 +14,6 @@ from minislam.tracking.pose_from_flow import POSE_ITERATIONS, ROBUST_WIDENING
 from minislam.tracking.reprojection import lengths, parallax
 from minislam.tracking.safeguards.robust import weighted_median
 
-# px of a 320x240 image; the table stands in RESULTS.md, "Clips that nobody had tuned to".
-LEAST_BEYOND_TURNS = 0.45
-MOST_RESTING = 0.75  # fraction of the keyframes: cameras that stand .88 to 1, pans 0 to .16 [-]
-LEAST_CONFIRMED = 0.15  # fraction of the cells: a hand-held camera .05, pans .24 and more [-]
 TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
 MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
 
@@ -67,13 +63,6 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
     largest = (shift * (valid & graph.grid.camera.contains(positions.mT))).amax(0)
     most = weighted_median(largest, graph.keyframes.cell_weights[keyframe])
     return most is None or most < graph.least_parallax
-
-
-def tells_no_depth(beyond_turns: float | None, resting: float, confirmed: float) -> bool:
-    """Tell whether nothing measures depth, by the numbers of a `Watch`: flow, poses, sweeps."""
-    if beyond_turns is None or beyond_turns >= LEAST_BEYOND_TURNS:
-        return False
-    return confirmed < LEAST_CONFIRMED or resting > MOST_RESTING
 
 
 def adjust_turns(graph: KeyframeGraph) -> None:

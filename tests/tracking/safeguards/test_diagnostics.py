@@ -9,6 +9,7 @@ import torch
 from minislam.geometry import se3_exp
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust
 from minislam.tracking.safeguards import diagnostics
 from minislam.tracking.safeguards.diagnostics import (
@@ -22,16 +23,18 @@ from minislam.tracking.safeguards.diagnostics import (
     weight_so_far,
 )
 from minislam.tracking.safeguards.motion_memory import judge_all
+from tests.tracking.scene import normal
 from tests.tracking.wall import CAMERA, GRID, true_graph
 
-HEALTHY, WEAK, UNEXPLAINED, DEEP, UNTIED, NEW = (
-    (0.97, 0.02, 0.2, 0.9),
+HEALTHY, WEAK, UNEXPLAINED, DEEP, UNTIED, NEW, LOOSE = (
+    (0.97, 0.02, 0.2, 0.9, 0.04),
     (0.8, 0.02, 0.2, 0.9),
     (0.4, 0.02, 0.2, 0.9),
     (0.97, 0.5, 0.2, 0.9),
     (0.97, 0.02, 0.003, None),
     (0.97, 0.02, 0.2, 0.4),
-)  # explained flow, depth error, continuity, agreement
+    (0.97, 0.02, 0.2, 0.9, 0.13),
+)  # explained flow, depth error, continuity, agreement, deviation of the scale
 
 
 def keyframes(*kinds: tuple[float | None, ...]) -> list[KeyframeDiagnostics]:
@@ -209,12 +212,47 @@ def test_a_keyframe_without_links_is_reported_as_such():
         ([UNEXPLAINED, *[HEALTHY] * 4, DEEP], [Break(0, 0), Break(50, 50)]),
         ([HEALTHY, (None,) * 4, HEALTHY], []),
         ([HEALTHY, UNTIED, HEALTHY, NEW, HEALTHY], [Break(10, 30)]),
+        ([HEALTHY, LOOSE, HEALTHY], [Break(10, 10)]),
         ([HEALTHY, WEAK, WEAK, HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),
     ],
 )
 def test_breaks_are_runs_of_broken_keyframes(kinds: list, breaks: list[Break]):
     assert find_breaks(keyframes(*kinds)) == breaks
+
+
+def walk_tied_by(cells: int) -> KeyframeGraph:
+    """Return a walk between whose halves, up to keyframe 4 and from it on, so many cells match."""
+    graph = true_graph(range(10))
+    graph.match(neighbourhood_edges(0, 10, 2))
+    few, links = torch.arange(len(GRID.rays)) < cells, graph.links
+    for position, (source, target) in enumerate(links.edges):
+        links.targets[position] = (
+            links.targets[position] + 0.3 * normal(position, 2, len(few)).float()
+        )
+        if (source < 5) != (target < 5):
+            links.confidences[position] = links.confidences[position] * few
+    return graph
+
+
+def test_a_walk_is_broken_where_too_little_hands_the_scale_on():
+    for cells, breaks in ((len(GRID.rays), []), (4, [Break(3, 5)])):
+        (watch := Watch(walk_tied_by(cells))).conclude()
+        told = {k.frame_index for k in watch.diagnostics if k.scale_deviation is not None}
+        assert told == {3, 4, 5} and watch.breaks == breaks
+
+
+def test_a_scale_that_a_prior_tells_or_that_hardly_any_flow_shows_is_not_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    graph = walk_tied_by(4)
+    graph.keyframes.prior_disparities[0] = 1.0
+    (watch := Watch(graph)).conclude()
+    assert watch.breaks == [] and watch.diagnostics[4].scale_deviation is None
+    graph.keyframes.prior_disparities[0] = 0.0
+    monkeypatch.setattr(diagnostics, "LEAST_BEYOND_TURNS", math.inf)
+    (watch := Watch(graph)).conclude()
+    assert watch.breaks == [] and watch.diagnostics[4].scale_deviation is None
 
 
 def test_segments_lie_between_breaks():

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
-from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust
+from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, normal_equations
 from minislam.tracking.reference import moved, predicted_positions
 from minislam.tracking.reprojection import reproject
 from minislam.tracking.safeguards.focal_column import focal_jacobian, within_reach, zoomed
@@ -20,7 +20,6 @@ from tests.tracking.scene import (
     distance,
     known_problem,
     noisy,
-    normal_equations,
     perturbed,
     pose_equations,
     two_fixed_poses,

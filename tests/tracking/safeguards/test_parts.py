@@ -8,9 +8,9 @@ import torch
 from minislam import memory
 from minislam.tracking import optimisation
 from minislam.tracking.bundle_adjustment import (
-    _normal_equations,
     bundle_adjust,
     edge_costs,
+    normal_equations,
     residuals,
 )
 from minislam.tracking.optimisation import adjust_touched, touched_rows
@@ -68,13 +68,13 @@ def test_couplings_in_a_file_are_those_in_memory(monkeypatch: pytest.MonkeyPatch
     whole, _ = bundle_adjust(problem, start, 4)
     monkeypatch.setattr(parts, "CELLS_COUPLED", 12 * CELLS - 1)
     monkeypatch.setattr(memory, "SMALLEST", 1)
-    blocks = _normal_equations(problem, start).source_blocks
+    blocks = normal_equations(problem, start).source_blocks
     assert len(list(blocks)) == 4 and all(blocks._shelf.holds(E) for _, _, E in blocks)
     in_file, _ = bundle_adjust(problem, start, 4)
     assert torch.equal(in_file.T_camera_world, whole.T_camera_world)
     assert torch.equal(in_file.disparities, whole.disparities)
     monkeypatch.setattr(parts, "CELLS_COUPLED", 12 * CELLS)
-    assert _normal_equations(problem, start).source_blocks._shelf is None
+    assert normal_equations(problem, start).source_blocks._shelf is None
 
 
 def test_rows_that_nothing_touches_stay_and_the_others_move_as_in_the_whole(

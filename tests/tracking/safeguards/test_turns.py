@@ -10,16 +10,14 @@ from minislam.geometry import se3_exp, se3_inverse, se3_log
 from minislam.tracking.bundle_adjustment import BundleState
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.safeguards.diagnostics import Watch, diagnose
-from minislam.tracking.safeguards.turns import (
+from minislam.tracking.safeguards.diagnostics import (
     LEAST_BEYOND_TURNS,
     LEAST_CONFIRMED,
     MOST_RESTING,
-    adjust_turns,
-    flow_beyond_turns,
-    fraction_at_rest,
-    tells_no_depth,
+    Watch,
+    diagnose,
 )
+from minislam.tracking.safeguards.turns import adjust_turns, flow_beyond_turns, fraction_at_rest
 from tests.tracking.scene import assert_same_bits
 from tests.tracking.wall import CAMERA, GRID, true_graph
 
@@ -97,12 +95,14 @@ def test_parallax_that_no_sweep_confirms_is_none():
 
 
 def test_weak_parallax_is_depth_only_if_poses_and_sweeps_make_depth_of_it():
+    _, watch = watched(GRID.pixels + GRID.pixels.new_tensor([20.0, 0.0]))
+    assert watch.diagnostics[1].parallax > 3  # by its poses
     weak, few, many = 0.5 * LEAST_BEYOND_TURNS, 0.9 * MOST_RESTING, 1.1 * MOST_RESTING
-    assert not tells_no_depth(weak, few, 2 * LEAST_CONFIRMED)
-    assert tells_no_depth(weak, many, 2 * LEAST_CONFIRMED)
-    assert tells_no_depth(weak, few, 0.5 * LEAST_CONFIRMED)
-    for strong in (LEAST_BEYOND_TURNS, None):
-        assert not tells_no_depth(strong, many, 0.0)
+    cases = [(weak, few, 2.0, False), (weak, many, 2.0, True), (weak, few, 0.5, True)]
+    cases += [(strong, many, 0.0, False) for strong in (LEAST_BEYOND_TURNS, None)]
+    for watch.beyond_turns, watch.resting, confirmed, expected in cases:
+        watch.confirmed = confirmed * LEAST_CONFIRMED
+        assert watch.only_turned == expected
 
 
 @pytest.mark.parametrize("moving", [0.1, 0.2])
