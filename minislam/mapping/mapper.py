@@ -13,6 +13,7 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
+from minislam.mapping.gaps import filled_depth
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
@@ -21,7 +22,9 @@ from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.memory import release
 from minislam.records import Keyframe, Progress
 from minislam.splatting import GaussianMap, Rendering
+from minislam.uncertainty.losses import FAR_FACTOR
 
+MOST_FAR = 0.99  # of the largest depth that is inserted: where a gap, or what is farther, is put
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
 
 
@@ -104,6 +107,7 @@ class Mapper(JointOptimisation):
             self._optimise(*how, range(done, half))
             if half >= safeguards.LEAST_VIEWS * len(self.keyframes):
                 self._exclude_upper_mode()
+                self._fill_gaps()
         self._optimise(*how, range(max(done, half), iterations))
         if self.uncertainty.enabled:
             self._remove_unsupported()
@@ -123,12 +127,16 @@ class Mapper(JointOptimisation):
         return self._workers.map(refine_pose, calls)
 
     @torch.no_grad()
-    def _insert(self, position: int) -> None:
+    def _insert(self, position: int, fills: bool = False) -> None:
         """Add Gaussians for what a keyframe sees and the map does not show."""
         keyframe = self.keyframes[position]
         if not keyframe.inserts:
             return
         rendering = self.render(keyframe.T_camera_world) if len(self.gaussians) else None
+        if fills and rendering is not None:
+            known = torch.where(keyframe.depth > 0, keyframe.depth, surface_depth(rendering))
+            farthest = MOST_FAR * FAR_FACTOR * self.median_depth
+            keyframe = replace(keyframe, depth=filled_depth(known).clamp_max(farthest))
         weight = self.static_weight(self.beta_of(keyframe), self.camera)
         scene = self.camera, rendering, weight, self.median_depth
         insertion = replace(self.config.insertion, cell=self.cell)
@@ -156,6 +164,11 @@ class Mapper(JointOptimisation):
         if least > self.least_weight and self.uncertainty.enabled:
             self.least_weight = least
             self._replace_dynamic_gaussians()
+
+    def _fill_gaps(self) -> None:
+        """Give what is static and not shown the depth of its surroundings."""
+        for position in range(len(self.keyframes)):
+            self._insert(position, fills=True)
 
     def _remove_unsupported(self) -> None:
         """Remove Gaussians that hardly any static pixel shows: no image speaks for them.

@@ -1,0 +1,46 @@
+"""Fill what stands still and no view could measure, such as a plain road or ceiling: ours.
+
+Without a depth network such a pixel has no depth, so nothing is inserted there. By half of the
+refinement, the MLP has learnt what moves. What it calls static and the map leaves transparent then
+gets the depth of its surroundings: 1/depth is linear over a plane, and so is the solution of
+Laplace's equation whose border is linear.
+"""
+
+import cv2
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse import linalg
+from torch import Tensor
+
+CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
+
+
+def filled_depth(depth: Tensor) -> Tensor:
+    """Return depth (H, W) whose gaps (0) are filled from around them; with no depth, as it is."""
+    height, width = depth.shape
+    known = (depth > 0).float().cpu().numpy()
+    inverse = torch.where(depth > 0, 1 / depth, 0).cpu().numpy()
+    size = -(-width // CELL), -(-height // CELL)
+    part, mean = (cv2.resize(a, size, None, 0, 0, cv2.INTER_AREA) for a in (known, inverse))
+    if not part.any():
+        return depth
+    cells = membrane(mean / np.maximum(part, 1e-6), part > 0)
+    smooth = torch.from_numpy(cv2.resize(cells, (width, height))).to(depth)
+    return torch.where(depth > 0, depth, 1 / smooth)
+
+
+def membrane(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return values (h, w) whose unknown cells (not known) are the means of their neighbours."""
+    number = np.arange(values.size).reshape(values.shape)
+    pairs = [(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]
+    first, second = (
+        np.concatenate([ends.ravel() for ends in side]) for side in zip(*pairs, strict=True)
+    )
+    links = sparse.coo_array((np.ones(len(first)), (first, second)), shape=2 * (values.size,))
+    laplacian = sparse.csgraph.laplacian(links + links.T).tocsr()
+    filled, free = values.astype(np.float64).ravel(), ~known.ravel()
+    if free.any():
+        rows = laplacian[free]
+        filled[free] = linalg.spsolve(rows[:, free].tocsc(), -(rows[:, ~free] @ filled[~free]))
+    return filled.reshape(values.shape)

@@ -1,0 +1,75 @@
+"""Gaps in a depth image are filled from around them; only what is static gets Gaussians there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from minislam.mapping.gaps import CELL, filled_depth, membrane
+from tests.mapping.plane_scene import make_mapper, wall_keyframe
+
+COLUMN, ROW = torch.arange(64.0).expand(48, 64), torch.arange(48.0)[:, None].expand(48, 64)
+PLANE = 1 / (0.1 + 0.002 * COLUMN + 0.005 * ROW)  # the depth of a tilted plane
+INSIDE = (COLUMN > 11) & (COLUMN < 44) & (ROW > 15) & (ROW < 32)
+
+
+def test_a_gap_that_a_plane_surrounds_is_of_the_plane():
+    filled = filled_depth(PLANE * ~INSIDE)
+    torch.testing.assert_close(filled, PLANE, rtol=1e-5, atol=0)
+
+
+def test_known_depth_stays_to_the_bit():
+    depth = torch.where(COLUMN > 30, PLANE, 0)
+    filled = filled_depth(depth)
+    assert torch.equal(filled[depth > 0], PLANE[depth > 0]) and (filled > 0).all()
+    assert torch.equal(filled_depth(PLANE), PLANE)
+
+
+def test_without_any_depth_nothing_is_filled():
+    assert not filled_depth(torch.zeros(48, 64)).any()
+
+
+def test_beyond_the_last_known_depth_it_goes_on_alike():
+    depth = torch.where(ROW < 20, 4.0, 0)
+    torch.testing.assert_close(filled_depth(depth), torch.full_like(depth, 4.0))
+
+
+@pytest.mark.parametrize("shape", [(1, 7), (5, 1), (6, 9)])
+def test_each_unknown_cell_is_the_mean_of_its_neighbours(shape: tuple[int, int]):
+    generator = np.random.default_rng(3)
+    values, known = generator.random(shape), generator.random(shape) < 0.4
+    known.flat[0] = True
+    filled = membrane(values, known)
+    assert np.array_equal(filled[known], values[known])
+    assert filled.min() >= values[known].min() and filled.max() <= values[known].max()
+    height, width = shape
+    for row, column in zip(*np.nonzero(~known), strict=True):
+        beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
+        inside = [filled[r, c] for r, c in beside if 0 <= r < height and 0 <= c < width]
+        assert filled[row, column] == pytest.approx(np.mean(inside))
+
+
+def test_an_image_of_any_size_is_filled():
+    depth = torch.full((4 * CELL + 3, 5 * CELL + 1), 2.0)
+    depth[-3:, -1:] = 0
+    torch.testing.assert_close(filled_depth(depth), torch.full_like(depth, 2.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_static_gap_is_in_the_map_and_a_moving_one_is_not(moves: bool):
+    keyframe, mapper = wall_keyframe(1), make_mapper()
+    gap = torch.zeros_like(keyframe.depth, dtype=torch.bool)
+    gap[6:18, 6:26] = True
+    keyframe.depth[gap] = 0
+    mapper.initialise([replace(keyframe, moving_mask=gap if moves else None)])
+    inside = slice(10, 14), slice(12, 20)
+    before = mapper.render(keyframe.T_camera_world).opacity[inside]
+    mapper.refine(8)
+    after = mapper.render(keyframe.T_camera_world)
+    assert before.mean() < 0.5
+    assert (after.opacity[inside].mean() > 0.8) != moves
+    if not moves:
+        surface = (after.depth / after.opacity)[inside]
+        torch.testing.assert_close(surface, torch.full_like(surface, 2.0), rtol=0.05, atol=0)
