@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -107,12 +108,20 @@ def _judged(job: dict[str, Any], seed: int | None) -> dict[str, dict[str, Any]]:
             (folder / VERDICTS).write_text("", encoding="utf-8")
             ending = _run_judge(folder, seed)
             ended = {"status": "wrong", "sentence": ending, "hint": "", "seconds": 0.0}
-            lines = (folder / VERDICTS).read_text(encoding="utf-8").splitlines()
+            lines = (folder / VERDICTS).read_bytes().splitlines()
+            begun = [row for row in map(_row, lines) if row.get("key") in remaining]
             # Who ends the process before any exercise has begun would do so again.
-            begun = [json.loads(line) for line in lines] or [{"key": key} for key in remaining]
-            for row in begun:
+            for row in begun or [{"key": key} for key in remaining]:
                 verdicts[row["key"]] = ended | row
     return verdicts
+
+
+def _row(line: bytes) -> dict[str, Any]:
+    """Return a line of the judge; nothing if it is half written, or the student's own."""
+    with suppress(ValueError, RecursionError):
+        row = json.loads(line)
+        return row if isinstance(row, dict) else {}
+    return {}
 
 
 def _run_judge(folder: Path, seed: int | None) -> str:

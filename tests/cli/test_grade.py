@@ -54,6 +54,20 @@ def test_a_wrong_answer_loses_just_its_points(tmp_path: Path, capsys):
     assert {row["file"] for row in rows} == {name} and len(rows) == len(ann["exercises"])
 
 
+def test_a_line_that_is_half_written_or_forged_ends_no_grading(monkeypatch):
+    begun, passed = '{"key": "ex03_1"}', '{"key": "ex03_1", "status": "passed"}'
+    for last, status in ((passed, "passed"), (passed[:-9], "wrong"), ('["ex03_1"]', "wrong")):
+
+        def judged(folder: Path, seed: int | None, last: str = last) -> str:
+            lines = [begun, last, '{"key": "ex99_1"}', "5"]
+            (folder / grade.VERDICTS).write_text("\n".join(lines))
+            return "it ends"
+
+        monkeypatch.setattr(grade, "_run_judge", judged)
+        [(key, verdict)] = grade._judged({"keys": ["ex03_1"]}, None).items()
+        assert key == "ex03_1" and verdict["status"] == status
+
+
 def test_each_trouble_is_one_sentence(tmp_path: Path, capsys):
     notebook = solved("03")
     first, second = exercise_cells(notebook)[:2]

@@ -126,7 +126,10 @@ def test_the_cache_follows_its_environment_variable(tmp_path, monkeypatch):
     found = cached_sequence(*arguments)
     assert found == tmp_path / "synth" / "static-1-1-64x48"
     assert (found / "groundtruth.txt").exists()
-    cached_sequence(*arguments)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))  # Windows
+    monkeypatch.setenv("MINISLAM_CACHE", "~")
+    assert cached_sequence(*arguments) == found
     assert calls == [(1, 1)]  # the second call rendered nothing
 
 
