@@ -70,7 +70,7 @@ SHORT = {
 ROOMS_BORDERS = {
     "priors/dense_flow.py", "priors/flow.py", "priors/features.py",
     "tracking/bundle_adjustment.py", "tracking/frame_graph.py", "tracking/keyframe_graph.py",
-    "tracking/pose_from_flow.py", "tracking/trajectory.py",
+    "tracking/pose_from_flow.py", "tracking/schur.py", "tracking/trajectory.py",
     "tracking/safeguards/motion_memory.py", "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py", "tracking/safeguards/rolling_shutter.py",
     "mapping/views.py", "mapping/safeguards.py", "stereo/second_adjustment.py",

@@ -8,6 +8,7 @@ import torch
 
 from minislam.mapping.gaps import CELL, filled_depth, membrane
 from tests.mapping.plane_scene import make_mapper, wall_keyframe
+from tests.pretended_gpu import GPU, pretended_gpu
 
 COLUMN, ROW = torch.arange(64.0).expand(48, 64), torch.arange(48.0)[:, None].expand(48, 64)
 PLANE = 1 / (0.1 + 0.002 * COLUMN + 0.005 * ROW)  # the depth of a tilted plane
@@ -48,6 +49,14 @@ def test_each_unknown_cell_is_the_mean_of_its_neighbours(shape: tuple[int, int])
         beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
         inside = [filled[r, c] for r, c in beside if 0 <= r < height and 0 <= c < width]
         assert filled[row, column] == pytest.approx(np.mean(inside))
+
+
+def test_on_a_gpu_it_is_filled_as_on_the_cpu():
+    depth = PLANE * ~INSIDE
+    with pretended_gpu():
+        filled = filled_depth(depth.to(GPU))
+        assert filled.device.type == GPU
+        assert torch.equal(filled.cpu(), filled_depth(depth))
 
 
 def test_an_image_of_any_size_is_filled():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse
 from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
@@ -12,6 +13,7 @@ from minislam.tracking.safeguards.scale_certainty import (
     _log_ratio_gradients,
     scale_deviations,
 )
+from tests.pretended_gpu import GPU, pretended_gpu
 from tests.tracking.scene import KnownProblem, known_problem, noisy, scaled
 
 KEYFRAMES, SIGMA, DRAWS = 10, 0.3, 100
@@ -125,6 +127,16 @@ def test_without_a_path_or_without_any_weight_nothing_is_told():
     )
     nothing = replace(known.problem, weights=0 * known.problem.weights)
     assert scale_deviations(nothing, known.truth) == {}
+
+
+def test_on_a_gpu_it_is_as_certain_as_on_the_cpu():
+    known = chain()
+    problem, state = noisy(known, SIGMA), known.truth
+    expected = scale_deviations(problem, state)
+    with pretended_gpu():
+        there = {k: v.to(GPU) for k, v in vars(problem).items() if isinstance(v, Tensor)}
+        moved = (state.T_camera_world.to(GPU), state.disparities.to(GPU))
+        assert scale_deviations(replace(problem, **there), BundleState(*moved)) == expected
 
 
 def test_where_the_camera_rests_lengths_lead_beyond_the_rest():
