@@ -2,6 +2,7 @@
 
 import errno
 import gc
+import mmap
 import subprocess
 import sys
 import tempfile
@@ -156,9 +157,10 @@ def test_a_large_stack_is_not_in_memory() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")
 def test_what_is_put_is_no_longer_in_memory() -> None:
-    give_back_freed()  # else the tensor may lie where something was freed
     shelf, before = Shelf(), resident()
-    tensor = noise(10_000_000)  # 40 MB
+    pages = mmap.mmap(-1, 40_000_000)  # new ones: what other tests have freed may be resident
+    tensor = torch.frombuffer(pages, dtype=torch.float32).fill_(0.5)
+    del pages
     assert resident() > before + 30
     shelf.put([tensor])
     assert resident() < before + 10
