@@ -1,4 +1,4 @@
-"""The focal length that a camera noted in its file: EXIF of a photo, QuickTime tags of a video.
+"""What a file notes: the size of an image; the focal length, by EXIF or the tags of QuickTime.
 
 Photos (JPEG) name the equivalent on 35 mm film, or else the focal length and the pixels per inch
 of the sensor. iPhone videos name the equivalent; most other videos name nothing. Equivalents are
@@ -8,6 +8,7 @@ whole millimetres, and stabilisation crops the image, so that all this is a firs
 import math
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
@@ -16,54 +17,92 @@ VIDEO_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 POSSIBLE = (0.2, 20.0)  # image diagonals, of a focal length that is believed
 
 # Tags of EXIF
-_POINTER, _FILM_EQUIVALENT, _FOCAL_LENGTH, _RESOLUTION, _UNIT, _WIDTH, _HEIGHT = (
-    0x8769, 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002, 0xA003,
+_POINTER, _FILM_EQUIVALENT, _FOCAL_LENGTH, _RESOLUTION, _UNIT, _WIDTH, _HEIGHT, _ORIENTATION = (
+    0x8769, 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002, 0xA003, 0x0112,
 )  # fmt: skip
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution
 _EXIF_NUMBERS = {3: "H", 4: "I", 5: "II"}  # struct codes: short, long, rational
+_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"  # the first bytes
+_APP1, _SIZES = 0xE1, {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of JPEG's segments
+_UNREADABLE = OSError, struct.error, LookupError, ValueError, ArithmeticError, RecursionError
 _VIDEO_NUMBERS = {21: ">i", 22: ">I", 67: ">i", 77: ">I", 66: ">h", 76: ">H", 23: ">f", 24: ">d"}
 
 
 def noted_focal_length(path: Path) -> tuple[float, str] | None:
     """Return the focal length over the image diagonal and its origin; None if none is noted."""
     try:
-        with path.open("rb") as file:
-            content = memoryview(mmap(file.fileno(), 0, access=ACCESS_READ))
-        is_photo = content[:2] == b"\xff\xd8"
-        found = _of_exif(_exif_segment(content)) if is_photo else _of_video(content)
-    except (OSError, struct.error, LookupError, ValueError, ArithmeticError, RecursionError):
+        content = _mapped(path)
+        is_photo = content[:2] == _JPEG
+        found = _of_exif(_exif(content)) if is_photo else _of_video(content)
+    except _UNREADABLE:
         return None  # Damaged notes are no reason to refuse whole images.
     if found is None or not POSSIBLE[0] < found < POSSIBLE[1]:
         return None
     return found, f"{'EXIF' if is_photo else 'QuickTime tag'} of {path.name}"
 
 
-def _exif_segment(photo: memoryview) -> memoryview:
-    """Return the TIFF structure in the APP1 segment of a JPEG file."""
+def noted_size(path: Path) -> tuple[int, int] | None:
+    """Return (width, height) px of an image file as it is decoded, upright; None if not noted."""
+    try:
+        content = _mapped(path)
+        if content[:8] == _PNG:
+            return struct.unpack_from(">II", content, 16)
+        if content[:2] != _JPEG:
+            return None
+        height, width = next(
+            struct.unpack_from(">HH", segment, 1)
+            for marker, segment in _segments(content)
+            if marker in _SIZES
+        )
+    except (*_UNREADABLE, StopIteration):
+        return None
+    with suppress(*_UNREADABLE):
+        if _tags(_exif(content)).get(_ORIENTATION, 1) >= 5:  # the camera was held upright
+            return height, width
+    return width, height
+
+
+def _mapped(path: Path) -> memoryview:
+    with path.open("rb") as file:
+        return memoryview(mmap(file.fileno(), 0, access=ACCESS_READ))
+
+
+def _segments(photo: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Yield marker and content of the segments in the header of a JPEG file."""
     at = 2
     while photo[at] == 0xFF:
         (length,) = struct.unpack_from(">H", photo, at + 2)
-        if photo[at + 1] == 0xE1 and photo[at + 4 : at + 10] == b"Exif\0\0":
-            return photo[at + 10 : at + 2 + length]
+        yield photo[at + 1], photo[at + 4 : at + 2 + length]
         at += 2 + length
+
+
+def _exif(photo: memoryview) -> memoryview:
+    """Return the TIFF structure of a JPEG file."""
+    for marker, segment in _segments(photo):
+        if marker == _APP1 and segment[:6] == b"Exif\0\0":
+            return segment[6:]
     raise ValueError("no EXIF")
+
+
+def _tags(tiff: memoryview, within: int | None = None) -> dict[int, float]:
+    """Return the numbers of the first directory, or of the one that a tag of it points to."""
+    order = {b"II": "<", b"MM": ">"}[bytes(tiff[:2])]
+    (at,) = struct.unpack_from(f"{order}I", tiff, 4)
+    if within is not None:
+        at = int(_tags(tiff)[within])
+    values = {}
+    for entry in range(struct.unpack_from(f"{order}H", tiff, at)[0]):
+        tag, kind, count, place = struct.unpack_from(f"{order}HHII", tiff, at + 2 + 12 * entry)
+        if kind in _EXIF_NUMBERS and count == 1:
+            start = place if kind == 5 else at + 10 + 12 * entry
+            first, *rest = struct.unpack_from(order + _EXIF_NUMBERS[kind], tiff, start)
+            values[tag] = first / (rest[0] or math.inf) if rest else first
+    return values
 
 
 def _of_exif(tiff: memoryview) -> float | None:
     """Return the focal length over the image diagonal."""
-    order = {b"II": "<", b"MM": ">"}[bytes(tiff[:2])]
-
-    def tags(at: int) -> dict[int, float]:
-        values = {}
-        for entry in range(struct.unpack_from(f"{order}H", tiff, at)[0]):
-            tag, kind, count, place = struct.unpack_from(f"{order}HHII", tiff, at + 2 + 12 * entry)
-            if kind in _EXIF_NUMBERS and count == 1:
-                start = place if kind == 5 else at + 10 + 12 * entry
-                first, *rest = struct.unpack_from(order + _EXIF_NUMBERS[kind], tiff, start)
-                values[tag] = first / (rest[0] or math.inf) if rest else first
-        return values
-
-    found = tags(int(tags(struct.unpack_from(f"{order}I", tiff, 4)[0])[_POINTER]))
+    found = _tags(tiff, within=_POINTER)
     if found.get(_FILM_EQUIVALENT):
         return found[_FILM_EQUIVALENT] / FILM_DIAGONAL
     per_millimetre = found[_RESOLUTION] / _MILLIMETRES[int(found.get(_UNIT, 2))]
@@ -75,7 +114,8 @@ def _boxes(content: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     while len(content) >= 8:
         size, kind = struct.unpack_from(">I4s", content)
         start = 16 if size == 1 else 8
-        size = struct.unpack_from(">Q", content, 8)[0] if size == 1 else size
+        if size < 2:  # 1: it stands behind the kind; 0: the box is the last
+            size = struct.unpack_from(">Q", content, 8)[0] if size else len(content)
         if size < start:
             return
         yield kind, content[start:size]

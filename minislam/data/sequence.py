@@ -11,9 +11,10 @@ import torch
 
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.images import read_color, read_depth, read_mask
+from minislam.data.metadata import noted_size
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
 from minislam.data.preparation import ImagePreparation, KeptImages, Window, picture_window
-from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
+from minislam.data.sources import FileImages, Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.parameters import absolute_path, user_path
@@ -72,6 +73,7 @@ class RecordedSequence:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
         self.files = [*recording.images.paths, *self._masks.values()]
         height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
+        self._check_sizes(width, height)
         picture = picture_window(recording.images.brightest())
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
@@ -104,6 +106,20 @@ class RecordedSequence:
         self.description = f"{recording.kind}: {', '.join(parts)}"
         truth = _RecordedTruth(self, recording)
         self.ground_truth: GroundTruth | None = truth if recording.has_truth() else None
+
+    def _check_sizes(self, width: int, height: int) -> None:
+        """Refuse a folder of unlike images at once, rather than when the first of them comes."""
+        images = self._recording.images
+        if isinstance(images, FileImages):
+            paths = [images.paths[index] for index in self._chosen]
+            sizes = ((noted_size(path) or (width, height), path) for path in paths)
+            if odd := [(size, path) for size, path in sizes if size != (width, height)]:
+                (first, path) = odd[0]
+                raise InputError(
+                    f"expected images of one size, {width}x{height} as the first, found "
+                    f"{len(odd)} of another, such as {first[0]}x{first[1]} in {path}; remove or "
+                    "resize the odd ones"
+                )
 
     def __len__(self) -> int:
         return len(self._chosen)

@@ -1,15 +1,18 @@
-"""The focal length that photos and videos note, in files made byte by byte."""
+"""The focal length and the size that photos and videos note, in files made byte by byte."""
 
 import math
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from minislam.data.metadata import VIDEO_KEY, noted_focal_length
+from minislam.data.images import encode_jpeg, encode_png, read_color
+from minislam.data.metadata import VIDEO_KEY, noted_focal_length, noted_size
 
 DIAGONAL = math.hypot(36, 24)  # mm, of 35 mm film
 SHORT, LONG, RATIONAL = 3, 4, 5
+PNG = encode_png(np.zeros((2, 2)))
 
 
 def exif(tags: dict[int, tuple[int, object]], order: str = "<") -> bytes:
@@ -86,6 +89,8 @@ def test_a_video_names_its_equivalent_on_film(number, kind, in_track, tmp_path: 
     assert found == (pytest.approx(26 / DIAGONAL), "QuickTime tag of camera.file")
     as_iso = noted(tmp_path, movie(number, kind, in_track, version=bytes(4)))
     assert as_iso == found
+    before, moov, after = movie(number, kind, in_track).partition(b"moov")
+    assert noted(tmp_path, before[:-4] + bytes(4) + moov + after) == found  # 0: up to the end
 
 
 # Files that say nothing
@@ -120,3 +125,32 @@ def test_a_file_without_a_possible_focal_length_says_nothing(content: bytes, tmp
 
 def test_a_file_that_is_not_there_says_nothing(tmp_path: Path):
     assert noted_focal_length(tmp_path / "none.mp4") is None
+
+
+@pytest.mark.parametrize(("orientation", "size"), [(None, (31, 20)), (3, (31, 20)), (6, (20, 31))])
+def test_a_photo_notes_its_size_as_it_is_decoded(orientation, size, tmp_path: Path):
+    photo = encode_jpeg(np.zeros((20, 31, 3)), 31)
+    if orientation:
+        tiff = struct.pack("<2sHIHHHIHxxI", b"II", 42, 8, 1, 0x0112, SHORT, 1, orientation, 0)
+        photo = _with_segment(photo, b"Exif\0\0" + tiff)
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(photo)
+    assert noted_size(path) == size
+    assert read_color(path).shape[1::-1] == size
+
+
+def test_a_picture_notes_its_size(tmp_path: Path):
+    (path := tmp_path / "a.png").write_bytes(encode_png(np.zeros((20, 31))))
+    assert noted_size(path) == (31, 20)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"text", b"\xff\xd8", b"\xff\xd8\xff\xc0\x00\x08", PNG[:17]]
+)
+def test_of_a_damaged_picture_no_size_is_known(content: bytes, tmp_path: Path):
+    (path := tmp_path / "a.jpg").write_bytes(content)
+    assert noted_size(path) is None
+
+
+def _with_segment(photo: bytes, segment: bytes) -> bytes:
+    return photo[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + photo[2:]

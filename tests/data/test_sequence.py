@@ -230,9 +230,10 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch):
 def test_images_of_another_size_are_named(tmp_path: Path):
     save(tmp_path / "1.png", picture(1))
     save(tmp_path / "2.png", picture(1, 32, 48))
-    sequence = open_sequence(str(tmp_path))
-    with pytest.raises(InputError, match=r"one size, 48x32.*found 32x48 in .*2\.png"):
-        list(sequence)
+    save(tmp_path / "3.png", picture(1))
+    with pytest.raises(InputError, match=r"one size, 48x32.*1 of another, .* 32x48 in .*2\.png"):
+        open_sequence(str(tmp_path))
+    assert len(open_sequence(str(tmp_path), InputOptions(stride=2))) == 2  # without the odd one
 
 
 def test_one_pixel_images_are_refused(tmp_path: Path):
