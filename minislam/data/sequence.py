@@ -11,10 +11,9 @@ import torch
 
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.images import read_color, read_depth, read_mask
-from minislam.data.metadata import noted_size
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
 from minislam.data.preparation import ImagePreparation, KeptImages, Window, picture_window
-from minislam.data.sources import FileImages, Recording, mask_files, read_image_folder, read_video
+from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError
 from minislam.parameters import absolute_path, user_path
@@ -57,15 +56,18 @@ class RecordedSequence:
         source = source if source.startswith(SYNTHETIC) else absolute_path(source)
         self.opened_as = {"sequence": source, "input": asdict(options)}
         chosen = range(options.start, len(recording.images), options.stride)
-        self._chosen = chosen[: options.max_frames]
+        chosen, odd = chosen[: options.max_frames], recording.images.odd
+        self._chosen = [index for index in chosen if index not in odd]
         if len(self._chosen) < 2:
             raise InputError(
                 f"expected at least two frames, found {len(self._chosen)} among "
                 f"{len(recording.images)} images of {recording.name} after --start, --stride and "
                 "--max-frames; change these, or give more images"
             )
-        stamps = recording.timestamps[self._chosen.start : self._chosen.stop : self._chosen.step]
-        self.lost = [row for row in recording.lost if stamps[0] < row[0] < stamps[-1]]
+        stamps = recording.timestamps
+        first, last = stamps[chosen[0]], stamps[chosen[-1]]
+        self.lost = [row for row in recording.lost if first < row[0] < last]
+        self.lost += [(float(stamps[index]), odd[index]) for index in chosen if index in odd]
         self.checksums: dict[int, int] = {}
         self._kept = KeptImages()
         self._masks = recording.mask_paths
@@ -73,7 +75,6 @@ class RecordedSequence:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
         self.files = [*recording.images.paths, *self._masks.values()]
         height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
-        self._check_sizes(width, height)
         picture = picture_window(recording.images.brightest())
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
@@ -84,6 +85,9 @@ class RecordedSequence:
         given_fx = 0.0 if calibration.is_rough else camera.fx
         doubts = _doubts(first, recording.images.labels[self._chosen[0]], given_fx)
         self.warnings = [*recording.warnings, *doubts]
+        if left_out := [odd[index] for index in chosen if index in odd]:
+            text = f"{len(left_out)} of {len(chosen)} images are left out because of their size"
+            self.warnings.append(f"{text}, such as {left_out[0]}; crop or resize them")
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
         knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
@@ -106,20 +110,6 @@ class RecordedSequence:
         self.description = f"{recording.kind}: {', '.join(parts)}"
         truth = _RecordedTruth(self, recording)
         self.ground_truth: GroundTruth | None = truth if recording.has_truth() else None
-
-    def _check_sizes(self, width: int, height: int) -> None:
-        """Refuse a folder of unlike images at once, rather than when the first of them comes."""
-        images = self._recording.images
-        if isinstance(images, FileImages):
-            paths = [images.paths[index] for index in self._chosen]
-            sizes = ((noted_size(path) or (width, height), path) for path in paths)
-            if odd := [(size, path) for size, path in sizes if size != (width, height)]:
-                (first, path) = odd[0]
-                raise InputError(
-                    f"expected images of one size, {width}x{height} as the first, found "
-                    f"{len(odd)} of another, such as {first[0]}x{first[1]} in {path}; remove or "
-                    "resize the odd ones"
-                )
 
     def __len__(self) -> int:
         return len(self._chosen)

@@ -1,20 +1,18 @@
 """Recordings: raw images, files in a folder or a video, and what lies beside them."""
 
 import math
-import os
 import re
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from minislam.data.calibration import Calibration, calibration_beside
-from minislam.data.images import is_image, list_images, read_color
+from minislam.data.images import is_image, list_images
 from minislam.data.metadata import noted_focal_length
+from minislam.data.raw_images import FileImages, ImageSource, VideoImages
 from minislam.data.trajectory import truth_beside
-from minislam.errors import InputError, MinislamError
+from minislam.errors import InputError
 from minislam.parameters import FILES, user_path
 from minislam.records import Trajectory
 
@@ -24,128 +22,6 @@ _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 _ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
 _COUNTED = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
 _MOST_COUNTED = 1e6  # larger whole numbers in names are times
-_MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
-_TEXT = cv2.VideoWriter.fourcc(*"ansi")  # FFmpeg films a text file on a terminal
-_CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
-
-
-class FileImages:
-    """Images that are files."""
-
-    def __init__(self, paths: list[Path]) -> None:
-        self.paths = paths
-        self.labels = [str(path) for path in paths]  # how to call the images in a message
-        self.names = [path.name for path in paths]
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    def read(self, index: int) -> np.ndarray:
-        """Return a raw image (H, W, 3) uint8 RGB."""
-        return read_color(self.paths[index])
-
-    def brightest(self) -> np.ndarray:  # (H, W) uint8
-        """Return the largest value of each pixel in some of the images, as large as the first."""
-        found = self.read(0).max(2)
-        for index in filter(_is_looked_at, range(1, len(self.paths))):
-            with suppress(MinislamError):  # told when it is that frame's turn
-                image = self.read(index).max(2)
-                found = np.maximum(found, image) if image.shape == found.shape else found
-        return found
-
-
-class VideoImages:
-    """Images that are frames of a video. OpenCV applies the rotation that phones note in it.
-
-    The frame count in a container is an estimate, and seeking is inexact for many codecs.
-    Therefore the frames are counted by reading through the file once, and reading an earlier
-    frame starts again at the beginning. What cannot be decoded is passed over.
-    """
-
-    def __init__(self, path: Path, limit: int | None = None) -> None:
-        self.path, self.paths = path, [path]  # the files that hold the images
-        self._rewind()
-        self._calls: list[int] = []  # of grab(), after which a frame can be had
-        self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self._brightest = np.zeros((), np.uint8)  # of each pixel, in some of the images
-        stamps: list[float] = []
-        last = 0  # A failed call is the end of the file, or damage with more frames behind it.
-        while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
-            self._grabbed += 1
-            if self._capture.grab():
-                last = self._grabbed
-                self._calls.append(self._grabbed)
-                if _is_looked_at(len(stamps)):
-                    decoded, image = self._capture.retrieve()
-                    if decoded:
-                        self._brightest = np.maximum(self._brightest, image.max(2))
-                stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-        # Of as many frames as were read, 0 or less if unknown: the container tells it of all.
-        promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.promised = 0 if len(stamps) == limit else promised
-        self.timestamps = np.array(stamps)  # (N,) second, as the container has them
-        self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
-        self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]
-        self.is_whole = not self._capture.grab()  # no image follows
-        self._rewind()
-
-    def __len__(self) -> int:
-        return len(self._calls)
-
-    def read(self, index: int) -> np.ndarray:
-        """Return a raw image (H, W, 3) uint8 RGB; walking forward decodes every frame once.
-
-        The same frame may be read again at once: an export needs it in two sizes.
-        """
-        if self._calls[index] < self._grabbed:
-            self._rewind()
-        while self._grabbed < self._calls[index]:
-            self._capture.grab()
-            self._grabbed += 1
-        _, image = self._capture.retrieve()
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-    def brightest(self) -> np.ndarray:  # (H, W) uint8
-        """Return the largest value of each pixel in some of the images."""
-        return self._brightest
-
-    def lost(self) -> np.ndarray:  # (M,) second
-        """Return about when frames are missing: gaps of a constant rate, or calls that failed."""
-        gaps = np.diff(self.timestamps) * self.frame_rate  # frames
-        missing = np.diff(self._calls) - 1
-        if self.promised > len(self) > 1 and np.median(np.abs(gaps - 1)) < _CONSTANT_RATE:
-            missing = np.maximum(missing, np.round(gaps).astype(int) - 1)
-        rows = zip(self.timestamps, self.timestamps[1:], missing, strict=False)
-        return np.concatenate([[], *(np.linspace(a, b, n + 2)[1:-1] for a, b, n in rows)])
-
-    def _rewind(self) -> None:
-        # FFmpeg, because other back ends may take the name for a camera or a pattern.
-        # It takes what precedes a colon for a protocol, and crashes at a name that is no text.
-        name = os.path.abspath(self.path)
-        if re.search("[\ud800-\udfff]", name):
-            raise InputError(
-                f"expected a video whose name is text, found {name!a}; give it another name"
-            )
-        self._capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
-        self._grabbed = 0  # calls of grab() since the start
-        codec = self._capture.get(cv2.CAP_PROP_FOURCC)
-        if not self._capture.isOpened() or codec == _TEXT:
-            size, hint = self.path.stat().st_size, "convert it to MP4 (H.264) or give images"
-            content = np.memmap(self.path, mode="r").data if size else memoryview(b"")
-            # The table of contents, which cameras write at the end of an MP4
-            if content[4:8] == b"ftyp" and not re.search(b"(?s)moov....mvhd", content):
-                hint = "the file is cut short, copy it again"
-            raise InputError(
-                f"expected a video, but {self.path} ({size} bytes) cannot be opened as one; {hint}"
-            )
-
-
-def _is_looked_at(index: int) -> bool:
-    """Tell whether an image is 0, 1, 2, 4, 8 ...: few, the first, and others far apart."""
-    return index & (index - 1) == 0
-
-
-ImageSource = FileImages | VideoImages
 
 
 @dataclass(frozen=True)
@@ -274,7 +150,7 @@ def _found(folder: Path) -> str:
     return "none; give a folder that holds images, a video file, or synth:NAME"
 
 
-def mask_files(images: ImageSource, masks: str, chosen: range) -> dict[int, Path]:
+def mask_files(images: ImageSource, masks: str, chosen: list[int]) -> dict[int, Path]:
     """Return the mask of each chosen image in files:FOLDER: of its name, or of its number."""
     folder = user_path(masks.removeprefix(FILES))
     if not masks.startswith(FILES) or not folder.is_dir():

@@ -10,6 +10,7 @@ from minislam.data import sources
 from minislam.data.calibration import Calibration, calibration_beside
 from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
 from minislam.data.images import list_images, read_color
+from minislam.data.raw_images import FileImages
 from minislam.data.trajectory import read_trajectory, truth_beside
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion
@@ -69,7 +70,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
     return sources.Recording(
         name=sources.folder_name(folder),
         kind="TUM RGB-D folder",
-        images=sources.FileImages(paths),
+        images=FileImages(paths),
         timestamps=stamps,
         calibration=calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
         trajectory=trajectory,

@@ -256,7 +256,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("evaluation/trajectory.py", "evaluation/test_trajectory.py"): [
         ("<= max_difference", "<= 2 * max_difference"),
     ],
-    ("data/sources.py", "data/test_sources.py"): [
+    ("data/raw_images.py", "data/test_raw_images.py data/test_sequence.py"): [
+        ("if index not in self.odd", ""), ("size != usual[0][0]", "False"),
         ("self.promised > len(self) > 1", "len(self) > 1"),
         ("0 if len(stamps) == limit else promised", "promised"),
         ("index & (index - 1) == 0", "index == 0"), ("np.maximum(found, image)", "image"),

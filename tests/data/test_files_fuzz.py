@@ -17,7 +17,7 @@ from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.files import read_json
 from minislam.data.images import encode_jpeg, encode_png, read_color
 from minislam.data.ply import GaussianArrays, encode_ply, read_ply
-from minislam.data.sources import VideoImages
+from minislam.data.raw_images import VideoImages
 from minislam.data.trajectory import read_trajectory
 from minislam.data.tum import read_tum_folder
 from minislam.errors import InputError

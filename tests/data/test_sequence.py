@@ -227,13 +227,24 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch):
         open_sequence("synth:static", InputOptions(max_frames=2, size=(32, 24)))
 
 
-def test_images_of_another_size_are_named(tmp_path: Path):
+def test_images_of_another_size_are_left_out(tmp_path: Path):
     save(tmp_path / "1.png", picture(1))
     save(tmp_path / "2.png", picture(1, 32, 48))
     save(tmp_path / "3.png", picture(1))
-    with pytest.raises(InputError, match=r"one size, 48x32.*1 of another, .* 32x48 in .*2\.png"):
-        open_sequence(str(tmp_path))
-    assert len(open_sequence(str(tmp_path), InputOptions(stride=2))) == 2  # without the odd one
+    sequence = open_sequence(str(tmp_path))
+    assert [frame.timestamp for frame in sequence] == pytest.approx([1 / 30, 3 / 30])
+    assert sequence.lost == [(pytest.approx(2 / 30), "2.png is 32x48 px, others are 48x32")]
+    assert "1 of 3 images are left out because of their size" in sequence.warnings[-1]
+    sequence = open_sequence(str(tmp_path), InputOptions(stride=2))  # without the odd one
+    assert len(sequence) == 2 and not sequence.lost
+
+
+def test_the_size_of_most_images_counts_not_that_of_the_first(tmp_path: Path):
+    save(tmp_path / "1.png", picture(1, 32, 48))
+    for name in "23":
+        save(tmp_path / f"{name}.png", picture(1))
+    sequence = open_sequence(str(tmp_path))
+    assert len(sequence) == 2 and len(sequence.lost) == 1
 
 
 def test_one_pixel_images_are_refused(tmp_path: Path):

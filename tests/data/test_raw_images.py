@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from minislam.data import sources
+from minislam.data import raw_images
 from minislam.data.options import InputOptions
+from minislam.data.raw_images import VideoImages
 from minislam.data.sequence import RecordedSequence, open_sequence
-from minislam.data.sources import VideoImages, read_image_folder, read_video
+from minislam.data.sources import read_image_folder, read_video
 from minislam.errors import InputError
 from tests.recordings import picture, save, video
 
@@ -178,7 +179,7 @@ class Capture:
 
 
 def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(monkeypatch):
-    monkeypatch.setattr(sources.cv2, "VideoCapture", lambda *_: Capture())
+    monkeypatch.setattr(raw_images.cv2, "VideoCapture", lambda *_: Capture())
     recording = read_video(Path("phone.mp4"), None)
     np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2, 0.233, 0.4])
     assert [recording.images.read(k)[0, 0, 0] for k in (0, 2, 4, 1)] == [1, 4, 6, 2]
@@ -188,7 +189,7 @@ def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(mo
 
 @pytest.mark.parametrize("limit", [None, 5])
 def test_a_pause_of_the_recorder_is_no_damage(limit: int | None, monkeypatch):
-    monkeypatch.setattr(sources.cv2, "VideoCapture", lambda *_: Capture())
+    monkeypatch.setattr(raw_images.cv2, "VideoCapture", lambda *_: Capture())
     monkeypatch.setattr(Capture, "stamps", tuple(k / 30 for k in (0, 1, 2, 3, 7, 8)))
     recording = read_video(Path("phone.mp4"), limit)
     assert (recording.lost, recording.warnings) == ([], [])
@@ -196,7 +197,7 @@ def test_a_pause_of_the_recorder_is_no_damage(limit: int | None, monkeypatch):
 
 
 def test_without_timestamps_the_frame_rate_is_taken_and_said(monkeypatch):
-    monkeypatch.setattr(sources.cv2, "VideoCapture", lambda *_: Capture())
+    monkeypatch.setattr(raw_images.cv2, "VideoCapture", lambda *_: Capture())
     monkeypatch.setattr(Capture, "stamps", (0.0,) * 6)
     recording = read_video(Path("old.avi"), None)
     np.testing.assert_allclose(recording.timestamps, np.arange(6) / 30)
