@@ -3,8 +3,12 @@
 Without a depth network such a pixel has no depth, so nothing is inserted there. By half of the
 refinement, the MLP has learnt what moves. What it calls static and the map leaves transparent then
 gets the depth of its surroundings: 1/depth is linear over a plane, and so is the solution of
-Laplace's equation whose border is linear.
+Laplace's equation whose border is linear. Between a table and the wall behind it, that is the depth
+of neither: seen from elsewhere it would float before what is known there, so other views vote.
 """
+
+import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -13,7 +17,13 @@ from scipy import sparse
 from scipy.sparse import linalg
 from torch import Tensor
 
+from minislam.geometry import Camera
+from minislam.mapping.insertion import nearest_pixels
+from minislam.records import Keyframe
+
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
+VOTERS = 24  # images of the map, spread evenly over the clip, that vote
+SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 
 
 def filled_depth(depth: Tensor) -> Tensor:
@@ -28,6 +38,18 @@ def filled_depth(depth: Tensor) -> Tensor:
     cells = membrane(mean / np.maximum(part, 1e-6), part > 0)
     smooth = torch.from_numpy(cv2.resize(cells, (width, height))).to(depth)
     return torch.where(depth > 0, depth, 1 / smooth)
+
+
+def hides_known(means: Tensor, camera: Camera, keyframes: Sequence[Keyframe]) -> Tensor:  # (N,)
+    """Tell which points (N, 3) more views know to be before their surface than on it."""
+    votes = torch.zeros_like(means[:, 0], dtype=torch.int64)
+    for keyframe in keyframes[:: math.ceil(len(keyframes) / VOTERS)]:
+        z, row, column, inside = nearest_pixels(means, camera, keyframe.T_camera_world)
+        known = keyframe.depth[row, column]
+        beyond = (known - z) / z
+        votes += (inside & (beyond > SAME_DEPTH)).long()
+        votes -= (inside & (known > 0) & (beyond.abs() <= SAME_DEPTH)).long()
+    return votes > 0
 
 
 def membrane(values: np.ndarray, known: np.ndarray) -> np.ndarray:

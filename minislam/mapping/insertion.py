@@ -113,11 +113,21 @@ def is_on_dynamic_object(
 
     They were inserted before the MLP had learnt that the object there moves.
     """
+    # Optimisation may have moved a Gaussian out of the image: the nearest pixel counts.
+    z, row, column, _ = nearest_pixels(means, camera, T_camera_world)
+    return (z > 0) & (weight[row, column] == 0)
+
+
+def nearest_pixels(
+    means: Tensor,  # (N, 3) world units
+    camera: Camera,
+    T_camera_world: Tensor,  # (4, 4) float64
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # z float64, row and column int64, inside bool: (N,)
+    """Return depth and nearest pixel of points, and which are in front of the camera and inside."""
     points = transform_points(T_camera_world, means.double())
-    in_front = points[:, 2] > 0
-    # A point behind the camera has no pixel; another point takes its place, then it is masked.
-    pixels = camera.project(torch.where(in_front[:, None], points, torch.ones_like(points)))
-    # Optimisation may have moved a Gaussian out of the image: take the nearest pixel.
+    z = points[:, 2]
+    # A point behind the camera has no pixel; another point takes its place.
+    pixels = camera.project(torch.where((z > 0)[:, None], points, torch.ones_like(points)))
     column = pixels[:, 0].round().clamp(0, camera.width - 1).long()
     row = pixels[:, 1].round().clamp(0, camera.height - 1).long()
-    return in_front & (weight[row, column] == 0)
+    return z, row, column, (z > 0) & camera.contains(pixels)

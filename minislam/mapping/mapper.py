@@ -13,7 +13,7 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
-from minislam.mapping.gaps import filled_depth
+from minislam.mapping.gaps import filled_depth, hides_known
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
@@ -141,6 +141,8 @@ class Mapper(JointOptimisation):
         scene = self.camera, rendering, weight, self.median_depth
         insertion = replace(self.config.insertion, cell=self.cell)
         new = gaussians_of_keyframe(keyframe, position, *scene, insertion, self._generator)
+        if fills:
+            new = new.prune(~hides_known(new.means, self.camera, self.keyframes))
         self._optimizer.append(new)
         self._reset_gradients()
 

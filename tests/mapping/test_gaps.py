@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.mapping.gaps import CELL, filled_depth, membrane
-from tests.mapping.plane_scene import make_mapper, wall_keyframe
+from minislam.mapping.gaps import CELL, VOTERS, filled_depth, hides_known, membrane
+from minislam.records import Keyframe
+from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 from tests.pretended_gpu import GPU, pretended_gpu
 
 COLUMN, ROW = torch.arange(64.0).expand(48, 64), torch.arange(48.0)[:, None].expand(48, 64)
@@ -49,6 +50,30 @@ def test_each_unknown_cell_is_the_mean_of_its_neighbours(shape: tuple[int, int])
         beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
         inside = [filled[r, c] for r, c in beside if 0 <= r < height and 0 <= c < width]
         assert filled[row, column] == pytest.approx(np.mean(inside))
+
+
+def views(*depths: float) -> tuple[Keyframe, ...]:
+    """Return views from the origin along z, each of which knows one depth, or none (0)."""
+    view = replace(wall_keyframe(0), T_camera_world=torch.eye(4, dtype=torch.float64))
+    return tuple(replace(view, depth=torch.full_like(view.depth, z)) for z in depths)
+
+
+@pytest.mark.parametrize(
+    ("known", "hides"),
+    [
+        ((2.0,), True), ((2.0, 2.0, 1.0), True), ((2.0, 1.0), False), ((1.05,), False),
+        ((1.15,), True), ((0.0,), False), ((0.5, 0.5), False), ((1.0, 2.0, 0.0, 2.0), True),
+    ],
+)  # fmt: skip
+def test_a_point_hides_what_more_views_know_behind_it_than_at_it(known, hides: bool):
+    points = torch.tensor([[0.0, 0.0, 1.0], [9.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    assert hides_known(points, CAMERA, views(*known)).tolist() == [hides, False, False]
+
+
+def test_of_many_views_every_nth_votes():
+    point = torch.tensor([[0.0, 0.0, 1.0]])
+    assert hides_known(point, CAMERA, views(2.0, 1.0, 1.0) * VOTERS)
+    assert not hides_known(point, CAMERA, views(1.0, 2.0, 2.0) * VOTERS)
 
 
 def test_on_a_gpu_it_is_filled_as_on_the_cpu():
