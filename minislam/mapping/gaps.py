@@ -48,7 +48,7 @@ def hides_known(means: Tensor, camera: Camera, keyframes: Sequence[Keyframe]) ->
         known = keyframe.depth[row, column]
         beyond = (known - z) / z
         votes += (inside & (beyond > SAME_DEPTH)).long()
-        votes -= (inside & (known > 0) & (beyond.abs() <= SAME_DEPTH)).long()
+        votes -= (inside & (beyond.abs() <= SAME_DEPTH)).long()
     return votes > 0
 
 

@@ -39,7 +39,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/insertion.py", "mapping/test_insertion.py"): [
         ("& (weight > 0)", ""), ("opacity < EXPLAINED_OPACITY", "opacity > EXPLAINED_OPACITY"),
-        ("torch.where(known, priority, -1)", "priority"), ("in_front & (weight", "(weight"),
+        ("torch.where(known, priority, -1)", "priority"), ("(z > 0) & (weight", "(weight"),
         ("config.cell * z / focal", "config.cell / focal"),
     ],
     ("mapping/losses.py", "mapping/test_losses.py"): [
@@ -50,9 +50,12 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("mapping/mapper.py", "mapping/test_mapper.py"): [("if not keyframe.inserts", "if False")],
     ("mapping/gaps.py", "mapping/test_gaps.py"): [
         ("mean / np.maximum(part, 1e-6)", "mean"), ("-(rows[:, ~free]", "(rows[:, ~free]"),
+        ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
+        ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
     ],
     ("mapping/mapper.py", "mapping/test_gaps.py"): [
         ("self._insert(position, fills=True)", "self._insert(position)"),
+        ("new.prune(~hides_known(new.means, self.camera, self.keyframes))", "new"),
     ],
     ("mapping/safeguards.py", "mapping/test_mapper.py"): [
         ("opacity[weight > 0] > OPAQUE", "opacity[weight > -1] > OPAQUE"),

@@ -70,6 +70,12 @@ def test_a_point_hides_what_more_views_know_behind_it_than_at_it(known, hides: b
     assert hides_known(points, CAMERA, views(*known)).tolist() == [hides, False, False]
 
 
+def test_a_view_that_does_not_see_a_point_does_not_vote():
+    [seeing], [other] = views(2.0), views(1.0)
+    other.T_camera_world[0, 3] = 9.0
+    assert hides_known(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, [seeing, other])
+
+
 def test_of_many_views_every_nth_votes():
     point = torch.tensor([[0.0, 0.0, 1.0]])
     assert hides_known(point, CAMERA, views(2.0, 1.0, 1.0) * VOTERS)
@@ -107,3 +113,16 @@ def test_a_static_gap_is_in_the_map_and_a_moving_one_is_not(moves: bool):
     if not moves:
         surface = (after.depth / after.opacity)[inside]
         torch.testing.assert_close(surface, torch.full_like(surface, 2.0), rtol=0.05, atol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("knows", [False, True])
+def test_what_would_hide_the_surface_that_another_view_knows_is_not_filled(knows: bool):
+    keyframe, mapper = wall_keyframe(1), make_mapper()
+    near = replace(keyframe, depth=torch.ones_like(keyframe.depth))
+    near.depth[6:18, 6:26] = 0
+    wall = keyframe.depth if knows else torch.zeros_like(keyframe.depth)
+    mapper.initialise([near, replace(keyframe, depth=wall, inserts=False)])
+    mapper.refine(8)
+    inside = mapper.render(keyframe.T_camera_world).opacity[10:14, 12:20]
+    assert (inside.mean() > 0.8) != knows
