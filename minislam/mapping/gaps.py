@@ -40,16 +40,26 @@ def filled_depth(depth: Tensor) -> Tensor:
     return torch.where(depth > 0, depth, 1 / smooth)
 
 
-def hides_known(means: Tensor, camera: Camera, keyframes: Sequence[Keyframe]) -> Tensor:  # (N,)
-    """Tell which points (N, 3) more views know to be before their surface than on it."""
-    votes = torch.zeros_like(means[:, 0], dtype=torch.int64)
+def hides_known(
+    means: Tensor,  # (N, 3) world units, of what a keyframe inserts
+    camera: Camera,
+    own: Keyframe,
+    keyframes: Sequence[Keyframe],  # of the map
+) -> Tensor:  # (N,) bool
+    """Tell which points that their keyframe does not measure stand before what others know.
+
+    More views must know a surface behind the point than one at its depth.
+    """
+    _, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
+    is_guessed = own.depth[row, column] == 0
+    votes = torch.zeros_like(row)
     for keyframe in keyframes[:: math.ceil(len(keyframes) / VOTERS)]:
         z, row, column, inside = nearest_pixels(means, camera, keyframe.T_camera_world)
         known = keyframe.depth[row, column]
         beyond = (known - z) / z
         votes += (inside & (beyond > SAME_DEPTH)).long()
         votes -= (inside & (beyond.abs() <= SAME_DEPTH)).long()
-    return votes > 0
+    return is_guessed & (votes > 0)
 
 
 def membrane(values: np.ndarray, known: np.ndarray) -> np.ndarray:

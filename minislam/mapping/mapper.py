@@ -142,7 +142,8 @@ class Mapper(JointOptimisation):
         insertion = replace(self.config.insertion, cell=self.cell)
         new = gaussians_of_keyframe(keyframe, position, *scene, insertion, self._generator)
         if fills:
-            new = new.prune(~hides_known(new.means, self.camera, self.keyframes))
+            views = self.keyframes[position], self.keyframes
+            new = new.prune(~hides_known(new.means, self.camera, *views))
         self._optimizer.append(new)
         self._reset_gradients()
 

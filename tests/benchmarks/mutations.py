@@ -52,10 +52,11 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("mean / np.maximum(part, 1e-6)", "mean"), ("-(rows[:, ~free]", "(rows[:, ~free]"),
         ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
         ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
+        ("is_guessed & (votes > 0)", "votes > 0"),
     ],
     ("mapping/mapper.py", "mapping/test_gaps.py"): [
         ("self._insert(position, fills=True)", "self._insert(position)"),
-        ("new.prune(~hides_known(new.means, self.camera, self.keyframes))", "new"),
+        ("new.prune(~hides_known(new.means, self.camera, *views))", "new"),
     ],
     ("mapping/safeguards.py", "mapping/test_mapper.py"): [
         ("opacity[weight > 0] > OPAQUE", "opacity[weight > -1] > OPAQUE"),

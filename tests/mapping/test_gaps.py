@@ -67,19 +67,23 @@ def views(*depths: float) -> tuple[Keyframe, ...]:
 )  # fmt: skip
 def test_a_point_hides_what_more_views_know_behind_it_than_at_it(known, hides: bool):
     points = torch.tensor([[0.0, 0.0, 1.0], [9.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    assert hides_known(points, CAMERA, views(*known)).tolist() == [hides, False, False]
+    assert hides_known(points, CAMERA, *views(0.0), views(*known)).tolist() == [hides, False, False]
 
 
 def test_a_view_that_does_not_see_a_point_does_not_vote():
     [seeing], [other] = views(2.0), views(1.0)
     other.T_camera_world[0, 3] = 9.0
-    assert hides_known(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, [seeing, other])
+    assert hides_known(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(0.0), [seeing, other])
 
 
 def test_of_many_views_every_nth_votes():
     point = torch.tensor([[0.0, 0.0, 1.0]])
-    assert hides_known(point, CAMERA, views(2.0, 1.0, 1.0) * VOTERS)
-    assert not hides_known(point, CAMERA, views(1.0, 2.0, 2.0) * VOTERS)
+    assert hides_known(point, CAMERA, *views(0.0), views(2.0, 1.0, 1.0) * VOTERS)
+    assert not hides_known(point, CAMERA, *views(0.0), views(1.0, 2.0, 2.0) * VOTERS)
+
+
+def test_what_its_own_keyframe_measures_stays():
+    assert not hides_known(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(1.0), views(2.0))
 
 
 def test_on_a_gpu_it_is_filled_as_on_the_cpu():
