@@ -24,8 +24,9 @@ _DPI = 110  # dots per inch
 _UNKNOWN_RGB = (0.25, 0.25, 0.25)  # where there is no depth
 _QUANTILES = (0.02, 0.98)  # a few outliers must not take the whole colour range
 _LEAST_BETA = 0.1  # a smaller one counts as this, `uncertainty.weights.clipped_beta`
-# A range at least this wide keeps the noise of a static frame from filling all colours.
-_LEAST_BETA_RATIO = 4.0
+# A range at least this wide keeps the noise of a static frame from filling all colours, and bright
+# is only what the map leaves out, `uncertainty.weights.BETA_CUT`, or nearly.
+_LEAST_BETA_RATIO, _BRIGHT_BETA = 4.0, 1.41
 _LEAST_DEPTH_RATIO = 1.1  # of the farthest to the nearest: a backdrop is one colour
 
 Limits = tuple[float, float]  # values of the first and the last colour; None: from all values
@@ -141,7 +142,7 @@ def beta_limits(beta: np.ndarray) -> Limits:
     """Return the beta drawn darkest, at least 0.1, and the beta drawn brightest."""
     least = np.maximum(np.asarray(beta, dtype=np.float64), _LEAST_BETA)
     low, high = map(float, np.quantile(least, _QUANTILES))
-    return low, max(high, _LEAST_BETA_RATIO * low)
+    return low, max(high, _LEAST_BETA_RATIO * low, _BRIGHT_BETA)
 
 
 def _mapped(values: np.ndarray, low: float, high: float, kind: str) -> np.ndarray:

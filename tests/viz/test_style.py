@@ -36,6 +36,13 @@ def test_the_noise_of_a_still_scene_stays_dark():
     assert beta_to_rgb(beta).mean() < 0.1
 
 
+def test_what_the_map_shows_is_not_bright():
+    beta = np.geomspace(0.1, 0.4, 48).reshape(6, 8)  # of a plain floor, where nothing moves
+    assert beta_to_rgb(beta).max() < 0.8
+    beta[0, 0] = 1.5
+    assert beta_to_rgb(beta)[0, 0].max() > 0.95
+
+
 @pytest.mark.parametrize("kind, limits", [("depth", (1, 3)), ("weight", (0, 1)), ("beta", (1, 9))])
 def test_a_colour_bar_has_the_colours_and_the_limits_of_its_kind(kind, limits):
     figure = new_figure((3, 2))
