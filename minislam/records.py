@@ -17,7 +17,7 @@ Progress = Callable[[int, int], None]  # called with the steps done and their nu
 
 
 class Pictured:
-    """What has an image. Bytes are kept, because numbers take four times the memory."""
+    """Anything that has an image. It is kept as bytes: floats take four times the memory."""
 
     pixels: Tensor  # (H, W, 3) uint8 RGB; an image in [0, 1] is taken as it is
     exposure: Tensor | None = None  # (3,) how many times as bright as the map, None: as bright

@@ -28,7 +28,7 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        if not 0 < min(self.fx, self.fy) <= max(self.fx, self.fy) <= LONGEST_FOCAL:
+        if not all(0 < focal <= LONGEST_FOCAL for focal in (self.fx, self.fy)):
             found = f"fx={self.fx} fy={self.fy}; give them in pixels with --fx and --fy"
             wanted = f"positive focal lengths up to {LONGEST_FOCAL:g}"
             raise InputError(f"expected {wanted}, found {found}")
@@ -106,7 +106,8 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """Return the camera of the same image resized: c -> (c + 0.5) s - 0.5 per axis."""
         sx, sy = width / self.width, height / self.height
-        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        cx = min((self.cx + 0.5) * sx, width) - 0.5  # rounding must not put it outside
+        cy = min((self.cy + 0.5) * sy, height) - 0.5
         return Camera(self.fx * sx, self.fy * sy, cx, cy, width, height)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Camera":

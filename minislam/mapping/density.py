@@ -76,6 +76,7 @@ def useful_rows(gaussians: GaussianMap, median_depth: float) -> Tensor:  # (N,) 
     """Tell which Gaussians stay: finite, not faint, not huge beside the scene's median depth."""
     opaque = gaussians.opacities > PRUNE_OPACITY
     small = gaussians.scales.max(-1).values < PRUNE_SCALE * median_depth
-    # One bad number would spread to every pixel that the Gaussian touches.
-    finite = gaussians.means.isfinite().all(-1)
+    # One bad number would spread to all pixels of the tiles that list the Gaussian.
+    numbers = gaussians.means, gaussians.quats_wxyz, gaussians.colors
+    finite = torch.cat(numbers, 1).isfinite().all(-1)
     return (opaque & small & finite).detach()

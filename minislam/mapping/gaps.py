@@ -22,7 +22,7 @@ from minislam.mapping.insertion import nearest_pixels
 from minislam.records import Keyframe
 
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
-VOTERS = 24  # images of the map, spread evenly over the clip, that vote
+VOTERS = 24  # images of the map, evenly over the clip, that vote: so many, or down to half
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 
 
@@ -63,7 +63,7 @@ def hides_known(
 
 
 def membrane(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return values (h, w) whose unknown cells (not known) are the means of their neighbours."""
+    """Return values (h, w) in which each cell that is not known is the mean of its neighbours."""
     number = np.arange(values.size).reshape(values.shape)
     pairs = [(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]
     first, second = (

@@ -51,11 +51,12 @@ def least_weight(beta_raw: Tensor) -> float:
     """Return the weight below which a pixel is excluded, 0.1 or more, by all betas (n,) of a clip.
 
     How large beta is on a dynamic object depends on how unlike its background it looks. Otsu's
-    threshold splits the betas into two modes; if the upper one is large, all of it is excluded.
+    threshold splits the betas into two modes; if the upper one is large, betas from three quarters
+    of its mean on are excluded.
     """
-    bins = (BINS * beta_raw).clamp_max(255).byte().cpu().numpy()
-    split, _ = cv2.threshold(bins, 0, 255, cv2.THRESH_OTSU)
-    upper = beta_raw[BINS * beta_raw > split].mean()
+    bins = (BINS * beta_raw).clamp_max(255).byte()
+    split, _ = cv2.threshold(bins.cpu().numpy(), 0, 255, cv2.THRESH_OTSU)
+    upper = beta_raw[bins > split].mean()  # the last bin of the lower mode is `split`
     if not upper > LEAST_UPPER_MODE:  # nan without one
         return weights.MAPPING_CUT
     cut = weights.stretched(weights.clipped_beta(UPPER_MODE * upper))

@@ -19,8 +19,8 @@ class GaussianMap:
     quats_wxyz: Tensor  # (N, 4) any length but zero; the rotation is that of q / |q|
     log_scales: Tensor  # (N, 3) log of the standard deviation in world units
     opacity_logits: Tensor  # (N,) logit of the opacity
-    colors: Tensor  # (N, 3) linear RGB, used as it is
-    anchor_keyframe: Tensor  # (N,) int64, index of the keyframe a Gaussian was inserted for
+    colors: Tensor  # (N, 3) RGB as in the images, not passed through a function
+    anchor_keyframe: Tensor  # (N,) int64, position in the map of the keyframe that inserted it
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -98,7 +98,7 @@ class MapOptimizer(Stateful):
     _steps: Tensor  # (N,)
 
     BETAS = (0.9, 0.999)  # decay of the first and second moment, Adam's defaults
-    EPSILON = 1e-15  # floor of the denominator: 3DGS, gradients per pixel mean are tiny
+    EPSILON = 1e-15  # added to the denominator: 3DGS, gradients of a mean over pixels are tiny
 
     def __init__(self, gaussians: GaussianMap, rates: LearningRates) -> None:
         self.rates = rates

@@ -44,9 +44,10 @@ def with_swept_depth(
 ) -> list[Keyframe]:
     """Return the keyframes with swept depth and confirmation.
 
-    Where nothing was swept their own depth fills in, scaled to what was swept in the same image,
-    because a network errs image by image. What other views look through moves, and stays empty,
-    but for a camera that hardly did more than turn: a wrong depth costs it no picture, a hole does.
+    Where the sweep found nothing, the keyframe's own depth fills in, scaled by the swept depth of
+    the same image, because a network errs image by image. Where other views look through that depth
+    something moves, and the pixel stays empty. With `fills`, if less than half is known, holes take
+    the depth of the nearest known pixel: a wrong depth costs a turning camera no picture.
     """
     small, judges, result = _small(camera, WIDTH), votes.judges(len(keyframes)), []
     judging: dict[int, votes.SweptView] = {}

@@ -25,7 +25,7 @@ from minislam.tracking.schur import NormalEquations, marginalised, source_blocks
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
 DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all of it [-]
 MIN_RAISED_DAMPING = 1e-6  # relative; an undamped solve that fails is tried again with this
-LEAST_SAVING = 1e-6  # of the cost: a step that saves no more is the last; 1e-9 moved no pose
+LEAST_SAVING = 1e-6  # of the cost: a step that saves no more is the last; 1e-9 gave the same poses
 MAX_DAMPING = 1e6  # relative; a step damped more than this would not move anything
 
 
@@ -137,8 +137,8 @@ def _linearised(problem: BundleProblem, state: BundleState) -> Iterator[_Lineari
         weight = part.weights * reprojection.valid[:, None]
         if part.robust is not None:
             weight = weight * part.robust.weight(residual.square().sum(1, keepdim=True))
-        # A point behind the target counts as a residual of the image's width. Were it left out, the
-        # cheapest camera would be one that looks away from all points.
+        # A point behind the target, or too near, counts as a residual of the image's width in u and
+        # v. Were it left out, the cheapest camera would be one that looks away from all points.
         far = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
         costs = edge_losses(part.weights, far, part.robust)
         yield _Linearised(edges, part, costs, residual, weight, reprojection, transforms)

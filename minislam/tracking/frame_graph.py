@@ -18,7 +18,7 @@ from minislam.tracking.reprojection import lengths, relative_transforms, reproje
 # has no meaningful distance. DROID-SLAM: 0.75
 MIN_VALID_FRACTION = 0.5
 FAR = math.inf  # px, the distance of a pair below this fraction
-COARSE, COARSE_MARGIN = 16, 2.0  # one cell in so many tells a distance to such a factor
+COARSE, COARSE_MARGIN = 16, 2.0  # one cell in 16 tells a distance to within a factor of 2
 # New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8
 AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together

@@ -33,7 +33,7 @@ class Grid(Stateful):
         self.camera, self.rays = zoomed(self.camera, self.rays, log_focal)
 
     def sample(self, values: Tensor, positions: Tensor) -> Tensor:
-        """Interpolate cell values (..., N, C) bilinearly at pixels (..., N, 2).
+        """Return values (..., N, C) of the cells interpolated bilinearly at pixels (..., M, 2).
 
         Beyond the outermost cells their values are repeated.
         """

@@ -20,7 +20,7 @@ def keyframe_flow(graph: KeyframeGraph, is_initialised: bool) -> float:
 
 
 def mean_flow(graph: KeyframeGraph, matches: FlowMatches) -> float:
-    """Return the mean flow of matches (E = 1), weighted by their confidences [px]."""
+    """Return the mean flow of matches (E = 1), weighted by their confidences in u [px]."""
     length = lengths(matches.targets - graph.grid.pixels.T)[0]
     confidence = matches.confidences[0, 0]
     return float((confidence * length).sum() / confidence.sum())

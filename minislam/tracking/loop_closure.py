@@ -24,7 +24,7 @@ def loop_pairs(
     edges: list[tuple[int, int]],  # that exist already
     newest: int,  # keyframe whose loops are looked for
     max_distance: float,  # px
-    min_gap: int,  # keyframes between the ends of a loop
+    min_gap: int,  # keyframes, least difference of the ends of a loop
     limit: int,  # pairs at most
     suppression: int,  # keyframes around a pair that would repeat it
 ) -> list[tuple[int, int]]:

@@ -82,7 +82,7 @@ def adjust(
     lambda_prior: float | None = None,  # None: as configured
     widening: float = 1.0,  # of the robust weight
     free_camera: bool = False,  # refine an unknown focal length, and the readouts
-    settled: bool = False,  # poses and depths are, so the robust weight follows the residuals
+    settled: bool = False,  # poses and depths have, so the robust width follows the residuals
 ) -> None:
     """Run a bundle adjustment over the links that touch the free keyframes."""
     positions = graph.links.select(first_free)

@@ -17,7 +17,7 @@ from minislam.tracking.safeguards.robust import RobustKernel
 
 INVERSION_STEPS = 4  # of a fixed point; the flow estimator corrects what is left
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
-# Times the final width: 50 px, those of a start off by 10 degrees, are outliers for a narrow one.
+# Times the final width. A start off by 10 degrees has residuals of 50 px: outliers when narrow.
 ROBUST_WIDENING = (16.0, 4.0, 1.0)
 
 

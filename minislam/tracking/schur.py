@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Eq. (5), linearised: what its edges say of the poses, and its disparities of both."""
+    """The normal equations of Eq. (5): pose blocks by edge, disparities, and what couples them."""
 
     cost: float  # px^2, Eq. (5)
     of_edges: list[Tensor]  # J^T W J (E, 6 + G, 6 + G), J^T W r (E, 6 + G), Ad (E, 6, 6), float64

@@ -52,7 +52,7 @@ class UncertaintyConfig:
     )
     neighbours: int = parameter(128, "most similar cells that enter L_reg_V [cells], official", 1)
     variance_samples: int = parameter(
-        350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes"
+        350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes", 1
     )
     neighbour_keyframes: int = parameter(
         2, "images of the map before and after that L_reg_V looks at, official"

@@ -15,7 +15,7 @@ SSIM_WINDOW = 7  # px, official; NeRF On-the-go uses a 5x5 box
 SSIM_C3 = SSIM_C2 / 2  # the usual choice, with which l c s is the classic SSIM
 STRUCTURE_CAP = 0.98  # of c and s: one perfect factor must not hide the two others
 SURFACE_OPACITY = 0.9  # a rendering less opaque than this shows a hole, not a surface, official
-FAR_FACTOR = 10.0  # median depths: a reference depth beyond them is not used, official
+FAR_FACTOR = 10.0  # median depths: farther reference depths are not used, official: at most 50 m
 
 
 def ssim_components(

@@ -12,7 +12,7 @@ from minislam.uncertainty import losses
 from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.mlp import UncertaintyMLP
 
-DECAYS, EPSILON = (0.9, 0.999), 1e-8  # of Adam: of its moments; floor of the denominator
+DECAYS, EPSILON = (0.9, 0.999), 1e-8  # of Adam: of its moments; added to the denominator
 
 
 @dataclass(frozen=True)

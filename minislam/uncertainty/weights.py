@@ -6,8 +6,8 @@ follow here, first stretches beta, then caps the weight in tracking and cuts it 
     beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
     tracking: w capped at 1,        mapping: w below 0.1 set to 0, and (ours) capped at 5.
 
-So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41, or
-above less where the betas of a clip tell two modes apart (ours, `mapping/safeguards.py`).
+So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41. Where
+the betas of a clip have two modes, mapping cuts at a smaller beta (ours, `mapping/safeguards.py`).
 """
 
 import torch
@@ -19,7 +19,7 @@ from minislam.images import resample
 BETA_FLOOR = 0.1  # smallest beta, official: keeps 1 / beta^2 and log beta finite
 BETA_OFFSET = 1e-3  # added to the clipped beta, official
 TRAIN_FRACTION = 0.3  # x: position in NeRF On-the-go's schedule, fixed in the official code
-SCHLICK_SLOPE = 0.8  # s: slope of that schedule at its end, official
+SCHLICK_MIDDLE = 0.8  # s: value of that schedule at its middle, x = 1/2, official
 WEIGHT_SCALE = 0.5  # numerator of the weight, official
 TRACKING_CAP = 1.0  # beta may lower the weight that the flow confidence gives, not raise it
 BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: what the capped SSIM alone gives
@@ -30,12 +30,12 @@ STATIC_FRACTION = 0.1  # ours: so much of a frame counts fully in tracking, what
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
 
 
-def schlick_bias(position: float, slope: float) -> float:
-    """Return x / (1 + (1 - x) (1/s - 2)), Schlick's bias of x in [0, 1]; s = 0.5 returns x."""
-    return position / (1 + (1 - position) * (1 / slope - 2))
+def schlick_bias(position: float, middle: float) -> float:
+    """Return x / (1 + (1 - x) (1/s - 2)), Schlick's bias of x in [0, 1], which is s at x = 1/2."""
+    return position / (1 + (1 - position) * (1 / middle - 2))
 
 
-DATA_RATE = 1 + schlick_bias(TRAIN_FRACTION, SCHLICK_SLOPE)  # 1.6316
+DATA_RATE = 1 + schlick_bias(TRAIN_FRACTION, SCHLICK_MIDDLE)  # 1.6316
 
 
 def clipped_beta(beta_raw: Tensor) -> Tensor:

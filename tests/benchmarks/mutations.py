@@ -119,7 +119,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("information > SETTLED", "information < SETTLED"), (".clamp_min(LEAST)", ""),
     ],
     ("tracking/safeguards/scale_certainty.py", "tracking/safeguards/test_scale_certainty.py"): [
-        ("(1 + HOLD)", "1"), ("C + DISPARITY_DAMPING * C[C > 0].mean()", "C"),
+        ("LEAST_C * C[C > 0].mean()", "0"), ("HOLD = 1e-8", "HOLD = 1e-6"),
+        ("LEAST_C = 1e-6", "LEAST_C = 1e-2"), ("(1 + HOLD)", "1"),
         ("gradient[end, :3] -=", "gradient[end, :3] +="), (".square().sum(0)", ".abs().sum(0)"),
         ("(weights * residual.square()).sum()", "residual.square().sum()"),
         ("row[end].square()", "row[end]"), ("diagonal(REACH)", "diagonal(1)"),

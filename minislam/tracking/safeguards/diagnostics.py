@@ -105,8 +105,8 @@ class Watch(Stateful):
     def only_turned(self) -> bool:
         """Tell whether the camera stood still or only turned, so that nothing measures depth.
 
-        Either no pose claims parallax, or hardly any flow shows it and poses or sweeps make no
-        depth of that.
+        Either no pose claims parallax. Or hardly any flow is beyond turns, and most keyframes rest
+        or sweeps confirm hardly any depth.
         """
         if all(k.parallax < self._graph.least_parallax for k in self.diagnostics):
             return True
@@ -172,13 +172,15 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
     """Return continuity and agreement [-]: does what held the camera before hold this keyframe?
 
-    A cell of a keyframe before this one is known if its flow to the next keyframe fits. Of the
-    keyframe just before, the cells are known to which known ones flow: what comes into view is not.
+    A cell of an earlier keyframe is known if its flow to the next keyframe fits. The flow of the
+    keyframe just before leads to this one, which is being judged, so there the cells are known to
+    which known ones flow; what has just come into view is not.
 
-    Continuity is what is known, matched and fits, weighed by motion, too, in the best link into
-    this keyframe, over all that the keyframe just before matches: in a fast turn both are small.
-    Agreement is the part that fits of what is known and matched, moving or not, in the worst link.
-    None: a link is missing, the camera was lost, or no link knows enough to agree.
+    Continuity: the mean weight of the cells that are known, matched and fit, motion weight
+    included, in the best link into this keyframe, over the mean confidence of the link from the
+    keyframe just before: in a fast turn both are small. Agreement: the part that fits of what is
+    known and matched, without motion weights, in the worst link. Both are None if a link is missing
+    or the camera was lost; agreement is None if no link knows enough.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
@@ -251,8 +253,9 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
         is_weak = keyframe.explained is not None and keyframe.explained < MIN_EXPLAINED_LONG
         weak = weak + 1 if is_weak else 0
         if weak >= LONG or _is_broken(keyframe):
-            first = diagnostics[index - LONG + 1 if weak >= LONG else index].frame_index
-            if found and index - last <= HEALED_AFTER:
+            start = index - LONG + 1 if weak >= LONG else index
+            first = diagnostics[start].frame_index
+            if found and start - last <= HEALED_AFTER:
                 first = found.pop().first_frame
             found.append(Break(first, keyframe.frame_index))
             last = index

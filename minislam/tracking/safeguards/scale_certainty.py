@@ -14,7 +14,6 @@ from torch import Tensor
 
 from minislam.geometry import se3_inverse
 from minislam.tracking.bundle_adjustment import (
-    DISPARITY_DAMPING,
     BundleProblem,
     BundleState,
     normal_equations,
@@ -24,7 +23,8 @@ from minislam.tracking.safeguards.parts import in_parts
 from minislam.tracking.schur import marginalised
 
 REACH = 3  # keyframes: the usual distance over so many is the length that is compared
-HOLD = 1e-6  # relative damping: holds the scale of the whole, which nothing tells [-]
+LEAST_C = 1e-6  # fraction of the mean C, added to all: more would tell depths that no flow tells
+HOLD = 1e-8  # relative damping of the poses: holds the scale of the whole, which nothing tells [-]
 
 
 def scale_deviations(problem: BundleProblem, state: BundleState) -> dict[int, float]:
@@ -38,8 +38,7 @@ def scale_deviations(problem: BundleProblem, state: BundleState) -> dict[int, fl
         return {}
     equations = normal_equations(problem, state)
     C = equations.disparity_diagonal
-    C = C + DISPARITY_DAMPING * C[C > 0].mean()  # cells that the flow hardly measures
-    S, _ = marginalised(problem, equations, C.reciprocal())
+    S, _ = marginalised(problem, equations, (C + LEAST_C * C[C > 0].mean()).reciprocal())
     S.diagonal().mul_(1 + HOLD)
     factor, failure = torch.linalg.cholesky_ex(S)
     rows = torch.stack([gradient[1:].flatten() for gradient in gradients.values()])
@@ -61,8 +60,9 @@ def _variance(problem: BundleProblem, state: BundleState) -> Tensor:  # px^2
 def _log_ratio_gradients(state: BundleState) -> Iterator[tuple[int, Tensor]]:  # k, (K, 6)
     """Yield the derivative of ln(length after / length before) by the twists of all poses.
 
-    A length leads to the nearest keyframe in time that is as far away as REACH usually are: where
-    the camera rests there is none.
+    The length after a keyframe is the distance to the first later one at least as far away as
+    keyframes REACH apart usually are; the length before, to the last such earlier one. A keyframe
+    without both is left out.
     """
     poses = state.T_camera_world
     centres = se3_inverse(poses)[:, :3, 3]

@@ -7,12 +7,19 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
+from minislam.tracking.bundle_adjustment import (
+    BundleProblem,
+    BundleState,
+    bundle_adjust,
+    normal_equations,
+)
 from minislam.tracking.safeguards.scale_certainty import (
     REACH,
     _log_ratio_gradients,
+    _variance,
     scale_deviations,
 )
+from minislam.tracking.schur import marginalised
 from tests.pretended_gpu import GPU, pretended_gpu
 from tests.tracking.scene import KnownProblem, known_problem, noisy, scaled
 
@@ -94,6 +101,26 @@ def test_a_scale_that_few_measurements_hand_on_is_less_certain():
     doubtful = scale_deviations(weak, state)
     assert set(doubtful) == set(certain)
     assert doubtful[middle] > 3 * certain[middle]
+
+
+def exactly(problem: BundleProblem, state: BundleState) -> float:
+    """Return the largest deviation by the pseudo-inverse, undamped and in float64."""
+    names = "rays targets weights prior_disparities prior_weights".split()
+    problem = replace(problem, **{name: getattr(problem, name).double() for name in names})
+    state = replace(state, disparities=state.disparities.double())
+    equations = normal_equations(problem, state)
+    S, _ = marginalised(problem, equations, equations.disparity_diagonal.reciprocal())
+    covariance = _variance(problem, state) * torch.linalg.pinv(S, rtol=1e-12, hermitian=True)
+    gradients = [gradient[1:].flatten() for _, gradient in _log_ratio_gradients(state)]
+    return max(float(g @ covariance @ g) ** 0.5 for g in gradients)
+
+
+@pytest.mark.parametrize("count", [12, 40])
+def test_what_few_measurements_tell_is_exact_in_long_clips_too(count: int):
+    known = chain(count)
+    weak = weakly_joined(noisy(known, SIGMA), count // 2, 1e-4)
+    found = max(scale_deviations(weak, known.truth).values())
+    assert found == pytest.approx(exactly(weak, known.truth), rel=0.05)
 
 
 def test_it_knows_no_unit_of_length():
