@@ -120,7 +120,7 @@ def test_what_few_measurements_tell_is_exact_in_long_clips_too(count: int):
     known = chain(count)
     weak = weakly_joined(noisy(known, SIGMA), count // 2, 1e-4)
     found = max(scale_deviations(weak, known.truth).values())
-    assert found == pytest.approx(exactly(weak, known.truth), rel=0.05)
+    assert found == pytest.approx(exactly(weak, known.truth), rel=0.1)
 
 
 def test_it_knows_no_unit_of_length():
