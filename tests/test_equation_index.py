@@ -20,7 +20,7 @@ DOCUMENTS += [ROOT / "tests/benchmarks/RESULTS.md", PACKAGE / "priors/networks/R
 
 MOST_WORDS = 1300  # of README, outside tables
 MOST_LINES = 150  # of README, besides tables
-PAPER_BUDGET = 5_515
+PAPER_BUDGET = 5_520
 PACKAGE_BUDGET = 21_910
 PAPER_ROOMS = ("splatting", "uncertainty", "tracking", "mapping", "slam.py")
 BESIDE_THE_PAPER = (

@@ -63,11 +63,16 @@ def reproject(
 ) -> tuple[Tensor, Tensor]:  # (E, 2, N) px, (E, N) bool
     """Return the position of every source cell in the target image, and whether it is valid."""
     x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
-    valid = z >= MIN_DEPTH_RATIO
-    inverse_z = torch.where(valid, z, torch.ones_like(z)).reciprocal()
+    inverse_z, valid = guarded_inverse(z)
     u = camera.fx * x * inverse_z + camera.cx
     v = camera.fy * y * inverse_z + camera.cy
     return torch.stack([u, v], 1), valid
+
+
+def guarded_inverse(z: Tensor) -> tuple[Tensor, Tensor]:  # (E, N), (E, N) bool
+    """Return 1 / z and where z is valid; elsewhere 1, a finite number for what weighs nothing."""
+    valid = z >= MIN_DEPTH_RATIO
+    return torch.where(valid, z, torch.ones_like(z)).reciprocal(), valid
 
 
 def lengths(vectors: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) px
@@ -102,9 +107,7 @@ def reproject_with_jacobians(
     inverse depth is d / X_z: J_target is `Camera.twist_jacobian` there. A larger d moves X along t.
     """
     x, y, z = scaled_points(T_target_source, disparities, rays).unbind(1)
-    valid = z >= MIN_DEPTH_RATIO
-    # Invalid points get zero weight from the caller; z = 1 keeps their numbers finite.
-    inverse_z = torch.where(valid, z, torch.ones_like(z)).reciprocal()
+    inverse_z, valid = guarded_inverse(z)
     ray_x, ray_y = x * inverse_z, y * inverse_z
     J_target = camera.twist_jacobian(ray_x, ray_y, disparities * inverse_z)
     tx, ty, tz = T_target_source[:, :3, 3, None].unbind(1)

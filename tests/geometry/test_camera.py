@@ -102,6 +102,14 @@ def test_the_image_centre_and_its_outer_corners_stay_there_under_resizing():
     torch.testing.assert_close(resized.rays(corner), centred.rays(corner))
 
 
+def test_a_principal_point_on_the_border_stays_there_under_resizing():
+    for before in range(1, 60):
+        for after in range(1, 60):
+            camera = Camera(50, 50, before - 0.5, before - 0.5, before, before)
+            resized = camera.resized(after, after)
+            assert resized.cx == resized.cy == pytest.approx(after - 0.5)
+
+
 def test_cropping_shifts_pixels_by_the_corner_of_the_window():
     cropped = CAMERA.cropped(left=10, top=5, width=60, height=40)
     points = points_in_front()
@@ -191,6 +199,7 @@ def test_no_points_give_no_pixels():
         ((0.0, 50, 31, 23, 64, 48), "found fx=0.0"),
         ((50, -1.0, 31, 23, 64, 48), "fy=-1.0"),
         ((float("nan"), 50, 31, 23, 64, 48), "fx=nan"),
+        ((50, float("nan"), 31, 23, 64, 48), "fy=nan"),
         ((50, 50, 31, 23, 0, 48), "at least 1x1 pixels, found 0x48"),
         ((50, 50, 64, 23, 64, 48), "inside the 64x48 image, found cx=64"),
         ((50, 50, 31, -0.6, 64, 48), "cy=-0.6"),

@@ -51,10 +51,11 @@ def test_small_ones_are_cloned_and_large_ones_split():
 
 
 def test_faint_huge_and_broken_gaussians_are_not_useful():
-    gaussians = map_of([0.01, 0.01, 5.0, 0.01])
+    gaussians = map_of([0.01, 0.01, 5.0, 0.01, 0.01, 0.01])
     gaussians.opacity_logits[1] = -5
-    gaussians.means[3, 0] = torch.nan
-    assert useful_rows(gaussians, 1.0).tolist() == [True, False, False, False]
+    for broken, row in (("means", 3), ("quats_wxyz", 4), ("colors", 5)):
+        getattr(gaussians, broken)[row, 0] = torch.nan
+    assert useful_rows(gaussians, 1.0).tolist() == [True, *[False] * 5]
 
 
 # Identities

@@ -11,7 +11,13 @@ from minislam.mapping.safeguards import (
     least_weight,
 )
 from minislam.uncertainty import RenderingError
-from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
+from minislam.uncertainty.weights import (
+    MAPPING_CUT,
+    WEIGHT_SCALE,
+    clipped_beta,
+    mapping_weight,
+    stretched,
+)
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 
 # Known answers
@@ -46,6 +52,14 @@ def test_what_moves_in_this_clip_is_excluded_though_its_beta_is_below_the_usual_
     excluded = [float(mapping_weight(torch.full((2, 2), beta), CAMERA, least).max()) == 0
                 for beta in (0.80, 0.84, 0.89, 1.15)]  # fmt: skip
     assert excluded == [False, False, True, True]  # three quarters of 1.15 are .86
+
+
+def test_the_last_bin_of_the_lower_mode_is_no_part_of_the_upper_one():
+    lower, upper = torch.linspace(0.19, 0.195, 9000), torch.linspace(1.2, 1.5, 1000)
+    cut = stretched(clipped_beta(0.75 * upper.mean()))
+    found = least_weight(torch.cat([lower, upper]))
+    assert found > MAPPING_CUT
+    assert found == pytest.approx(WEIGHT_SCALE / float(cut) ** 2, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .003 to .15, broken .5
 MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
 MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
-MAX_SCALE_DEVIATION = 0.1  # of a length, relative; healthy to .05, broken .17 and .35
+MAX_SCALE_DEVIATION = 0.1  # of a length, relative; healthy to .06, broken .19 and .40
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
 

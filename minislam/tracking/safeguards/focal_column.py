@@ -64,7 +64,7 @@ def focal_jacobian(
     x, y, z = reprojection.scaled_points(T_target_source, disparities, rays).unbind(1)
     narrowed = rays * rays.new_tensor([-1.0, -1.0, 0.0])
     dx, dy, dz = (T_target_source[:, :3, :3] @ narrowed.T).unbind(1)
-    inverse_z = torch.where(z >= reprojection.MIN_DEPTH_RATIO, z, torch.ones_like(z)).reciprocal()
+    inverse_z, _ = reprojection.guarded_inverse(z)
     a, b = x * inverse_z, y * inverse_z
     J_u = camera.fx * (a + (dx - a * dz) * inverse_z)
     J_v = camera.fy * (b + (dy - b * dz) * inverse_z)

@@ -215,6 +215,7 @@ def test_a_keyframe_without_links_is_reported_as_such():
         ([HEALTHY, LOOSE, HEALTHY], [Break(10, 10)]),
         ([HEALTHY, WEAK, WEAK, HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),
+        ([HEALTHY, DEEP, HEALTHY, WEAK, WEAK, WEAK], [Break(10, 50)]),
     ],
 )
 def test_breaks_are_runs_of_broken_keyframes(kinds: list, breaks: list[Break]):
