@@ -6,13 +6,13 @@ and the files of a run folder. Everything else may move.
 
 from collections.abc import Mapping
 from dataclasses import fields
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from minislam.cli.help import nearest
 from minislam.cli.progress import ProgressLine, SilentProgress, ending_signals, plan_of
 from minislam.config import preset as preset_of
-from minislam.config import with_settings
+from minislam.config import settings_of, with_settings
 from minislam.data.options import InputOptions, default_depth
 from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
@@ -46,8 +46,10 @@ def run(
     inputs = {name: value for name, value in given.items() if name in _INPUTS}
     priors = {name: value for name, value in given.items() if name in _PRIORS}
     for name in options.keys() - _INPUTS - _PRIORS:
-        near = get_close_matches(name, _INPUTS | _PRIORS, n=1, cutoff=0)[0]
-        raise InputError(f"expected a known option, found {name}; the nearest is {near}")
+        hint = nearest(name, sorted(_INPUTS | _PRIORS), "see help(minislam.run)")
+        if name in settings_of(preset_of(preset)):
+            hint = f"it is a setting: settings={ {name: options[name]} }"
+        raise InputError(f"expected a known option, found {name}; {hint}")
     from_files = {"uncertainty.given_masks": True} if inputs.get("masks") else {}
     config = with_settings(preset_of(preset), from_files | dict(settings or {}))
     choice = with_values(PriorChoice(depth=default_depth(str(source))), priors)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.mapping.config import MappingConfig
 from minislam.parameters import flattened, leaves, parameter, with_values
 from minislam.priors.depth import SimulatedDepthConfig
@@ -113,8 +113,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def preset(name: str) -> SlamConfig:
     """Return a preset by name."""
-    if name not in PRESETS:
-        raise InputError(f"expected a preset among {', '.join(PRESETS)}, found {name!r}")
+    require(name in PRESETS, f"a preset among {', '.join(PRESETS)}", f"{name!r}; choose one")
     return with_settings(SlamConfig(), PRESETS[name])
 
 

@@ -96,7 +96,8 @@ def _converted(name: str, value: Any, present: Any, entry: Field[Any]) -> Any:
     except (KeyError, OverflowError, TypeError, ValueError):
         wanted = "a finite number" if kind is float else f"of type {kind.__name__}"
         like = "" if present is None else f" like {present!r}"
-        raise InputError(f"expected {name} to be {wanted}{like}, found {value!r}") from None
+        advice = f"; write {name}=(320, 240)" * (present is None and get_origin(kind) is tuple)
+        raise InputError(f"expected {name} to be {wanted}{like}, found {value!r}{advice}") from None
 
 
 def _plain(kind: Any, value: Any) -> Any:

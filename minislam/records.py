@@ -157,6 +157,9 @@ class Sequence(Protocol):
     def source_name(self, frame_index: int) -> str:
         """Return the name of a frame's image file, or of its video with the number in it."""
 
+    def source_index(self, frame_index: int) -> int:
+        """Return the number of a frame among all images of the source."""
+
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return (H, W) bool, True where something moves; None if no masks are given."""
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from minislam.cli.help import UsageError
 from minislam.cli.options import input_options, lpips_of, prior_choice, settings
 from minislam.cli.progress import ending_signals, say
 from minislam.data.files import make_folder, read_json, write_json, write_text
@@ -19,7 +20,7 @@ from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
 LEGEND = """\
 RMSE of the ATE over all frames, for minislam after a Sim(3) alignment. F: failed. -: no number.
-*: frames were lost or the geometry broke (minislam), run by the authors of the paper (others)."""
+*: exit code 3, not to be trusted as a whole (minislam); run by the paper's authors (others)."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -35,7 +36,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("folders", nargs="+", metavar="FOLDER", help="a sequence, or its parents")
     parser.add_argument("options", nargs=argparse.REMAINDER, help="-o OUT, options of minislam run")
-    parser.set_defaults(run=_bench)
+    parser.set_defaults(run=_bench, hint="folders come first, then the options")
 
 
 def _bench(args: argparse.Namespace) -> int:
@@ -45,6 +46,8 @@ def _bench(args: argparse.Namespace) -> int:
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
     own.add_argument("-o", "--output", default="output/bench", type=Path)
     given, options = own.parse_known_args(args.options)
+    if "--resume" in options:
+        raise UsageError("expected no --resume, found it; leave it out, bench resumes by itself")
     sequences, noted = find_sequences(args.folders), given.output / "options.json"
     run = parsed(["run", args.folders[0], "--overwrite", *options])
     settings(run), input_options(run), prior_choice(run, "none"), lpips_of(run)  # or refuse them

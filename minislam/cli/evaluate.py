@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from minislam.cli.progress import say
 from minislam.data.files import atomic_write, require_new, write_json
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add("--t_max_diff", type=float, default=0.01, help="largest difference of timestamps [s], 0.01")
     add("--t_offset", type=float, default=0.0, help="added to the estimate's timestamps [s], 0")
     add("--rpe", action="store_true", help="relative pose error: the drift over --delta")
-    add("--delta", type=float, default=1.0, help="length of each motion for --rpe, 1")
-    add("--delta_unit", choices=("s", "f"), default="s", help="of --delta: seconds or frames, s")
+    add("--delta", type=float, help="length of each motion for --rpe, 1")
+    add("--delta_unit", choices=("s", "f"), help="of --delta: seconds or frames, s")
     add("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
     add("--save_results", metavar="FILE.json", help="write the numbers to a file")
     add("--overwrite", action="store_true", help="replace files of these names")
@@ -51,6 +51,10 @@ def run_eval(args: argparse.Namespace) -> None:
     from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
     from minislam.records import Trajectory
 
+    if not args.rpe and (args.delta, args.delta_unit) != (None, None):
+        raise InputError("expected --rpe with --delta and --delta_unit, found none; add --rpe")
+    found = f"the folder {args.reference}; give the ground truth, then the estimate"
+    require(not Path(args.reference).is_dir(), "a file of true poses first", found)
     if Path(args.estimate).is_dir():
         args.estimate = str(Path(args.estimate) / TRAJECTORY)
     plot = args.save_plot and args.save_plot + ("" if Path(args.save_plot).suffix else ".png")
@@ -119,16 +123,17 @@ def _relative_errors(
 
     if len(result.truth) < 2:
         raise InputError("expected at least 2 pairs of poses for --rpe, found 1; give longer paths")
-    step, is_possible = args.delta, 0 < args.delta < 1e9  # not NaN either
-    if args.delta_unit == "s" and is_possible:
-        step = max(1, round(step / float(np.median(np.diff(result.truth.timestamps)))))
-    if not (is_possible and step == int(step)):
-        raise InputError(
-            f"expected a --delta of seconds or of whole frames, found {args.delta:g} "
-            f"{args.delta_unit}; give a positive one"
-        )
+    delta, unit = 1.0 if args.delta is None else args.delta, args.delta_unit or "s"
+    step, most = delta, len(result.truth) - 1  # poses
+    wanted = f"as a whole number of frames, 1 to {most}"
+    if unit == "s":
+        seconds = float(np.median(np.diff(result.truth.timestamps)))  # between poses
+        wanted = f"of more than 0 and at most {most * seconds:g} s, the length of the paths"
+        step = max(1, round(delta / seconds)) if 0 < delta < 1e9 else 0
+    is_possible = 1 <= step <= most and step == int(step)  # not NaN either
+    require(is_possible, f"a --delta {wanted}", f"{delta:g} {unit}; give a value between")
     shifts, angles = relative_pose_error(result.estimate, result.truth, int(step))
-    over = f"over {args.delta:g} {args.delta_unit} ({int(step)} poses)"
+    over = f"over {delta:g} {unit} ({int(step)} poses)"
     return {
         f"RPE w.r.t. translation part (m) {over}": statistics(shifts),
         f"RPE w.r.t. rotation angle (deg) {over}": statistics(np.rad2deg(angles)),

@@ -63,7 +63,8 @@ def _export(args: argparse.Namespace) -> None:
     for folder, write in zip(folders, [*writers, export.export_masks], strict=True):
         if folder:
             write(run, Path(folder), progress.over(f"writing {folder}", frames, len(frames)))
-            say(f"{folder}: {len(frames)} frames, lengths in {run.unit}")
+            unit = "" if write is export.export_masks else f", lengths in {run.unit}"
+            say(f"{folder}: {len(frames)} frames{unit}")
     if args.points:
         export.export_points(run, Path(args.points))
         say(f"{args.points}: {len(export.points_of(run)[0])} points, lengths in {run.unit}")

@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import textwrap
 from collections.abc import Iterable
 from typing import Any
 
@@ -28,6 +29,7 @@ files of a run folder:
   run.json, log.txt                        timings, warnings, how the run ended; what was printed
   config.json, camera.json                 sequence, input, priors and settings; camera and frames
   checkpoint.npz                           until the run is finished: arrays, no pickle
+Frame numbers in files and messages count the frames of the run from 0.
 
 minislam run --config FOLDER/config.json -o NEW_FOLDER
   repeats a run, on the same CPU to the same bytes. Other flags replace values of the file.
@@ -37,10 +39,11 @@ minislam run --resume -o FOLDER
   to the same bytes. Other settings are refused. Checkpoints are written before each of the
   last stages, on Ctrl-C, and between steps in --checkpoint_fraction of the time (1 %).
 
-exit codes: 0 finished, 1 known error in one sentence, 2 wrong usage, 3 finished but not to be
-  trusted as a whole: frames were lost, the trajectory is broken (motion and depth contradict the
-  images; run.json lists the breaks and the segments between them), the map has large holes or
-  most bundle adjustments failed, 130 interrupted with everything so far written
+exit codes: 0 finished; 1 what was given cannot be used, in one sentence; 2 an unknown command or
+  option, or an option without a readable value; 3 finished but not to be trusted as a whole:
+  frames were lost, the trajectory is broken (motion and depth contradict the images; run.json
+  lists the breaks and the segments between them), the map has large holes or most bundle
+  adjustments failed; 130 interrupted with everything so far written
 
 settings: every constant is an option, like --tracking.window 8; minislam settings lists them.
   Ablations of the paper:
@@ -71,6 +74,11 @@ class Help(argparse.Action):
                     action.help = argparse.SUPPRESS
             for group in parser._action_groups:
                 group.description = None
+        elif parser.epilog is RUN_EPILOG:
+            from data_synth import SEQUENCES  # only here: it needs numpy
+
+            text = f"synthetic clips, synth:NAME[:SEED][?phone]: {', '.join(SEQUENCES)}"
+            parser.epilog = f"{textwrap.fill(text, 96, subsequent_indent='  ')}\n\n{RUN_EPILOG}"
         parser.print_help()
         parser.exit()
 
@@ -95,22 +103,25 @@ def add_command(
 
 
 def unknown_option(found: str, parser: argparse.ArgumentParser) -> UsageError:
-    """Return what to say about an option that a command does not have, with the nearest one."""
+    """Return what to say about an option that a command lacks: whose it is, or the nearest."""
     if not found.startswith("-"):
         return UsageError(
             f"expected only the names that {parser.prog} takes, found also {found!r}; put a name "
             "with spaces in quotes"
         )
     name = found.partition("=")[0]
+    is_of_run = name in (parser.get_default("of_run") or ())
+    otherwise = "it is an option of minislam run" if is_of_run else f"see {parser.prog} --help"
     known = {option: option for option in parser._option_string_actions}
-    if parser.get_default("takes_settings") and not difflib.get_close_matches(name, known):
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.75 if is_of_run else 0.6)
+    if parser.get_default("takes_settings") and not near and not is_of_run:
         from minislam.config import SlamConfig, settings_of
 
         # A name without dots may be the end of a setting's; the first setting with it comes last.
         settings = [f"--{setting}" for setting in reversed(settings_of(SlamConfig()))]
         known = {s if "." in name else f"--{s.rpartition('.')[2]}": s for s in settings}
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"the nearest is {known[near[0]]}" if near else f"see {parser.prog} --help"
+        near = difflib.get_close_matches(name, known, n=1)
+    hint = f"the nearest is {known[near[0]]}" if near else parser.get_default("hint") or otherwise
     return UsageError(f"expected a known option, found {name}; {hint}")
 
 

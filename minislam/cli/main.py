@@ -114,6 +114,6 @@ def _parser() -> argparse.ArgumentParser:
     for name in COMMANDS:
         import_module(f"minislam.cli.{name}").add_parser(commands)
     for command in commands.choices.values():
-        command.set_defaults(parser=command)
+        command.set_defaults(parser=command, of_run=commands.choices["run"]._option_string_actions)
     parser.set_defaults(commands=commands.choices)
     return parser

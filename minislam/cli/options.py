@@ -53,7 +53,7 @@ def add_priors(
     group = parser.add_argument_group(
         "priors",
         "networks need their official checkpoints: minislam weights list\n"
-        "FILE: a path, or a name of that list; without it the file called like the network",
+        "FILE: a path, or a name of that list; default: the name of the network, as metric3d",
     )
     add = group.add_argument
     add(

@@ -41,6 +41,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     options.add_settings(parser)
     options.add_input(parser)
     options.add_priors(parser, default_depth="none")
+    for action in parser._actions:  # what is shared with run, but changes nothing here
+        if action.dest in ("no_uncertainty", "checkpoint_fraction", "masks"):
+            action.help = argparse.SUPPRESS
     parser.set_defaults(run=_priors)
 
 

@@ -72,7 +72,7 @@ def _run(args: argparse.Namespace) -> int:
             require_free(args.output, args.overwrite, args.otherwise)
         choice = options.prior_choice(args, default_depth(source))
         from minislam.data.sequence import open_sequence
-        from minislam.runs.resume import way_on
+        from minislam.runs.resume import NO_WAY_ON, way_on
         from minislam.runs.run import default_output, run_in_folder
         from minislam.runs.summary import as_text, summarise
 
@@ -99,7 +99,7 @@ def _run(args: argparse.Namespace) -> int:
                 say(f"WARNING: {warning}", "stderr")
         say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
         if facts["state"] == "interrupted":
-            say(f"to go on: minislam run --resume -o {shlex.quote(output)}")
+            say(way_on(output) or NO_WAY_ON)
         else:
             say(f"next: minislam render {shlex.quote(output)} -o fly.webm, or minislam export -h")
         return facts["exit_code"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from minislam.cli.help import nearest
 from minislam.cli.progress import ProgressLine
-from minislam.errors import InputError, MinislamError
+from minislam.errors import InputError, MinislamError, require
 from minislam.parameters import user_path
 from minislam.priors.names import PublishedFile, published_files
 
@@ -61,13 +61,13 @@ def _fetch(args: argparse.Namespace) -> None:
 def _check(args: argparse.Namespace) -> None:
     rows = {row.file: row for row in published_files().values()}
     folder = user_path(args.folder or rows["droid.pth"].path.parent)
-    found = folder.iterdir() if folder.is_dir() else ()
-    files = sorted(path for path in found if path.suffix.lower() in CHECKPOINT_ENDINGS)
-    if not files:
-        raise InputError(
-            f"expected a folder with checkpoint files ({', '.join(CHECKPOINT_ENDINGS)}), found "
-            f"none in {folder}; give another one, or fetch some with minislam weights fetch"
-        )
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in CHECKPOINT_ENDINGS)
+    found = f"none in {folder}; give another one, or fetch some with minislam weights fetch"
+    if not folder.is_dir():
+        found = f"no folder at {folder}; check the path"
+    if folder.is_file():
+        found = f"the file {folder}; give the folder it is in"
+    require(bool(files), f"a folder with checkpoint files ({', '.join(CHECKPOINT_ENDINGS)})", found)
     for file in files:
         row, verdict = rows.get(file.name), _verdict(file)
         if row and row.sha256 and row.sha256 != _sha256(file):

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -151,5 +152,6 @@ def finite_numbers(fields: list[str], where: str) -> list[float]:
         if all(map(math.isfinite, numbers)):
             return numbers
     shown = " ".join(fields)[:80]
-    hint = "write a decimal point" if "," in shown else "correct this line"
+    is_table = "," in shown and re.fullmatch(r"[-+\deE.,;\s]+", shown)
+    hint = "separate columns by spaces, and write decimal points" if is_table else "correct it"
     raise InputError(f"expected finite numbers in {where}, found '{shown}'; {hint}")

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from minislam.data.files import atomic_write, read_bytes
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -93,8 +93,8 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
     """
     kind = Path(path).suffix.lower()
     encoders = {".webm": _write_webm, ".webp": _write_webp}
-    if kind not in encoders:
-        raise InputError(f"expected a file that ends in .webm or .webp, found {kind or 'neither'}")
+    found = f"{kind or 'neither'}; write .webm, and convert that with ffmpeg if you need .mp4"
+    require(kind in encoders, "a file that ends in .webm or .webp", found)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"animation{kind}"
         encoders[kind](file, map(_bgr, images), rate)

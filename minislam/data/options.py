@@ -3,9 +3,10 @@
 import os
 import re
 from dataclasses import dataclass, fields
+from pathlib import Path
 
-from minislam.errors import InputError
-from minislam.parameters import parameter, require_bounds, user_path
+from minislam.errors import InputError, require
+from minislam.parameters import FILES, parameter, require_bounds, user_path
 
 SYNTHETIC = "synth:"  # before the name of a synthetic sequence
 PHONE = "?phone"  # behind one that a phone films
@@ -19,19 +20,19 @@ class InputOptions:
 
     start: int = parameter(0, "first frame of the source to use [frame]")
     stride: int = parameter(1, "use every n-th frame of the source [frame]", least=1)
-    max_frames: int | None = parameter(None, "use so many frames at most, none: all [frame]", 1)
+    max_frames: int | None = parameter(None, "use so many frames at most, default all [frame]", 1)
     size: tuple[int, int] | None = parameter(
-        None, "working size, none: keep the aspect and choose by `pixels` [px]", MINIMUM_SIDE, 16384
+        None, "working size; default: keep the aspect, about `pixels` [px]", MINIMUM_SIDE, 16384
     )
     pixels: int = parameter(
         320 * 240, "about width * height of the chosen working size [px]", MINIMUM_SIDE**2
     )
     fx: float | None = parameter(None, "focal length of the raw images, x [px]", 1, 1e6)
-    fy: float | None = parameter(None, "focal length of raw images, y; none: as fx [px]", 1, 1e6)
-    cx: float | None = parameter(None, "principal point of raw images, x; none: centre [px]", -1)
-    cy: float | None = parameter(None, "principal point of raw images, y; none: centre [px]", -1)
+    fy: float | None = parameter(None, "focal length of raw images, y; default fx [px]", 1, 1e6)
+    cx: float | None = parameter(None, "principal point of raw images, x; default centre [px]", -1)
+    cy: float | None = parameter(None, "principal point of raw images, y; default centre [px]", -1)
     k1: float | None = parameter(
-        None, "radial distortion of raw images; none: that of the calibration [-]", -10, 10
+        None, "radial distortion of raw images; default that of the calibration [-]", -10, 10
     )
     k2: float | None = parameter(None, "the next term of the distortion, as k1 [-]", -100, 100)
     calibration: str | None = parameter(
@@ -56,12 +57,14 @@ class InputOptions:
         for field in fields(self):
             bounds = field.metadata["least"], field.metadata["most"]
             require_bounds(field.name, getattr(self, field.name), *bounds)
-        if self.focal not in FOCAL_MODES:
-            raise InputError(f"expected focal as {', '.join(FOCAL_MODES)}, found {self.focal!r}")
+        wanted = f"focal as {', '.join(FOCAL_MODES)}"
+        require(self.focal in FOCAL_MODES, wanted, f"{self.focal!r}; choose one")
 
 
-def require_source(source: str) -> None:
-    """Refuse a sequence that does not exist, before anything is loaded or rendered."""
+def require_source(source: str, masks: str | None = None) -> None:
+    """Refuse a sequence or masks that do not exist, before anything is loaded or rendered."""
+    if masks is not None:
+        mask_folder(masks)
     if source.startswith(SYNTHETIC):
         import data_synth  # only here: real footage needs no scene generator
 
@@ -78,6 +81,15 @@ def require_source(source: str) -> None:
             f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
             f"{source[:300]} does not exist or is a device; check the path"
         )
+
+
+def mask_folder(masks: str) -> Path:
+    """Return the folder of --masks files:FOLDER; refuse what names none."""
+    folder = user_path(masks.removeprefix(FILES))
+    is_there, is_named = os.path.isdir(folder), masks.startswith(FILES)
+    found = f"{masks}; write {FILES}{masks}" if is_there else f"no folder at {folder}; check it"
+    require(is_there and is_named, f"--masks {FILES}FOLDER with a folder that exists", found)
+    return folder
 
 
 def synthetic_parts(source: str) -> tuple[str, str, bool]:

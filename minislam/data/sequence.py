@@ -30,7 +30,7 @@ def open_sequence(
     A folder is recognised by its content. `progress` is called while a scene is rendered.
     """
     options = options or InputOptions()
-    require_source(source)
+    require_source(source, options.masks)
     if source.startswith(SYNTHETIC):
         return _open_synthetic(source, options, progress)
     path = user_path(source)
@@ -146,6 +146,10 @@ class RecordedSequence:
     def source_name(self, frame_index: int) -> str:
         """Return the name of a frame's image file, or of its video with the number in it."""
         return self._recording.images.names[self._chosen[frame_index]]
+
+    def source_index(self, frame_index: int) -> int:
+        """Return the number of a frame among all images of the source."""
+        return self._chosen[frame_index]
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""

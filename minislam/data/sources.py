@@ -10,10 +10,10 @@ import numpy as np
 from minislam.data.calibration import Calibration, calibration_beside
 from minislam.data.images import is_image, list_images
 from minislam.data.metadata import noted_focal_length
+from minislam.data.options import mask_folder
 from minislam.data.raw_images import FileImages, ImageSource, VideoImages
 from minislam.data.trajectory import truth_beside
 from minislam.errors import InputError
-from minislam.parameters import FILES, user_path
 from minislam.records import Trajectory
 
 _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
@@ -152,11 +152,7 @@ def _found(folder: Path) -> str:
 
 def mask_files(images: ImageSource, masks: str, chosen: list[int]) -> dict[int, Path]:
     """Return the mask of each chosen image in files:FOLDER: of its name, or of its number."""
-    folder = user_path(masks.removeprefix(FILES))
-    if not masks.startswith(FILES) or not folder.is_dir():
-        raise InputError(
-            f"expected --masks {FILES}FOLDER with a folder that exists, found {masks}; check it"
-        )
+    folder = mask_folder(masks)
     files = {path.stem: path for path in list_images(folder)}
     named = {k: files[path.stem] for k, path in enumerate(images.paths) if path.stem in files}
     numbered = {int(name): path for name, path in files.items() if name.isdecimal()}

@@ -42,12 +42,12 @@ def choose_flow(
 
 
 def choose_features(
-    choice: PriorChoice, camera: Camera, networks: NetworksConfig, frames: int = 0
+    choice: PriorChoice, camera: Camera, networks: NetworksConfig, sequence: Sequence | None = None
 ) -> FeatureExtractor:
-    """Return the features: classical, a network, a plugin, or files:FOLDER of so many frames."""
+    """Return the features: classical, a network, a plugin, or files:FOLDER of a sequence."""
     makers: Makers = {
         "classical": ClassicalFeatures,
-        FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera, frames),
+        FOLDER: lambda: FileFeatures(folder_of(choice.features, FEATURES), camera, sequence),
     }
     return _choose("features", choice, networks, makers)
 

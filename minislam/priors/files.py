@@ -21,6 +21,8 @@ from minislam.records import Frame, Sequence
 INDEX = "frames.txt"  # beside the files: which of them belongs to which moment
 FEATURES, DEPTH = "features", "depth"  # folders of one sequence's priors
 _FOLDERS = {FEATURES: ("features",), DEPTH: ("depth", "depths")}  # the last: of WildGS-SLAM
+# The number at the end of an image's name, with or without its ending; no part of a decimal one.
+_NUMBER = re.compile(r"(?<![.\d])(\d{1,9})(\.png|\.jpe?g)?$", re.ASCII | re.IGNORECASE)
 _AXES = {FEATURES: ("rows", "columns", "channels"), DEPTH: ("rows", "columns")}
 _MAKE = "make them from this sequence with minislam priors"  # advice where files are missing
 
@@ -51,9 +53,11 @@ class FrameFiles:
     def require_frames_of(self, sequence: Sequence) -> None:
         """Refuse files that are numbered like the images where a frame has another number."""
         frame, image = len(sequence) - 1, sequence.source_name(len(sequence) - 1)
-        numbered = re.search(r"[0-9]{1,9}$", image)
-        number = frame if numbered is None or self._number_of is not None else int(numbered[0])
-        if number != frame and number in self._files:
+        numbered = None if self._number_of is not None else _NUMBER.search(image)
+        number = frame if numbered is None else int(numbered[1])
+        # Of the first images, counted from 1, a file 0 shows that the files are counted from 0.
+        is_right = sequence.source_index(frame) == frame and 0 in self._files
+        if number != frame and number in self._files and not is_right:
             wanted = f"{self.what} files named by the frame of the run, {frame:05d} for {image}"
             found = f"{self._files[number]}, which has the number of that image"
             advice = f"rename them, or write {INDEX} beside them, as minislam priors does"
@@ -74,19 +78,23 @@ class FrameFiles:
 class FileFeatures:
     """Features made elsewhere, from .npy files (h', w', C): a `FeatureExtractor`."""
 
-    def __init__(self, folder: Path | str, camera: Camera, frames: int = 0) -> None:
-        """Open a folder; raises InputError where it has fewer files than there are `frames`."""
-        self._files = FrameFiles(folder, "features", (".npy",))
-        wanted = f"features of every frame in {folder}, {frames} files"
-        require(len(self._files) >= frames, wanted, f"{len(self._files)}; {_MAKE}")
-        rows, _, self.dimension = read_array(self._files.first, FEATURES).shape
+    def __init__(
+        self, folder: Path | str, camera: Camera, sequence: Sequence | None = None
+    ) -> None:
+        """Open a folder; raises InputError where it lacks files of the sequence or has others."""
+        self.files = FrameFiles(folder, "features", (".npy",))
+        if sequence is not None:
+            wanted = f"features of every frame in {folder}, {len(sequence)} files"
+            require(len(self.files) >= len(sequence), wanted, f"{len(self.files)}; {_MAKE}")
+            self.files.require_frames_of(sequence)
+        rows, _, self.dimension = read_array(self.files.first, FEATURES).shape
         self.stride = max(1, round(camera.height / rows))
 
     def __call__(self, frame: Frame) -> Tensor:  # (h', w', C) float32
         """Read the features of a frame."""
-        path = self._files.of(frame)
+        path = self.files.of(frame)
         if path is None:
-            wanted = f"features of every frame in {self._files.folder}"
+            wanted = f"features of every frame in {self.files.folder}"
             found = f"none for frame {frame.frame_index}"
             raise InputError(f"expected {wanted}, found {found}; {_MAKE}")
         features = read_array(path, FEATURES).astype(np.float32)

@@ -18,6 +18,7 @@ from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.mapping.mapper import surface_depth
 from minislam.runs.loaded import Run
+from minislam.runs.resume import NO_WAY_ON, way_on
 from minislam.runs.summary import summarise
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
@@ -123,6 +124,7 @@ def _write_report(
         summary=summarise(metrics, facts),
         command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
         settings=named_settings(slam.config),
+        next_step=way_on(folder.path) or NO_WAY_ON,
         **pictures,
     )
     write_text(folder.path / REPORT, viz.build_report(report))

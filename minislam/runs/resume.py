@@ -17,6 +17,8 @@ from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
 from minislam.slam import Slam
 
+NO_WAY_ON = "no checkpoint was written (--checkpoint_fraction 0); start again with --overwrite"
+
 
 def way_on(folder: Path | str) -> str:
     """Return how to go on with a run, or nothing where it has no checkpoint."""

@@ -18,7 +18,7 @@ from minislam.data.files import atomic_write, write_json
 from minislam.data.ply import GaussianArrays, encode_ply
 from minislam.data.run_folder import RunFolder
 from minislam.data.trajectory import write_trajectory
-from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, InputError
+from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, InputError, require
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
@@ -45,7 +45,7 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
         )
     return Priors(
         choose_flow(choice, config.flow, networks),
-        choose_features(choice, sequence.camera, networks, len(sequence)),
+        choose_features(choice, sequence.camera, networks, sequence),
         choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
 
@@ -75,6 +75,8 @@ def run_in_folder(
     choice = choice.from_anywhere()
     if choice.features.startswith(FILES) or choice.depth.startswith(FILES):
         sequence.seeks_lens = False  # the files belong to the images as they are
+    is_used = config.uncertainty.enabled or sequence.opened_as["input"]["masks"] is None
+    require(is_used, "either --masks or --no-uncertainty", "both; leave one out")
     for index in range(len(sequence)):
         if config.uncertainty.takes_masks:
             required_mask(sequence, index)

@@ -55,24 +55,26 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
     if lost:
         tracked = slam.tracker.tracked
         since = 1 + max((t.frame_index for t in tracked if t.status.is_followed), default=-1)
-        rest = f"If the film is cut at frame {since}, run the rest by itself (--start). "
+        start = slam.sequence.source_index(since) if since < len(tracked) else None
+        rest = f"If the film is cut there, run the rest by itself: --start {start}. "
         yield (
             f"{lost} of {len(tracked)} frames could not be tracked and have no pose; "
-            f"lost_frames.txt lists them. {rest if since < len(tracked) else ''}{_FAR_APART}"
+            f"lost_frames.txt lists them. {rest * (start is not None)}{_FAR_APART}"
         )
     if watch.breaks:
         where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
         pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
         yield (
-            f"{BROKEN} at frames {where}: motion or depth contradicts the images, too little "
-            "parallax hands the scale on, or the camera follows something that came into view. "
-            "Before and after, scale and direction do not belong together; look at each piece "
-            f"(frames {pieces or 'none'}) by itself. {_FAR_APART}"
+            f"{BROKEN} at frames {where}: motion or depth contradicts the images, there is too "
+            "little parallax to carry the scale across, or the camera follows something that came "
+            "into view. Before and after, scale and direction do not belong together; look at each "
+            f"piece (frames {pieces or 'none'}) by itself. {_FAR_APART}"
         )
     if graph.failed_adjustments:
         yield (
             f"{graph.failed_adjustments} of {graph.adjustments} bundle adjustments failed "
-            "and changed nothing: poses and depths there are those of the start"
+            "and changed nothing: their poses and depths stay as first guessed, so do not trust "
+            "them; try more texture, slower motion, or a smaller --stride"
         )
     if has_large_holes(slam):
         least = slam.mapper.keyframes[int(np.argmin(slam.mapper.shown))].frame_index
@@ -83,8 +85,9 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         )
     if (hidden := left_out(slam)) > MOST_LEFT_OUT:
         yield (
-            f"beta leaves {hidden:.0%} of the images out, as if they moved: what it always covers "
-            "is missing from the map and from the figures; look at the pictures of beta"
+            f"beta takes {hidden:.0%} of all pixels for moving, so they are neither in the map nor "
+            "measured. Look at the pictures of beta; if they are bright on what stands still, try "
+            "other --features or --no-uncertainty"
         )
     yield from _camera_warnings(slam)
     without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
@@ -97,10 +100,10 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         )
     elif watch.hardly_walked and not keyframes.has_prior:
         yield (
-            f"between neighbouring keyframes only {watch.beyond_turns:.2f} px of the flow, in the "
-            "median and in an image of 320x240, are more than a turn of the camera: depth is "
-            "hardly determined, and near and far may be exchanged; look at the pictures of the "
-            "depth, and film while you walk sideways"
+            "the camera hardly did more than turn: walking moved the image by only "
+            f"{watch.beyond_turns:.2f} px between neighbouring keyframes (median, for 320x240). "
+            "Depth is hardly determined, and near and far may be exchanged; film while you walk "
+            "sideways, and look at the pictures of the depth"
         )
     if keyframes.overlay is not None:
         yield (
@@ -131,7 +134,7 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
         yield (
             f"the flow fits a lens that bends straight lines, the corners by {lens.bend:+.0%}, "
             f"with {lens.saved:.0%} less cost: focal length, trajectory and map may be bent; film "
-            "in the linear mode of the camera, or give --calibration with k1 and k2"
+            "in the linear mode of the camera, or give --fx, --k1 and --k2"
         )
         return
     # The flow of a broken run fits whatever focal length.

@@ -13,7 +13,7 @@ from minislam.viz.style import beta_to_rgb, depth_to_rgb
 from minislam.viz.viewer import picture_url, template
 
 _STOPS = 9  # colours of a colour bar
-_TEXTS = "title folder state description command settings".split()  # of a report
+_TEXTS = "title folder state description command settings next_step".split()  # of a report
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class Report:
     figures: Series[tuple[str, bytes]] = ()  # caption, PNG
     command: str = ""
     settings: str = ""
+    next_step: str = ""  # after an interruption
 
 
 def build_report(report: Report) -> str:

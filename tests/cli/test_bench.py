@@ -131,7 +131,7 @@ def test_an_interrupted_bench_keeps_its_tables_and_goes_on(made: Bench):
         (["--seed", "2", "--depth", "laser"], 1, "expected --depth none, simulated"),
         (["--preset", "fast"], 1, "expected a preset among"),
         (["other"], 2, "found also 'other'"),
-        (["--resume"], 2, "not allowed with argument --overwrite"),
+        (["--resume"], 2, "leave it out, bench resumes by itself"),
     ],
 )
 def test_options_of_no_run_are_refused_and_not_kept(made: Bench, capsys, options, code, words):
@@ -142,6 +142,13 @@ def test_options_of_no_run_are_refused_and_not_kept(made: Bench, capsys, options
         assert ended.code == code
     assert words in capsys.readouterr().err
     assert made.commands() == [] and not made.out.exists()
+
+
+def test_options_before_the_folders_are_refused(made: Bench, capsys):
+    for options in (["-o", str(made.out)], ["--stride", "2"]):
+        assert main(["bench", *options, str(made.data)]) == 2
+        words = f"found {options[0]}; folders come first, then the options"
+        assert words in capsys.readouterr().err
 
 
 def test_tables_are_of_one_kind_of_run(made: Bench, capsys):

@@ -144,11 +144,21 @@ def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path: P
 @pytest.mark.parametrize(
     "flags",
     [["--delta", "0"], ["--delta", "nan"], ["--delta", "inf"],
-     ["--delta", "1.5", "--delta_unit", "f"]],
+     ["--delta", "1.5", "--delta_unit", "f"], ["--delta", "30"],
+     ["--delta", "30", "--delta_unit", "f"]],
 )  # fmt: skip
-def test_a_motion_of_no_length_or_of_half_a_frame_is_refused(files, flags: list[str]):
-    with pytest.raises(InputError, match="a --delta of seconds or of whole frames"):
+def test_a_motion_of_no_length_of_half_a_frame_or_of_all_is_refused(files, flags: list[str]):
+    wanted = "as a whole number of frames, 1 to 19" if "f" in flags else "at most 19 s, the length"
+    with pytest.raises(InputError, match=f"expected a --delta .*{wanted}.*; give a value between"):
         run_eval(parse(*files, "--rpe", *flags))
+
+
+def test_flags_of_rpe_alone_and_a_folder_as_truth_are_refused(files, tmp_path: Path):
+    for flags in (["--delta", "2"], ["--delta_unit", "f"]):
+        with pytest.raises(InputError, match="found none; add --rpe"):
+            run_eval(parse(*files, *flags))
+    with pytest.raises(InputError, match="expected a file of true poses first, found the folder"):
+        run_eval(parse(str(tmp_path), files[1]))
 
 
 def test_contradicting_flags_and_strange_clocks(files):

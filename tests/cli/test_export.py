@@ -29,7 +29,9 @@ def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
     names = ["colmap", "nerfstudio", "depth", "masks"]
     targets = [word for name in names for word in (f"--{name}", tmp_path / name)]
     assert export(folder, *targets, "--points", tmp_path / "p.ply", "--sh-degree", 3) == 0
-    assert "to go on: ns-train splatfacto --data" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "to go on: ns-train splatfacto --data" in said
+    assert f"{tmp_path}/depth: 2 frames, lengths in" in said and "/masks: 2 frames\n" in said
     made = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     pictures = {f"{kind}/{n:06d}.png" for kind in ("images", "masks") for n in range(2)}
     both = {f"{name}/{picture}" for name in names[:2] for picture in pictures}

@@ -4,6 +4,7 @@ import argparse
 
 import pytest
 
+from data_synth import SEQUENCES
 from minislam.cli.help import ESSENTIAL, RUN_EPILOG, nearest, unknown_option
 from minislam.cli.main import main
 
@@ -27,6 +28,14 @@ def test_the_long_help_of_run_has_every_option_and_the_files(monkeypatch, capsys
     assert "--stride" in short and "--depth-scale" not in short and "exit codes: 0" not in short
     assert all(name in long for name in ("--depth-scale", "--lpips-heads", "--threads"))
     assert long.endswith(RUN_EPILOG) and "minislam settings" in short + long
+    clips = " ".join(long.partition("synthetic clips, synth:NAME[:SEED][?phone]: ")[2].split())
+    assert clips.startswith(", ".join(SEQUENCES)) and "synthetic clips" not in short
+
+
+def test_the_help_of_priors_leaves_out_what_changes_nothing_there(monkeypatch, capsys):
+    text = help_of(monkeypatch, capsys, "priors", "--help")
+    assert "--stride" in text and "--seed" in text
+    assert not any(name in text for name in ("--no-unc", "--checkpoint_fraction", "--masks"))
 
 
 def test_every_essential_option_exists(monkeypatch, capsys):

@@ -88,6 +88,11 @@ def test_what_is_wrong_is_said_before_torch_is_loaded(arguments: list[str], word
         (["run", "synth:crowd", "--tracking.windw", "3"], "the nearest is --tracking.window"),
         (["run", "synth:crowd", "--tracking.windo=3"], "the nearest is --tracking.window"),
         (["eval", "a", "b", "--rep"], "the nearest is --rpe"),
+        (["demo", "--stride", "3"], "found --stride; it is an option of minislam run"),
+        (["demo", "--max-frames", "3"], "it is an option of minislam run"),
+        (["demo", "--size=96x72"], "it is an option of minislam run"),
+        (["priors", "a", "--out", "b", "--workers", "2"], "it is an option of minislam run"),
+        (["priors", "a", "--out", "b", "--output", "c"], "the nearest is --out"),
         (["doctor", "--every.thing", "3"], "found --every.thing; see minislam doctor --help"),
     ],
 )

@@ -53,7 +53,7 @@ def test_nonsense_is_one_sentence(folder: str, tmp_path: Path, capsys):
     assert main(["render", folder, "--size", "99999x72", "-o", str(tmp_path / "a.webm")]) == 1
     assert "--size of at least 16 and at most 16384" in capsys.readouterr().err
     assert main(["render", folder, "-o", str(tmp_path / "a.gif")]) == 1
-    assert "ends in .webm or .webp, found .gif" in capsys.readouterr().err
+    assert "ends in .webm or .webp, found .gif; write .webm, and convert" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -45,3 +45,20 @@ def test_quiet_prints_warnings_only_and_the_log_has_everything(tmp_path: Path, c
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", row) for row in rows)
     assert "image folder: 2 of 2 images" in rows[0] and "results in" in "".join(rows)
     assert any(re.search(r"stage \d of \d, refining the map: 2/2", row) for row in rows)
+
+
+def test_an_interrupted_run_is_resumed_or_without_a_checkpoint_begun_anew(
+    tmp_path: Path, monkeypatch, capsys
+):
+    source, out = images(tmp_path / "in", [texture(0), texture(3)]), tmp_path / "out"
+    facts = {"state": "interrupted", "warnings": [], "exit_code": 130}
+    monkeypatch.setattr("minislam.runs.run.run_in_folder", lambda *_: ({}, facts))
+    monkeypatch.setattr("minislam.runs.summary.summarise", lambda *_: [])
+    assert run(source, "-o", out) == 130
+    assert "no checkpoint was written (--checkpoint_fraction 0); start again with --overwrite" in (
+        capsys.readouterr().out
+    )
+    out.mkdir()
+    (out / "checkpoint.npz").touch()
+    assert run(source, "-o", out, "--overwrite") == 130
+    assert f"go on with: minislam run --resume -o {out}\n" in capsys.readouterr().out

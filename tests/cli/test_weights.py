@@ -188,8 +188,14 @@ def test_what_is_broken_or_foreign_is_said_on_its_line(tmp_path: Path, capsys):
 
 
 def test_a_folder_without_checkpoints_is_one_sentence(tmp_path: Path, capsys):
-    for folder in (tmp_path, tmp_path / "nowhere"):
+    (file := tmp_path / "droid.pt").write_bytes(b"")
+    (tmp_path / "empty").mkdir()
+    for folder, words in (
+        (tmp_path / "empty", "found none in"),
+        (tmp_path / "nowhere", f"found no folder at {tmp_path}/nowhere; check the path"),
+        (file, f"found the file {file}; give the folder it is in"),
+    ):
         assert main(["weights", "check", str(folder)]) == 1
         said = capsys.readouterr().err
         assert said.startswith("minislam: expected a folder with checkpoint files")
-        assert said.count("\n") == 1
+        assert said.count("\n") == 1 and words in said

@@ -170,6 +170,14 @@ def test_broken_json_is_named(tmp_path: Path):
         read_json(tmp_path / "c.json")
 
 
+def test_a_comma_is_an_advice_about_points_only_in_a_line_of_numbers():
+    with pytest.raises(InputError, match="separate columns by spaces, and write decimal points"):
+        finite_numbers(["-1,5e3,2", "3.5"], "line 4 of x")
+    for fields in (["timestamp,x,y"], ["1,5", "nan"], ["none"]):
+        with pytest.raises(InputError, match="; correct it"):
+            finite_numbers(fields, "line 4 of x")
+
+
 @pytest.mark.parametrize("field", ["nan", "inf", "-Infinity", "1e999", "abc", "0x10", "1,5"])
 def test_only_finite_numbers_pass(field: str):
     with pytest.raises(InputError, match="line 4 of x"):

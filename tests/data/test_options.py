@@ -25,5 +25,7 @@ def test_impossible_options_are_refused(field: str, value: object):
 
 def test_the_bounds_of_a_focal_length_are_those_of_a_camera():
     assert InputOptions(fx=LONGEST_FOCAL, fy=LONGEST_FOCAL).fx == LONGEST_FOCAL
+    with pytest.raises(InputError, match=r"auto, found 'maybe'; choose one"):
+        InputOptions(focal="maybe")
     with pytest.raises(InputError, match=r"expected fx of at least 1 and at most 1e\+06, found -1"):
         InputOptions(fx=-1.0)

@@ -78,6 +78,7 @@ def test_masks_are_found_by_the_names_of_the_images_or_by_their_numbers(tmp_path
     assert columns(open_sequence(source, InputOptions(masks=numbered))) == [1, 2, 3]
     later = InputOptions(masks=numbered, start=1, stride=1)
     assert columns(open_sequence(source, later)) == [2, 3]  # the number is that in the source
+    assert [open_sequence(source, later).source_index(k) for k in range(2)] == [1, 2]
     # Names win: these numbers are names.
     source = photos(tmp_path / "stamps", "2", "3", "4")
     stamps = masks(tmp_path / "of_stamps", "0", "1", "2", "3", "4")
@@ -104,8 +105,9 @@ def test_masks_of_a_video_are_found_by_number(tmp_path: Path):
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        (lambda folder: str(folder), "expected --masks files:FOLDER with a folder that exists"),
-        (lambda folder: f"files:{folder}/none", "a folder that exists, found files:.*none"),
+        (lambda folder: str(folder), "expected --masks files:FOLDER .*; write files:.*wrong_masks"),
+        (lambda folder: f"files:{folder}/none", "that exists, found no folder at .*none; check it"),
+        (lambda folder: "nowhere", "that exists, found no folder at nowhere; check it"),
         (lambda folder: masks(folder / "few", "a"), r"found none for 2 of 3, such as .*b\.png"),
         (lambda folder: masks(folder / "no"), "found none for 3 of 3"),
         (lambda folder: masks(folder / "one", "a", "b", "c", value=1),
@@ -116,6 +118,13 @@ def test_wrong_masks_are_one_sentence(given, sentence: str, tmp_path: Path):
     source = photos(tmp_path / "photos", "a", "b", "c")
     with pytest.raises(InputError, match=sentence):
         open_sequence(source, InputOptions(masks=given(tmp_path))).given_mask(0)
+
+
+def test_masks_are_looked_for_before_a_clip_is_rendered(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path))
+    with pytest.raises(InputError, match="found no folder at nowhere"):
+        open_sequence("synth:ball", InputOptions(masks="files:nowhere"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path: Path):

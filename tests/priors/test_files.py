@@ -132,38 +132,60 @@ def test_bad_folders_of_features_are_one_sentence(tmp_path: Path, write, words: 
 def test_a_missing_file_and_another_network_are_refused(tmp_path: Path):
     files = {"0.npy": grid(1), "1.npy": grid(1, channels=7)}
     with pytest.raises(InputError, match=r"of every frame in .*, 3 files, found 2"):
-        FileFeatures(folder_with(tmp_path, files), CAMERA, frames=3)
-    features = FileFeatures(tmp_path, CAMERA, frames=2)
+        FileFeatures(folder_with(tmp_path, files), CAMERA, Images(["a", "b", "c"]))
+    features = FileFeatures(tmp_path, CAMERA, Images(["a", "b"]))
     with pytest.raises(InputError, match="found none for frame 2"):
         features(frame_of(IMAGE, 2))
     with pytest.raises(InputError, match=r"of 6 channels in .*1\.npy, found 7"):
         features(frame_of(IMAGE, 1))
 
 
+class Images:
+    """A sequence of which only the names of its images are known, from one on."""
+
+    def __init__(self, names: list[str], start: int = 0, kind: str = "") -> None:
+        self.names, self.start, self.kind = names, start, kind
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def source_name(self, index: int) -> str:
+        return f"img_{self.names[index]}{self.kind}"
+
+    def source_index(self, index: int) -> int:
+        return self.start + index
+
+
+@pytest.mark.parametrize("kind", ["", ".png", ".JPG"])  # of a video; of a folder
 @pytest.mark.parametrize(
-    ("names", "refused"),
+    ("names", "start", "refused"),
     [
-        (["7", "8", "9"], "00009.npy, which has the number of that image"),  # of ten, from 7 on
-        (["1", "2", "3"], None),  # files are numbered from 0, images from 1
-        (["a", "b", "c"], None),
-        (["0", "1", "2"], None),
+        (["7", "8", "9"], 7, "00009.npy, which has the number of that image"),  # of ten, from 7 on
+        (["1", "2", "3"], 0, None),  # files are numbered from 0, images from 1
+        (["1", "2", "3"], 1, "00003.npy, which has the number"),  # both from 0, and the run from 1
+        (["a", "b", "c"], 3, None),
+        (["0", "1", "2"], 0, None),
+        (["4.007", "4.008", "4.009"], 7, None),  # times
     ],
 )
-def test_files_with_the_numbers_of_the_images_are_refused_in_a_part(tmp_path, names, refused):
-    count = 10 if refused else 3
-    folder = folder_with(tmp_path, {f"{k:05d}.npy": np.ones((2, 2)) for k in range(count)})
-    files = FrameFiles(folder, "depth", (".npy",))
-
-    class Images:
-        source_name = staticmethod(lambda index: f"img_{names[index]}")
-        __len__ = lambda self: len(names)  # noqa: E731
-
+def test_files_with_the_numbers_of_the_images_are_refused(tmp_path, names, start, refused, kind):
+    folder = folder_with(tmp_path, {f"{k:05d}.npy": grid(k) for k in range(10)})
+    images = Images(names, start, kind)
     if refused is None:
-        return files.require_frames_of(Images())
-    with pytest.raises(InputError, match=refused):
-        files.require_frames_of(Images())
+        FileFeatures(folder, CAMERA, images)
+        return FrameFiles(folder, "depth", (".npy",)).require_frames_of(images)
+    with pytest.raises(InputError, match=f"depth files named by the frame .*{refused}"):
+        FrameFiles(folder, "depth", (".npy",)).require_frames_of(images)
+    with pytest.raises(InputError, match=f"features files named by the frame .*{refused}"):
+        FileFeatures(folder, CAMERA, images)
     (folder / "frames.txt").write_text("0 0.0\n")
-    FrameFiles(folder, "depth", (".npy",)).require_frames_of(Images())
+    FrameFiles(folder, "depth", (".npy",)).require_frames_of(images)
+
+
+def test_files_counted_from_one_like_the_images_are_refused(tmp_path: Path):
+    folder = folder_with(tmp_path, {f"{k}.npy": grid(k) for k in range(1, 4)})
+    with pytest.raises(InputError, match=r"00002 for img_3\.png, found .*3\.npy"):
+        FileFeatures(folder, CAMERA, Images(["1", "2", "3"], 0, ".png"))
 
 
 def test_a_damaged_index_is_refused(tmp_path: Path):

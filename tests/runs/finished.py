@@ -59,7 +59,9 @@ def finished(**parts: object) -> SimpleNamespace:
     mapper.beta_of, mapper.static_weight = lambda keyframe: hidden, lambda beta, camera: beta
     return SimpleNamespace(
         mapper=mapper,
-        sequence=SimpleNamespace(warnings=[], camera=CAMERA, ground_truth=truth),
+        sequence=SimpleNamespace(
+            warnings=[], camera=CAMERA, ground_truth=truth, source_index=lambda k: 10 + 3 * k
+        ),
         lost_frames=lambda: [None] * lost,
         trajectory=lambda: Trajectory(np.arange(4) / 30, random_transforms(4, "normal", 1).numpy()),
         tracker=tracker,

@@ -185,6 +185,10 @@ def test_options_are_converted_or_refused_before_anything_is_lost(run: minislam.
 def test_unknown_options_and_outputs_in_use_are_refused(run: minislam.Run):
     with pytest.raises(InputError, match="found strid; the nearest is stride"):
         minislam.run("synth:person", strid=3)
+    with pytest.raises(InputError, match=r"found seed; it is a setting: settings=\{'seed': 3\}"):
+        minislam.run("synth:person", seed=3)
+    with pytest.raises(InputError, match=r"found resume; see help\(minislam\.run\)"):
+        minislam.run("synth:person", resume=True)
     with pytest.raises(InputError, match="expected a new or empty output folder"):
         minislam.run("synth:person", run.folder.path, max_frames=4, size=(96, 72), preset="test")
 
@@ -197,6 +201,11 @@ def test_masks_of_the_user_are_used_as_on_the_command_line(root: Path, tmp_path:
         masks=f"files:{tmp_path}", depth="simulated", quiet=True,
     )  # fmt: skip
     assert done.config.uncertainty.given_masks
+    with pytest.raises(InputError, match="either --masks or --no-uncertainty, found both; leave"):
+        minislam.run(
+            "synth:person", stride=3, max_frames=10, size=(96, 72), masks=f"files:{tmp_path}",
+            settings={"uncertainty.enabled": False},
+        )  # fmt: skip
     assert done.beta(5).min() > 1 > done.beta(0).max()
 
 
@@ -219,4 +228,6 @@ def test_ctrl_c_ends_a_quiet_run_after_the_present_step(root: Path, monkeypatch,
         quiet=True,
     )  # fmt: skip
     assert done.folder.read_run()["state"] == "interrupted"
+    html = (root / "quiet/report.html").read_text(encoding="utf-8")
+    assert f"<pre>go on with: minislam run --resume -o {root}/quiet</pre>" in html
     assert capsys.readouterr() == ("", "")

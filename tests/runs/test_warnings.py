@@ -19,8 +19,12 @@ WARNINGS = [
         {"lost": 1},
         "1 of 4 frames could not be tracked and have no pose; lost_frames.txt lists them",
     ),
-    ({"lost": 2, "ends_lost": True}, "If the film is cut at frame 2, run the rest by itself"),
-    ({"lost": 2, "ends_lost": True}, "(--start). If the images lie far apart, give more frames"),
+    # The run begins at image 10 and takes every third.
+    (
+        {"lost": 2, "ends_lost": True},
+        "film is cut there, run the rest by itself: --start 16",
+    ),
+    ({"lost": 2, "ends_lost": True}, "16. If the images lie far apart, give more frames"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
     ({"breaks": [Break(2, 2)]}, "look at each piece (frames 0 to 1, 3 to 3) by itself"),
     (
@@ -30,12 +34,15 @@ WARNINGS = [
     ({"truth": [0.0]}, "found 1 (estimate 4 poses, 0.000 to 0.100 s, truth 1 pose, 0.000 to 0.000"),
     ({"truth": [0.0, 33.0, 67.0]}, "check that the times of both are in seconds: poses of the est"),
     ({"truth": [k / 30 for k in range(3)], "stands": True}, "or a camera that does not move"),
+    ({"breaks": [Break(2, 2)]}, "there is too little parallax to carry the scale across, or the"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
+    ({"failed": 3}, "their poses and depths stay as first guessed, so do not trust them; try"),
     ({"shown": [0.8, 0.4]}, "the map shows only 60% of what stands still, least in frame 8"),
     (
         {"lens": LensFit(300.0, (-0.1, 0.0), -0.07, 0.13)},
         "bends straight lines, the corners by -7%, with 13% less",
     ),
+    ({"lens": LensFit(300.0, (-0.1, 0.0), -0.07, 0.13)}, "or give --fx, --k1 and --k2"),
     (
         {"lens": LensFit(300.0, (0.0, 0.0), 0.01, 0.13), "focal_length": DOUBTFUL},
         "the flow fits 1.10 times the",
@@ -51,7 +58,7 @@ WARNINGS = [
     ({"parallax": [0.1], "knows_depth": False}, "and all that the map shows is at one depth"),
     ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),
     ({"overlay": torch.tensor([0.0, 1, 1, 1])}, "25% of the image stand still while the rest mov"),
-    ({"left_out": 0.5}, "beta leaves 50% of the images out"),
+    ({"left_out": 0.5}, "beta takes 50% of all pixels for moving"),
     ({"has_prior": False}, "the unit of length is arbitrary"),
 ]
 
@@ -83,7 +90,7 @@ def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_
     assert not list(warnings(finished(**weak)))
     assert len(list(warnings(finished(has_prior=False)))) == 1
     warning, _ = warnings(finished(**weak, has_prior=False))
-    assert "only 0.41 px of the flow, in the median" in warning
+    assert "only 0.41 px between neighbouring keyframes (median, for 320x240)" in warning
     warning, _ = warnings(finished(**weak, has_prior=False, parallax=[0.1]))  # said once
     assert "hardly any parallax" in warning
 

@@ -71,7 +71,8 @@ def test_settings_and_commands_are_said():
     html = report(command="minislam run a.mp4", settings="preset test with seed 4 instead of 0")
     assert "<p>Settings: preset test with seed 4 instead of 0.</p>" in html
     assert "<pre>minislam run a.mp4</pre>" in html and "minislam render out/my --path" in html
-    assert "minislam run --resume -o out/my" in html  # the style shows it where it fits
+    html = report(next_step="go on with: minislam run --resume -o <my>")
+    assert "<pre>go on with: minislam run --resume -o &lt;my&gt;</pre>" in html
 
 
 def test_the_end_of_the_run_decides_what_is_shown():
