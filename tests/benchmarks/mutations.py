@@ -13,7 +13,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("torch.where(q[..., :1] < 0, -q, q)", "q"),
     ],
     ("geometry/camera.py", "geometry/test_camera.py"): [
-        ("(self.cx + 0.5) * sx - 0.5", "self.cx * sx"),
+        ("min((self.cx + 0.5) * sx, width) - 0.5", "self.cx * sx"),
         ("fx * (1 + a * a)", "fx * (1 - a * a)"), ("self.cx - left", "self.cx + left"),
         ("u <= self.width - 1", "u <= self.width"),
     ],
@@ -183,7 +183,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("fitted * graph.keyframes.motion_weights[i]", "fitted"),
         ("matched * graph.keyframes.static_weights[i]", "matched"),
         ("max(holding)", "min(holding)"), ("min(agreeing,", "max(agreeing,"),
-        ("index - last <= HEALED_AFTER", "False"), ("counted * expected)", "counted)"),
+        ("start - last <= HEALED_AFTER", "False"), ("start - last <=", "index - last <="), ("counted * expected)", "counted)"),
     ],
     ("tracking/safeguards/turns.py", "tracking/safeguards/test_turns.py"): [
         ("free_focal=graph.seeks_focal and", "free_focal=False and"),
