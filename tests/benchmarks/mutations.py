@@ -179,11 +179,11 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("max(holding) / max(matched, 1e-6)", "max(holding)"),
         ("max(LEAST_CELLS, MIN_EVIDENCE * len(matched))", "MIN_EVIDENCE * len(matched)"),
         ("or agreement < MIN_AGREEMENT", ""), ("matched * fits[i, keyframe]", "matched"),
-        ("known[i] * graph.links.conf", "graph.links.conf"),
+        ("known[i] * graph.links.conf", "graph.links.conf"), ("start - last <=", "index - last <="),
         ("fitted * graph.keyframes.motion_weights[i]", "fitted"),
         ("matched * graph.keyframes.static_weights[i]", "matched"),
         ("max(holding)", "min(holding)"), ("min(agreeing,", "max(agreeing,"),
-        ("start - last <= HEALED_AFTER", "False"), ("start - last <=", "index - last <="), ("counted * expected)", "counted)"),
+        ("start - last <= HEALED_AFTER", "False"), ("counted * expected)", "counted)"),
     ],
     ("tracking/safeguards/turns.py", "tracking/safeguards/test_turns.py"): [
         ("free_focal=graph.seeks_focal and", "free_focal=False and"),
