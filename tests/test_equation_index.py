@@ -17,6 +17,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", PACKAGE / "DIFFERENCES.md"]
 DOCUMENTS += [ROOT / "tests/benchmarks/RESULTS.md", PACKAGE / "priors/networks/README.md"]
+DOCUMENTS += sorted((ROOT / "tests/benchmarks/diary").glob("*.md"))
 
 MOST_WORDS = 1300  # of README, outside tables
 MOST_LINES = 150  # of README, besides tables

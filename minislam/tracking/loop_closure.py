@@ -15,7 +15,7 @@ from minislam.tracking.optimisation import FIRST_WIDENING, adjust, bundle_proble
 from minislam.tracking.reprojection import lengths
 
 LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code
-FITTING_LOOP_RESIDUAL = 1.5  # px at 320x240: a loop that is better fits already (RESULTS.md, Loops)
+FITTING_LOOP_RESIDUAL = 1.5  # px at 320x240: a loop that is better fits already (diary/tracking.md)
 MAX_LOOP_RESIDUAL = 3.0  # px at 320x240: a loop that stays worse than this is undone
 
 

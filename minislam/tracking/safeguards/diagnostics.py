@@ -1,12 +1,12 @@
 """How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
 
 With a low matched ratio or little parallax the scale can drift while all residuals stay small.
-Where everything is matched, five measurements tell broken keyframes from healthy ones (RESULTS.md,
-"Broken runs"): a wrong pose does not explain the flow of the keyframes before it; after a wrong
-scale two keyframes see a thing at different depths; where too little hands the scale on, lengths
-before and after are not told (scale_certainty.py); and where a large dynamic object takes the place
-of the scene, hardly anything that held the keyframes before holds this one, or what is left of it
-does not fit.
+Where everything is matched, five measurements tell broken keyframes from healthy ones
+(diary/broken_runs.md): a wrong pose does not explain the flow of the keyframes before it; after a
+wrong scale two keyframes see a thing at different depths; where too little hands the scale on,
+lengths before and after are not told (scale_certainty.py); and where a large dynamic object takes
+the place of the scene, hardly anything that held the keyframes before holds this one, or what is
+left of it does not fit.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ MAX_SCALE_DEVIATION = 0.1  # of a length, relative; healthy to .06, broken .19 a
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
 
-# A camera that walks; the tables stand in RESULTS.md, "Clips that nobody had tuned to".
+# A camera that walks; the tables stand in tests/benchmarks/diary/turning_cameras.md.
 LEAST_BEYOND_TURNS = 0.45  # px of a 320x240 image
 MOST_RESTING = 0.75  # fraction of the keyframes: cameras that stand .88 to 1, pans 0 to .16 [-]
 LEAST_CONFIRMED = 0.15  # fraction of the cells: a hand-held camera .05, pans .24 and more [-]

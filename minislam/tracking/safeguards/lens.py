@@ -35,7 +35,7 @@ TURNS = 16  # of straightening and adjusting, at most
 SETTLED = 0.001  # a turn that bends a corner by no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
-# RESULTS.md, "A lens that nobody told of". [-]
+# tests/benchmarks/diary/focal_length.md, "A lens that nobody told of". [-]
 WORTH_SAYING, WORTH_SAVING, WORTH_UNDOING = 0.04, 0.03, 0.1
 # What moves a corner farther, or sees 130 degrees and more, is no lens but a failed fit.
 MOST_BEND, LEAST_FOCAL = 0.4, 0.23  # [-] and image widths
