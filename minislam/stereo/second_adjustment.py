@@ -42,7 +42,7 @@ def adjust_again(
     tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
     followed = [frame.frame_index for frame in tracked if frame.status.is_followed]
-    # To pose all frames took two to five times as long and no more exact (diary/dense_structure.md).
+    # To pose all frames took two to five times as long, as accurate (diary/dense_structure.md).
     wanted = {*swept_frames(keyframes, followed)}
     tracker.tracked = [frame for frame in tracked if frame.frame_index in wanted]
     try:
