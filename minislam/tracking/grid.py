@@ -32,6 +32,13 @@ class Grid(Stateful):
         """Make both focal lengths exp(log_focal) times as long, for all who hold this grid."""
         self.camera, self.rays = zoomed(self.camera, self.rays, log_focal)
 
+    def cells_at(self, positions: Tensor) -> tuple[Tensor, Tensor]:  # (2, N) px -> (N,), (N,) bool
+        """Return the nearest cell of each position, and whether it is in the image."""
+        column, row = (positions / self.stride).round().long()
+        height, width = self.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return row * width + column, inside
+
     def sample(self, values: Tensor, positions: Tensor) -> Tensor:
         """Return values (..., N, C) of the cells interpolated bilinearly at pixels (..., M, 2).
 

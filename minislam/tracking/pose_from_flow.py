@@ -115,11 +115,10 @@ def splat_disparities(
     cells = T_target_source[None].to(disparities.dtype), disparities[None], grid.rays
     depth_ratio = scaled_points(*cells)[0, 2]
     positions, valid = reproject(*cells, grid.camera)
-    column, row = (positions[0] / grid.stride).round().long()
-    height, width = grid.shape
-    kept = valid[0] & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    cell, inside = grid.cells_at(positions[0])
+    kept = valid[0] & inside
     warped, nearness = torch.zeros_like(disparities), disparities / depth_ratio
-    return warped.scatter_reduce_(0, (row * width + column)[kept], nearness[kept], "amax")
+    return warped.scatter_reduce_(0, cell[kept], nearness[kept], "amax")
 
 
 def filled_from_nearest(values: Tensor, empty: Tensor) -> Tensor:  # (h, w), (h, w) bool -> (N,)

@@ -20,7 +20,7 @@ from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bund
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.safeguards.parts import Start, of_cells, of_rows
-from minislam.tracking.safeguards.robust import MIN_RESIDUAL
+from minislam.tracking.safeguards.robust import least_cost
 from minislam.workers import Workers
 
 STEP = math.log(1.05)  # to either side, where the cost must have risen
@@ -142,7 +142,7 @@ def fit_focal_length(
         better = beside[rises.index(min(rises))][0]
         found, best = adjust_narrowing(free, better, [1.0], ITERATIONS)
     lowest = best.cost_after
-    floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
+    floor = least_cost(problem.weights)
     saved = (present.cost_after - lowest) / max(present.cost_after, floor)
     least_rise = MIN_RISE if saved < WORTH_SAVING else MIN_RISE_OF_BETTER
     rises_enough = sum(rises) / 2 >= least_rise * max(lowest, floor)
@@ -170,6 +170,6 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     problem, start = _thinned(graph, problem, range(min(MOST_KEYFRAMES, len(graph.keyframes))))
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
-    floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
+    floor = least_cost(problem.weights)
     if held.cost_after - free.cost_after > READOUT_WORTH_SAVING * max(held.cost_after, floor):
         shutter.take(state.readout, columns)

@@ -28,7 +28,7 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing
 from minislam.tracking.safeguards import focal_length
 from minislam.tracking.safeguards.focal_length import ITERATIONS, WIDENINGS
-from minislam.tracking.safeguards.robust import MIN_RESIDUAL
+from minislam.tracking.safeguards.robust import least_cost
 
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
 TURNS = 16  # of straightening and adjusting, at most
@@ -37,8 +37,8 @@ INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # tests/benchmarks/diary/focal_length.md, "A lens that nobody told of". [-]
 WORTH_SAYING, WORTH_SAVING, WORTH_UNDOING = 0.04, 0.03, 0.1
-# What moves a corner farther, or sees 130 degrees and more, is no lens but a failed fit.
-MOST_BEND, LEAST_FOCAL = 0.4, 0.23  # [-] and image widths
+# What moves a corner farther in or out, or sees 130 degrees and more, is no lens but a failed fit.
+MOST_INWARDS, MOST_OUTWARDS, LEAST_FOCAL = 0.4, 0.1, 0.23  # [-], [-] and image widths
 
 Radial = tuple[float, float]  # k1, k2
 
@@ -54,13 +54,14 @@ class LensFit:
 
     @property
     def is_bent(self) -> bool:
-        """Tell whether the images are probably no pinhole's: both thresholds are exceeded."""
-        return abs(self.bend) > WORTH_SAYING and self.saved > WORTH_SAVING
+        """Tell whether the images are probably no pinhole's: they are bent, and it saves much."""
+        is_large = WORTH_SAYING < abs(self.bend) and self.bend < MOST_OUTWARDS
+        return is_large and self.saved > WORTH_SAVING
 
     @property
     def is_worth_undoing(self) -> bool:
         """Tell whether the images should be straightened: that saves much."""
-        return WORTH_SAYING < abs(self.bend) < MOST_BEND and self.saved > WORTH_UNDOING
+        return self.is_bent and self.bend > -MOST_INWARDS and self.saved > WORTH_UNDOING
 
 
 class BentLens(MinislamError):
@@ -106,7 +107,7 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
             break
     lens = replace(straightened(problem, radial), shutter=None)
     state, held = adjust_narrowing(lens, state, [1.0], ITERATIONS)
-    floor = MIN_RESIDUAL**2 * float(problem.weights.mean(1).sum())
+    floor = least_cost(problem.weights)
     saved = (pinhole.cost_after - held.cost_after) / max(pinhole.cost_after, floor)
     zoom, bend = math.exp(state.log_focal), bend_of(problem.camera, radial)
     radial = radial[0] * zoom**2, radial[1] * zoom**4

@@ -115,13 +115,10 @@ def arrived(grid: Grid, matches: FlowMatches, marks: Tensor) -> Tensor:  # (N,) 
 
 def _inherited(grid: Grid, matches: FlowMatches, values: Tensor) -> Tensor:  # (h, w), inf: none
     """Return the lowest value of the source cells that flow to each target cell."""
-    cells = (matches.targets[0].mT / grid.stride).round().long()
-    height, width = grid.shape
-    inside = (cells >= 0).all(1) & (cells[:, 0] < width) & (cells[:, 1] < height)
+    cell, inside = grid.cells_at(matches.targets[0])
     arrives = inside & _is_matched(matches)
-    index = cells[arrives, 1] * width + cells[arrives, 0]
     unknown = torch.full_like(values, torch.inf)
-    return unknown.scatter_reduce(0, index, values[arrives], "amin").reshape(grid.shape)
+    return unknown.scatter_reduce(0, cell[arrives], values[arrives], "amin").reshape(grid.shape)
 
 
 def _is_matched(matches: FlowMatches) -> Tensor:  # (N,) bool

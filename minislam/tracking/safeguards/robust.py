@@ -62,6 +62,11 @@ def edge_losses(
     return (weights.mean(1) * loss).sum(1, dtype=torch.float64)
 
 
+def least_cost(weights: Tensor) -> float:  # (E, 2, N)
+    """Return the cost of residuals that are as small as the flow is exact."""
+    return MIN_RESIDUAL**2 * float(weights.mean(1).sum())
+
+
 def weighted_median(values: Tensor, weights: Tensor) -> float | None:
     """Return the value below which half of the weight lies; None without weight."""
     order = values.flatten().argsort()
