@@ -43,6 +43,7 @@ from minislam.tracking.trajectory import as_trajectory, pose_all_frames
 from minislam.uncertainty.weights import beta_of_mask, relative_weight, tracking_weight
 from minislam.workers import Workers
 
+ONLINE_CELL = 4  # px, side of the square of a Gaussian in the map that the final one replaces
 FRAMES_AT_ONCE = 8  # whose poses are refined side by side; with more, Ctrl-C waits longer
 
 
@@ -84,7 +85,7 @@ class Slam(Stateful):
         parts = priors.flow, self._features, priors.depth, self._static_weight
         self.tracker = Tracker(sequence.camera, config.tracking, *parts, device)
         self.tracker.graph.seeks_focal = sequence.refines_focal
-        self.mapper = self._new_mapper(config.mapping.insertion.online_cell)
+        self.mapper = self._new_mapper(ONLINE_CELL)
         self._stride, self.poses, self.first_frame = priors.flow.stride, {}, FirstFrame()
 
     def run(self) -> None:

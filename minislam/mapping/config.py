@@ -12,9 +12,6 @@ class InsertionConfig:
     """How densely a keyframe adds Gaussians, and how they start."""
 
     cell: int = parameter(3, "one Gaussian per square cell of this side [px of the full image]", 1)
-    online_cell: int = parameter(
-        4, "the same in the map that is learnt online, which the final one replaces", 1
-    )
     footprint: float = parameter(
         0.45, "first scale over the side of a cell seen at its depth [1]; official 0.22", 0.01
     )

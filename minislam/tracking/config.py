@@ -44,7 +44,6 @@ class TrackingConfig:
     warmup_iterations: int = parameter(6, "Gauss-Newton steps per round of the warm-up", 1)
     window: int = parameter(10, "newest keyframes that the local BA moves", 1)
     active_edges: int = parameter(0, "edges measured per keyframe, old ones included; 0: its own")
-    min_link_ratio: float = parameter(0.1, "least matched ratio of a far link [-]", most=1)
     rounds: int = parameter(2, "rounds of flow and BA per keyframe", 1)
     iterations: int = parameter(3, "Gauss-Newton steps per round", 1)
     global_iterations: int = parameter(4, "Gauss-Newton steps per round of a global BA", 1)
@@ -67,7 +66,6 @@ class TrackingConfig:
     )
     mask_min_corresponding: int = parameter(2, "views that must see a cell, paper supplement")
     mask_min_consistent: int = parameter(2, "of which this many must agree, official code")
-    min_parallax: float = parameter(2.0, "with less on all links, disparities are kept [px]")
     global_interval: int = parameter(20, "fewest keyframes between global BAs; 0: none, paper 3.3")
     loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
     loop_min_gap: int = parameter(

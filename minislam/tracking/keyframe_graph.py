@@ -45,6 +45,8 @@ NEIGHBOURHOOD = 5  # predecessors that every keyframe is linked with
 PROXIMITY_EDGES = 2  # further links of a new keyframe, nearest by flow distance
 PROXIMITY_DISTANCE = 120.0  # px at 320x240, largest flow distance of such a link
 HORIZON = 3  # BA windows of keyframes among which a new one looks for such links
+MIN_LINK_RATIO = 0.1  # least matched ratio of a far link [-]
+MIN_PARALLAX = 2.0  # px at 320x240; with less on all links, disparities are kept
 GLOBAL_EDGES = 6  # further links per keyframe in a global BA
 GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
 ROBUST_NARROWING = 0.5  # between keyframes, because the structure is known by then [-]
@@ -80,7 +82,7 @@ class KeyframeGraph(Stateful):
         self.shutter = RollingShutter(*parts)
         self.flow = flow
         self.pixel_scale = pixel_scale(camera)
-        self.least_parallax = self.config.min_parallax * self.pixel_scale  # px, that measures depth
+        self.least_parallax = MIN_PARALLAX * self.pixel_scale  # px, that measures depth
 
     @property
     def robust(self) -> RobustKernel | None:
@@ -216,8 +218,7 @@ class KeyframeGraph(Stateful):
         ratio: dict[Edge, float] = {}
         for part, matches in self._flow_from_geometry(edges):
             ratio |= zip(part, matches.matched_ratios.tolist(), strict=True)
-        least = self.config.min_link_ratio
-        return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= least]
+        return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= MIN_LINK_RATIO]
 
     def _flow_from_geometry(self, edges: list[Edge]) -> Iterator[tuple[list[Edge], FlowMatches]]:
         """Yield some of the edges and their flow, started from what the present geometry predicts.

@@ -16,7 +16,7 @@ from tests.tracking.wall import TrueFlow, true_graph
 
 def test_a_new_link_needs_both_directions():
     flow = TrueFlow(ratios={(0, 3): 0.9, (3, 0): 0.05, (1, 3): 0.5, (3, 1): 0.4})
-    graph = true_graph([0, 1, 2, 3], TrackingConfig(min_link_ratio=0.1), flow)
+    graph = true_graph([0, 1, 2, 3], TrackingConfig(), flow)
     asked = [(0, 3), (3, 0), (1, 3), (3, 1)]
     assert graph.filter_confirmed(asked) == [(1, 3), (3, 1)]
     assert graph.filter_confirmed([]) == [] and len(graph.links) == 0

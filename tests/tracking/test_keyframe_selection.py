@@ -74,7 +74,7 @@ def test_few_matches_make_a_keyframe():
 def test_time_makes_a_keyframe_unless_the_start_needs_parallax():
     graph, last = true_graph([0]), CONFIG.keyframe_interval
     assert needs(graph, last, shifted(0.0)) and not needs(graph, last - 1, shifted(0.0))
-    least = CONFIG.min_parallax * graph.pixel_scale
+    least = graph.least_parallax
     assert not needs(graph, last, shifted(0.99 * least), initialised=False)
     assert needs(graph, last, shifted(1.01 * least), initialised=False)
     assert not needs(graph, last - 1, shifted(1.01 * least), initialised=False)

@@ -122,7 +122,8 @@ def test_the_prior_weighs_where_it_is_known_and_grows_with_the_focal_length():
 
 @pytest.mark.parametrize("has_prior", [True, False])
 def test_without_parallax_a_start_keeps_the_disparities_that_a_prior_gave(has_prior: bool):
-    graph = matched(3, min_parallax=1e3)
+    graph = matched(3)
+    graph.least_parallax = 1e3
     graph.keyframes.disparities *= 1.1
     graph.keyframes.prior_disparities[1, 4] = 0.2 * has_prior
     before = graph.keyframes.disparities.clone()

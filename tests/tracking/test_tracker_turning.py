@@ -81,7 +81,7 @@ def test_a_camera_that_only_turns_is_followed_and_known_to_stand(with_depth: boo
         distance = np.median(turning()[0].depth)
         assert np.linalg.norm(estimate[:, :3, 3], axis=1).max() < MAX_DRIFT * distance
     # That is what the run warns of: the distances that the camera covered are unknown.
-    least = CONFIG.min_parallax * tracker.graph.pixel_scale
+    least = tracker.graph.least_parallax
     assert len(tracker.watch.diagnostics) == len(tracker.keyframes) > 4
     assert all(found.parallax < least for found in tracker.watch.diagnostics)
 
