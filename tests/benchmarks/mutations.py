@@ -215,7 +215,6 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("counts.consistent < ", "counts.consistent <= "),
     ],
     ("tracking/frame_graph.py", "tracking/test_frame_graph.py"): [
-        ("ratio >= KEPT_FRACTION *", "ratio >= 0 *"),
         ("(without_rotation, 1 - full_flow_weight)", "(without_rotation, full_flow_weight)"),
         ("min(abs(i - j) - 2, suppression)", "suppression"),
     ],

@@ -8,9 +8,10 @@ import torch
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.safeguards.settling import (
-    HANDED_ON,
     SETTLED,
-    Settling,
+    certainty,
+    fall_back_on_prior,
+    hand_on,
     measured_information,
 )
 from tests.tracking.wall import GRID, true_graph, true_poses
@@ -21,7 +22,7 @@ def test_a_just_settled_cell_counts_half_and_a_prior_wholly():
     graph.keyframes.prior_disparities[1, 3] = 0.2
     information = torch.zeros(len(GRID.rays))
     information[1:3] = torch.tensor([SETTLED, math.inf])
-    found = Settling(graph).certainty(information)
+    found = certainty(graph, information)
     assert found[:4].tolist() == pytest.approx([0.05, 0.5, 1.0, 1.0])
 
 
@@ -48,47 +49,29 @@ def test_without_edges_nothing_is_known():
 
 def test_an_unsettled_outlier_is_not_handed_on():
     graph = true_graph([0, 1])
-    settling = Settling(graph)
     information = torch.full((len(GRID.rays),), 4 * SETTLED)
     information[::7] = 0.0
     graph.keyframes.disparities[1, ::7] = 0.6
     assert graph.warp_disparities(1, true_poses()[2]).max() > 0.5
-    disparities = settling.hand_on(information, true_poses()[2])
-    assert disparities.max() < 0.4
-    assert 0 < float(settling.handed_on.max()) <= HANDED_ON * 4 * SETTLED + 1e-3
+    assert hand_on(graph, information, true_poses()[2]).max() < 0.4
 
 
 def test_where_nothing_is_settled_all_is_handed_on():
     graph = true_graph([0, 1])
-    nothing = torch.zeros(len(GRID.rays))
-    disparities = Settling(graph).hand_on(nothing, true_poses()[2])
+    disparities = hand_on(graph, torch.zeros(len(GRID.rays)), true_poses()[2])
     assert torch.equal(disparities, graph.warp_disparities(1, true_poses()[2]))
 
 
 def test_a_depth_prior_is_handed_on_but_settles_nothing():
     graph = true_graph([0, 1])
     graph.match([(1, 0)])
-    settling = Settling(graph)
-    measured = settling.information()
+    measured = measured_information(graph, 1)
     graph.keyframes.prior_disparities[1] = 0.2
-    assert torch.equal(settling.information(), measured)
-    nothing = torch.zeros_like(measured)
-    nothing[0] = 2 * SETTLED
-    disparities = settling.hand_on(nothing, true_poses()[2])
+    assert torch.equal(measured_information(graph, 1), measured)
+    one = torch.zeros_like(measured)
+    one[0] = 2 * SETTLED
+    disparities = hand_on(graph, one, true_poses()[2])
     assert torch.equal(disparities, graph.warp_disparities(1, true_poses()[2]))
-    assert (settling.handed_on > 0).float().mean() < 0.05
-
-
-@pytest.mark.parametrize("count", [3, 5])
-def test_the_information_of_the_newest_keyframe_includes_what_was_handed_on(count: int):
-    graph = true_graph(list(range(count)))
-    graph.match([(count - 1, 0)])
-    settling = Settling(graph)
-    settling.handed_on += 7.0
-    expected = measured_information(graph, count - 1) + 7.0
-    torch.testing.assert_close(settling.information(), expected)
-    graph.flow_to_next[-1] = None  # the camera was lost: nothing could be handed on
-    torch.testing.assert_close(settling.information(), expected - 7.0)
 
 
 def test_where_flow_has_not_settled_a_start_the_prior_stays():
@@ -100,7 +83,7 @@ def test_where_flow_has_not_settled_a_start_the_prior_stays():
     for index in range(3):
         settled[index] = measured_information(graph, index) > SETTLED
     assert settled.any() and not settled.all()
-    Settling(graph).fall_back_on_prior()
+    fall_back_on_prior(graph)
     expected = torch.where(settled, before, 0.7)
     expected[2], expected[1, 3] = before[2], before[1, 3]
     assert torch.equal(graph.keyframes.disparities, expected)
