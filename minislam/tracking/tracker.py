@@ -175,14 +175,12 @@ class Tracker(Stateful):
         edge = len(self.keyframes) - 1, len(self.keyframes)
         matches = self.graph.shutter.corrected(matches, [edge], frame.frame_index)
         if self.initialised:  # before, initialise() will estimate all poses together
-            information = settling.measured_information(self.graph, len(self.keyframes) - 1)
-            pose = self.graph.start_pose(matches, settling.certainty(self.graph, information))
+            pose = self.graph.start_pose(matches)
             if self.graph.is_learned:
-                pose, _ = self.graph.fit_pose(frame, [len(self.keyframes) - 1], pose)
-            disparities = settling.hand_on(self.graph, information, pose)
-            motion_memory.remember(
-                self.graph, matches, pose, settled=information > settling.SETTLED
-            )
+                pose, _ = self.graph.fit_pose(frame, [edge[0]], pose)
+            settled = settling.settled_cells(self.graph, edge[0])
+            disparities = settling.hand_on(self.graph, settled, pose)
+            motion_memory.remember(self.graph, matches, pose, settled=settled)
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()
         self.last_non_keyframe = None

@@ -3,8 +3,8 @@
 Without a depth prior, a new keyframe gets its disparities from its predecessor; where its view is
 new, they are filled in from the nearest cells. If one of those is an outlier, a whole strip of the
 image is wrong, the robust weight takes it for outliers for ever, and the next keyframe fills in a
-wider strip. Therefore only settled cells are handed on, and the pose of a new frame trusts a cell
-as far as it is settled. A depth prior settles nothing: it may be wrong by a tenth.
+wider strip. Therefore only settled cells are handed on. A depth prior settles nothing: it may be
+wrong by a tenth.
 
 By its edges e a disparity d has the information sum_e w_e |J_e|^2 (its entry of C in Eq. (5)). So
 its relative standard deviation is 1 / sqrt(I) with I = d^2 sum_e w_e |J_e|^2 [px^2], about
@@ -22,7 +22,6 @@ from minislam.tracking.pose_from_flow import warp_disparities
 from minislam.tracking.reprojection import reproject_with_jacobians
 
 SETTLED = 25.0  # px^2, information of a disparity that is known to a fifth of itself
-LEAST = 0.05  # weight of a cell whose disparity nothing is known of: it still shows a rotation [-]
 
 
 def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) px^2
@@ -37,20 +36,19 @@ def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
     return disparities.square() * (weights * at.J_disparity.square()).sum((0, 1))
 
 
-def certainty(graph: KeyframeGraph, information: Tensor) -> Tensor:  # (N,) px^2 -> (N,) in (0, 1]
-    """Return the weight of the newest cells in a pose: 1/2 if just settled, 1 with a prior."""
-    settled = (1 / (1 + SETTLED / information)).clamp_min(LEAST)
-    return torch.where(graph.keyframes.prior_disparities[-1] > 0, 1.0, settled)
+def settled_cells(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) bool
+    """Return which disparities of a keyframe are settled."""
+    return measured_information(graph, keyframe) > SETTLED
 
 
-def hand_on(graph: KeyframeGraph, information: Tensor, T_camera_world: Tensor) -> Tensor:  # (N,)
-    """Return the disparities of the next keyframe, warped from settled cells of the newest.
+def hand_on(graph: KeyframeGraph, settled: Tensor, T_camera_world: Tensor) -> Tensor:  # (N,)
+    """Return the disparities of the next keyframe, warped from settled cells (N,) of the newest.
 
     Those with a depth prior are warped, too; if there is none of either, all are. The camera
     moves on to `T_camera_world` (4, 4).
     """
     keyframes = graph.keyframes
-    warped = (information > SETTLED) | (keyframes.prior_disparities[-1] > 0)
+    warped = settled | (keyframes.prior_disparities[-1] > 0)
     known = keyframes.disparities[-1] * (warped | ~warped.any())
     motion = keyframes.T_camera_world[-1] @ se3_inverse(T_camera_world)
     return warp_disparities(graph.grid, se3_inverse(motion), known)
@@ -59,4 +57,4 @@ def hand_on(graph: KeyframeGraph, information: Tensor, T_camera_world: Tensor) -
 def fall_back_on_prior(graph: KeyframeGraph) -> None:
     """Take the prior where flow has settled nothing, as where the camera only turns."""
     for index in range(len(graph.keyframes)):
-        graph.keyframes.take_prior(index, measured_information(graph, index) <= SETTLED)
+        graph.keyframes.take_prior(index, ~settled_cells(graph, index))

@@ -1,29 +1,17 @@
 """Settled disparities: information against numbers, and an outlier that must not spread."""
 
-import math
-
-import pytest
 import torch
 
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.safeguards.settling import (
     SETTLED,
-    certainty,
     fall_back_on_prior,
     hand_on,
     measured_information,
+    settled_cells,
 )
 from tests.tracking.wall import GRID, true_graph, true_poses
-
-
-def test_a_just_settled_cell_counts_half_and_a_prior_wholly():
-    graph = true_graph([0, 1])
-    graph.keyframes.prior_disparities[1, 3] = 0.2
-    information = torch.zeros(len(GRID.rays))
-    information[1:3] = torch.tensor([SETTLED, math.inf])
-    found = certainty(graph, information)
-    assert found[:4].tolist() == pytest.approx([0.05, 0.5, 1.0, 1.0])
 
 
 def test_information_is_the_curvature_of_the_cost_in_the_logarithm_of_a_disparity():
@@ -41,6 +29,7 @@ def test_information_is_the_curvature_of_the_cost_in_the_logarithm_of_a_disparit
     derivative = (shifts[1] - shifts[0]) / (2 * step)
     expected = (problem.weights[:, :, cell] * derivative.square()).sum()
     torch.testing.assert_close(found[cell], expected, rtol=2e-2, atol=0)
+    assert torch.equal(settled_cells(graph, 3), found > SETTLED)
 
 
 def test_without_edges_nothing_is_known():
@@ -49,16 +38,16 @@ def test_without_edges_nothing_is_known():
 
 def test_an_unsettled_outlier_is_not_handed_on():
     graph = true_graph([0, 1])
-    information = torch.full((len(GRID.rays),), 4 * SETTLED)
-    information[::7] = 0.0
+    settled = torch.ones(len(GRID.rays), dtype=torch.bool)
+    settled[::7] = False
     graph.keyframes.disparities[1, ::7] = 0.6
     assert graph.warp_disparities(1, true_poses()[2]).max() > 0.5
-    assert hand_on(graph, information, true_poses()[2]).max() < 0.4
+    assert hand_on(graph, settled, true_poses()[2]).max() < 0.4
 
 
 def test_where_nothing_is_settled_all_is_handed_on():
     graph = true_graph([0, 1])
-    disparities = hand_on(graph, torch.zeros(len(GRID.rays)), true_poses()[2])
+    disparities = hand_on(graph, torch.zeros(len(GRID.rays)).bool(), true_poses()[2])
     assert torch.equal(disparities, graph.warp_disparities(1, true_poses()[2]))
 
 
@@ -68,8 +57,8 @@ def test_a_depth_prior_is_handed_on_but_settles_nothing():
     measured = measured_information(graph, 1)
     graph.keyframes.prior_disparities[1] = 0.2
     assert torch.equal(measured_information(graph, 1), measured)
-    one = torch.zeros_like(measured)
-    one[0] = 2 * SETTLED
+    one = torch.zeros(len(GRID.rays)).bool()
+    one[0] = True
     disparities = hand_on(graph, one, true_poses()[2])
     assert torch.equal(disparities, graph.warp_disparities(1, true_poses()[2]))
 
@@ -79,9 +68,8 @@ def test_where_flow_has_not_settled_a_start_the_prior_stays():
     graph.match([(0, 1), (1, 0), (1, 2), (2, 1)])
     graph.keyframes.prior_disparities[:2] = 0.7
     graph.keyframes.prior_disparities[1, 3] = 0
-    before, settled = graph.keyframes.disparities.clone(), torch.zeros(3, len(GRID.rays)).bool()
-    for index in range(3):
-        settled[index] = measured_information(graph, index) > SETTLED
+    before = graph.keyframes.disparities.clone()
+    settled = torch.stack([settled_cells(graph, index) for index in range(3)])
     assert settled.any() and not settled.all()
     fall_back_on_prior(graph)
     expected = torch.where(settled, before, 0.7)
