@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from minislam.geometry import Camera
+from minislam.geometry import Camera, se3_inverse
 from minislam.geometry.se3 import rotation_from_quaternion
 from minislam.mapping.config import DensityConfig
 from minislam.splatting import GaussianMap, MapOptimizer
@@ -14,7 +14,7 @@ CHILDREN = 2  # of a Gaussian that is split, 3DGS
 SPLIT_SCALE = 0.02  # median depths: larger ones are split, smaller ones cloned; official 0.06 m
 SPLIT_SHRINK = 1.6  # scale of a parent over that of its children, 3DGS
 PRUNE_OPACITY = 0.1  # fainter ones are removed; official 0.005 at first and 0.7 online
-PRUNE_SCALE = 0.2  # median depths: larger ones are removed, official 0.6 m
+PRUNE_SCALE = 0.2  # median depths, or own distance: larger ones are removed, official 0.6 m
 
 
 def screen_gradients(
@@ -72,10 +72,19 @@ def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
     return replace(doubled, means=doubled.means + offsets, log_scales=log_scales)
 
 
-def useful_rows(gaussians: GaussianMap, median_depth: float) -> Tensor:  # (N,) bool
-    """Tell which Gaussians stay: finite, not faint, not huge beside the scene's median depth."""
+def useful_rows(
+    gaussians: GaussianMap,
+    T_camera_world: Tensor,  # (K, 4, 4) of the keyframes that they are anchored to
+    median_depth: float,  # world units, of the scene
+) -> Tensor:  # (N,) bool
+    """Tell which Gaussians stay: finite, not faint, not huge beside the scene or their distance.
+
+    The sky is far, and few Gaussians that are large are enough for it.
+    """
+    centres = se3_inverse(T_camera_world)[gaussians.anchor_keyframe, :3, 3]
+    distances = (gaussians.means - centres.to(gaussians.means)).norm(dim=-1)
     opaque = gaussians.opacities > PRUNE_OPACITY
-    small = gaussians.scales.max(-1).values < PRUNE_SCALE * median_depth
+    small = gaussians.scales.max(-1).values < PRUNE_SCALE * distances.clamp_min(median_depth)
     # One bad number would spread to all pixels of the tiles that list the Gaussian.
     numbers = gaussians.means, gaussians.quats_wxyz, gaussians.colors
     finite = torch.cat(numbers, 1).isfinite().all(-1)

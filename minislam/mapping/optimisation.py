@@ -197,6 +197,7 @@ class JointOptimisation(Stateful):
         """Clone, split and prune, then let the map settle before the MLP learns again."""
         config = self.config.density
         densify(self._optimizer, self._gradients, self.median_depth, config, self._generator)
-        self._optimizer.prune(useful_rows(self.gaussians, self.median_depth))
+        poses = torch.stack([keyframe.T_camera_world for keyframe in self.keyframes])
+        self._optimizer.prune(useful_rows(self.gaussians, poses, self.median_depth))
         self._reset_gradients()
         self._frozen_until = self._iteration + self.config.freeze_iterations

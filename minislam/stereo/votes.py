@@ -50,7 +50,7 @@ def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> Confirm
     known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)
     known &= _window_share(known) >= MIN_SUPPORT
     static = known & (view.cost < CONFIRMING_COST)
-    known &= static.any()  # if nothing matches well, aggregation has only spread a guess
+    known &= _joined(known, static)  # where nothing matches well, aggregation has spread a guess
     return ConfirmedDepth(np.where(known, view.inverse_depth, 0), _window_share(static))
 
 
@@ -80,6 +80,12 @@ def keep_what_stays(
         known &= _window_share(known) >= MIN_SUPPORT
         confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(left), 0)
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
+
+
+def _joined(known: np.ndarray, seeds: np.ndarray) -> np.ndarray:  # (h, w) bool, of known ones
+    """Return the connected parts of what is known that hold a seed."""
+    _, parts = cv2.connectedComponents(known.astype(np.uint8), connectivity=4)
+    return np.isin(parts, np.unique(parts[seeds & known]))
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
