@@ -177,15 +177,15 @@ class Mapper(JointOptimisation):
         """Remove Gaussians that hardly any static pixel shows: no image speaks for them.
 
         They were inserted on an object that moves, before the MLP knew, and where it always covers
-        the view no weight has pulled at them since. Where nothing is static, all stay, and so do
-        those that no keyframe shows.
+        the view no weight has pulled at them since; or steps have carried them out of all views,
+        and they would float in new ones. Where nothing is static, all stay.
         """
         sums = self.gaussians.means.new_zeros(2, len(self.gaussians))
         for of_view in self._workers.stream(safeguards.blending_weights, self._small_views()):
             sums += of_view
         static, whole = sums
         if static.any():
-            self._optimizer.prune(static >= safeguards.LEAST_STATIC * whole)
+            self._optimizer.prune(static > safeguards.LEAST_STATIC * whole)
             self._reset_gradients()
 
     def _small_views(self) -> Iterator[tuple[GaussianMap, Camera, Tensor, Tensor]]:

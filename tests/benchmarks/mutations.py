@@ -162,7 +162,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/mapper.py", "mapping/test_safeguards.py"): [
         ("if static.any():", "if True:"), ("self._remove_unsupported()", "pass"),
-        ("static >= safeguards.LEAST_STATIC * whole", "static < safeguards.LEAST_STATIC * whole"),
+        ("static > safeguards.LEAST_STATIC * whole", "static >= safeguards.LEAST_STATIC * whole"),
     ],
     ("tracking/keyframe_selection.py", "tracking/test_keyframe_selection.py"): [
         ("if not graph.keyframes.has_prior", "if True"),
@@ -250,6 +250,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("stereo/votes.py", "stereo/test_votes.py"): [
         ("expected - 2 * tolerance", "expected"), ("& (other.cost.take(place) < WELL_MATCHED)", ""),
+        ("known &= _joined(", "known |= _joined("),
     ],
     ("evaluation/images.py", "evaluation/test_images_separability.py"): [
         ('("left", "right")', '("left", "left")'),

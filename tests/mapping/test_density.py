@@ -9,6 +9,7 @@ from minislam.splatting import GaussianMap, LearningRates, MapOptimizer
 from tests.helpers import generator
 
 CONFIG = DensityConfig(max_gaussians=10000)
+HERE = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)  # T_camera_world of six keyframes
 
 
 def map_of(scales: list[float], opacity_logit: float = 2.0) -> GaussianMap:
@@ -55,7 +56,18 @@ def test_faint_huge_and_broken_gaussians_are_not_useful():
     gaussians.opacity_logits[1] = -5
     for broken, row in (("means", 3), ("quats_wxyz", 4), ("colors", 5)):
         getattr(gaussians, broken)[row, 0] = torch.nan
-    assert useful_rows(gaussians, 1.0).tolist() == [True, *[False] * 5]
+    assert useful_rows(gaussians, HERE, 1.0).tolist() == [True, *[False] * 5]
+
+
+def test_what_is_far_from_its_keyframe_may_be_as_large_as_it_looks():
+    gaussians = map_of([0.15, 0.25, 5.0, 5.0])  # 2.2, 7.1, 12.2 and 17.4 from the origin
+    assert useful_rows(gaussians, HERE, 1.0).tolist() == [True, True, False, False]
+    gaussians.means[2:] *= 3
+    assert useful_rows(gaussians, HERE, 1.0).tolist() == [True] * 4
+    there = HERE.clone()
+    there[3, :3, 3] = -gaussians.means[3].double()  # its keyframe has gone where it is
+    assert useful_rows(gaussians, there, 1.0).tolist() == [True, True, True, False]
+    assert useful_rows(gaussians, there, 30.0).tolist() == [True] * 4
 
 
 # Identities
@@ -86,4 +98,4 @@ def test_an_empty_map_stays_empty():
     optimizer = MapOptimizer(GaussianMap.empty(), LearningRates())
     densify(optimizer, torch.zeros(2, 0), 1.0, CONFIG, generator(0))
     assert len(optimizer.gaussians) == 0
-    assert useful_rows(optimizer.gaussians, 1.0).tolist() == []
+    assert useful_rows(optimizer.gaussians, HERE, 1.0).tolist() == []

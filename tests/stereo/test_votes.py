@@ -47,6 +47,17 @@ def test_a_depth_that_nobody_else_finds_is_unknown():
     assert (result.inverse_depth[4:8, 8:-8] > 0).all()
 
 
+def test_parts_in_which_nothing_matches_are_guesses():
+    swept = view()
+    swept.cost[:, 24:] = 0.9  # a plain wall at the right, joined to what matches at its left
+    joined = confirmed(swept, others())
+    swept.inverse_depth[:, 24:27] = np.nan
+    apart = confirmed(swept, others())
+    assert (joined.inverse_depth[4:-4, 27:32] > 0).all()
+    assert (apart.inverse_depth[:, 27:] == 0).all()
+    assert (apart.inverse_depth[4:-4, 8:20] > 0).all()
+
+
 def test_a_view_that_looks_through_a_point_refutes_it():
     near = with_square(view(), 0.8)
     agrees, refutes = vote(CAMERA, near, view(0.1))
