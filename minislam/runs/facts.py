@@ -83,6 +83,8 @@ def focal_length_note(slam: Slam) -> str:
         how = "as given"
     elif graph.focal_is_free:
         how = f"estimated from the motion, from {slam.sequence.camera.fx:.1f} px on"
+    elif not slam.tracker.initialised:
+        how = "not sought yet"
     else:
         how = "kept as at the start, because the motion does not tell it"
     return f"{camera.fx:.1f} px for {camera.width}x{camera.height} images, {how}"

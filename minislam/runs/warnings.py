@@ -67,8 +67,8 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         yield (
             f"{BROKEN} at frames {where}: motion or depth contradicts the images, there is too "
             "little parallax to carry the scale across, or the camera follows something that came "
-            "into view. Before and after, scale and direction do not belong together; look at each "
-            f"piece (frames {pieces or 'none'}) by itself. {_FAR_APART}"
+            "into view. Before and after, scale and direction do not belong together; run each "
+            f"piece (frames {pieces or 'none'}) anew, with --start and --max-frames. {_FAR_APART}"
         )
     if graph.failed_adjustments:
         yield (
