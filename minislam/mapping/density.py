@@ -77,10 +77,7 @@ def useful_rows(
     T_camera_world: Tensor,  # (K, 4, 4) of the keyframes that they are anchored to
     median_depth: float,  # world units, of the scene
 ) -> Tensor:  # (N,) bool
-    """Tell which Gaussians stay: finite, not faint, not huge beside the scene or their distance.
-
-    The sky is far, and few Gaussians that are large are enough for it.
-    """
+    """Tell which Gaussians stay: finite, not faint, not huge beside scene and distance."""
     centres = se3_inverse(T_camera_world)[gaussians.anchor_keyframe, :3, 3]
     distances = (gaussians.means - centres.to(gaussians.means)).norm(dim=-1)
     opaque = gaussians.opacities > PRUNE_OPACITY
