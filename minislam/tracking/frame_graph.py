@@ -19,6 +19,8 @@ from minislam.tracking.reprojection import lengths, relative_transforms, reproje
 MIN_VALID_FRACTION = 0.5
 FAR = math.inf  # px, the distance of a pair below this fraction
 COARSE, COARSE_MARGIN = 16, 2.0  # one cell in 16 tells a distance to within a factor of 2
+# New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
+KEPT_FRACTION = 0.8
 AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
 
 
@@ -29,6 +31,7 @@ class FrameGraph(Stateful):
     edges: list[tuple[int, int]] = field(default_factory=list)
     targets: list[Tensor] = field(default_factory=list)  # per edge (2, N) px
     confidences: list[Tensor] = field(default_factory=list)  # per edge (2, N) in [0, 1]
+    matched_ratios: list[float] = field(default_factory=list)  # per edge, in [0, 1]
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         """Take up a saved state."""
@@ -39,22 +42,29 @@ class FrameGraph(Stateful):
         return len(self.edges)
 
     def record(self, edges: list[tuple[int, int]], matches: FlowMatches) -> None:
-        """Store the matches of these edges, adding the edges that are new."""
+        """Store the matches of these edges, adding the edges that are new.
+
+        An edge keeps its old flow if the new one matches clearly less: flow that started from a
+        wrong pose fails, and the old flow is needed to correct that pose.
+        """
         flows = SHELF.rows(torch.cat([matches.targets, matches.confidences], 1))
         position_of = {edge: position for position, edge in enumerate(self.edges)}
-        for edge, flow in zip(edges, flows, strict=True):
+        ratios = matches.matched_ratios.tolist()
+        for edge, flow, ratio in zip(edges, flows, ratios, strict=True):
             target, confidence = flow[:2], flow[2:]
             position = position_of.setdefault(edge, len(self))
             if position == len(self):
                 self.edges.append(edge)
                 self.targets.append(target)
                 self.confidences.append(confidence)
-            else:
+                self.matched_ratios.append(ratio)
+            elif ratio >= KEPT_FRACTION * self.matched_ratios[position]:
                 self.targets[position], self.confidences[position] = target, confidence
+                self.matched_ratios[position] = ratio
 
     def remove_newest(self, count: int) -> None:
         """Remove the `count` edges that were added last."""
-        for column in (self.edges, self.targets, self.confidences):
+        for column in (self.edges, self.targets, self.confidences, self.matched_ratios):
             del column[len(column) - count :]
 
     def select(self, first: int) -> list[int]:

@@ -26,12 +26,13 @@ from minislam.tracking.keyframe_graph import NEIGHBOURHOOD, KeyframeGraph
 from minislam.tracking.keyframe_selection import needs_keyframe
 from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
-from minislam.tracking.safeguards import motion_memory, settling
+from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.diagnostics import Watch
 from minislam.tracking.safeguards.focal_length import seek_readouts
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.scale_drift import undo_scale_drift
+from minislam.tracking.safeguards.settling import SETTLED, Settling
 from minislam.tracking.safeguards.turns import adjust_turns
 from minislam.workers import Workers
 
@@ -63,6 +64,7 @@ class Tracker(Stateful):
     graph: KeyframeGraph
     tracked: list[TrackedFrame]
     watch: Watch
+    _settling: Settling
     mode: Mode = Mode.WAITING
     last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
     _last_global: int = 0  # keyframes at the last online global BA
@@ -82,7 +84,7 @@ class Tracker(Stateful):
         self.config = self.graph.config  # for this kind of flow
         self.keyframes = self.graph.keyframes
         self.grid = self.graph.grid
-        self.tracked, self.watch = [], Watch(self.graph)
+        self.tracked, self.watch, self._settling = [], Watch(self.graph), Settling(self.graph)
         self._features = features
         self._depth_prior = lambda frame: depth_prior(frame, camera)  # as given: one unit of length
         self._predict_static_weight = predict_static_weight
@@ -175,12 +177,12 @@ class Tracker(Stateful):
         edge = len(self.keyframes) - 1, len(self.keyframes)
         matches = self.graph.shutter.corrected(matches, [edge], frame.frame_index)
         if self.initialised:  # before, initialise() will estimate all poses together
-            pose = self.graph.start_pose(matches)
+            information = self._settling.information()
+            pose = self.graph.start_pose(matches, self._settling.certainty(information))
             if self.graph.is_learned:
-                pose, _ = self.graph.fit_pose(frame, [edge[0]], pose)
-            settled = settling.settled_cells(self.graph, edge[0])
-            disparities = settling.hand_on(self.graph, settled, pose)
-            motion_memory.remember(self.graph, matches, pose, settled=settled)
+                pose, _ = self.graph.fit_pose(frame, [len(self.keyframes) - 1], pose)
+            disparities = self._settling.hand_on(information, pose)
+            motion_memory.remember(self.graph, matches, pose, settled=information > SETTLED)
         assert self._chain is not None, "there is a chain from the first frame on"
         self._chain = self._chain.restart()
         self.last_non_keyframe = None
@@ -246,7 +248,7 @@ class Tracker(Stateful):
                 f"{len(self.tracked)} frames; check that the images are not blank and overlap"
             )
         first_geometry(self.graph, workers)
-        settling.fall_back_on_prior(self.graph)
+        self._settling.fall_back_on_prior()
         self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)

@@ -116,7 +116,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("+ DEPTH_ERROR**2 * parallax", ""),
     ],
     ("tracking/safeguards/settling.py", "tracking/safeguards/test_settling.py"): [
-        (") > SETTLED", ") < SETTLED"), ("settled | (", "(1 > 0) | ("),
+        ("information > SETTLED", "information < SETTLED"), (".clamp_min(LEAST)", ""),
     ],
     ("tracking/safeguards/scale_certainty.py", "tracking/safeguards/test_scale_certainty.py"): [
         ("LEAST_C * C[C > 0].mean()", "0"), ("HOLD = 1e-8", "HOLD = 1e-6"),
@@ -216,7 +216,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("tracking/frame_graph.py", "tracking/test_frame_graph.py"): [
         ("(without_rotation, 1 - full_flow_weight)", "(without_rotation, full_flow_weight)"),
-        ("min(abs(i - j) - 2, suppression)", "suppression"),
+        ("min(abs(i - j) - 2, suppression)", "suppression"), ("ratio >= KEPT", "0 >= -KEPT"),
     ],
     ("tracking/reprojection.py", "tracking/safeguards/test_turns.py"): [
         ("torch.zeros_like(disparities), rays, camera)", "disparities, rays, camera)"),

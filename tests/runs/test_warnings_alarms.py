@@ -17,7 +17,9 @@ def said(statuses: list[TrackingStatus], explained: dict[int, float | None]) -> 
         tracked.append(TrackedFrame(index, index / 30, status, 0.5))
         slam.tracker.initialised |= status is TrackingStatus.OK
         if index in explained:
-            diagnostics.append(KeyframeDiagnostics(index, 9.0, explained[index], 0.01, 0.2, 0.9))
+            diagnostics.append(
+                KeyframeDiagnostics(index, 0.5, 9.0, explained[index], 0.01, 0.2, 0.9)
+            )
         texts |= dict.fromkeys(alarms(slam))  # a text that was said is not said again
     return list(texts)
 

@@ -45,6 +45,17 @@ def test_recording_an_edge_again_replaces_its_matches():
     assert graph.targets[0].shape == graph.confidences[0].shape == (2, len(RAYS))
 
 
+def test_an_edge_keeps_what_it_has_against_clearly_less():
+    graph = FrameGraph()
+    graph.record([(0, 1)], matches_of(1.0, 1, ratio=0.5))
+    graph.record([(0, 1)], matches_of(2.0, 1, ratio=0.39))
+    assert float(graph.targets[0][0, 0]) == 1.0  # 0.39 < 0.8 * 0.5
+    graph.record([(0, 1)], matches_of(3.0, 1, ratio=0.41))
+    assert float(graph.targets[0][0, 0]) == 3.0
+    graph.record([(0, 1)], matches_of(4.0, 1, ratio=0.35))
+    assert float(graph.targets[0][0, 0]) == 4.0 and len(graph) == 1  # 0.35 > 0.8 * 0.41
+
+
 def test_recorded_targets_keep_the_order_of_cells():
     graph = FrameGraph()
     targets = GRID.pixels.T[None]

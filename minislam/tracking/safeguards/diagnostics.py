@@ -51,6 +51,7 @@ class KeyframeDiagnostics:
     """How one keyframe is tied to the others, after its adjustment or after the final one."""
 
     frame_index: int
+    matched_ratio: float  # of its cells, in the best of its links [-]
     parallax: float  # px, the largest mean flow by translation alone among its links
     explained: float | None  # of the matched flow from its predecessors; None: no link
     depth_error: float | None  # median relative difference from them; None: they see other things
@@ -135,9 +136,10 @@ def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]
     explained, depth_error = tie_to_predecessors(graph, keyframe)
     sources, targets = ([edges[p][end] for p in positions] for end in (0, 1))
+    ratio = max((graph.links.matched_ratios[p] for p in positions), default=0.0)
     parallax = float(graph.parallaxes(sources, targets).max()) if positions else 0.0
     ties = explained, depth_error, *continuity(graph, keyframe)
-    return KeyframeDiagnostics(frame_index, parallax, *ties)
+    return KeyframeDiagnostics(frame_index, ratio, parallax, *ties)
 
 
 def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:

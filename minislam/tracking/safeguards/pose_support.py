@@ -71,7 +71,7 @@ def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
     Its matched ratio is the part of its weight that the pose explains beyond chance, because a
     network learned only to weigh cells by its confidence.
     """
-    pose = graph.start_pose(matches)
+    pose = graph.start_pose(matches, torch.ones_like(graph.grid.rays[:, 0]))
     ends = torch.stack([graph.keyframes.T_camera_world[-1], pose])
     motion = relative_transforms(ends, [0], [1]).float()
     disparities = graph.keyframes.disparities[-1:]

@@ -39,14 +39,14 @@ HEALTHY, WEAK, UNEXPLAINED, DEEP, UNTIED, NEW, LOOSE = (
 
 def keyframes(*kinds: tuple[float | None, ...]) -> list[KeyframeDiagnostics]:
     """Return diagnostics of keyframes at frames 0, 10, 20, ..."""
-    return [KeyframeDiagnostics(10 * k, 30.0, *kind) for k, kind in enumerate(kinds)]
+    return [KeyframeDiagnostics(10 * k, 0.9, 30.0, *kind) for k, kind in enumerate(kinds)]
 
 
 def test_at_the_truth_all_is_matched_explained_and_of_one_depth():
     graph = true_graph([0, 1, 2])
     graph.match(neighbourhood_edges(0, 3, 2))
     found = diagnose(graph, 2)
-    assert found.frame_index == 2
+    assert found.frame_index == 2 and found.matched_ratio == 1
     assert found.parallax > 3
     assert found.explained == 1
     assert found.depth_error < 1e-3
@@ -198,7 +198,7 @@ def test_a_turning_camera_has_no_parallax_and_keeps_its_disparities():
 
 def test_a_keyframe_without_links_is_reported_as_such():
     found = diagnose(true_graph([0, 1]), 1)
-    assert found.parallax == 0
+    assert found.matched_ratio == 0 and found.parallax == 0
     assert found.explained is None and found.depth_error is None
     assert find_breaks([found]) == [] and not is_unexplained(found)
 
