@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from minislam.api import InputOptions, Run, load, open_sequence, run
+    from minislam.runs.api import InputOptions, Run, load, open_sequence, run
 
 __version__ = "0.1.0"
 __all__ = ["InputOptions", "Run", "__version__", "load", "open_sequence", "run"]
@@ -22,7 +22,7 @@ def __getattr__(name: str) -> Any:
     """Import the door when it is used first: torch alone takes seconds."""
     if name not in __all__:
         raise AttributeError(f"module 'minislam' has no attribute {name!r}")
-    return getattr(import_module("minislam.api"), name)
+    return getattr(import_module("minislam.runs.api"), name)
 
 
 def __dir__() -> list[str]:

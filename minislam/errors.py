@@ -1,5 +1,8 @@
 """The errors a user can meet. Everything else is a bug of ours and may show a traceback."""
 
+import difflib
+from collections.abc import Iterable
+
 # Exit codes: a known error, wrong usage, a run not to be trusted as a whole, an interruption.
 FAILED_EXIT, USAGE_EXIT, LOST_EXIT, INTERRUPTED_EXIT = 1, 2, 3, 130
 
@@ -19,6 +22,12 @@ def require(is_right: bool, wanted: str, found: object) -> None:
     """
     if not is_right:
         raise InputError(f"expected {wanted}, found {found}")
+
+
+def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return a hint at the most similar of the known names, or what else to say."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"the nearest is {near[0]}" if near else otherwise
 
 
 class TrackingLost(MinislamError):

@@ -3,7 +3,6 @@
 Settings stand in trees of dataclasses; names with dots reach every part of one: `tracking.window`.
 """
 
-import difflib
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -12,7 +11,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin
 
-from minislam.errors import InputError, require
+from minislam.errors import InputError, nearest, require
 
 Tree = TypeVar("Tree")  # a dataclass whose fields are values or again dataclasses
 
@@ -64,8 +63,8 @@ def with_values(tree: Tree, values: Mapping[str, Any]) -> Tree:
     for name, value in values.items():
         is_empty_part = value == {} and any(other.startswith(f"{name}.") for other in known)
         if name not in known and not is_empty_part:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
-            raise InputError(f"expected a known setting, found {name!r}; the nearest is {near[0]}")
+            hint = nearest(name, known, "minislam settings lists all of them")
+            raise InputError(f"expected a known setting, found {name!r}; {hint}")
     return _replaced(tree, values)
 
 

@@ -22,15 +22,15 @@ from minislam.errors import MinislamError
 from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
-from minislam.memory import SHELF
 from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, Keyframe, Sequence, Trajectory, required_mask
+from minislam.state.memory import SHELF
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import on_backdrop, swept_frames, with_swept_depth
-from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.stereo.second_adjustment import adjust_again, sweep_frames
+from minislam.tracking.safeguards.exposure import keyframe_exposures, with_exposure
 from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
 from minislam.tracking.safeguards.focal_length import (
     FocalLengthFit,

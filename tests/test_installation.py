@@ -19,7 +19,7 @@ WITHOUT_POSIX = """
 import sys
 sys.modules["resource"] = sys.modules["fcntl"] = None
 from minislam.cli.main import main
-from minislam.memory import peak_memory_mb
+from minislam.state.memory import peak_memory_mb
 assert peak_memory_mb() is None
 sys.exit(main(["doctor"]))
 """

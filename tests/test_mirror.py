@@ -15,7 +15,9 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "splatting/constants": "splatting/test_projection.py",
     "splatting/tile_loop": "splatting/test_renderer.py",
     "tracking/config": "test_config.py",
+    "tracking/bundle_problem": "tracking/test_bundle_adjustment.py",
     "tracking/reference": "tracking/test_bundle_adjustment.py",
+    "runs/api": "runs/test_loaded.py",
     "priors/interfaces": "priors/test_flow.py",  # protocols and one record
 }
 

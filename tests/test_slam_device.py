@@ -71,10 +71,11 @@ ROOMS_BORDERS = {
     "priors/dense_flow.py", "priors/flow.py", "priors/features.py",
     "tracking/bundle_adjustment.py", "tracking/frame_graph.py", "tracking/keyframe_graph.py",
     "tracking/pose_from_flow.py", "tracking/schur.py", "tracking/trajectory.py",
-    "tracking/safeguards/motion_memory.py", "tracking/safeguards/pose_support.py",
+    "tracking/safeguards/exposure.py", "tracking/safeguards/motion_memory.py",
+    "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py", "tracking/safeguards/rolling_shutter.py",
     "mapping/views.py", "mapping/safeguards.py", "stereo/second_adjustment.py",
-    "stereo/dense_structure.py", "stereo/exposure.py", "slam.py", "splatting/gaussians.py",
+    "stereo/dense_structure.py", "slam.py", "splatting/gaussians.py",
     "splatting/tiles.py",  # how long the lists are
 }  # fmt: skip
 # What stays on the CPU: random numbers, so that no draw depends on the device.

@@ -15,11 +15,11 @@ from minislam.data.options import InputOptions
 from minislam.data.sequence import open_sequence
 from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.images import psnr
-from minislam.memory import SHELF
 from minislam.priors.depth import SensorDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.networks.droid import DroidFlowConfig
 from minislam.slam import Priors, Slam
+from minislam.state.memory import SHELF
 from minislam.stereo import second_adjustment
 from tests.tracking.oracle import Clip, OracleFlow, Skill
 

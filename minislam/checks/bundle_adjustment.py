@@ -10,7 +10,7 @@ from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normal
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse
 from minislam.tracking import reprojection
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.disparity_prior import DepthView, depth_consistency
 from minislam.tracking.grid import Grid
 from minislam.tracking.reference import dense_normal_equations, moved

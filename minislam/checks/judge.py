@@ -19,7 +19,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import minislam
 from minislam import checks
 from minislam.checks.calls import Stopped, call
 from minislam.checks.grading import SECONDS, WRONG, Verdict
@@ -27,7 +26,7 @@ from minislam.checks.points import EXERCISES, MAY_CALL, MAY_NOT_CALL, Exercise
 from minislam.checks.submission import SUBMITTED, Part, parts_of
 
 REFUSED = "refused"
-PACKAGE = str(Path(minislam.__file__).parent)
+PACKAGE = str(Path(checks.__file__).parents[1])
 BY_KEY = {exercise.key: exercise for exercise in EXERCISES}
 
 

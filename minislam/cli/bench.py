@@ -13,9 +13,9 @@ from pathlib import Path
 
 from minislam.cli.help import UsageError
 from minislam.cli.options import input_options, lpips_of, prior_choice, settings
-from minislam.cli.progress import ending_signals, say
 from minislam.data.files import make_folder, read_json, write_json, write_text
 from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError
+from minislam.runs.progress import ending_signals, say
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
 LEGEND = """\

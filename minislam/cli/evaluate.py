@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minislam.cli.progress import say
 from minislam.data.files import atomic_write, require_new, write_json
 from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
+from minislam.runs.progress import say
 
 if TYPE_CHECKING:
     from minislam.evaluation.trajectory import Alignment, TrajectoryError

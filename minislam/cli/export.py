@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from minislam.cli.progress import ProgressLine, say
 from minislam.data.files import atomic_write, require_free, require_new
 from minislam.errors import InputError
+from minislam.runs.progress import ProgressLine, say
 
 EPILOG = """\
 The world has the axes of the first camera, so y points down; the unit of length is printed.

@@ -126,7 +126,7 @@ def _row(line: bytes) -> dict[str, Any]:
 
 def _run_judge(folder: Path, seed: int | None) -> str:
     """Run minislam.checks.judge; return a sentence for the exercise it did not come back from."""
-    root = str(Path(minislam.__file__).parent.parent)
+    root = str(Path(minislam.__file__).parents[1])
     environment = {name: v for name, v in os.environ.items() if not name.startswith("MINISLAM_S")}
     path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
     environment |= {"PYTHONPATH": path, "MPLBACKEND": "Agg"}

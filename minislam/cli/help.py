@@ -3,7 +3,6 @@
 import argparse
 import difflib
 import textwrap
-from collections.abc import Iterable
 from typing import Any
 
 from minislam.errors import InputError
@@ -123,9 +122,3 @@ def unknown_option(found: str, parser: argparse.ArgumentParser) -> UsageError:
         near = difflib.get_close_matches(name, known, n=1)
     hint = f"the nearest is {known[near[0]]}" if near else parser.get_default("hint") or otherwise
     return UsageError(f"expected a known option, found {name}; {hint}")
-
-
-def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Return a hint at the most similar of the known names, or what else to say."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"the nearest is {near[0]}" if near else otherwise

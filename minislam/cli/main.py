@@ -11,10 +11,10 @@ from contextlib import suppress
 from importlib import import_module
 
 import minislam
-from minislam.cli.help import UsageError, nearest, unknown_option
+from minislam.cli.help import UsageError, unknown_option
 from minislam.cli.options import take_settings
-from minislam.cli.progress import ProgressLine, ending_signals, say
-from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, USAGE_EXIT, MinislamError
+from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, USAGE_EXIT, MinislamError, nearest
+from minislam.runs.progress import ProgressLine, ending_signals, say
 
 # The modules of minislam.cli that add the commands, in the order of the help.
 COMMANDS = "run render export evaluate settings weights priors bench notebooks grade doctor".split()

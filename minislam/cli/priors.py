@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 from minislam.cli import options
 from minislam.cli.help import add_command
-from minislam.cli.progress import ProgressLine
 from minislam.data.files import atomic_file, make_folder, read_text, write_text
 from minislam.data.options import require_source
 from minislam.errors import InputError
 from minislam.parameters import user_path
+from minislam.runs.progress import ProgressLine
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -3,8 +3,8 @@
 import argparse
 
 from minislam.cli.options import size_of
-from minislam.cli.progress import ProgressLine, say
 from minislam.data.files import require_new
+from minislam.runs.progress import ProgressLine, say
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 from minislam.cli import options
 from minislam.cli.help import RUN_EPILOG, SHORT_EPILOG, add_command
 from minislam.cli.log import recorded
-from minislam.cli.progress import ProgressLine, ending_signals, plan_of, say
 from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
 from minislam.errors import InputError
 from minislam.parameters import require_bounds
+from minislam.runs.progress import ProgressLine, ending_signals, plan_of, say
 
 DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
 

@@ -5,8 +5,7 @@ import fnmatch
 import shutil
 import textwrap
 
-from minislam.cli.help import nearest
-from minislam.errors import InputError
+from minislam.errors import nearest, require
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -29,11 +28,8 @@ def _settings(args: argparse.Namespace) -> None:
 
     settings = {name: (value, entry.metadata) for name, value, entry in leaves(SlamConfig())}
     found = fnmatch.filter(settings, f"*{args.pattern}*")
-    if not found:
-        hint = nearest(args.pattern, settings, "minislam settings lists all of them")
-        raise InputError(
-            f"expected part of a setting's name, found {args.pattern!r} in none; {hint}"
-        )
+    hint = nearest(args.pattern, settings, "minislam settings lists all of them")
+    require(bool(found), "part of a setting's name", f"{args.pattern!r} in none; {hint}")
     width = min(shutil.get_terminal_size().columns, 100)
     for name in found:
         value, about = settings[name]

@@ -5,11 +5,10 @@ import hashlib
 from functools import partial
 from pathlib import Path
 
-from minislam.cli.help import nearest
-from minislam.cli.progress import ProgressLine
-from minislam.errors import InputError, MinislamError, require
+from minislam.errors import InputError, MinislamError, nearest, require
 from minislam.parameters import user_path
 from minislam.priors.names import PublishedFile, published_files
+from minislam.runs.progress import ProgressLine
 
 CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
 
@@ -39,10 +38,9 @@ def _fetch(args: argparse.Namespace) -> None:
     from minislam.data.download import download
 
     known = published_files()
-    unknown = [name for name in args.names if name not in known]
-    if unknown:
-        hint = nearest(unknown[0], known, "see which there are")
-        raise InputError(f"expected names of minislam weights list, found {unknown[0]!r}; {hint}")
+    for name in args.names:
+        hint = nearest(name, known, "see which there are")
+        require(name in known, "names of minislam weights list", f"{name!r}; {hint}")
     rows, progress = [known[name] for name in args.names], ProgressLine()
 
     def show(file: str, done: int, total: int) -> None:  # bytes

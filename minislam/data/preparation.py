@@ -10,7 +10,7 @@ import numpy as np
 from minislam.data.options import MINIMUM_SIDE
 from minislam.errors import InputError
 from minislam.geometry import BrownDistortion, Camera
-from minislam.memory import Shelf, release
+from minislam.state.memory import Shelf, release
 
 Window = tuple[int, int, int, int]  # left, top, width, height px
 

@@ -19,9 +19,9 @@ from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
-from minislam.memory import release
 from minislam.records import Keyframe, Progress
 from minislam.splatting import GaussianMap, Rendering
+from minislam.state.memory import release
 from minislam.uncertainty.losses import FAR_FACTOR
 
 MOST_FAR = 0.99  # of the largest depth that is inserted: where a gap, or what is farther, is put

@@ -13,9 +13,9 @@ from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
 from minislam.mapping.views import Comparison, ViewGradients, view_gradients, view_of
 from minislam.mapping.window import in_turn
-from minislam.memory import SHELF, release
 from minislam.records import Keyframe, MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
+from minislam.state.memory import SHELF, release
 from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.uncertainty import RenderingError, UncertaintyConfig, UncertaintyMLP, beta_of_mask
 from minislam.uncertainty.training import UncertaintyTrainer

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from minislam.memory import SHELF, release
 from minislam.priors import grid_flow
 from minislam.priors.dense_flow import composed_flow, dense_from_grid, grayscale, reverse_flow
 from minislam.priors.interfaces import FlowMatches
+from minislam.state.memory import SHELF, release
 from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target

@@ -17,15 +17,15 @@ from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MappedView, ate_cm, measure_run
 from minislam.mapping.mapper import Mapper, surface_depth
-from minislam.memory import peak_memory_mb
 from minislam.priors.choice import PriorChoice
 from minislam.records import Keyframe, Trajectory
 from minislam.runs.resume import Checkpoints
 from minislam.runs.warnings import shown_static, warnings
 from minislam.slam import Slam
 from minislam.splatting import Rendering
-from minislam.stereo.exposure import with_exposure
+from minislam.state.memory import peak_memory_mb
 from minislam.tracking.optimisation import bundle_problem, typical_residual
+from minislam.tracking.safeguards.exposure import with_exposure
 
 MOST_UNSEEN = 20  # frames, evenly spread, that the map is compared with
 

@@ -63,7 +63,7 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         )
     if watch.breaks:
         where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
-        pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments)
+        pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments if first < last)
         yield (
             f"{BROKEN} at frames {where}: motion or depth contradicts the images, there is too "
             "little parallax to carry the scale across, or the camera follows something that came "

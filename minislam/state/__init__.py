@@ -1,1 +1,1 @@
-"""A resumed run needs the state of its parts (stateful.py) and its finished steps (steps.py)."""
+"""The state of a run: its memory (memory.py), its parts (stateful.py), its steps (steps.py)."""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from minislam.memory import give_back_freed
+from minislam.state.memory import give_back_freed
 from minislam.state.stateful import Stateful
 
 

@@ -7,5 +7,4 @@ Not a part of the paper, which takes its depth from a network alone. Read the fi
     votes              which depths other views confirm: those of what stands still
     dense_structure    which frames are swept, and against which others
     second_adjustment  the final adjustment again, on what is confirmed
-    exposure           how bright each keyframe is, from the matches of the adjustment
 """

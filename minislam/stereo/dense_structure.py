@@ -13,8 +13,8 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.images import resample
-from minislam.memory import SHELF
 from minislam.records import Frame, Keyframe, Progress
+from minislam.state.memory import SHELF
 from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep

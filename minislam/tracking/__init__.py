@@ -4,6 +4,7 @@ Reading order:
 
     grid                the cells of the image on which everything is measured
     reprojection        where a cell of one keyframe is seen in another, with derivatives
+    bundle_problem      what a bundle adjustment is given, and its unknowns
     bundle_adjustment   dense bundle adjustment, Eq. (5); reference.py is its slow twin
     schur               its normal equations, assembled and freed of the disparities
     disparity_prior     the mask M of the disparity prior, Eq. (8)

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from minislam.geometry import Camera, se3_adjoint, se3_exp, se3_normalised
+from minislam.geometry import se3_adjoint, se3_exp, se3_normalised
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal, within_reach
 from minislam.tracking.safeguards.parts import SourceBlocks, in_parts, joined
-from minislam.tracking.safeguards.robust import RobustKernel, edge_losses
-from minislam.tracking.safeguards.rolling_shutter import Readout, with_readout
+from minislam.tracking.safeguards.robust import edge_losses
+from minislam.tracking.safeguards.rolling_shutter import with_readout
 from minislam.tracking.schur import NormalEquations, marginalised, source_blocks
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
@@ -27,26 +28,6 @@ DISPARITY_DAMPING = 1e-2  # fraction of the mean diagonal C that is added to all
 MIN_RAISED_DAMPING = 1e-6  # relative; an undamped solve that fails is tried again with this
 LEAST_SAVING = 1e-6  # of the cost: a step that saves no more is the last; 1e-9 gave the same poses
 MAX_DAMPING = 1e6  # relative; a step damped more than this would not move anything
-
-
-@dataclass(frozen=True)
-class BundleProblem:
-    """Everything that is constant while poses and disparities are optimised."""
-
-    camera: Camera
-    rays: Tensor  # (N, 3) of the grid cells, z = 1
-    edges_source: Tensor  # (E,) int64 keyframe index, sorted or not
-    edges_target: Tensor  # (E,) int64
-    targets: Tensor  # (E, 2, N) px, flow targets p~
-    weights: Tensor  # (E, 2, N) Sigma / beta^2, >= 0
-    prior_disparities: Tensor  # (K, N) 1 / D~ [1/world unit]
-    prior_weights: Tensor  # (K, N) lambda_4 M [px^2 per disparity^2], 0 where there is no prior
-    free_poses: Tensor  # (K,) bool
-    free_disparities: Tensor  # (K,) bool
-    robust: RobustKernel | None = None  # None: plain least squares
-    disparity_damping: Tensor | None = None  # (K, N) px^2; None: a fraction of the mean diagonal
-    free_focal: bool = False  # f is one more unknown, not in the paper
-    shutter: Tensor | None = None  # (E, 2, 2, N) px/s; then the readout is free, too
 
 
 @dataclass(frozen=True)
@@ -58,16 +39,6 @@ class BundleReport:
     cost_after: float  # px^2, never larger than cost_before
     iterations: int  # accepted steps
     damping: float  # at the end
-
-
-@dataclass(frozen=True)
-class BundleState:
-    """The unknowns."""
-
-    T_camera_world: Tensor  # (K, 4, 4) float64
-    disparities: Tensor  # (K, N) 1/world unit
-    log_focal: float = 0.0  # s = ln(f / f of the problem's camera)
-    readout: Readout = (0.0, 0.0)  # s, beside that of the problem's targets
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.memory import SHELF
 from minislam.priors.interfaces import FlowMatches
+from minislam.state.memory import SHELF
 from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from minislam.geometry import se3_interpolate, se3_inverse
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.bundle_adjustment import BundleState
+from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import start_pose, warp_disparities

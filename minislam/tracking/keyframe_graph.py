@@ -11,11 +11,12 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_interpolate, se3_inverse
 from minislam.geometry.camera import pixel_scale
-from minislam.memory import give_back_freed
 from minislam.priors.interfaces import FlowEstimator, FlowMatches
 from minislam.records import Frame
+from minislam.state.memory import give_back_freed
 from minislam.state.stateful import Stateful
-from minislam.tracking.bundle_adjustment import BundleReport, BundleState, bundle_adjust, residuals
+from minislam.tracking.bundle_adjustment import BundleReport, bundle_adjust, residuals
+from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import (
     FAR,

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from minislam.memory import SHELF, give_back_freed
 from minislam.records import Frame
+from minislam.state.memory import SHELF, give_back_freed
 from minislam.state.stateful import FrameOf, Stateful, Tree
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from minislam.memory import release, stack
 from minislam.records import Progress
+from minislam.state.memory import release, stack
 from minislam.tracking.bundle_adjustment import (
     BundleProblem,
     BundleReport,

@@ -7,15 +7,12 @@ Each disparity appears in one source frame only, so its block C is diagonal and 
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from minislam.tracking.bundle_problem import BundleProblem
 from minislam.tracking.safeguards.parts import SourceBlocks
-
-if TYPE_CHECKING:
-    from minislam.tracking.bundle_adjustment import BundleProblem
 
 
 @dataclass(frozen=True)
@@ -30,7 +27,7 @@ class NormalEquations:
 
 
 def marginalised(
-    problem: "BundleProblem",
+    problem: BundleProblem,
     equations: NormalEquations,
     inverse_C: Tensor,  # (K, N)
 ) -> tuple[Tensor, Tensor]:  # (U, U), (U,) float64
@@ -47,13 +44,13 @@ def marginalised(
     return S, b
 
 
-def _pose_slots(problem: "BundleProblem") -> Tensor:
+def _pose_slots(problem: BundleProblem) -> Tensor:
     """Return the position of every keyframe among the free poses, -1 for a fixed one."""
     return torch.where(problem.free_poses, torch.cumsum(problem.free_poses.long(), 0) - 1, -1)
 
 
 def assemble_poses(
-    problem: "BundleProblem", A: Tensor, b: Tensor, adjoint: Tensor
+    problem: BundleProblem, A: Tensor, b: Tensor, adjoint: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Sum J^T W J = A and J^T W r = b of all edges over the free poses, targets and sources.
 
@@ -82,7 +79,7 @@ def assemble_poses(
 
 
 def source_blocks(
-    problem: "BundleProblem", E_target: Tensor, E_source: Tensor
+    problem: BundleProblem, E_target: Tensor, E_source: Tensor
 ) -> list[tuple[int, Tensor, Tensor]]:
     """Collect for each source frame the coupling of its disparities with the free poses.
 

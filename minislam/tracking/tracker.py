@@ -8,7 +8,6 @@ from torch import Tensor
 
 from minislam.errors import TrackingLost
 from minislam.geometry import Camera
-from minislam.memory import release
 from minislam.priors.interfaces import (
     DepthPrior,
     FeatureExtractor,
@@ -17,6 +16,7 @@ from minislam.priors.interfaces import (
     FlowMatches,
 )
 from minislam.records import Frame, Progress, TrackedFrame, TrackingStatus
+from minislam.state.memory import release
 from minislam.state.stateful import FrameOf, Stateful, Tree, to_tree
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import mask_priors

@@ -20,7 +20,8 @@ from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.records import Frame
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
+from minislam.tracking.bundle_adjustment import bundle_adjust
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.grid import Grid
 from minislam.tracking.reference import dense_step

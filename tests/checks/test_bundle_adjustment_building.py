@@ -6,7 +6,7 @@ import torch
 
 from minislam.checks import check_bundle_adjustment, check_prior_mask, check_robust_weight
 from minislam.geometry import se3_adjoint, se3_exp, se3_inverse, transform_points
-from minislam.tracking.bundle_adjustment import BundleState
+from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.reprojection import relative_transforms, reproject_with_jacobians
 from tests.helpers import assert_variants
 

@@ -5,8 +5,9 @@ import argparse
 import pytest
 
 from data_synth import SEQUENCES
-from minislam.cli.help import ESSENTIAL, RUN_EPILOG, nearest, unknown_option
+from minislam.cli.help import ESSENTIAL, RUN_EPILOG, unknown_option
 from minislam.cli.main import main
+from minislam.errors import nearest
 
 
 def help_of(monkeypatch, capsys, *arguments: str) -> str:

@@ -6,9 +6,9 @@ import torch
 from minislam.errors import InputError
 from minislam.geometry import se3_exp
 from minislam.mapping.views import view_of
-from minislam.memory import SHELF
 from minislam.records import Frame
 from minislam.splatting.constants import MIN_ALPHA
+from minislam.state.memory import SHELF
 from minislam.uncertainty import UncertaintyConfig
 from tests.mapping.plane_scene import CAMERA, CONFIG, make_mapper, wall_keyframe
 

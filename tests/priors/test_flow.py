@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from minislam import memory
 from minislam.geometry import Camera
-from minislam.memory import SHELF
 from minislam.priors import flow as flow_module
 from minislam.priors.dense_flow import (
     composed_flow,
     grayscale,
 )
 from minislam.priors.flow import FlowChain
+from minislam.state import memory
+from minislam.state.memory import SHELF
 from tests.priors.patterns import (
     CONFIG,
     GRID,

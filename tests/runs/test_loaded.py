@@ -11,12 +11,12 @@ import pytest
 import torch
 
 import minislam
-from minislam import api
 from minislam.data.files import write_json
 from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.mapping import Mapper
+from minislam.runs import api
 from minislam.tracking.grid import Grid
 from minislam.tracking.safeguards import diagnostics
 from minislam.tracking.safeguards.rolling_shutter import ImageMotion

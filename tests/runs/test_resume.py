@@ -14,9 +14,9 @@ import torch
 
 import minislam
 from minislam.cli.main import main
-from minislam.cli.progress import ProgressLine
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.run_folder import RunFolder
+from minislam.runs.progress import ProgressLine
 
 pytestmark = pytest.mark.slow
 

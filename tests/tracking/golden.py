@@ -9,7 +9,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.geometry.se3 import make_transform, rotation_from_quaternion
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 
 FILE = Path(__file__).parents[1] / "data" / "tracking" / "droid_ba.npz"
 CONFIDENCE_SCALE = 0.001  # the official code multiplies confidences by this

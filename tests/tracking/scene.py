@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, normal_equations
+from minislam.tracking.bundle_adjustment import normal_equations
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.schur import assemble_poses
 from tests.helpers import generator

@@ -4,8 +4,8 @@ from copy import deepcopy
 
 import pytest
 
-from minislam import memory
-from minislam.memory import SHELF
+from minislam.state import memory
+from minislam.state.memory import SHELF
 from minislam.tracking import frame_graph, keyframe_graph
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import FrameGraph

@@ -5,8 +5,8 @@ from copy import deepcopy
 import pytest
 import torch
 
-from minislam.memory import SHELF
 from minislam.records import Frame
+from minislam.state.memory import SHELF
 from minislam.tracking import keyframes
 from minislam.tracking.keyframes import KeyframeStore
 from tests.tracking.scene import normal, poses_on_an_arc, uniform

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
 from minislam.tracking import frame_graph
-from minislam.tracking.bundle_adjustment import BundleState, residuals
+from minislam.tracking.bundle_adjustment import residuals
+from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph

@@ -15,5 +15,6 @@ focal_column     the focal length as one more unknown of the bundle adjustment
 lens             finds a lens that bends straight lines although no calibration says so
 scale_certainty  how exactly the flow hands the scale on, by the covariance of the poses
 scale_drift      undoes a drift of the scale that a depth prior tells
+exposure         how bright each keyframe is, from the matches of the adjustment
 rolling_shutter  the time to read an image, as unknowns too; images as a global shutter sees them
 """

@@ -18,7 +18,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleReport, BundleState
+from minislam.tracking.bundle_adjustment import BundleReport
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem

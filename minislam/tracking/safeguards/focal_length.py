@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleState, bundle_adjust
+from minislam.tracking.bundle_adjustment import bundle_adjust
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.safeguards.parts import Start, of_cells, of_rows

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from minislam.errors import MinislamError
 from minislam.geometry import Camera
-from minislam.tracking.bundle_adjustment import BundleProblem
+from minislam.tracking.bundle_problem import BundleProblem
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing
 from minislam.tracking.safeguards import focal_length

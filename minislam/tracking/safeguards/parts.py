@@ -6,15 +6,13 @@ because arrays of few megabytes are taken from memory that was used before.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from minislam.memory import Shelf, give_back_freed, release
-
-if TYPE_CHECKING:
-    from minislam.tracking.bundle_adjustment import BundleProblem, BundleState
+from minislam.state.memory import Shelf, give_back_freed, release
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 
 CELLS_AT_ONCE = 50_000  # of all edges of a part: 200 bytes a cell
 PARTS_UNTIDIED = 16  # thousands of edges in parts would leave hundreds of MB of holes
@@ -23,13 +21,13 @@ _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
 _OF_CELLS = "targets weights shutter prior_disparities prior_weights disparity_damping"
 
-Start = tuple["BundleProblem", "BundleState"]  # a problem, and the state it is adjusted from
+Start = tuple[BundleProblem, BundleState]  # a problem, and the state it is adjusted from
 
 
 class SourceBlocks:
     """Couplings of disparities and poses by source frame; those of thousands of edges in a file."""
 
-    def __init__(self, problem: "BundleProblem") -> None:
+    def __init__(self, problem: BundleProblem) -> None:
         self._blocks: list[tuple[int, Tensor, Tensor]] = []
         self._shelf = Shelf() if problem.weights[:, 0].numel() > CELLS_COUPLED else None
 
@@ -46,7 +44,7 @@ class SourceBlocks:
                 release()
 
 
-def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"]]:
+def in_parts(problem: BundleProblem) -> Iterator[tuple[Tensor, BundleProblem]]:
     """Yield positions (E',) of some edges, and the problem of these edges alone.
 
     The edges of one source stay together, because its disparities couple them.
@@ -57,10 +55,8 @@ def in_parts(problem: "BundleProblem") -> Iterator[tuple[Tensor, "BundleProblem"
         if len(parts) > PARTS_UNTIDIED and part % PARTS_UNTIDIED == 0:
             give_back_freed()
         edges = (number == part).nonzero()[:, 0]
-        if len(edges) == len(number):
-            yield edges, problem
-        else:
-            yield edges, replace(problem, **_chosen(problem, _OF_EDGES, edges))
+        every = len(edges) == len(number)
+        yield edges, problem if every else replace(problem, **_chosen(problem, _OF_EDGES, edges))
 
 
 def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:
@@ -70,7 +66,7 @@ def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:
     return [torch.cat(column)[order] for column in columns]
 
 
-def of_rows(problem: "BundleProblem", state: "BundleState", rows: Tensor) -> Start:
+def of_rows(problem: BundleProblem, state: BundleState, rows: Tensor) -> Start:
     """Return problem and state of some keyframes (K',) alone; all edges must be among them."""
     values = _chosen(problem, _OF_KEYFRAMES, rows)
     for name in ("edges_source", "edges_target"):
@@ -80,14 +76,14 @@ def of_rows(problem: "BundleProblem", state: "BundleState", rows: Tensor) -> Sta
     return replace(problem, **values), state
 
 
-def of_cells(problem: "BundleProblem", state: "BundleState", cells: Tensor) -> Start:
+def of_cells(problem: BundleProblem, state: BundleState, cells: Tensor) -> Start:
     """Return problem and state of some cells (N',) of the grid alone."""
     values = _chosen(problem, _OF_CELLS, (..., cells))
     problem = replace(problem, rays=problem.rays[cells], **values)
     return problem, replace(state, disparities=state.disparities[:, cells])
 
 
-def _chosen(problem: "BundleProblem", names: str, index: Any) -> dict[str, Any]:
+def _chosen(problem: BundleProblem, names: str, index: Any) -> dict[str, Any]:
     """Return these columns of a problem at an index; one that is None stays None."""
     chosen = {}
     for name in names.split():

@@ -24,10 +24,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.memory import SHELF, stack
 from minislam.priors.dense_flow import dense_from_grid, grayscale, residual_flow, warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
+from minislam.state.memory import SHELF, stack
 from minislam.state.stateful import Stateful
 from minislam.tracking.frame_graph import FrameGraph, at_once
 from minislam.tracking.grid import Grid

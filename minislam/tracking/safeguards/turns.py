@@ -7,7 +7,8 @@ from statistics import median
 import torch
 
 from minislam.tracking import pose_from_flow
-from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, residuals
+from minislam.tracking.bundle_adjustment import bundle_adjust, residuals
+from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
 from minislam.tracking.pose_from_flow import POSE_ITERATIONS, ROBUST_WIDENING

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import Camera, se3_exp
-from minislam.tracking.bundle_adjustment import BundleState, bundle_adjust, normal_equations
+from minislam.tracking.bundle_adjustment import bundle_adjust, normal_equations
+from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.reference import moved, predicted_positions
 from minislam.tracking.reprojection import reproject
 from minislam.tracking.safeguards.focal_column import focal_jacobian, within_reach, zoomed

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from minislam.geometry import se3_exp
-from minislam.tracking.bundle_adjustment import BundleProblem, BundleReport, BundleState
+from minislam.tracking.bundle_adjustment import BundleReport
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import warm_up_ba

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from minislam.tracking.bundle_adjustment import BundleProblem
+from minislam.tracking.bundle_problem import BundleProblem
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.reprojection import relative_transforms, reproject
 from minislam.tracking.safeguards import lens as lens_module

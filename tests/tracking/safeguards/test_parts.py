@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from minislam import memory
+from minislam.state import memory
 from minislam.tracking import optimisation
 from minislam.tracking.bundle_adjustment import (
     bundle_adjust,

@@ -11,7 +11,8 @@ from minislam.geometry import se3_exp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
 from minislam.tracking import frame_graph
-from minislam.tracking.bundle_adjustment import BundleProblem, bundle_adjust
+from minislam.tracking.bundle_adjustment import bundle_adjust
+from minislam.tracking.bundle_problem import BundleProblem
 from minislam.tracking.frame_graph import FrameGraph
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.reference import moved, predicted_positions

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
-from minislam.tracking.bundle_adjustment import BundleState
+from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.diagnostics import (

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from minislam.records import Frame
-from minislam.stereo.exposure import keyframe_exposures, with_exposure
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.safeguards.exposure import keyframe_exposures, with_exposure
 from tests.tracking.wall import true_graph
 
 FRAMES = [0, 3, 6, 9]

@@ -11,10 +11,10 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from minislam.cli.progress import ENDING, ProgressLine, ending_signals, plan_of, say
 from minislam.config import PRESETS, preset
 from minislam.geometry import Camera
 from minislam.priors.names import PriorChoice
+from minislam.runs.progress import ENDING, ProgressLine, ending_signals, plan_of, say
 
 
 def test_off_a_terminal_a_stage_prints_a_line_every_tenth(monkeypatch, capsys):

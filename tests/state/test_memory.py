@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from minislam import memory
-from minislam.memory import Shelf, give_back_freed, peak_memory_mb, release, stack
+from minislam.state import memory
+from minislam.state.memory import Shelf, give_back_freed, peak_memory_mb, release, stack
 
 
 def noise(*shape: int) -> torch.Tensor:
@@ -208,7 +208,7 @@ def test_peak_memory_is_in_megabytes(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.slow
 def test_the_memory_of_the_process_that_starts_a_run_is_not_counted():
-    child = "from minislam.memory import peak_memory_mb; print(peak_memory_mb() or 0)"
+    child = "from minislam.state.memory import peak_memory_mb; print(peak_memory_mb() or 0)"
     parent = (
         "import subprocess, sys\nlarge = bytearray(b'1') * 900_000_000\n"
         f"subprocess.run([sys.executable, '-c', {child!r}])"
@@ -221,7 +221,8 @@ def test_the_memory_of_the_process_that_starts_a_run_is_not_counted():
 def test_without_the_counter_of_unix_the_package_still_imports():
     program = (
         "import sys; sys.modules['resource'] = None\n"
-        "import minislam.api; from minislam.memory import peak_memory_mb\nprint(peak_memory_mb())"
+        "import minislam.runs.api; from minislam.state.memory import peak_memory_mb\n"
+        "print(peak_memory_mb())"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout == "None\n", done.stderr

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.memory import release
 from minislam.records import Frame, Keyframe
+from minislam.state.memory import release
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.robust import weighted_median
 

@@ -9,16 +9,15 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from minislam.cli.help import nearest
-from minislam.cli.progress import ProgressLine, SilentProgress, ending_signals, plan_of
 from minislam.config import preset as preset_of
 from minislam.config import settings_of, with_settings
 from minislam.data.options import InputOptions, default_depth
 from minislam.data.sequence import open_sequence
-from minislam.errors import InputError
+from minislam.errors import InputError, nearest
 from minislam.parameters import user_path, with_values
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run
+from minislam.runs.progress import ProgressLine, SilentProgress, ending_signals, plan_of
 from minislam.runs.run import default_output, run_in_folder
 
 _INPUTS = {field.name for field in fields(InputOptions)}
