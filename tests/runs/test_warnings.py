@@ -26,7 +26,7 @@ WARNINGS = [
     ),
     ({"lost": 2, "ends_lost": True}, "16. If the images lie far apart, give more frames"),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
-    ({"breaks": [Break(2, 2)]}, "run each piece (frames 0 to 1, 3 to 3) anew, with --start"),
+    ({"breaks": [Break(2, 2)]}, "run each piece (frames 0 to 1) anew, with --start"),
     (
         {"truth": [9.0, 9.5]},
         "there is no ATE: expected at least 3 timestamps of estimate and truth",
