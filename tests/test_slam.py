@@ -40,7 +40,7 @@ METRICS = [
     "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db",
     "psnr_unseen_db", "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
-    "shown_static", "path_length", "reprojection_px", "beyond_turns_px",
+    "left_out", "shown_static", "path_length", "reprojection_px", "beyond_turns_px",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0
@@ -132,7 +132,7 @@ def test_the_metrics_are_those_we_promise(finished: RunFolder):
     assert list(metrics) == METRICS
     unknown = [name for name, value in metrics.items() if value is None]
     config = with_settings(SlamConfig(), settings_in(finished.read_config()))
-    assert unknown == ([] if config.uncertainty.enabled else ["beta_auroc"])
+    assert unknown == ([] if config.uncertainty.enabled else ["beta_auroc", "left_out"])
 
 
 def test_every_frame_has_a_pose_at_its_own_time(finished: RunFolder):

@@ -12,7 +12,7 @@ from minislam.cli.help import RUN_EPILOG, SHORT_EPILOG, add_command
 from minislam.cli.log import recorded
 from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
 from minislam.runs.progress import ProgressLine, ending_signals, plan_of, say
 
@@ -36,9 +36,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     where(help="run folder, default output/NAME_TIME")
     earlier = run.add_mutually_exclusive_group()
     earlier.add_argument("--overwrite", action="store_true", help="replace an earlier run")
-    earlier.add_argument(
-        "--resume", action="store_true", help="go on with the interrupted run in OUTPUT"
-    )
+    earlier.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     options.add_talk(run)
     options.add_settings(run)
     options.add_input(run)
@@ -56,10 +54,9 @@ def _demo(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     require_bounds("--workers", args.workers, 1, 256)
-    if args.resume and args.output is None:
-        raise InputError(
-            "expected --output FOLDER with --resume, found none; give that of the interrupted run"
-        )
+    has_folder = args.output is not None or not args.resume
+    found = "none; give that of the interrupted run"
+    require(has_folder, "--output FOLDER with --resume", found)
     with recorded(args.quiet) as log:
         # What may be wrong is looked for in the order of the time that it takes.
         source, inputs = options.source_of(args), options.input_options(args)
@@ -95,7 +92,7 @@ def _run(args: argparse.Namespace) -> int:
             metrics, facts = run_in_folder(sequence, config, choice, output, progress, lpips, *how)
         say("\n".join([f"{facts['state']}:", *as_text(summarise(metrics, facts))]))
         for warning in facts["warnings"]:
-            if warning not in sequence.warnings:
+            if warning not in sequence.warnings and not (args.quiet and warning in progress.warned):
                 say(f"WARNING: {warning}", "stderr")
         say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
         if facts["state"] == "interrupted":

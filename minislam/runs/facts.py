@@ -20,7 +20,7 @@ from minislam.mapping.mapper import Mapper, surface_depth
 from minislam.priors.choice import PriorChoice
 from minislam.records import Keyframe, Trajectory
 from minislam.runs.resume import Checkpoints
-from minislam.runs.warnings import shown_static, warnings
+from minislam.runs.warnings import left_out, shown_static, warnings
 from minislam.slam import Slam
 from minislam.splatting import Rendering
 from minislam.state.memory import peak_memory_mb
@@ -104,6 +104,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         "seconds_total": seconds,
         "frames_per_second": len(slam.tracker.tracked) / seconds,
         "peak_memory_mb": peak_memory_mb(),
+        "left_out": left_out(slam) if slam.config.uncertainty.enabled else None,
         "shown_static": shown_static(slam),
         **_ties(slam),
     }
@@ -147,9 +148,8 @@ def _static_psnr(mapper: Mapper, keyframe: Keyframe, rendering: Rendering) -> fl
 def _ties(slam: Slam) -> dict[str, float | None]:
     """Return how long the path is and how well poses, depths and flow agree, without any truth."""
     graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
-    links, error = range(len(graph.links)), None
-    if links:
-        error = typical_residual(bundle_problem(graph, links, 0, 0.0), graph.state)
+    links = range(len(graph.links))
+    error = typical_residual(bundle_problem(graph, links, 0, 0.0), graph.state) if links else None
     return {
         "path_length": float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
         "reprojection_px": error,

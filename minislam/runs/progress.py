@@ -103,6 +103,7 @@ class ProgressLine:
         is_terminal = sys.stderr is not None and sys.stderr.isatty()  # None: no console at all
         self._terminal = is_terminal and not (is_quiet or is_verbose)
         self._plain_step = 0.0 if is_verbose else PLAIN_STEP
+        self.warned: set[str] = set()  # what the user has been told
         self._should_stop = False
         self._is_open = False  # on a terminal: the line has no end yet
 
@@ -165,6 +166,7 @@ class ProgressLine:
 
     def warn(self, text: str) -> None:
         """Print a warning on a line of its own."""
+        self.warned.add(text)
         self.tell(f"WARNING: {text}")
 
     def tell(self, text: str) -> None:

@@ -36,11 +36,14 @@ def test_a_number_of_workers_is_refused_before_the_input_is_read(count: str, cap
     assert "expected --workers of at least 1 and at most 256, found" in the_sentence(capsys)
 
 
-def test_quiet_prints_warnings_only_and_the_log_has_everything(tmp_path: Path, capsys):
+def test_quiet_prints_warnings_only_and_the_log_has_everything(tmp_path: Path, monkeypatch, capsys):
+    at_its_end = "without a depth prior the unit of length is arbitrary"
+    monkeypatch.setattr("minislam.runs.run.alarms", lambda _: [at_its_end])  # also while it runs
     source, out = images(tmp_path / "in", [texture(0), texture(3)]), tmp_path / "out"
     assert run(source, "-o", out, "--mapping.refine_iterations", "2", "-q") == 0
     printed = capsys.readouterr()
     assert printed.out == "" and printed.err.count("\n") == printed.err.count("WARNING: ") > 0
+    assert printed.err.count(at_its_end) == 1
     rows = (out / "log.txt").read_text().splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", row) for row in rows)
     assert "image folder: 2 of 2 images" in rows[0] and "results in" in "".join(rows)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from minislam.config import SlamConfig
 from minislam.geometry import Camera
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
@@ -59,6 +60,7 @@ def finished(**parts: object) -> SimpleNamespace:
     mapper.beta_of, mapper.static_weight = lambda keyframe: hidden, lambda beta, camera: beta
     return SimpleNamespace(
         mapper=mapper,
+        config=SlamConfig(),
         sequence=SimpleNamespace(
             warnings=[], camera=CAMERA, ground_truth=truth, source_index=lambda k: 10 + 3 * k
         ),

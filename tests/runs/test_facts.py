@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from minislam.config import with_settings
 from minislam.records import Keyframe, Pictured, Trajectory
 from minislam.runs import facts
 from minislam.splatting import Rendering
@@ -22,6 +23,17 @@ def test_without_an_ate_there_is_no_straight_walk(monkeypatch: pytest.MonkeyPatc
         errors = {"ate_all_cm": ate, "ate_straight_line_cm": 86.0}
         monkeypatch.setattr(facts, "measure_run", lambda *_, found=errors: found)
         assert facts.measure(run, 1.0, None)["ate_straight_line_cm"] == line
+
+
+def test_what_beta_leaves_out_is_measured(monkeypatch: pytest.MonkeyPatch):
+    run = finished(left_out=0.4)
+    run.keyframe_trajectory, run.render = run.trajectory, None
+    run.tracker.grid, errors = run.tracker.graph.grid, {"ate_all_cm": 1.0}
+    for name, known in (("measure_run", errors), ("unseen_psnr", None), ("_ties", {})):
+        monkeypatch.setattr(facts, name, lambda *_, known=known: known)
+    assert facts.measure(run, 1.0, None)["left_out"] == pytest.approx(0.4)
+    run.config = with_settings(run.config, {"uncertainty.enabled": False})
+    assert facts.measure(run, 1.0, None)["left_out"] is None
 
 
 @pytest.mark.parametrize(
