@@ -4,13 +4,12 @@ Read `initialise`, `integrate` and `refine` first: they are the three moments at
 built. `update_keyframes` moves it when the tracker has corrected poses.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from minislam.geometry import Camera
 from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.gaps import filled_depth, hides_known
@@ -20,7 +19,7 @@ from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import median_depth
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
-from minislam.splatting import GaussianMap, Rendering
+from minislam.splatting import Rendering
 from minislam.state.memory import release
 from minislam.uncertainty.losses import FAR_FACTOR
 
@@ -109,9 +108,7 @@ class Mapper(JointOptimisation):
                 self._exclude_upper_mode()
                 self._fill_gaps()
         self._optimise(*how, range(max(done, half), iterations))
-        if self.uncertainty.enabled:
-            self._remove_unsupported()
-        self.shown = [*self._workers.stream(safeguards.shown_fraction, self._small_views())]
+        self._remove_unsupported()
 
     def refine_poses(
         self,
@@ -174,26 +171,24 @@ class Mapper(JointOptimisation):
             self._insert(position, fills=True)
 
     def _remove_unsupported(self) -> None:
-        """Remove Gaussians that hardly any static pixel shows: no image speaks for them.
+        """Remove Gaussians that hardly any static pixel shows, and note what is shown.
 
         They were inserted on an object that moves, before the MLP knew, and where it always covers
         the view no weight has pulled at them since; or steps have carried them out of all views,
         and they would float in new ones. Where nothing is static, all stay.
         """
-        sums = self.gaussians.means.new_zeros(2, len(self.gaussians))
-        for of_view in self._workers.stream(safeguards.blending_weights, self._small_views()):
+        camera, gaussians, self.shown = self._online_camera, self.gaussians, []
+        weights = (self.static_weight(self.beta_of(k), camera) for k in self.keyframes)
+        views = zip(self.keyframes, weights, strict=True)
+        calls = ((gaussians, camera, k.T_camera_world, weight) for k, weight in views)
+        sums = gaussians.means.new_zeros(2, len(gaussians))
+        for of_view, fraction in self._workers.stream(safeguards.support, calls):
             sums += of_view
+            self.shown.append(fraction)
         static, whole = sums
-        if static.any():
+        if static.any() and self.uncertainty.enabled:
             self._optimizer.prune(static > safeguards.LEAST_STATIC * whole)
             self._reset_gradients()
-
-    def _small_views(self) -> Iterator[tuple[GaussianMap, Camera, Tensor, Tensor]]:
-        """Yield map, camera, pose and static weight of each image at the size it has online."""
-        camera = self._online_camera
-        for keyframe in self.keyframes:
-            weight = self.static_weight(self.beta_of(keyframe), camera)
-            yield self.gaussians, camera, keyframe.T_camera_world, weight
 
     def _replace_dynamic_gaussians(self) -> None:
         """Remove Gaussians on dynamic objects; let keyframes fill the holes that they see."""

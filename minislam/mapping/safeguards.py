@@ -63,32 +63,22 @@ def least_weight(beta_raw: Tensor) -> float:
     return max(weights.MAPPING_CUT, weights.WEIGHT_SCALE / float(cut) ** 2)
 
 
-def blending_weights(
+def support(
     gaussians: GaussianMap,
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4)
     weight: Tensor,  # (H, W) static weight
-) -> Tensor:  # (2, N) px
-    """Return the blending weight of each Gaussian over the static pixels of a view, and over all.
+) -> tuple[Tensor, float]:  # (2, N) px, [-]
+    """Return what the static pixels of a view say of the map.
 
-    The rendered colour is linear in the colours of the Gaussians; its derivative is that weight.
+    That is the blending weight of each Gaussian over the static pixels, and over all; and the
+    fraction of the static pixels where the map is opaque. Without any, nothing is missing, unless
+    the map is empty. The rendered colour is linear in the colours of the Gaussians; its derivative
+    is the blending weight.
     """
-    colors = gaussians.colors.detach().requires_grad_()
+    colors, static = gaussians.colors.detach().requires_grad_(), weight > 0
     rendering = render(replace(gaussians, colors=colors), camera, T_camera_world.float())
-    (static,) = torch.autograd.grad(rendering.color[..., 0][weight > 0].sum(), colors)
-    return torch.stack([static[:, 0], rendering.weight_sums])
-
-
-@torch.no_grad()
-def shown_fraction(
-    gaussians: GaussianMap,
-    camera: Camera,
-    T_camera_world: Tensor,  # (4, 4)
-    weight: Tensor,  # (H, W) static weight
-) -> float:
-    """Return the fraction of a view's static pixels where the map is opaque [-].
-
-    Without static pixels nothing is missing, unless the map is empty.
-    """
-    shown = render(gaussians, camera, T_camera_world.float()).opacity[weight > 0] > OPAQUE
-    return float(shown.float().mean()) if len(shown) else float(len(gaussians) > 0)
+    (of_static,) = torch.autograd.grad(rendering.color[..., 0][static].sum(), colors)
+    shown = rendering.opacity.detach()[static] > OPAQUE
+    fraction = float(shown.float().mean()) if len(shown) else float(len(gaussians) > 0)
+    return torch.stack([of_static[:, 0], rendering.weight_sums]), fraction

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from minislam.mapping.safeguards import (
-    blending_weights,
     confirmed_beta,
     doubted_error,
     least_weight,
+    support,
 )
 from minislam.uncertainty import RenderingError
 from minislam.uncertainty.weights import (
@@ -130,7 +130,7 @@ def test_the_blending_weights_of_two_parts_of_a_view_are_those_of_all():
     mapper.initialise([wall_keyframe(0), wall_keyframe(2)])
     left = torch.zeros(CAMERA.height, CAMERA.width)
     left[:, : CAMERA.width // 3] = 0.5  # any weight but 0 is static
-    parts = [blending_weights(mapper.gaussians, CAMERA, pose, w) for w in (left, (left == 0) * 1.0)]
+    parts = [support(mapper.gaussians, CAMERA, pose, w)[0] for w in (left, (left == 0) * 1.0)]
     torch.testing.assert_close(parts[0][0] + parts[1][0], parts[0][1], atol=1e-4, rtol=1e-4)
     assert torch.equal(parts[0][1], mapper.render(pose).weight_sums)
     pixels = CAMERA.project(mapper.gaussians.means.detach() @ pose[:3, :3].T.float() + pose[:3, 3])
