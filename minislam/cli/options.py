@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from minislam.cli.help import UsageError, unknown_option
 from minislam.data.files import read_json
 from minislam.data.options import InputOptions
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import flattened, kind_of, user_path, with_values
 from minislam.priors.names import BUILT_IN, PriorChoice, find_weights, require_prior
 
@@ -152,8 +152,7 @@ def config_file(args: argparse.Namespace) -> dict[str, Any]:
 def source_of(args: argparse.Namespace) -> str:
     """Return the name of the sequence, from the command line or from the file of --config."""
     source = args.sequence or config_file(args).get("sequence")
-    if not source:
-        raise InputError("expected a SEQUENCE, or --config FILE that names one, found neither")
+    require(bool(source), "a SEQUENCE, or --config FILE that names one", "neither")
     return str(source)
 
 
@@ -209,8 +208,7 @@ def settings(args: argparse.Namespace) -> SlamConfig:
     if args.config:
         base = with_settings(base, settings_in(config_file(args)))
     known, given = settings_of(base), dict(args.settings)
-    unknown = [name for name in given if name not in known]
-    if unknown:
+    if unknown := [name for name in given if name not in known]:
         raise unknown_option(f"--{unknown[0]}", args.parser)
     flags = {name: getattr(args, name) for name in known if "." not in name}
     given |= {name: value for name, value in flags.items() if value is not None}

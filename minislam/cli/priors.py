@@ -17,7 +17,7 @@ from minislam.cli import options
 from minislam.cli.help import add_command
 from minislam.data.files import atomic_file, make_folder, read_text, write_text
 from minislam.data.options import require_source
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import user_path
 from minislam.runs.progress import ProgressLine
 
@@ -51,10 +51,8 @@ def _priors(args: argparse.Namespace) -> None:
     source, inputs = options.source_of(args), options.input_options(args)
     choice = options.prior_choice(args, "none")
     require_source(source)
-    if args.features is None and choice.depth == "none":
-        raise InputError(
-            "expected --features or --depth, found neither; name at least one to write"
-        )
+    is_named = args.features is not None or choice.depth != "none"
+    require(is_named, "--features or --depth", "neither; name at least one to write")
     import torch
 
     from minislam.data.sequence import open_sequence

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from minislam.data.files import read_bytes
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 
 _SH_C0 = 0.28209479177387814  # Y_00 = 1 / (2 sqrt(pi)): colour = 0.5 + Y_00 * f_dc
 
@@ -109,11 +109,8 @@ def _parse_header(header: bytes, name: str) -> tuple[int, list[str]]:
     """Return the number of Gaussians and the property names."""
     rows = header.decode("ascii", errors="replace").splitlines()
     lines = [row for row in rows if not row.startswith(("comment", "obj_info"))]
-    if lines[:2] != _FORMAT or len(lines) < 3:
-        raise InputError(
-            f"expected a binary little-endian PLY file with Gaussians, found another kind of file "
-            f"in {name}; give a map.ply"
-        )
+    is_ply, found = lines[:2] == _FORMAT and len(lines) > 2, f"another kind of file in {name}"
+    require(is_ply, "a binary little-endian PLY file with Gaussians", f"{found}; give a map.ply")
     element, *fields = [line.split() for line in lines[2:]]
     plain = all(len(field) == 3 and field[:2] == ["property", "float"] for field in fields)
     names = [field[2] for field in fields] if plain else []
@@ -141,7 +138,5 @@ def _validate(gaussians: GaussianArrays, name: str) -> None:
             f"expected |log scale| < {_MAX_LOG_SCALE:g} in {name}, found {worst:.3g}; store scales "
             "as natural logarithms"
         )
-    if len(gaussians) and np.linalg.norm(gaussians.quats_wxyz.astype(float), axis=1).min() < 1e-12:
-        raise InputError(
-            f"expected quaternions other than zero in {name}, found a zero one; it is no rotation"
-        )
+    turns = np.linalg.norm(gaussians.quats_wxyz.astype(float), axis=1).min(initial=1) >= 1e-12
+    require(turns, f"quaternions other than zero in {name}", "a zero one; it is no rotation")

@@ -13,7 +13,7 @@ from minislam.data.metadata import noted_focal_length
 from minislam.data.options import mask_folder
 from minislam.data.raw_images import FileImages, ImageSource, VideoImages
 from minislam.data.trajectory import truth_beside
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.records import Trajectory
 
 _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
@@ -83,10 +83,8 @@ def read_image_folder(folder: Path) -> Recording:
 
 def read_video(path: Path, limit: int | None) -> Recording:
     """Read a video file; frames after the first `limit` are left alone."""
-    if is_image(path):
-        raise InputError(
-            f"expected a video or a folder, found the single image {path}; give the folder it is in"
-        )
+    found = f"the single image {path}; give the folder it is in"
+    require(not is_image(path), "a video or a folder", found)
     images = VideoImages(path, limit)
     if len(images) == 0:
         raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")

@@ -4,6 +4,7 @@ Read `initialise`, `integrate` and `refine` first: they are the three moments at
 built. `update_keyframes` moves it when the tracker has corrected poses.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -16,11 +17,12 @@ from minislam.mapping.gaps import filled_depth, hides_known
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
-from minislam.mapping.views import median_depth
+from minislam.mapping.views import median_depth, view_gradients
 from minislam.mapping.window import sampling_probabilities, update_window
 from minislam.records import Keyframe, Progress
 from minislam.splatting import Rendering
 from minislam.state.memory import release
+from minislam.uncertainty import RenderingError
 from minislam.uncertainty.losses import FAR_FACTOR
 
 MOST_FAR = 0.99  # of the largest depth that is inserted: where a gap, or what is farther, is put
@@ -158,10 +160,22 @@ class Mapper(JointOptimisation):
         self._reset_gradients()
 
     def _exclude_upper_mode(self) -> None:
-        """Exclude the upper mode of all betas, if there is one; only confirmed images are asked."""
-        betas = [self.beta_of(k).flatten() for k in self.keyframes if k.confirmation is not None]
-        least = safeguards.least_weight(torch.cat(betas)) if betas else self.least_weight
-        if least > self.least_weight and self.uncertainty.enabled:
+        """Exclude the upper mode of all betas, if there is one, and the map is wrong there.
+
+        Only confirmed images are asked.
+        """
+        known = [keyframe for keyframe in self.keyframes if keyframe.confirmation is not None]
+        if not known or not self.uncertainty.is_learnt:
+            return
+        least = safeguards.least_weight(torch.cat([self.beta_of(k).flatten() for k in known]))
+        if least <= self.least_weight:
+            return
+        some = known[:: math.ceil(len(known) / safeguards.ASKED)]
+        calls = (self._view_arguments(k, self._online_camera, trains=True) for k in some)
+        errors = [vars(v.error).values() for v in self._workers.stream(view_gradients, calls)]
+        error = RenderingError(*map(torch.stack, zip(*errors, strict=True)))
+        beta = torch.stack([self.beta_of(keyframe) for keyframe in some])
+        if safeguards.is_wrong(error, beta, least, self.uncertainty.lambda_depth):
             self.least_weight = least
             self._replace_dynamic_gaussians()
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from minislam.geometry import Camera
 from minislam.splatting import GaussianMap, render
 from minislam.uncertainty import RenderingError, weights
+from minislam.uncertainty.losses import SURFACE_OPACITY
 
 # The rendering error of a confirmed cell fades: where it stands still, the map is wrong. [-]
 CONFIRMED_ERROR = 1.5
@@ -29,6 +30,8 @@ LEAST_VIEWS = 2  # renderings of each keyframe, before which most of a static ro
 # Of the pixels that show a Gaussian, by blending weight, that must be static [-]: 0.01 to 0.1 take
 # a carried table out of the map; from 0.05 on, they also take a wall that beta doubts.
 LEAST_STATIC = 0.02
+LEAST_WRONG = 0.5  # of the cells of the upper mode, else they are kept [-]
+ASKED = 24  # keyframes, at least half of them, whose rendering errors tell that
 OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 
@@ -61,6 +64,21 @@ def least_weight(beta_raw: Tensor) -> float:
         return weights.MAPPING_CUT
     cut = weights.stretched(weights.clipped_beta(UPPER_MODE * upper))
     return max(weights.MAPPING_CUT, weights.WEIGHT_SCALE / float(cut) ** 2)
+
+
+def is_wrong(error: RenderingError, beta_raw: Tensor, least: float, lambda_depth: float) -> bool:
+    """Tell whether the map is wrong in most cells (..., h', w') that a least weight would exclude.
+
+    The MLP tells features, not places: a dark wall, rendered well, gets the beta of a dark dog
+    before it. The rendering error of a cell by itself asks for a beta of 2 sqrt(L) (`cell_loss`).
+    """
+    asked = 2 * (error.ssim + lambda_depth * error.depth).sqrt()
+    doomed, wrong = (
+        weights.WEIGHT_SCALE / weights.stretched(weights.clipped_beta(beta)) ** 2 < least
+        for beta in (beta_raw, asked)
+    )
+    doomed &= error.opacity >= SURFACE_OPACITY  # a hole says nothing
+    return not doomed.any() or float(wrong[doomed].float().mean()) >= LEAST_WRONG
 
 
 def support(

@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+CORNERS, CONTRAST = 1500, 8  # at most, of an image; least difference around them [grey values]
+LEAST_CORNERS, CORNER_ERROR = 12, 4.0  # that follow one homography, else by chance; within [px]
+
 
 def grayscale(image: Tensor) -> np.ndarray:
     """Return the 8-bit luminance (H, W) of an image (H, W, 3) in [0, 1]."""
@@ -53,6 +56,26 @@ def composed_flow(source: np.ndarray, target: np.ndarray, start: np.ndarray) -> 
     """
     remainder = residual_flow(source, warp(target, start))
     return remainder + warp(start, remainder)
+
+
+def plane_flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the flow (H, W, 2) of the homography that most matched corners follow, or 0.
+
+    It is the flow of a plane, and that of everything if the camera only turns, however far.
+    """
+    pixels = pixel_positions(source.shape[:2])
+    orb = cv2.ORB_create(CORNERS, fastThreshold=CONTRAST)  # type: ignore[attr-defined]
+    (here, codes), (there, others) = (orb.detectAndCompute(i, None) for i in (source, target))
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    pairs = matcher.match(codes, others) if here and there else []
+    if len(pairs) < LEAST_CORNERS:
+        return np.zeros_like(pixels)
+    start = np.array([here[pair.queryIdx].pt for pair in pairs])
+    end = np.array([there[pair.trainIdx].pt for pair in pairs])
+    homography, inside = cv2.findHomography(start, end, cv2.RANSAC, CORNER_ERROR)
+    if homography is None or inside.sum() < LEAST_CORNERS:
+        return np.zeros_like(pixels)
+    return cv2.perspectiveTransform(pixels, homography) - pixels
 
 
 def reverse_flow(source: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:

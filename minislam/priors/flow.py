@@ -8,14 +8,16 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from minislam.priors import grid_flow
-from minislam.priors.dense_flow import composed_flow, dense_from_grid, grayscale, reverse_flow
+from minislam.priors import dense_flow, grid_flow
 from minislam.priors.interfaces import FlowMatches
 from minislam.state.memory import SHELF, release
 from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
+# Matched ratio; with less, the motion may be too fast for a chain, and corners tell one more start.
+# From 0.4 on they find an umbrella that fills the view. [-]
+WEAK = 0.2
 _THREADS = ThreadPoolExecutor(2)  # compute flows side by side, without effect on the result
 
 
@@ -55,7 +57,7 @@ class ClassicalFlow(Stateful):
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
-        gray = grayscale(image)
+        gray = dense_flow.grayscale(image)
         self._images[keyframe_index] = SHELF.array(gray)
         self._textures[keyframe_index] = grid_flow.texture_confidence(gray, self.stride)
 
@@ -96,13 +98,13 @@ class ClassicalFlow(Stateful):
         flows: dict[Edge, np.ndarray] = {}
         for (i, j), start in starts.items():
             on_grid = np.ascontiguousarray(start.T).reshape(*self._textures[i].shape, 2)
-            dense = dense_from_grid(on_grid, self._images[i].shape, self.stride)
-            flows[i, j] = composed_flow(self._images[i], self._images[j], dense)
+            dense = dense_flow.dense_from_grid(on_grid, self._images[i].shape, self.stride)
+            flows[i, j] = dense_flow.composed_flow(self._images[i], self._images[j], dense)
         measured = {}
         for (i, j), flow in flows.items():
             images, backward = (self._images[i], self._images[j]), flows.get((j, i))
             if backward is None:
-                backward = reverse_flow(*images, flow)
+                backward = dense_flow.reverse_flow(*images, flow)
             texture = self._textures[i]
             matches = grid_flow.measure_on_grid(*images, flow, backward, texture, self.stride)
             # A copy: a view would keep the starts of all edges of this call.
@@ -118,7 +120,7 @@ class ClassicalFlow(Stateful):
 
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
-        gray = grayscale(image)
+        gray = dense_flow.grayscale(image)
         standing = np.zeros((*gray.shape, 2), np.float32)
         return FlowChain(gray, gray, standing, standing, self.config)
 
@@ -144,18 +146,21 @@ class FlowChain(Stateful):
 
     def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
         """Return the chain and the matches (E = 1) from the reference to this next image."""
-        gray, stride = grayscale(image), self.config.stride
+        gray, stride = dense_flow.grayscale(image), self.config.stride
         texture = grid_flow.texture_confidence(self.reference, stride)
 
         def follow(start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             images = self.reference, gray
-            flow = composed_flow(*images, start)
-            backward = reverse_flow(*images, flow)
+            flow = dense_flow.composed_flow(*images, start)
+            backward = dense_flow.reverse_flow(*images, flow)
             return flow, *grid_flow.measure_on_grid(*images, flow, backward, texture, stride)
 
         # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
         # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
-        measured = _THREADS.map(follow, (self.flow, self.flow + self.increment))
+        measured = [*_THREADS.map(follow, (self.flow, self.flow + self.increment))]
+        if max(m[2].sum() for m in measured) < WEAK * texture.sum():
+            step = dense_flow.plane_flow(self.newest, gray)
+            measured.append(follow(self.flow + dense_flow.warp(step, self.flow)))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
         chain = FlowChain(self.reference, gray, flow, flow - self.flow, self.config)
         return chain, grid_flow.as_matches([targets], [confidence], [texture], image)

@@ -44,13 +44,18 @@ def judge(value: float, good: float | None, fair: float | None) -> str:
     return "fair" if sign * value >= sign * fair else "poor"
 
 
+def span(first: int, last: int) -> str:
+    """Return the numbers of some frames in words."""
+    return f"{first} to {last}" if first < last else str(first)
+
+
 def _counted(facts: Mapping[str, Any]) -> Iterator[Line]:
     frames, lost = facts["frames"], facts["lost_frames"]
     followed = f"{frames - lost:,} of {frames:,}"
     verdict = judge(lost / max(frames, 1), 0.0, 0.1)
     yield Line("frames followed", followed, verdict, "frames with a pose; the others are lost")
     if facts["breaks"]:
-        where = ", ".join(f"{b['first_frame']} to {b['last_frame']}" for b in facts["breaks"])
+        where = ", ".join(span(b["first_frame"], b["last_frame"]) for b in facts["breaks"])
         yield Line("broken at frames", where, "poor", "before and after do not belong together")
     meaning = "frames that the tracker keeps; the map is fitted to them and to some between"
     yield Line("keyframes", f"{facts['keyframes']:,}", "", meaning)

@@ -7,6 +7,7 @@ import numpy as np
 from minislam.errors import InputError
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
+from minislam.runs.summary import span
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import is_unexplained
 from minislam.tracking.safeguards.lens import BentLens
@@ -62,13 +63,18 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             f"lost_frames.txt lists them. {rest * (start is not None)}{_FAR_APART}"
         )
     if watch.breaks:
-        where = ", ".join(f"{found.first_frame} to {found.last_frame}" for found in watch.breaks)
-        pieces = ", ".join(f"{first} to {last}" for first, last in watch.segments if first < last)
+        where = ", ".join(span(found.first_frame, found.last_frame) for found in watch.breaks)
+        pieces = [
+            f"--start {slam.sequence.source_index(first)} --max-frames {last - first + 1}"
+            for first, last in watch.segments
+            if last - first + 1 >= slam.config.tracking.warmup_keyframes  # else it cannot start
+        ]
+        anew = f"; run each piece anew, with the other options as here: {', or '.join(pieces)}"
         yield (
             f"{BROKEN} at frames {where}: motion or depth contradicts the images, there is too "
             "little parallax to carry the scale across, or the camera follows something that came "
-            "into view. Before and after, scale and direction do not belong together; run each "
-            f"piece (frames {pieces or 'none'}) anew, with --start and --max-frames. {_FAR_APART}"
+            "into view. Before and after, scale and direction do not belong "
+            f"together{anew * bool(pieces)}. {_FAR_APART}"
         )
     if graph.failed_adjustments:
         yield (

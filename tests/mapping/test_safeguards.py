@@ -7,6 +7,7 @@ import torch
 from minislam.mapping.safeguards import (
     confirmed_beta,
     doubted_error,
+    is_wrong,
     least_weight,
     support,
 )
@@ -76,6 +77,28 @@ def test_otherwise_the_usual_cut_stays(modes):
     assert least_weight(betas(*modes)) == MAPPING_CUT
 
 
+# Cells of (beta, L'_SSIM, L_depth, opacity); the least weight excludes from a beta of .86 on.
+RIGHT, BY_COLOUR, BY_DEPTH = (1.1, 0.1, 0.0, 1.0), (1.1, 0.25, 0.0, 1.0), (1.1, 0.0, 1.25, 1.0)
+HOLE, ELSEWHERE = (1.1, 0.0, 0.0, 0.5), (0.8, 4.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        ([BY_COLOUR, BY_DEPTH, RIGHT], True),
+        ([BY_COLOUR, RIGHT], True),  # half of them
+        ([BY_COLOUR, RIGHT, RIGHT], False),
+        ([BY_COLOUR, RIGHT, ELSEWHERE, ELSEWHERE, HOLE], True),
+        ([RIGHT, BY_COLOUR, RIGHT, ELSEWHERE, HOLE], False),
+        ([HOLE, ELSEWHERE], True),  # nothing is known
+    ],
+)
+def test_an_upper_mode_is_kept_where_the_map_explains_most_of_it(cells, expected: bool):
+    beta, ssim, depth, opacity = torch.tensor(cells).T
+    least = WEIGHT_SCALE / float(stretched(clipped_beta(torch.tensor(0.86)))) ** 2
+    assert is_wrong(RenderingError(ssim, depth, opacity), beta, least, 0.2) == expected
+
+
 # Whole refinements
 
 
@@ -101,6 +124,22 @@ def test_half_way_all_that_moves_leaves_the_map():
     movers = [int((m.gaussians.means[:, 2] < 1.5).sum()) for m in (half, mapper)]
     assert half.least_weight == MAPPING_CUT < mapper.least_weight
     assert movers[1] < 0.4 * movers[0]
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_what_looks_like_a_mover_is_kept_where_the_map_is_right(moves: bool):
+    # The features are those of something that moves, but only in one case it is there.
+    keyframes = []
+    for index in range(3):
+        shown = wall_keyframe(index, mover_column=4 + 4 * index if moves else None)
+        features = wall_keyframe(index, mover_column=4 + 4 * index).features
+        confirmation = torch.zeros(GRID)
+        keyframes.append(replace(shown, features=features, confirmation=confirmation))
+    mapper = make_mapper(replace(CONFIG, init_iterations=60))
+    mapper.predict_beta = lambda features: 0.1 + 1.05 * features[..., 1]
+    mapper.initialise(keyframes)
+    mapper.refine(48)
+    assert (mapper.least_weight > MAPPING_CUT) == moves
 
 
 def test_without_confirmation_the_usual_cut_stays():

@@ -9,6 +9,7 @@ from minislam.priors.dense_flow import (
     dense_from_grid,
     grayscale,
     pixel_positions,
+    plane_flow,
     residual_flow,
     reverse_flow,
     warp,
@@ -111,3 +112,29 @@ def test_forward_and_reverse_flow_cancel_on_real_images():
 def test_searching_from_zero_finds_nothing_between_equal_images():
     gray = grayscale(shifted(0, 0, SIZE))
     assert np.abs(residual_flow(gray, gray)).max() < 0.05
+
+
+# The flow of a plane
+
+
+def test_the_flow_of_a_plane_that_turns_far_is_found_though_a_fifth_moves_otherwise():
+    size, angle = (192, 256), np.radians(25)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    offset = np.array([30.0, -20.0])
+    first, second = (
+        grayscale(view(m, o, size)) for m, o in ((np.eye(2), 0 * offset), (turn, offset))
+    )
+    second[:76, :128] = grayscale(view(np.eye(2), np.array([9.0, 4.0]), (76, 128)))
+    pixels = pixel_positions(size)
+    truth = (pixels - offset) @ turn - pixels  # where turn q + offset = p
+    found = plane_flow(first, second)
+    assert np.linalg.norm(truth, axis=-1).max() > 100
+    assert np.linalg.norm(found - truth, axis=-1).max() < 2
+
+
+@pytest.mark.parametrize("other", ["grey", "noise"])
+def test_without_common_corners_nothing_moves(other: str):
+    gray, noise = np.full(SIZE, 90, np.uint8), np.random.default_rng(1).integers(0, 256, SIZE)
+    there = {"grey": gray, "noise": noise.astype(np.uint8)}[other]
+    assert not plane_flow(grayscale(shifted(0, 0, SIZE)), there).any()
+    assert not plane_flow(there, grayscale(shifted(0, 0, SIZE))).any()

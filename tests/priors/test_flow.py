@@ -7,11 +7,9 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
+from minislam.priors import dense_flow
 from minislam.priors import flow as flow_module
-from minislam.priors.dense_flow import (
-    composed_flow,
-    grayscale,
-)
+from minislam.priors.dense_flow import composed_flow, grayscale, pixel_positions
 from minislam.priors.flow import FlowChain
 from minislam.state import memory
 from minislam.state.memory import SHELF
@@ -72,13 +70,13 @@ def test_a_long_shift_needs_the_prediction():
 
 def test_a_backward_edge_that_is_matched_as_well_is_used(monkeypatch: pytest.MonkeyPatch):
     calls = []
-    reverse = flow_module.reverse_flow
+    reverse = dense_flow.reverse_flow
 
     def counted(*arguments: np.ndarray) -> np.ndarray:
         calls.append(1)
         return reverse(*arguments)
 
-    monkeypatch.setattr(flow_module, "reverse_flow", counted)
+    monkeypatch.setattr(dense_flow, "reverse_flow", counted)
     images = [shifted(d, 0, SIZE) for d in (0, 2, 4)]
     both = flow_of(images).match([0, 1], [1, 0], still(2))
     assert not calls
@@ -185,6 +183,29 @@ def test_a_wrong_expectation_that_looks_less_different_is_not_followed():
     _, matches = chain.advance(second)
     error = (on_grid(matches.targets)[0] - GRID - torch.tensor([6.0, 0.0])).norm(dim=-1)
     assert error.median() < 0.1
+
+
+@pytest.mark.parametrize("steps", [1, 6])
+def test_a_jump_that_no_expectation_reaches_is_found_by_corners(steps: int):
+    size, shift = (192, 256), torch.tensor([12.0 * steps - 65.0, 24.0])
+    chain = flow_of([]).start_chain(shifted(0, 0, size))
+    for step in range(steps):
+        chain, _ = chain.advance(shifted(12 * (step + 1), 0, size))
+    _, matches = chain.advance(shifted(*shift.tolist(), size))
+    cells = torch.from_numpy(pixel_positions(size)[::8, ::8])
+    ends = cells + shift
+    stays = (ends > 8).all(-1) & (ends[..., 0] < 248) & (ends[..., 1] < 184)
+    error = (on_grid(matches.targets, cells.shape)[0] - ends).norm(dim=-1)[stays]
+    assert error.median() < 0.1 and error.quantile(0.9) < 0.5
+
+
+def test_corners_are_asked_only_where_the_chain_is_weak(monkeypatch: pytest.MonkeyPatch):
+    asked: list[None] = []
+    monkeypatch.setattr(dense_flow, "plane_flow", lambda a, b: asked.append(None) or constant(0, 0))
+    chain, _ = flow_of([]).start_chain(shifted(0, 0, SIZE)).advance(shifted(6, -3, SIZE))
+    assert asked == []
+    chain.advance(torch.full((*SIZE, 3), 0.5))
+    assert asked == [None]
 
 
 # Degenerate input

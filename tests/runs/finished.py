@@ -42,7 +42,7 @@ def finished(**parts: object) -> SimpleNamespace:
             beyond_turns=0.41,
             hardly_walked=parts.pop("hardly_walked", False),
             breaks=parts.pop("breaks", []),
-            segments=[(0, 1), (3, 3)],
+            segments=[(0, 5), (7, 7)],
         ),
         keyframes=SimpleNamespace(
             has_prior=parts.pop("has_prior", True), overlay=parts.pop("overlay", None)

@@ -25,8 +25,11 @@ WARNINGS = [
         "film is cut there, run the rest by itself: --start 16",
     ),
     ({"lost": 2, "ends_lost": True}, "16. If the images lie far apart, give more frames"),
-    ({"breaks": [Break(2, 2)]}, "broken at frames 2 to 2"),
-    ({"breaks": [Break(2, 2)]}, "run each piece (frames 0 to 1) anew, with --start"),
+    ({"breaks": [Break(2, 2)]}, "broken at frames 2: motion"),
+    (
+        {"breaks": [Break(2, 2)]},
+        "run each piece anew, with the other options as here: --start 10 --max-frames 6. If",
+    ),
     (
         {"truth": [9.0, 9.5]},
         "there is no ATE: expected at least 3 timestamps of estimate and truth",
