@@ -59,9 +59,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("new.prune(~hides_known(new.means, self.camera, *views))", "new"),
     ],
     ("mapping/safeguards.py", "mapping/test_mapper.py"): [
-        ("opacity[weight > 0] > OPAQUE", "opacity[weight > -1] > OPAQUE"),
-        ("opacity[weight > 0] > OPAQUE", "opacity[weight > 0] < OPAQUE"),
-        ("float(len(gaussians) > 0)", "1.0"),
+        (".detach()[static] > OPAQUE", ".detach()[weight > -1] > OPAQUE"),
+        (".detach()[static] > OPAQUE", ".detach()[static] < OPAQUE"), ("(len(gaussians) > 0)", "(1)"),
     ],
     ("runs/warnings.py", "runs/test_warnings.py runs/test_run_ending.py"): [
         ("shown is not None and shown < LEAST_SHOWN", "bool(shown) and shown < LEAST_SHOWN"),
@@ -158,10 +157,11 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("lost >= len(followed)", "lost > len(followed)"),
     ],
     ("mapping/safeguards.py", "mapping/test_safeguards.py"): [
-        ("[weight > 0].sum()", ".sum()"), ("[weight > 0].sum()", "[weight == 0].sum()"),
+        ("[static].sum()", ".sum()"), ("[static].sum()", "[~static].sum()"),
+        ("opacity >= SURFACE_OPACITY", "opacity >= 0"), (">= LEAST_WRONG", "> LEAST_WRONG"),
     ],
     ("mapping/mapper.py", "mapping/test_safeguards.py"): [
-        ("if static.any():", "if True:"), ("self._remove_unsupported()", "pass"),
+        ("static.any() and ", ""), ("self._remove_unsupported()", "pass"),
         ("static > safeguards.LEAST_STATIC * whole", "static >= safeguards.LEAST_STATIC * whole"),
     ],
     ("tracking/keyframe_selection.py", "tracking/test_keyframe_selection.py"): [
