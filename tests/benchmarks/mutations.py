@@ -60,7 +60,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/safeguards.py", "mapping/test_mapper.py"): [
         (".detach()[static] > OPAQUE", ".detach()[weight > -1] > OPAQUE"),
-        (".detach()[static] > OPAQUE", ".detach()[static] < OPAQUE"), ("(len(gaussians) > 0)", "(1)"),
+        (".detach()[static] > OPAQUE", ".detach()[static] < OPAQUE"), ("(len(gaussians) > 0)", "1"),
     ],
     ("runs/warnings.py", "runs/test_warnings.py runs/test_run_ending.py"): [
         ("shown is not None and shown < LEAST_SHOWN", "bool(shown) and shown < LEAST_SHOWN"),
