@@ -81,7 +81,7 @@ class Workers(AbstractContextManager["Workers"]):
     def map(self, function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Return function(*call) for every call, in their order; what it raises is raised here.
 
-        It must be a function of a module of this package, with annotated arguments and result:
+        `function` must stand in a module of this package, with annotated arguments and result:
         tensors, arrays, plain values, and dataclasses, lists or dictionaries of them.
         """
         arguments = [_contiguous(to_tree(list(call))) for call in calls]

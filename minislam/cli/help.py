@@ -44,7 +44,7 @@ exit codes: 0 finished; 1 what was given cannot be used, in one sentence; 2 an u
   lists the breaks and the segments between them), the map has large holes or most bundle
   adjustments failed; 130 interrupted with everything so far written
 
-settings: every constant is an option, like --tracking.window 8; minislam settings lists them.
+settings: each is an option, like --tracking.window 8; minislam settings lists them.
   Ablations of the paper:
   --no-uncertainty                       the same weight for every pixel
   --uncertainty.lambda_depth 0           no depth term in L_uncer, Eq. (4)

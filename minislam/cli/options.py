@@ -89,7 +89,7 @@ def add_talk(parser: argparse.ArgumentParser) -> None:
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add the presets and what stands over them. `take_settings` finds names with a dot."""
+    """Add --preset and the flags that set many settings; `take_settings` finds those with a dot."""
     parser.set_defaults(takes_settings=True)
     add = parser.add_argument
     add("--preset", help=f"{', '.join(PRESETS)}; laptop")
@@ -97,7 +97,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, help="seed of every random draw, 0")
     add("--threads", help="threads of torch, 1")
     add("--checkpoint_fraction", help="see minislam settings checkpoint; 0.01")
-    add("--no-uncertainty", action="store_true", help="give every pixel the same weight (ablation)")
+    add("--no-uncertainty", action="store_true", help="all weights 1, no second adjustment")
 
 
 def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str]]:

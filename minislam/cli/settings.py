@@ -1,4 +1,4 @@
-"""The sub-command `minislam settings`: every constant, with its default, bounds and meaning."""
+"""The sub-command `minislam settings`: every setting, with its default, bounds and meaning."""
 
 import argparse
 import fnmatch

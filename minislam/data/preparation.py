@@ -193,7 +193,7 @@ class KeptImages:
         image = self._images[number].copy() if number in self._images else prepare()
         if number not in self._images:
             with suppress(OSError):  # the image is prepared again next time
-                place = self._shelf.room(image.nbytes).reshape(image.shape)
+                place = self._shelf.reserve(image.nbytes).reshape(image.shape)
                 place[:] = image
                 self._images[number] = place
         release()

@@ -10,7 +10,7 @@ from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 
-MOST_SECONDS, MOST_RATIO = 1.0, 20.0  # between poses, and to the other's; more: milliseconds
+MOST_SECONDS, MOST_RATIO = 1.0, 20.0  # of a step, and to the other's: beyond, no seconds
 
 
 class Alignment(Enum):

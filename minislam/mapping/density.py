@@ -14,7 +14,7 @@ CHILDREN = 2  # of a Gaussian that is split, 3DGS
 SPLIT_SCALE = 0.02  # median depths: larger ones are split, smaller ones cloned; official 0.06 m
 SPLIT_SHRINK = 1.6  # scale of a parent over that of its children, 3DGS
 PRUNE_OPACITY = 0.1  # fainter ones are removed; official 0.005 at first and 0.7 online
-PRUNE_SCALE = 0.2  # median depths, or own distance: larger ones are removed, official 0.6 m
+PRUNE_SCALE = 0.2  # of median depth or own distance, the larger: beyond, removed; official 0.6 m
 
 
 def screen_gradients(

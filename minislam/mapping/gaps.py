@@ -4,7 +4,7 @@ Without a depth network such a pixel has no depth, so nothing is inserted there.
 refinement, the MLP has learnt what moves. What it calls static and the map leaves transparent then
 gets the depth of its surroundings: 1/depth is linear over a plane, and so is the solution of
 Laplace's equation whose border is linear. Between a table and the wall behind it, that is the depth
-of neither: seen from elsewhere it would float before what is known there, so other views vote.
+of neither: from elsewhere it would float in front of what is known there, so other views vote.
 """
 
 import math
@@ -22,7 +22,7 @@ from minislam.mapping.insertion import nearest_pixels
 from minislam.records import Keyframe
 
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
-VOTERS = 24  # images of the map, evenly over the clip, that vote: so many, or down to half
+VOTERS = 24  # images of the map that vote at most, evenly spread; of more, at least half as many
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 
 
@@ -46,9 +46,10 @@ def hides_known(
     own: Keyframe,
     keyframes: Sequence[Keyframe],  # of the map
 ) -> Tensor:  # (N,) bool
-    """Tell which points that their keyframe does not measure stand before what others know.
+    """Tell which points would hide a known surface.
 
-    More views must know a surface behind the point than one at its depth.
+    Such a point has no depth in its own keyframe, and more views know a surface behind it than at
+    its depth.
     """
     _, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
     is_guessed = own.depth[row, column] == 0

@@ -94,7 +94,7 @@ def color_loss(
 ) -> Tensor:  # (H, W)
     """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. (7).
 
-    It is 0 where the image is black: there undistortion left nothing.
+    It is 0 on black pixels: they are the border that undistortion leaves.
     """
     absolute = (rendered - image).abs().mean(-1)
     loss = (1 - lambda_ssim) * absolute

@@ -1,4 +1,4 @@
-"""The mapper: it decides when the map gets and loses Gaussians, and when it is optimised.
+"""The mapper: it decides what the map gets and loses, and when it is optimised.
 
 Read `initialise`, `integrate` and `refine` first: they are the three moments at which the map is
 built. `update_keyframes` moves it when the tracker has corrected poses.
@@ -25,7 +25,7 @@ from minislam.state.memory import release
 from minislam.uncertainty import RenderingError
 from minislam.uncertainty.losses import FAR_FACTOR
 
-MOST_FAR = 0.99  # of the largest depth that is inserted: where a gap, or what is farther, is put
+MOST_FAR = 0.99  # of the largest depth that is inserted: what fills a gap lies no farther [-]
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
 
 
@@ -95,10 +95,11 @@ class Mapper(JointOptimisation):
         self.keyframes = [replace(keyframe, T_camera_world=pose) for keyframe, pose in rows]
 
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
-        """Optimise map and MLP over all keyframes, the last part at full image size.
+        """Optimise map and MLP over all images of the map, the last part at full image size.
 
-        Half way, what is now known to move is excluded; at the end, Gaussians that no static pixel
-        shows are removed. A resumed run goes on after what is done.
+        Half way, if each had two renderings, the upper mode of beta is excluded and gaps are
+        filled; at the end, Gaussians that no static pixel shows are removed. A resumed run goes on
+        after what is done.
         """
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full

@@ -26,7 +26,7 @@ from minislam.workers import Workers
 class JointOptimisation(Stateful):
     """The map, the MLP and the keyframes, and the iterations that optimise map and MLP.
 
-    Which Gaussians there are, and when an optimisation runs, is decided in `mapper.py`.
+    What is inserted and removed, and when it is optimised, is decided in `mapper.py`.
     """
 
     camera: Camera  # of the keyframe images; the tracker may refine its focal length

@@ -31,7 +31,7 @@ LEAST_VIEWS = 2  # renderings of each keyframe, before which most of a static ro
 # a carried table out of the map; from 0.05 on, they also take a wall that beta doubts.
 LEAST_STATIC = 0.02
 LEAST_WRONG = 0.5  # of the cells of the upper mode, else they are kept [-]
-ASKED = 24  # keyframes, at least half of them, whose rendering errors tell that
+ASKED = 24  # keyframes at most, evenly spread, whose rendering errors tell that
 OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 
@@ -69,8 +69,8 @@ def least_weight(beta_raw: Tensor) -> float:
 def is_wrong(error: RenderingError, beta_raw: Tensor, least: float, lambda_depth: float) -> bool:
     """Tell whether the map is wrong in most cells (..., h', w') that a least weight would exclude.
 
-    The MLP tells features, not places: a dark wall, rendered well, gets the beta of a dark dog
-    before it. The rendering error of a cell by itself asks for a beta of 2 sqrt(L) (`cell_loss`).
+    The MLP tells features, not places: a dark wall, rendered well, gets the beta of a dark dog in
+    front of it. By itself, the error L of a cell asks for a beta of 2 sqrt(L) (`cell_loss`).
     """
     asked = 2 * (error.ssim + lambda_depth * error.depth).sqrt()
     doomed, wrong = (
@@ -90,9 +90,9 @@ def support(
     """Return what the static pixels of a view say of the map.
 
     That is the blending weight of each Gaussian over the static pixels, and over all; and the
-    fraction of the static pixels where the map is opaque. Without any, nothing is missing, unless
-    the map is empty. The rendered colour is linear in the colours of the Gaussians; its derivative
-    is the blending weight.
+    fraction of the static pixels where the map is opaque: without any static pixel 1, or 0 for an
+    empty map. The rendered colour is linear in the colours of the Gaussians, so the blending
+    weights are its derivative.
     """
     colors, static = gaussians.colors.detach().requires_grad_(), weight > 0
     rendering = render(replace(gaussians, colors=colors), camera, T_camera_world.float())

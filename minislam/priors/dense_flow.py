@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 CORNERS, CONTRAST = 1500, 8  # at most, of an image; least difference around them [grey values]
-LEAST_CORNERS, CORNER_ERROR = 12, 4.0  # that follow one homography, else by chance; within [px]
+LEAST_CORNERS, CORNER_ERROR = 12, 4.0  # inliers of a homography, else chance; within so many px
 
 
 def grayscale(image: Tensor) -> np.ndarray:

@@ -16,7 +16,7 @@ from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
 Edge = tuple[int, int]  # keyframe index of source and target
 
 # Matched ratio; with less, the motion may be too fast for a chain, and corners tell one more start.
-# From 0.4 on they find an umbrella that fills the view. [-]
+# With 0.4 and more, they would follow an umbrella that fills the view. [-]
 WEAK = 0.2
 _THREADS = ThreadPoolExecutor(2)  # compute flows side by side, without effect on the result
 

@@ -85,7 +85,7 @@ def published_files() -> dict[str, PublishedFile]:
 
 
 def find_weights(use: str, given: str | None) -> str | None:
-    """Return the path of what "--flow droid" reads: given (a path or a row's name), or fetched."""
+    """Return the path that "--flow droid" reads: given, of a row so named, or of what is there."""
     row = published_files().get(given or use.split()[-1])
     if row is None or row.use != use or not (given or row.path.exists()):
         return given

@@ -160,7 +160,7 @@ class Run:
         return resample(self._betas[frame_index], height, width).numpy()
 
     def displacement(self, frame_index: int) -> np.ndarray | None:  # (H, W, 2) px
-        """Return how far a rolling shutter shows each pixel from its place; None: not at all."""
+        """Return how far a rolling shutter shows each pixel from its place; None: negligibly."""
         across, down = self.folder.read_run().get("readout_seconds", (0.0, 0.0))
         is_global = across == down == 0
         return None if is_global else self._motion.displacement(frame_index, (across, down))

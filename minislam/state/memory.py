@@ -48,7 +48,7 @@ class Shelf:
                 continue
             if tensor.nbytes >= SMALLEST and not self.holds(tensor):
                 with suppress(OSError):
-                    place = torch.from_numpy(self.room(tensor.nbytes))
+                    place = torch.from_numpy(self.reserve(tensor.nbytes))
                     tensor.data = place.view(tensor.dtype).view(tensor.shape).copy_(tensor)
         release()
 
@@ -69,8 +69,8 @@ class Shelf:
         ranges = zip(starts, map(len, self._blocks), strict=True)
         return any(start <= tensor.data_ptr() < start + length for start, length in ranges)
 
-    def room(self, length: int) -> np.ndarray:  # (length,) uint8
-        """Return bytes that are free until the array is gone; OSError: the disk is full."""
+    def reserve(self, length: int) -> np.ndarray:  # (length,) uint8
+        """Return bytes that are used again once the array is gone; OSError: the disk is full."""
         size = -(-length // ALIGNMENT) * ALIGNMENT
         spare = self._spare.setdefault(size, [])
         if spare:
@@ -115,7 +115,7 @@ def stack(rows: list[Tensor]) -> Tensor:
     size, step = len(rows) * rows[0].nbytes, max(1, PIECE // rows[0].nbytes)
     if size > FIRST_BLOCK and rows[0].device.type == "cpu":
         with suppress(OSError):
-            place = torch.from_numpy(Shelf().room(size)).view(rows[0].dtype)
+            place = torch.from_numpy(Shelf().reserve(size)).view(rows[0].dtype)
             whole = place.view(len(rows), *rows[0].shape)
             for first in range(0, len(rows), step):
                 torch.stack(rows[first : first + step], out=whole[first : first + step])

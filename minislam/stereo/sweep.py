@@ -20,9 +20,9 @@ from minislam.geometry.distortion import camera_matrix
 
 NCC_WINDOW = (5, 5)  # px, that are correlated
 NCC_VARIANCE = 4e-4  # of grey values in [0, 1]: contrast below its root does not count
-COLOUR_WINDOW = (3, 3)  # px, of the absolute difference
-COLOUR_SCALE = 0.06  # grey values: a larger difference counts no more
-COLOUR_WEIGHT = 0.15  # of the absolute difference beside the correlation [-]
+DIFFERENCE_WINDOW = (3, 3)  # px, of the absolute difference
+DIFFERENCE_SCALE = 0.06  # grey values: a larger difference counts no more
+DIFFERENCE_WEIGHT = 0.15  # of the absolute difference beside the correlation [-]
 MIN_SEEN = 0.25  # of the views that must see a pixel's plane [-]
 UNSEEN_COST = 0.8  # of a plane that fewer views see: neither right nor wrong [-]
 OUTSIDE = -1e4  # grey value outside of an image; mixed into a pixel, it makes it negative
@@ -107,9 +107,9 @@ def _dissimilarity(
     mean_warped, variance_warped = _moments(warped)
     covariance = cv2.blur(gray * warped, NCC_WINDOW) - mean * mean_warped
     ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))
-    difference = cv2.blur(np.abs(gray - warped), COLOUR_WINDOW)
-    colour = np.minimum(difference / COLOUR_SCALE, 1)
-    return (1 - COLOUR_WEIGHT) * (1 - ncc.clip(0, 1)) + COLOUR_WEIGHT * colour
+    difference = cv2.blur(np.abs(gray - warped), DIFFERENCE_WINDOW)
+    absolute = np.minimum(difference / DIFFERENCE_SCALE, 1)
+    return (1 - DIFFERENCE_WEIGHT) * (1 - ncc.clip(0, 1)) + DIFFERENCE_WEIGHT * absolute
 
 
 def _mean_of_better_half(

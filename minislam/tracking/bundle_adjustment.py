@@ -34,7 +34,7 @@ MAX_DAMPING = 1e6  # relative; a step damped more than this would not move anyth
 class BundleReport:
     """What a bundle adjustment did."""
 
-    converged: bool  # False only if the normal equations were singular
+    converged: bool  # False only if the normal equations stayed singular, whatever the damping
     cost_before: float  # px^2
     cost_after: float  # px^2, never larger than cost_before
     iterations: int  # accepted steps

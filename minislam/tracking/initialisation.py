@@ -35,7 +35,7 @@ def first_disparity_hypotheses(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
 
-    They are the depth prior, if there is one, a wall before the camera, a ground that is nearer
+    They are the depth prior, if there is one, a wall facing the camera, a ground that is nearer
     below, and walls that are nearer on the left or on the right. The prior comes first, because the
     first of equal costs wins, as where no flow tells any depth.
     """

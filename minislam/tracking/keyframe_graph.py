@@ -47,11 +47,11 @@ PROXIMITY_EDGES = 2  # further links of a new keyframe, nearest by flow distance
 PROXIMITY_DISTANCE = 120.0  # px at 320x240, largest flow distance of such a link
 HORIZON = 3  # BA windows of keyframes among which a new one looks for such links
 MIN_LINK_RATIO = 0.1  # least matched ratio of a far link [-]
-MIN_PARALLAX = 2.0  # px at 320x240; with less on all links, disparities are kept
+MIN_PARALLAX = 2.0  # px at 320x240; with less on all links, flow does not measure depth
 GLOBAL_EDGES = 6  # further links per keyframe in a global BA
 GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
-ROBUST_NARROWING = 0.5  # between keyframes, because the structure is known by then [-]
-LEAST_WEIGHT = 0.01  # mean weight of cells, below which little is known of a pose between them [-]
+ROBUST_NARROWING = 0.5  # for frames between keyframes: the structure is known by then [-]
+LEAST_WEIGHT = 0.01  # mean weight of cells, below which little is known of such a frame's pose [-]
 FULL_FLOW_WEIGHT = 0.75  # eta of the flow distance [-]
 
 

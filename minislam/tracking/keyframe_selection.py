@@ -36,8 +36,8 @@ def needs_keyframe(
     """Tell whether a frame moved far, is hardly matched, or is `keyframe_interval` frames away.
 
     Without a depth prior each keyframe takes its scale from the one before, and drifts over wide
-    steps. So a frame is taken once the next one, if it moves as far, would lie farther beyond the
-    flow than this one lies before it.
+    steps. So the frame whose mean flow is nearest to the threshold is taken, not the first beyond
+    it: the next one is expected to move as far as this one did.
     """
     flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
     if not graph.keyframes.has_prior:

@@ -56,7 +56,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
 
 
 def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:
-    """Adjust all keyframes on fresh flow, without the prior: many views know depth better."""
+    """Adjust all keyframes on fresh flow; the prior only if `final_prior`: views know better."""
     config = graph.config
     edges = graph.links.edges + graph.global_edges()
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0

@@ -125,7 +125,7 @@ class Tracker(Stateful):
         return len(self.keyframes) > count
 
     def end(self) -> None:
-        """End with a keyframe, unless the last one is near: other frames are posed between two."""
+        """Make the last followed frame a keyframe, unless one is near: others are posed between."""
         if self.last_non_keyframe is not None:
             last = self.last_non_keyframe[0].frame_index
             if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:

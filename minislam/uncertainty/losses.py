@@ -88,8 +88,8 @@ def variance_regulariser(
 ) -> Tensor:  # ()
     """Return L_reg_V, the mean variance of beta among cells of similar features.
 
-    Each cell is compared with those whose cosine exceeds `similarity`, at most the `neighbours`
-    nearest and what ties with the last of them, itself included.
+    Each cell is compared with itself and those whose cosine exceeds `similarity`: at most the
+    `neighbours` most similar ones, and what ties with the last of them.
     """
     unit = functional.normalize(features.detach(), dim=-1)
     cosine = unit @ unit.T

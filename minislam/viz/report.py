@@ -1,4 +1,4 @@
-"""The report of a run: one HTML page, report.html its frame; and a summary for a notebook."""
+"""The report of a run: one HTML page, filled into report.html; and a summary for a notebook."""
 
 import json
 from collections.abc import Mapping

@@ -27,7 +27,7 @@ from minislam.tracking.safeguards.scale_certainty import scale_deviations
 from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_rest
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
-EXPLAINED = 2.0  # px, also in smaller images: a residual of a match that the geometry explains
+EXPLAINED = 2.0  # px at 320x240 and in smaller images: a residual that the geometry explains
 # Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .88 to 1, two in a
 # row on fast real video .68 and .82; broken ones .24 to .4, the worst of many in a row .6 to .84.
 MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
@@ -244,8 +244,8 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
     One keyframe is a break if it explains very little, sees other depths, does not know the scale,
-    is held by something new or contradicts what held before; LONG in a row are one if they explain
-    a little too little.
+    is held by something new or contradicts what held before. LONG keyframes in a row that explain a
+    little too little make one, too. Breaks at most HEALED_AFTER keyframes apart are joined.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little

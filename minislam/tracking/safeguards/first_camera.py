@@ -2,7 +2,7 @@
 
 Hypotheses of the first depths end in several minima. With a wrong camera the right one need not be
 the lowest: under a focal length that is 6 % too long, depth that is inside out fits better, and a
-far hill that takes the rolling shutter for parallax turns the rocks before it into outliers. So
+far hill that takes the rolling shutter for parallax turns rocks in front into outliers. So
 what is unknown of the camera is free before costs are compared: its focal length, and the readout.
 
 Under a long lens, or where the camera hardly walks, a scene and its mirror image in depth have
@@ -33,9 +33,9 @@ SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
 # Starts of an unknown focal length beside its guess: each search reaches a third either way.
 OTHER_FOCALS = (math.log(0.5), math.log(2.0))
 # Chosen on five real clips, four in which the camera hardly does more than turn, judged on others.
-FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guessed focal length [-]
+FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guess, and before it is freed [-]
 FARTHEST = math.log(4)  # from the guessed focal length; farther off, the start has failed
-RELIEF_WORTH_SAVING = 0.1  # of the cost, if disparities do not correlate with the usual ones [-]
+RELIEF_WORTH_SAVING = 0.1  # of the cost, per unit of correlation with the usual disparities [-]
 # More than later (focal_length.py), because in a short pan readout and focal length look alike. In
 # 14 real starts it saved 6 to 26 % of the cost, in 13 others at most 3.7 %, in 22 synthetic < 5 %.
 READOUT_WORTH_SAVING = 0.05  # [-]
@@ -103,8 +103,8 @@ def lowest_minimum(
 ) -> Found:
     """Return the geometry of the warm-up that is most plausible, adjusted with its camera.
 
-    The focal length stays as guessed if the motion does not tell it and it saves little, the
-    readout at zero if it saves little: it would follow noise or movers. Of few keyframes both stay.
+    The focal length stays as guessed if the motion does not tell it and it saves little. A readout
+    that saves little stays 0: it would follow noise or movers. Of few keyframes both stay.
     """
     tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
     seeks_focal = graph.seeks_focal and tells_camera

@@ -45,7 +45,7 @@ def has_warmed_up(tracker: Tracker) -> bool:
 
 
 def can_tell_depth(tracker: Tracker) -> bool:
-    """Tell whether the warm-up knows depth: by a prior, or because enough of it moves."""
+    """Tell whether depth may be known: by a prior, or from a mean flow of `least_parallax`."""
     graph = tracker.graph
     seen = [*graph.flow_to_next, *(tracker.last_non_keyframe or ())[1:]]
     lengths = (mean_flow(graph, flow) for flow in seen)

@@ -4,11 +4,11 @@ A focal length is estimated where it is unknown and checked where it is given.
 
 It is one more unknown of the bundle adjustment (focal_column.py), which converges from 0.75 to 1.3
 times the truth. A camera that does not turn fits its flow with any focal length. So an estimate
-counts only if the cost of the adjusted keyframes rises on both sides of it: much, or less if it
-is much lower than with the present focal length.
+counts only if the cost of the adjusted keyframes rises on both sides of it: by 1.2 %, or by .3 %
+if it saves more than 2 % against the present focal length.
 
-If the lens zooms while it films, a half of the keyframes fits another focal length than the whole:
-where all say 1.04, the second half says 1.40.
+If the lens zooms while it films, half of the keyframes fit another focal length than all of them:
+all fit 1.04 times the present one, say, and the second half 1.40 times.
 """
 
 import math
@@ -156,8 +156,8 @@ def fit_focal_length(
 def seek_readouts(graph: KeyframeGraph) -> None:
     """Set the readout that the flow fits if it saves enough; poses and depths stay.
 
-    Else that of a global shutter would follow noise and movers. A sensor is read along one axis:
-    the readout that displaces the flow more is set, and all later adjustments refine it.
+    If it saves little it stays 0, because it would follow noise and movers. A sensor is read along
+    one axis: the readout that displaces the flow more is set; all later adjustments refine it.
     """
     shutter, edges = graph.shutter, enumerate(graph.links.edges)
     if shutter.axis is not None or len(graph.keyframes) < LEAST_KEYFRAMES:

@@ -31,8 +31,8 @@ from minislam.tracking.safeguards.focal_length import ITERATIONS, WIDENINGS
 from minislam.tracking.safeguards.robust import least_cost
 
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
-TURNS = 16  # of straightening and adjusting, at most
-SETTLED = 0.001  # a turn that bends a corner by no more is the last [-]
+ROUNDS = 16  # of straightening and adjusting, at most
+SETTLED = 0.001  # a round that bends a corner by no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # tests/benchmarks/diary/focal_length.md, "A lens that nobody told of". [-]
@@ -98,7 +98,7 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
     problem, state = replace(among[0], free_focal=True), among[1]
     _, pinhole = adjust_narrowing(problem, state, WIDENINGS, ITERATIONS)
     radial, widenings = (0.0, 0.0), WIDENINGS
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         lens = straightened(problem, radial)
         found, _ = adjust_narrowing(lens, state, widenings, ITERATIONS)
         state, widenings = replace(found, readout=(0.0, 0.0)), [1.0]

@@ -4,7 +4,7 @@ While a dynamic object is small, the robust weight alone excludes it. Once it fi
 image, the pose follows it, not the static scene, and beta learns from wrong poses. So each cell has
 a motion weight: how well its flow has fitted the camera motion. The cell it flows to inherits it.
 
-What stands still in every image while the camera moves is no part of the scene either.
+An overlay, such as a logo, stands still in the image while the camera moves: its weight is 0.
 """
 
 from collections.abc import Sequence
@@ -21,17 +21,17 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import filled_from_nearest
 from minislam.tracking.reprojection import lengths, reproject
 
-MIN_CONFIDENCE = 0.1  # of a match that counts [-]
+MIN_CONFIDENCE = 0.1  # of a match that passes motion weights on [-]
 # Smoothing factors: the weight falls fast and recovers slowly, since a moving object may pause. [-]
 LOSS_RATE = 0.9
 RECOVERY_RATE = 0.1
 DEPTH_ERROR = 0.1  # of a depth prior, relative: so much of the parallax is no motion [-]
 STANDS, MOVES = 0.3, 5.0  # px: flow of a cell that stands, median flow where the camera moves
-CONFIRMED = 0.2  # confidence of a flow that counts [-]
+CONFIRMED = 0.2  # confidence of a flow that may tell an overlay [-]
 ALWAYS = 0.8  # of the pairs in which a cell of an overlay stands [-]
 MIN_PAIRS = 2  # pairs of keyframes in which the camera moves; fewer tell nothing
 MIN_CELLS = 4  # of an overlay; fewer stand still by chance
-REACH = 2  # cells around an overlay, whose flow is that of neither
+REACH = 2  # cells around an overlay left out too: their flow mixes it with the scene
 
 
 def judge_all(graph: KeyframeGraph) -> None:
@@ -128,8 +128,8 @@ def _is_matched(matches: FlowMatches) -> Tensor:  # (N,) bool
 def overlay_weights(flow_to_next: Sequence[FlowMatches], grid: Grid) -> Tensor | None:
     """Return a weight (N,) per cell, 0 on an overlay and beside it; None if there is none.
 
-    An overlay is a logo, a dashboard, black bars: its flow, exactly zero, is well confirmed. A cell
-    of the scene stands still only now and then. The flow of a cell is that of the patch around it.
+    An overlay is a logo, a dashboard, black bars. In most pairs in which the camera moves it stands
+    still, and forward and backward flow agree; a cell of the scene does so only now and then.
     """
     still = []
     for matches in flow_to_next:

@@ -13,7 +13,7 @@ becomes that of a global shutter by
 
 The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
 rho, which is one more unknown with the column c. A phone held upright reads columns, so there are
-two readouts, along x and y; once one is found, the one that displaces the flow less is held at 0.
+two, along x and y. One is held at 0: in the start the longer side's, then what displaces less.
 """
 
 import math
@@ -104,7 +104,7 @@ class RollingShutter(Stateful):
         positions: Tensor,  # (E, 2, N) px, of the source's cells in the target
         next_frame: int | None = None,  # frame that counts as the keyframe after the newest
     ) -> Tensor:  # (E, 2, 2, N) px/s
-        """Return c of some edges for either readout, Eq. (5)."""
+        """Return c, the derivative of the flow of some edges by either readout."""
         camera, pixels = self._grid.camera, self._grid.pixels
         frames = [frame.frame_index for frame in self._keyframes.frames]
         frames += [] if next_frame is None else [next_frame]

@@ -31,7 +31,7 @@ def scale_deviations(problem: BundleProblem, state: BundleState) -> dict[int, fl
     """Return the standard deviation of ln(length after / length before) of keyframes [-].
 
     The first pose must be fixed, all others and all disparities free, and the state adjusted.
-    Keyframes without a length on either side are left out, all if the equations are singular.
+    Keyframes that lack a length before or after are left out; of singular equations, all are.
     """
     gradients = dict(_log_ratio_gradients(state))
     if not gradients:

@@ -25,7 +25,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     A turn moves all points as if they were infinitely far away. The best one, under a wide robust
     weight, takes the place of any translation that looks like it, so that what is left, in the
     median, tells depth, whatever parallax the poses claim. Under a wrong focal length a turn looks
-    like parallax, so one that is sought and not told is free. None: no link has any weight.
+    like parallax, so one that is sought and not yet found is free. None: no link has any weight.
     """
     grid, links, keyframes = graph.grid, graph.links, graph.keyframes
     pairs = [p for p, (source, target) in enumerate(links.edges) if target == source + 1]
@@ -34,7 +34,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
         return None
     weights = [links.confidences[p] * keyframes.cell_weights[links.edges[p][0]] for p in pairs]
     numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
-    ends = torch.zeros_like(numbers[1:]), numbers[1:]  # seen from infinitely far, sources are one
+    ends = torch.zeros_like(numbers[1:]), numbers[1:]  # without translation sources share a pose
     measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
     problem = pose_from_flow.motion_only_problem(grid, *ends, *measured, numbers > 0, None)
     problem = replace(problem, free_focal=graph.seeks_focal and not graph.focal_is_free)
