@@ -14,7 +14,7 @@ from pathlib import Path
 from minislam.cli.help import UsageError
 from minislam.cli.options import input_options, lpips_of, prior_choice, settings
 from minislam.data.files import make_folder, read_json, write_json, write_text
-from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError
+from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError, require
 from minislam.runs.progress import ending_signals, say
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
@@ -80,18 +80,12 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
     for folder in map(Path, folders):
         inside = [folder, *sorted(folder.glob("*")), *sorted(folder.glob("*/*"))]
         paths = [path for path in inside if path.is_dir() and is_tum_folder(path)]
-        if not paths:
-            raise InputError(
-                f"expected sequences (folders with rgb.txt, or rgb/ with times as names) in "
-                f"{folder}, found none; check the path"
-            )
+        wanted = f"sequences (folders with rgb.txt, or rgb/ with times as names) in {folder}"
+        require(bool(paths), wanted, "none; check the path")
         for path in paths:
             name = path.resolve().name
-            if name in found:
-                raise InputError(
-                    f"expected sequences of different names, found two called {name}; bench them "
-                    "in two commands, each with its own -o"
-                )
+            two = f"two called {name}; bench them in two commands, each with its own -o"
+            require(name not in found, "sequences of different names", two)
             found[name] = path
     return found
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from minislam.data.files import atomic_write, require_free, require_new
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.runs.progress import ProgressLine, say
 
 EPILOG = """\
@@ -41,11 +41,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def _export(args: argparse.Namespace) -> None:
     folders = [args.colmap, args.nerfstudio, args.depth, args.masks]
-    if not any([*folders, args.points, args.sh_degree]):
-        raise InputError(
-            "expected at least one of --colmap, --nerfstudio, --points, --depth, --masks and "
-            "--sh-degree, found none; say what to write"
-        )
+    flags = "--colmap, --nerfstudio, --points, --depth, --masks and --sh-degree"
+    is_asked = any([*folders, args.points, args.sh_degree])
+    require(is_asked, f"at least one of {flags}", "none; say what to write")
     for folder in filter(None, folders):
         require_free(folder, args.overwrite)
     padded, own = (Path(args.folder) / name for name in ("map_sh.ply", "map.ply"))

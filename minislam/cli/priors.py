@@ -17,7 +17,7 @@ from minislam.cli import options
 from minislam.cli.help import add_command
 from minislam.data.files import atomic_file, make_folder, read_text, write_text
 from minislam.data.options import require_source
-from minislam.errors import InputError, require
+from minislam.errors import require
 from minislam.parameters import user_path
 from minislam.runs.progress import ProgressLine
 
@@ -106,11 +106,9 @@ def _write_kind(
     index = index_text(origin, [(frame.frame_index, frame.timestamp) for frame in sequence])
     make_folder(folder)
     path = folder / INDEX
-    if any(folder.iterdir()) and not (path.exists() and read_text(path) == index):
-        raise InputError(
-            f"expected an empty folder, or one of the same command, found {folder} with other "
-            "files; choose another --out"
-        )
+    is_ours = not any(folder.iterdir()) or (path.exists() and read_text(path) == index)
+    found = f"{folder} with other files; choose another --out"
+    require(is_ours, "an empty folder, or one of the same command", found)
     write_text(path, index)
     for frame in progress.over(f"writing {folder.name}", sequence, len(sequence)):
         path = folder / f"{frame.frame_index:05d}.npy"  # as WildGS-SLAM names its own

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from minislam.data.files import data_rows, finite_numbers, read_text
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion, Camera
 
 # Focal length over the longer image side when nothing is known: phone and consumer cameras film
@@ -36,11 +36,10 @@ class Calibration:
             camera = Camera(self.fx, self.fy, self.cx, self.cy, *made_for)
         except InputError as error:
             raise InputError(f"{self.origin}: {error}") from error
-        if not self.fits(width, height):
-            raise InputError(
-                f"expected images of {made_for[0]}x{made_for[1]} px or a resized version of that "
-                f"({self.origin}), found {width}x{height}; calibration and images do not match"
-            )
+        size = f"{made_for[0]}x{made_for[1]} px"
+        wanted = f"images of {size} or a resized version of that ({self.origin})"
+        found = f"{width}x{height}; calibration and images do not match"
+        require(self.fits(width, height), wanted, found)
         return camera.resized(width, height)
 
     def fits(self, width: int, height: int) -> bool:
@@ -73,16 +72,12 @@ def rough_calibration(
 def read_calibration(path: Path) -> Calibration:
     """Read `fx fy cx cy [width height [k1 k2 p1 p2 k3]]` from a text file."""
     fields = " ".join(row for _, row in data_rows(read_text(path), "")).replace(",", " ").split()
-    if len(fields) not in (4, 6, 11):
-        raise InputError(
-            "expected 4, 6 or 11 numbers, fx fy cx cy [width height [k1 k2 p1 p2 k3]], found "
-            f"{len(fields)} in {path}; add or remove numbers"
-        )
+    wanted = "4, 6 or 11 numbers, fx fy cx cy [width height [k1 k2 p1 p2 k3]]"
+    found = f"{len(fields)} in {path}; add or remove numbers"
+    require(len(fields) in (4, 6, 11), wanted, found)
     fx, fy, cx, cy, *rest = finite_numbers(fields, str(path))
     size = (int(rest[0]), int(rest[1])) if rest else None
-    if size and (size != tuple(rest[:2]) or min(size) < 1):
-        raise InputError(
-            f"expected width and height as positive whole numbers, found {fields[4]} and "
-            f"{fields[5]} in {path}; correct them"
-        )
+    is_whole = size is None or (size == tuple(rest[:2]) and min(size) >= 1)
+    found = f"{' and '.join(fields[4:6])} in {path}; correct them"
+    require(is_whole, "width and height as positive whole numbers", found)
     return Calibration(fx, fy, cx, cy, size, BrownDistortion(*rest[2:]), path.name)

@@ -53,22 +53,19 @@ def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
     """Read a black and white picture: white is True."""
     gray = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     white = 255 if gray.max() <= 255 else 65535
-    if 0 < gray.max() <= white // 2:
-        raise InputError(
-            f"expected a mask of 0 and {white}, found {gray.max()} as the largest value in {path}; "
-            f"write {white} where something moves, not its number"
-        )
+    found = f"{gray.max()} as the largest value in {path}"
+    advice = f"write {white} where something moves, not its number"
+    is_mask = gray.max() == 0 or gray.max() > white // 2
+    require(is_mask, f"a mask of 0 and {white}", f"{found}; {advice}")
     return gray > white // 2
 
 
 def read_depth(path: Path, units_per_metre: float) -> np.ndarray:  # (H, W) float32 metre
     """Read a 16-bit depth picture, 0 where unknown. TUM files store 5000 units per metre."""
     depth = _decode(path, cv2.IMREAD_UNCHANGED)
-    if depth.ndim != 2 or depth.dtype != np.uint16:
-        raise InputError(
-            f"expected a 16-bit single-channel depth image, found {depth.dtype} of shape "
-            f"{depth.shape} in {path}; export depth as 16-bit PNG"
-        )
+    is_depth = depth.ndim == 2 and depth.dtype == np.uint16
+    found = f"{depth.dtype} of shape {depth.shape} in {path}; export depth as 16-bit PNG"
+    require(is_depth, "a 16-bit single-channel depth image", found)
     return depth.astype(np.float32) / np.float32(units_per_metre)
 
 

@@ -69,11 +69,10 @@ def require_source(source: str, masks: str | None = None) -> None:
         import data_synth  # only here: real footage needs no scene generator
 
         name, seed, _ = synthetic_parts(source)
-        if name not in data_synth.SEQUENCES or not re.fullmatch(r"[0-9]{0,18}", seed):
-            raise InputError(
-                f"expected synth:NAME or synth:NAME:SEED with NAME one of "
-                f"{', '.join(data_synth.SEQUENCES)}, found {source}; choose one of them"
-            )
+        known = ", ".join(data_synth.SEQUENCES)
+        is_known = name in data_synth.SEQUENCES and re.fullmatch(r"[0-9]{0,18}", seed) is not None
+        wanted = f"synth:NAME or synth:NAME:SEED with NAME one of {known}"
+        require(is_known, wanted, f"{source}; choose one of them")
         return
     path = user_path(source)
     if not (os.path.isfile(path) or os.path.isdir(path)):  # these know names of any length

@@ -83,11 +83,9 @@ def read_ply(path: Path | str) -> GaussianArrays:
     content, name = read_bytes(path), str(path)
     header, ended, body = content.partition(b"end_header\n")
     count, names = _parse_header(header if ended else b"", name)
-    if len(body) != 4 * count * len(names):
-        raise InputError(
-            f"expected {4 * count * len(names)} bytes for {count} Gaussians, found {len(body)} in "
-            f"{name}; the file is cut short or damaged"
-        )
+    length = 4 * count * len(names)
+    found = f"{len(body)} in {name}; the file is cut short or damaged"
+    require(len(body) == length, f"{length} bytes for {count} Gaussians", found)
     table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
 
     def take(*wanted: str) -> np.ndarray:
@@ -128,15 +126,11 @@ def _parse_header(header: bytes, name: str) -> tuple[int, list[str]]:
 def _validate(gaussians: GaussianArrays, name: str) -> None:
     """Refuse values that would hang or blind a viewer."""
     for what, values in vars(gaussians).items():
-        if bad := int((~np.isfinite(values)).sum()):
-            raise InputError(
-                f"expected finite {what} in {name}, found {bad} values that are NaN or infinite; "
-                "remove these Gaussians"
-            )
-    if (worst := np.abs(gaussians.log_scales).max(initial=0)) >= _MAX_LOG_SCALE:
-        raise InputError(
-            f"expected |log scale| < {_MAX_LOG_SCALE:g} in {name}, found {worst:.3g}; store scales "
-            "as natural logarithms"
-        )
+        bad = int((~np.isfinite(values)).sum())
+        found = f"{bad} values that are NaN or infinite; remove these Gaussians"
+        require(bad == 0, f"finite {what} in {name}", found)
+    worst = np.abs(gaussians.log_scales).max(initial=0)
+    found = f"{worst:.3g}; store scales as natural logarithms"
+    require(worst < _MAX_LOG_SCALE, f"|log scale| < {_MAX_LOG_SCALE:g} in {name}", found)
     turns = np.linalg.norm(gaussians.quats_wxyz.astype(float), axis=1).min(initial=1) >= 1e-12
     require(turns, f"quaternions other than zero in {name}", "a zero one; it is no rotation")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from minislam.data.options import MINIMUM_SIDE
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion, Camera
 from minislam.state.memory import Shelf, release
 
@@ -38,11 +38,9 @@ class ImagePreparation:
         picture: Window | None = None,  # of the raw image, see `picture_window`; None: all
     ) -> None:
         self.raw_camera, self._raw_size = raw_camera, (raw_camera.width, raw_camera.height)
-        if min(self._raw_size) < MINIMUM_SIDE:
-            raise InputError(
-                f"expected images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px, found "
-                f"{raw_camera.width}x{raw_camera.height}; use larger images"
-            )
+        wanted = f"images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px"
+        found = f"{raw_camera.width}x{raw_camera.height}; use larger images"
+        require(min(self._raw_size) >= MINIMUM_SIDE, wanted, found)
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
         self._window = picture or (0, 0, *self._raw_size)
         if np.any(distortion.coefficients):
@@ -102,11 +100,9 @@ class ImagePreparation:
     ) -> np.ndarray:  # (H, W, ...)
         """Undistort an image and cut unseen borders, at the size of the source."""
         width, height = self._raw_size
-        if raw.shape[:2] != (height, width):
-            raise InputError(
-                f"expected images of one size, {width}x{height} as the first, found "
-                f"{raw.shape[1]}x{raw.shape[0]} in {label}; remove or resize the odd ones"
-            )
+        wanted = f"images of one size, {width}x{height} as the first"
+        found = f"{raw.shape[1]}x{raw.shape[0]} in {label}; remove or resize the odd ones"
+        require(raw.shape[:2] == (height, width), wanted, found)
         if self._maps is not None:
             raw = cv2.remap(raw, *self._maps, interpolation)
         left, top, width, height = self._window

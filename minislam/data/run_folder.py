@@ -14,7 +14,7 @@ from torch import Tensor
 from minislam.data import files
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.trajectory import read_trajectory
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import user_path
 from minislam.records import Trajectory
 
@@ -156,11 +156,9 @@ def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:
         is_ours = is_ours or _CONFIG_PARTS <= set(files.read_json(path / CONFIG))
     wrong = [e for e in entries if e.is_symlink() and e.name in (*_FILES, KEYFRAMES, PLOTS)]
     wrong += [i for i in inputs if i.resolve().is_relative_to(path.resolve())]
-    if wrong or not is_ours:
-        raise InputError(
-            "expected the folder of an earlier run for --overwrite, without links and without "
-            f"images of this one, found {[*wrong, path][0]}; nothing was removed, choose another "
-            "--output"
-        )
+    wanted = "the folder of an earlier run for --overwrite"
+    without = "without links and without images of this one"
+    found = f"{[*wrong, path][0]}; nothing was removed, choose another --output"
+    require(is_ours and not wrong, f"{wanted}, {without}", found)
     plain = [entry for entry in entries if entry.is_file() and not entry.is_symlink()]
     return [file for file in plain if _OURS.fullmatch(file.relative_to(path).as_posix())]

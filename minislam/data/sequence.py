@@ -15,7 +15,7 @@ from minislam.data.options import SYNTHETIC, InputOptions, require_source, synth
 from minislam.data.preparation import ImagePreparation, KeptImages, Window, picture_window
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import absolute_path, user_path
 from minislam.records import Frame, GroundTruth, Progress
 
@@ -58,12 +58,9 @@ class RecordedSequence:
         chosen = range(options.start, len(recording.images), options.stride)
         chosen, odd = chosen[: options.max_frames], recording.images.odd
         self._chosen = [index for index in chosen if index not in odd]
-        if len(self._chosen) < 2:
-            raise InputError(
-                f"expected at least two frames, found {len(self._chosen)} among "
-                f"{len(recording.images)} images of {recording.name} after --start, --stride and "
-                "--max-frames; change these, or give more images"
-            )
+        found = f"{len(self._chosen)} among {len(recording.images)} images of {recording.name}"
+        advice = "after --start, --stride and --max-frames; change these, or give more images"
+        require(len(self._chosen) >= 2, "at least two frames", f"{found} {advice}")
         stamps = recording.timestamps
         first, last = stamps[chosen[0]], stamps[chosen[-1]]
         self.lost = [row for row in recording.lost if first < row[0] < last]

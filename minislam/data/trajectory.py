@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minislam.data.files import data_rows, finite_numbers, read_text, write_text
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.records import Trajectory
 
 _TRUTHS = ("groundtruth.txt", "pose.txt")  # TUM and Bonn; Wild-SLAM
@@ -31,20 +31,15 @@ def read_trajectory(path: Path | str) -> Trajectory:
     for where, row in data_rows(read_text(path), str(path)):
         numbers = finite_numbers(row.split(), where)
         error = abs(math.hypot(*numbers[4:]) - 1)
-        if len(numbers) != 8 or error > _QUATERNION_NORM_TOLERANCE:
-            raise InputError(
-                f"expected 8 columns, {_COLUMNS}, the last four a unit quaternion, found "
-                f"{len(numbers)}, '{row[:200]}', in {where}; check their number and order"
-            )
-        if rows and numbers[0] < rows[-1][0]:
-            raise InputError(
-                f"expected timestamps that increase, found {numbers[0]} after {rows[-1][0]} in "
-                f"{where}; sort the file"
-            )
-        if not rows or numbers[0] > rows[-1][0]:
+        is_pose = len(numbers) == 8 and error <= _QUATERNION_NORM_TOLERANCE
+        found = f"{len(numbers)}, '{row[:200]}', in {where}; check their number and order"
+        require(is_pose, f"8 columns, {_COLUMNS}, the last four a unit quaternion", found)
+        last = rows[-1][0] if rows else -math.inf
+        found = f"{numbers[0]} after {last} in {where}; sort the file"
+        require(numbers[0] >= last, "timestamps that increase", found)
+        if numbers[0] > last:
             rows.append(numbers)
-    if not rows:
-        raise InputError(f"expected rows of {_COLUMNS}, found none in {path}; check the file")
+    require(bool(rows), f"rows of {_COLUMNS}", f"none in {path}; check the file")
     table = np.array(rows)
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
@@ -60,11 +55,9 @@ def write_trajectory(path: Path | str, trajectory: Trajectory) -> None:
     poses = np.asarray(trajectory.T_world_camera, dtype=np.float64).reshape(-1, 4, 4)
     stamps = np.round(trajectory.timestamps, 6)
     is_finite = np.isfinite(poses).all() and np.isfinite(stamps).all()
-    if not is_finite or np.any(np.diff(stamps) <= 0):
-        raise InputError(
-            "expected finite poses, and timestamps that increase by at least a microsecond, found "
-            "others; leave out lost poses, and pass the timestamps of the source"
-        )
+    wanted = "finite poses, and timestamps that increase by at least a microsecond"
+    found = "others; leave out lost poses, and pass the timestamps of the source"
+    require(bool(is_finite and (np.diff(stamps) > 0).all()), wanted, found)
     quats_xyzw = np.zeros((0, 4))
     if len(poses):
         quats_xyzw = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
-from minislam.errors import InputError
+from minislam.errors import require
 
 # Wang et al. 2004: an 11x11 Gaussian window, and constants that keep flat areas from 0/0.
 _SSIM_RADIUS, _SSIM_SIGMA = 5, 1.5  # px
@@ -72,12 +72,12 @@ def auroc(scores: ArrayLike, mask: ArrayLike) -> float:  # 1: perfect, 0.5: chan
     scores = np.asarray(scores, dtype=np.float64).ravel()
     mask = np.asarray(mask, dtype=bool).ravel()
     positives, negatives = int(mask.sum()), int((~mask).sum())
-    if scores.shape != mask.shape or positives == 0 or negatives == 0:
-        kinds = f"{positives} moving and {negatives} static pixels"
-        found = f"{scores.size} scores, {kinds}; choose frames with dynamic objects"
-        raise InputError(f"expected one score per pixel and pixels of both kinds, found {found}")
-    if not np.isfinite(scores).all():
-        raise InputError("expected finite scores, found NaN or infinity; check the uncertainty")
+    are_both = scores.shape == mask.shape and positives > 0 and negatives > 0
+    kinds = f"{positives} moving and {negatives} static pixels"
+    found = f"{scores.size} scores, {kinds}; choose frames with dynamic objects"
+    require(are_both, "one score per pixel and pixels of both kinds", found)
+    is_finite = bool(np.isfinite(scores).all())
+    require(is_finite, "finite scores", "NaN or infinity; check the uncertainty")
     static, moving = np.sort(scores[~mask]), scores[mask]
     u = sum(np.searchsorted(static, moving, side).sum() for side in ("left", "right")) / 2
     return float(u / (positives * negatives))

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 
 # Mean and spread of natural images, for values in [-1, 1]: RGB, from the authors' code.
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -55,9 +55,9 @@ class Lpips:
     def __init__(self, trunk: Mapping[str, Tensor], heads: Mapping[str, Tensor]) -> None:
         """Take torchvision's features.0.weight, ..., and the authors' lin0.model.1.weight, ..."""
         self._layout, self.name = recognise_trunk(trunk), recognise_heads(heads)
-        if self.name != self._layout.name:
-            found = f"heads for {self.name}; give alex.pth with AlexNet and vgg.pth with VGG-16"
-            raise InputError(f"expected LPIPS heads for {self._layout.name}, found {found}")
+        found = f"heads for {self.name}; give alex.pth with AlexNet and vgg.pth with VGG-16"
+        fits = self.name == self._layout.name
+        require(fits, f"LPIPS heads for {self._layout.name}", found)
         self._trunk, self._heads = trunk, heads
 
     def __call__(self, image: ArrayLike, reference: ArrayLike) -> float:
@@ -76,10 +76,9 @@ class Lpips:
     def require_size(self, width: int, height: int) -> None:
         """Refuse images that are too small to compare [px]."""
         side = self._layout.smallest_side
-        if min(width, height) < side:
-            wanted = f"images of at least {side}x{side} px for LPIPS with {self.name}"
-            found = f"{width}x{height}; give a larger working size"
-            raise InputError(f"expected {wanted}, found {found}")
+        wanted = f"images of at least {side}x{side} px for LPIPS with {self.name}"
+        found = f"{width}x{height}; give a larger working size"
+        require(min(width, height) >= side, wanted, found)
 
     def _features(self, image: Tensor) -> list[Tensor]:  # five of (C, h, w), of unit length
         scaled = (2 * image - 1 - image.new_tensor(_SHIFT)) / image.new_tensor(_SCALE)
@@ -115,10 +114,9 @@ def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:
             for part, shape in (("weight", (channels, before)), ("bias", (channels,))):
                 name = f"features.{number}.{part}"
                 found = tuple(trunk[name].shape[:2]) if name in trunk else "none"
-                if found != shape:
-                    found = f"{found}; give torchvision's file of this network, whole"
-                    wanted = f"{name} of {layout.name} to have {shape} channels"
-                    raise InputError(f"expected {wanted}, found {found}")
+                wanted = f"{name} of {layout.name} to have {shape} channels"
+                advice = "give torchvision's file of this network, whole"
+                require(found == shape, wanted, f"{found}; {advice}")
             before = channels
     return layout
 

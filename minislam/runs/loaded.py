@@ -18,7 +18,7 @@ from minislam.data.options import InputOptions
 from minislam.data.ply import GaussianArrays, read_ply
 from minislam.data.run_folder import CAMERA, CONFIG, MAP, PLOTS, VIEWER, RunFolder
 from minislam.data.sequence import RecordedSequence, open_sequence
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import Camera, se3_inverse
 from minislam.images import resample
 from minislam.mapping.mapper import surface_depth
@@ -201,18 +201,13 @@ class Run:
         """Return the source of the run, opened again."""
         source, options = (self.folder.read_config()[part] for part in ("sequence", "input"))
         sequence = open_sequence(source, with_values(InputOptions(), options))
-        if len(sequence) < len(self.frames):
-            raise InputError(
-                f"expected the {len(self.frames)} frames of the run in {source}, found "
-                f"{len(sequence)}; restore the source"
-            )
+        wanted = f"the {len(self.frames)} frames of the run in {source}"
+        require(len(sequence) >= len(self.frames), wanted, f"{len(sequence)}; restore the source")
         for frame in self.frames:
             found = sequence.source_name(frame.index)
-            if found != frame.source and is_image(Path(found)):  # a video may have another name
-                raise InputError(
-                    f"expected {frame.source} as frame {frame.index} of the run in {source}, "
-                    f"found {found}; restore the source"
-                )
+            is_right = found == frame.source or not is_image(Path(found))  # videos may be renamed
+            wanted = f"{frame.source} as frame {frame.index} of the run in {source}"
+            require(is_right, wanted, f"{found}; restore the source")
         return sequence
 
     @cached_property

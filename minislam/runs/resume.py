@@ -11,7 +11,7 @@ from typing import Any
 import minislam
 from minislam.config import SlamConfig
 from minislam.data.run_folder import CHECKPOINT, RunFolder
-from minislam.errors import InputError, MinislamError
+from minislam.errors import InputError, MinislamError, require
 from minislam.parameters import flattened
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
@@ -106,11 +106,9 @@ class Checkpoints:
                 )
             for index, checksum in found["checksums"].items():
                 slam.sequence.frame(int(index))
-                if slam.sequence.checksums[int(index)] != checksum:
-                    raise InputError(
-                        f"expected frame {index} as the interrupted run in {where} read it, found "
-                        "another image; restore it, or start anew in another folder"
-                    )
+                wanted = f"frame {index} as the interrupted run in {where} read it"
+                other = "another image; restore it, or start anew in another folder"
+                require(slam.sequence.checksums[int(index)] == checksum, wanted, other)
             slam.restore_state(found["slam"], functools.cache(slam.frame))
             self.start -= float(found["run_seconds"])
             self.seconds = float(found["checkpoint_seconds"])

@@ -18,7 +18,7 @@ from minislam.data.files import atomic_write, write_json
 from minislam.data.ply import GaussianArrays, encode_ply
 from minislam.data.run_folder import RunFolder
 from minislam.data.trajectory import write_trajectory
-from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, InputError, require
+from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, require
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
@@ -38,11 +38,9 @@ from minislam.workers import Workers, idle_cores
 def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -> Priors:
     """Return the priors that are named, their files read and checked."""
     networks, factor = config.networks, config.uncertainty.grid_factor
-    if choice.features.startswith(FILES) and factor != 1:
-        raise InputError(
-            f"expected uncertainty.grid_factor 1 with --features {FILES}FOLDER, found {factor}; a "
-            "finer grid needs the network: give the factor to minislam priors"
-        )
+    wanted = f"uncertainty.grid_factor 1 with --features {FILES}FOLDER"
+    advice = "a finer grid needs the network: give the factor to minislam priors"
+    require(not choice.features.startswith(FILES) or factor == 1, wanted, f"{factor}; {advice}")
     return Priors(
         choose_flow(choice, config.flow, networks),
         choose_features(choice, sequence.camera, networks, sequence),
