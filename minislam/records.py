@@ -14,6 +14,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 
 Progress = Callable[[int, int], None]  # called with the steps done and their number
+FramePicture = Callable[[int], np.ndarray | None]  # of a frame, by its index; None: unknown
 
 
 class Pictured:
@@ -107,22 +108,16 @@ class TrackedFrame:
         return self.status.value + (ratio if self.status is TrackingStatus.LOST else "")
 
 
-class GroundTruth(Protocol):
+@dataclass(frozen=True)
+class GroundTruth:
     """The ground truth of a benchmark, which the system must not see. Each part may be None."""
 
     trajectory: Trajectory | None  # in the benchmark's own world and at its own timestamps
-
-    def moving_mask(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) bool, True where a dynamic object is seen."""
-
-    def static_image(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W, 3) float32: the same view without dynamic objects and shadows."""
-
-    def depth(self, frame_index: int) -> np.ndarray | None:
-        """Return (H, W) float32 z-depth of what the camera saw, 0 where unknown."""
-
-    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return held-out static views as (T_world_camera (4, 4), image (H, W, 3)); may be []."""
+    moving_mask: FramePicture  # (H, W) bool, True where a dynamic object is seen
+    static_image: FramePicture  # (H, W, 3) float32, without dynamic objects and shadows
+    depth: FramePicture  # (H, W) float32 z-depth of what the camera saw, 0 where unknown
+    novel_views: Callable[[], list[tuple[np.ndarray, np.ndarray]]]
+    # held-out static views: T_world_camera (4, 4) and image (H, W, 3); may be []
 
 
 class Sequence(Protocol):

@@ -105,8 +105,14 @@ class RecordedSequence:
         if self.refines_focal:
             parts.append("focal length to be refined")
         self.description = f"{recording.kind}: {', '.join(parts)}"
-        truth = _RecordedTruth(self, recording)
-        self.ground_truth: GroundTruth | None = truth if recording.has_truth() else None
+        truth = GroundTruth(
+            recording.trajectory,
+            moving_mask=partial(self._picture, recording.mask_paths, read_mask),
+            static_image=partial(self._picture, recording.static_paths, read_color),
+            depth=self.sensor_depth,
+            novel_views=self._novel_views,
+        )
+        self.ground_truth = truth if recording.has_truth() else None
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -150,14 +156,14 @@ class RecordedSequence:
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
-        return self.picture(self._masks, frame_index, read_mask)
+        return self._picture(self._masks, read_mask, frame_index)
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
         """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
-        return self.picture(self._recording.depth_paths, frame_index, self.read_depth)
+        return self._picture(self._recording.depth_paths, self.read_depth, frame_index)
 
-    def picture(
-        self, paths: dict[int, Path], frame_index: int, read: Callable[[Path], np.ndarray]
+    def _picture(
+        self, paths: dict[int, Path], read: Callable[[Path], np.ndarray], frame_index: int
     ) -> np.ndarray | None:
         """Return what the file that belongs to a frame shows, None if there is no such file."""
         path = paths.get(self._chosen[frame_index])
@@ -166,25 +172,8 @@ class RecordedSequence:
         raw = read(path)
         return (self.prepare.color if raw.ndim == 3 else self.prepare.nearest)(raw, str(path))
 
-
-class _RecordedTruth:
-    """The ground truth of a recording: a `GroundTruth`, which says what each method returns."""
-
-    def __init__(self, sequence: RecordedSequence, recording: Recording) -> None:
-        self.trajectory = recording.trajectory
-        self._sequence, self._recording = sequence, recording
-
-    def moving_mask(self, frame_index: int) -> np.ndarray | None:
-        return self._sequence.picture(self._recording.mask_paths, frame_index, read_mask)
-
-    def static_image(self, frame_index: int) -> np.ndarray | None:
-        return self._sequence.picture(self._recording.static_paths, frame_index, read_color)
-
-    def depth(self, frame_index: int) -> np.ndarray | None:
-        return self._sequence.sensor_depth(frame_index)
-
-    def novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        views, prepare = self._recording.novel_views, self._sequence.prepare
+    def _novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        views, prepare = self._recording.novel_views, self.prepare
         return [(pose, prepare.color(read_color(path), str(path))) for pose, path in views]
 
 
