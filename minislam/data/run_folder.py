@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from minislam.data import files
-from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError, require
 from minislam.parameters import user_path
@@ -104,14 +103,6 @@ class RunFolder:
         """Write a plot, plots/NAME.png, or what a keyframe shows, keyframes/000123_KIND.png."""
         assert _OURS.fullmatch(name), name
         files.atomic_write(self.path / name, png)
-
-    def write_checkpoint(self, tree: dict[str, Any]) -> None:
-        """Write the state from which an interrupted run can continue."""
-        write_checkpoint(self.path / CHECKPOINT, tree)
-
-    def read_checkpoint(self, gpu: str = "cpu") -> dict[str, Any]:
-        """Return the state from which an interrupted run can continue, see `read_checkpoint`."""
-        return read_checkpoint(self.path / CHECKPOINT, gpu)
 
     def remove_checkpoint(self) -> None:
         """Remove the checkpoint, which a finished run does not need, and half-written files."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import minislam
 from minislam.config import SlamConfig
+from minislam.data.checkpoint import read_checkpoint, write_checkpoint
 from minislam.data.run_folder import CHECKPOINT, RunFolder
 from minislam.errors import InputError, MinislamError, require
 from minislam.parameters import flattened
@@ -73,7 +74,7 @@ class Checkpoints:
             "slam": slam.saved_state(),
         }
         try:
-            self._folder.write_checkpoint(tree)
+            write_checkpoint(self._folder.path / CHECKPOINT, tree)
             self.problem = None
         except InputError as error:
             reason = str(error).partition("; ")[0]  # another folder does not help this run
@@ -88,7 +89,7 @@ class Checkpoints:
         What a GPU began may go on without one, no longer to the same bytes.
         """
         device, where = self._origin["priors"]["device"], self._folder.path
-        found = self._folder.read_checkpoint(device)
+        found = read_checkpoint(where / CHECKPOINT, device)
         try:
             present = flattened(self._origin)
             then = flattened({name: found.get(name) for name in self._origin})

@@ -116,7 +116,7 @@ def test_after_a_power_cut_the_last_checkpoint_serves(step: int, whole: Path, ro
     with pytest.raises(PowerCut):
         run_until(power_cut, TRACKING, step, "synth:person", out, *often)
     assert RunFolder(out).read_run()["state"] == "running"
-    state = RunFolder(out).read_checkpoint()["slam"]
+    state = read_checkpoint(out / "checkpoint.npz")["slam"]
     assert state["steps"]["_done"] == {TRACKING: step - 1}
     assert run("synth:person", out, "--resume", *often) == 0
     assert_same_results(whole, out, SAME[:-1])
@@ -141,7 +141,7 @@ def test_without_a_depth_prior_after_a_damaged_image_was_replaced(photos: Path, 
     assert run(photos, root / "photos_broken", inputs=inputs) == 1
     assert "12.png (300 bytes) is damaged" in capsys.readouterr().err
     (photos / "12.png").write_bytes(content)
-    state = RunFolder(root / "photos_broken").read_checkpoint()["slam"]
+    state = read_checkpoint(root / "photos_broken/checkpoint.npz")["slam"]
     assert state["steps"]["_done"] == {TRACKING: 12}
     assert run(photos, root / "photos_broken", "--resume", inputs=inputs) == 0
     assert_same_results(root / "photos_whole", root / "photos_broken")
@@ -172,7 +172,7 @@ def test_what_a_gpu_began_goes_on_on_a_cpu(interrupted: Path, tmp_path: Path, mo
     assert_one_sentence("--precision fp32 or bf16 with --device cpu, found 'fp16'", capsys)
     again = ("--resume", "--device", "cpu", "--precision", "fp32")
     assert run_until(ctrl_c, TRACKING, 4, "synth:person", out, *again) == 130
-    state = RunFolder(out).read_checkpoint()
+    state = read_checkpoint(out / "checkpoint.npz")
     assert state["priors"]["device"] == "cpu" and state["slam"]["steps"]["_done"] == {TRACKING: 4}
 
 

@@ -30,11 +30,19 @@ class Folder:
     def __init__(self, clock: SimpleNamespace) -> None:
         self.clock = clock
 
-    def write_checkpoint(self, tree: dict[str, object]) -> None:
+    def write(self, path: Path, tree: dict[str, object]) -> None:
+        assert path == self.path / "checkpoint.npz"
         self.clock.now += 2
         if self.is_full:
             raise InputError("expected to be able to write, but the disk is full; choose another")
         self.written += 1
+
+
+@pytest.fixture
+def folder(clock: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Folder:
+    folder = Folder(clock)
+    monkeypatch.setattr(resume, "write_checkpoint", folder.write)
+    return folder
 
 
 def checkpoints(folder: Folder, fraction: str) -> resume.Checkpoints:
@@ -46,8 +54,9 @@ def checkpoints(folder: Folder, fraction: str) -> resume.Checkpoints:
 SLAM = SimpleNamespace(saved_state=dict, sequence=SimpleNamespace(checksums={}))
 
 
-def test_checkpoints_take_no_larger_fraction_of_the_time(root: Path, clock: SimpleNamespace):
-    folder = Folder(clock)
+def test_checkpoints_take_no_larger_fraction_of_the_time(
+    root: Path, clock: SimpleNamespace, folder: Folder
+):
     kept = checkpoints(folder, "0.01")
     for _ in range(1000):
         clock.now += 1
@@ -57,16 +66,14 @@ def test_checkpoints_take_no_larger_fraction_of_the_time(root: Path, clock: Simp
     assert folder.written == 6
 
 
-def test_a_fraction_of_zero_writes_none(root: Path, clock: SimpleNamespace):
-    folder = Folder(clock)
+def test_a_fraction_of_zero_writes_none(root: Path, folder: Folder):
     kept = checkpoints(folder, "0")
     kept.save(SLAM, False)
     kept.save(SLAM, True)
     assert folder.written == 0
 
 
-def test_a_full_disk_ends_no_run(root: Path, clock: SimpleNamespace):
-    folder = Folder(clock)
+def test_a_full_disk_ends_no_run(root: Path, folder: Folder):
     kept = checkpoints(folder, "0.01")
     folder.is_full = True
     kept.save(SLAM, True)

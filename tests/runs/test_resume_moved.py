@@ -7,7 +7,7 @@ import pytest
 
 import minislam
 from minislam.cli.main import main
-from minislam.data.run_folder import RunFolder
+from minislam.data.checkpoint import read_checkpoint
 from minislam.errors import InputError
 from tests.cli.test_main import images, texture
 from tests.recordings import save
@@ -35,7 +35,7 @@ def test_a_source_that_has_moved_is_found_again_with_config_json(tmp_path: Path,
     config = (out / "config.json").read_text()
     (out / "config.json").write_text(config.replace(str(source), str(moved)))
     assert run_until(ctrl_c, TRACKING, 4, moved, out, "--resume") == 130
-    assert RunFolder(out).read_checkpoint()["slam"]["steps"]["_done"] == {TRACKING: 4}
+    assert read_checkpoint(out / "checkpoint.npz")["slam"]["steps"]["_done"] == {TRACKING: 4}
 
 
 def test_files_named_from_one_folder_are_found_from_another(tmp_path: Path, monkeypatch):
