@@ -93,7 +93,7 @@ def adjust(
             kernel = kernel.narrowed(typical_residual(problem, graph.state))
         problem = replace(problem, robust=kernel)
     if free_camera:
-        columns = graph.shutter.link_columns(positions) if graph.shutter.axis is not None else None
+        columns = graph.shutter.link_columns(positions) if graph.shutter.is_found else None
         problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
     # Without parallax the flow does not measure depth. In a local BA such a keyframe keeps its
     # disparities, which hold the scale until the camera moves again; where all keyframes are

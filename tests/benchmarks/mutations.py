@@ -78,7 +78,6 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("for log_focal in OTHER_FOCALS", "for log_focal in ()"),
         ("saving <= FOCAL_WORTH_SAVING", "False"),
         ("link_columns(links) if tells_camera else None", "link_columns([])"),
-        ("camera.width < problem", "camera.width > problem"),
         ("(1 - READOUT_WORTH_SAVING) * min", "2 * min"),
         ("problem = flow_problem()  # corrected", "pass"),
         ("* doublings - RELIEF", "* doublings + RELIEF"),
@@ -87,8 +86,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("usual, cells = known_disparities.log(), known", "pass"),
     ],
     ("tracking/safeguards/rolling_shutter.py", "tracking/safeguards/test_rolling_shutter.py"): [
-        ("> abs(found[0]) * moved[0]", "> abs(found[0])"),
-        ("self.lengthen((0.0, found[1])", "self.lengthen(found"),
+        ("self._grid.camera.width < self", "self._grid.camera.width > self"),
+        ("self.is_found = True", "pass"), ("        self.lengthen(found)", "        pass"),
     ],
     ("tracking/safeguards/focal_length.py", "tracking/safeguards/test_focal_length.py"): [
         ("(free, start or state)", "(free, state)"),

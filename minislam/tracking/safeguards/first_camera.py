@@ -129,11 +129,9 @@ def lowest_minimum(
     chosen = best(found)
     columns = graph.shutter.link_columns(links) if tells_camera else None
     if columns is not None and columns.any():
-        # Sensors are read along the shorter side: the readout along the longer one is held.
-        columns[:, int(problem.camera.width < problem.camera.height)] = 0
         rolled = best(adjusted(replace(free, shutter=columns), found))
         if cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found)):
-            graph.shutter.take(rolled[0].readout, columns)
+            graph.shutter.take(rolled[0].readout)
             problem = flow_problem()  # corrected
             free = replace(problem, free_focal=seeks_focal)
             chosen = adjust_narrowing(free, rolled[0], WIDENINGS[2:], ITERATIONS)

@@ -156,11 +156,10 @@ def fit_focal_length(
 def seek_readouts(graph: KeyframeGraph) -> None:
     """Set the readout that the flow fits if it saves enough; poses and depths stay.
 
-    If it saves little it stays 0, because it would follow noise and movers. A sensor is read along
-    one axis: the readout that displaces the flow more is set; all later adjustments refine it.
+    If it saves little it stays 0, because it would follow noise and movers.
     """
     shutter, edges = graph.shutter, enumerate(graph.links.edges)
-    if shutter.axis is not None or len(graph.keyframes) < LEAST_KEYFRAMES:
+    if shutter.is_found or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
     positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
     columns = shutter.link_columns(positions)
@@ -173,4 +172,4 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = least_cost(problem.weights)
     if held.cost_after - free.cost_after > READOUT_WORTH_SAVING * max(held.cost_after, floor):
-        shutter.take(state.readout, columns)
+        shutter.take(state.readout)

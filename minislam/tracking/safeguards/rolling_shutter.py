@@ -12,8 +12,8 @@ becomes that of a global shutter by
     p~ + rho c,    c = s(x) u_i(x) - s(p~) u_j(p~).
 
 The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
-rho, which is one more unknown with the column c. A phone held upright reads columns, so there are
-two, along x and y. One is held at 0: in the start the longer side's, then what displaces less.
+rho, which is one more unknown with the column c. Sensors are read along the shorter side of the
+image, a phone held upright along x: the readout along the longer side stays 0.
 """
 
 import math
@@ -86,7 +86,7 @@ class RollingShutter(Stateful):
     """The readouts, found from the flow along all links and from the motion of the image."""
 
     readout: Readout = (0.0, 0.0)
-    axis: int | None = None  # 0: x, 1: y; of the readout that the flow has told; None: of neither
+    is_found: bool = False  # the flow has told it, and all later adjustments refine it
     motion: ImageMotion
 
     def __init__(self, grid: Grid, keyframes: KeyframeStore, links: FrameGraph, is_on: bool):
@@ -128,24 +128,24 @@ class RollingShutter(Stateful):
         return replace(matches, targets=matches.targets + displacements(columns, self.readout))
 
     def link_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
-        """Return c of the links at these positions in the graph, None if nothing is estimated."""
+        """Return c of the links at these positions in the graph, None if nothing is estimated.
+
+        That of the readout along the longer side is 0, so no adjustment moves it.
+        """
         if not (self.is_on and positions):
             return None
         rows: list[Tensor] = []
         for part in at_once(positions):
             targets = torch.stack([self._links.targets[position] for position in part])
             columns = self.columns([self._links.edges[position] for position in part], targets)
-            if self.axis is not None:
-                columns[:, 1 - self.axis] = 0
+            columns[:, int(self._grid.camera.width < self._grid.camera.height)] = 0
             rows += SHELF.rows(columns)
         return stack(rows)
 
-    def take(self, found: Readout, columns: Tensor) -> None:  # columns (E, 2, 2, N) px/s
-        """Set the readout that displaces the flow more: a sensor is read along one axis."""
-        moved = columns.abs().mean((0, 2, 3))
-        is_down = bool(abs(found[1]) * moved[1] > abs(found[0]) * moved[0])
-        self.axis = int(is_down)
-        self.lengthen((0.0, found[1]) if is_down else (found[0], 0.0))
+    def take(self, found: Readout) -> None:
+        """Set what the flow has told, from where all later adjustments refine it."""
+        self.is_found = True
+        self.lengthen(found)
 
     def lengthen(self, seconds: Readout) -> None:
         """Make the readouts longer, at most a frame's time, and correct the flow of all links."""

@@ -213,24 +213,22 @@ def test_links_in_parts_are_corrected_like_all_at_once(monkeypatch: pytest.Monke
     assert all(map(torch.equal, split.targets, links.targets))
 
 
-def test_once_an_axis_is_found_the_other_readout_is_held():
-    shutter, _ = linked()
-    both = shutter.link_columns([0, 1])
-    shutter.axis = 1
-    one = shutter.link_columns([0, 1])
-    assert both[:, 0].any()
-    assert not one[:, 0].any()
-    assert torch.equal(one[:, 1], both[:, 1])
+@pytest.mark.parametrize("size", [(160, 120), (160, 200), (160, 160)])
+def test_the_readout_along_the_longer_side_is_held(size: tuple[int, int]):
+    shutter, links = linked()
+    shutter._grid = replace(GRID, camera=replace(GRID.camera, width=size[0], height=size[1]))
+    free, held = (0, 1) if size[0] < size[1] else (1, 0)
+    both = shutter.columns(links.edges, torch.stack(links.targets))
+    found = shutter.link_columns([0, 1])
+    assert both[:, held].any() and not found[:, held].any()
+    assert torch.equal(found[:, free], both[:, free])
 
 
-def test_the_readout_that_displaces_the_flow_more_is_taken():
+def test_what_is_taken_is_refined_from_then_on():
     shutter, _ = linked()
-    columns = torch.tensor([3.0, 1.0]).reshape(1, 2, 1, 1).expand(1, 2, 2, 4)
-    shutter.take((0.01, 0.02), columns)
-    assert (shutter.axis, shutter.readout) == (0, (0.01, 0.0))
-    shutter, _ = linked()
-    shutter.take((0.01, -0.035), columns)
-    assert (shutter.axis, shutter.readout) == (1, (0.0, -0.035))
+    assert not shutter.is_found
+    shutter.take((0.0, -0.035))
+    assert shutter.is_found and shutter.readout == (0.0, -0.035)
 
 
 def test_no_readout_is_longer_than_the_time_between_two_frames():
