@@ -22,7 +22,8 @@ from minislam.mapping.insertion import nearest_pixels
 from minislam.records import Keyframe
 
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
-VOTERS = 24  # images of the map that vote at most, evenly spread; of more, at least half as many
+VOTERS = 48  # images of the map that vote at most, evenly spread; of more, at least half as many
+MUCH_NEARER = 0.4  # of the distance from which a keyframe guesses a depth [-]
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 
 
@@ -40,27 +41,28 @@ def filled_depth(depth: Tensor) -> Tensor:
     return torch.where(depth > 0, depth, 1 / smooth)
 
 
-def hides_known(
+def is_refuted(
     means: Tensor,  # (N, 3) world units, of what a keyframe inserts
     camera: Camera,
     own: Keyframe,
     keyframes: Sequence[Keyframe],  # of the map
 ) -> Tensor:  # (N,) bool
-    """Tell which points would hide a known surface.
+    """Tell which guesses, points that their own keyframe has no depth for, are refuted.
 
-    Such a point has no depth in its own keyframe, and more views know a surface behind it than at
-    its depth.
+    Either more views know a surface behind a guess, which it would hide, than one at its depth. Or
+    a view sees it from much nearer: there it would cover the picture, and that view can guess it.
     """
-    _, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
+    own_z, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
     is_guessed = own.depth[row, column] == 0
-    votes = torch.zeros_like(row)
+    votes, is_near = torch.zeros_like(row), torch.zeros_like(is_guessed)
     for keyframe in keyframes[:: math.ceil(len(keyframes) / VOTERS)]:
         z, row, column, inside = nearest_pixels(means, camera, keyframe.T_camera_world)
         known = keyframe.depth[row, column]
         beyond = (known - z) / z
         votes += (inside & (beyond > SAME_DEPTH)).long()
         votes -= (inside & (beyond.abs() <= SAME_DEPTH)).long()
-    return is_guessed & (votes > 0)
+        is_near |= inside & (z < MUCH_NEARER * own_z)
+    return is_guessed & ((votes > 0) | is_near)
 
 
 def membrane(values: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
-from minislam.mapping.gaps import filled_depth, hides_known
+from minislam.mapping.gaps import filled_depth, is_refuted
 from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
@@ -143,7 +143,7 @@ class Mapper(JointOptimisation):
         new = gaussians_of_keyframe(keyframe, position, *scene, insertion, self._generator)
         if fills:
             views = self.keyframes[position], self.keyframes
-            new = new.prune(~hides_known(new.means, self.camera, *views))
+            new = new.prune(~is_refuted(new.means, self.camera, *views))
         self._optimizer.append(new)
         self._reset_gradients()
 

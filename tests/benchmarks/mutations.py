@@ -52,11 +52,12 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("mean / np.maximum(part, 1e-6)", "mean"), ("-(rows[:, ~free]", "(rows[:, ~free]"),
         ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
         ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
-        ("is_guessed & (votes > 0)", "votes > 0"),
+        ("is_guessed & ((votes > 0)", "((votes > 0)"), ("(votes > 0) | is_near", "(votes > 0)"),
+        ("inside & (z < MUCH_NEARER", "(z < MUCH_NEARER"),
     ],
     ("mapping/mapper.py", "mapping/test_gaps.py"): [
         ("self._insert(position, fills=True)", "self._insert(position)"),
-        ("new.prune(~hides_known(new.means, self.camera, *views))", "new"),
+        ("new.prune(~is_refuted(new.means, self.camera, *views))", "new"),
     ],
     ("mapping/safeguards.py", "mapping/test_mapper.py"): [
         (".detach()[static] > OPAQUE", ".detach()[weight > -1] > OPAQUE"),

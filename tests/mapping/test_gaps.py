@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.mapping.gaps import CELL, VOTERS, filled_depth, hides_known, membrane
+from minislam.mapping.gaps import CELL, VOTERS, filled_depth, is_refuted, membrane
 from minislam.records import Keyframe
 from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 from tests.pretended_gpu import GPU, pretended_gpu
@@ -67,23 +67,33 @@ def views(*depths: float) -> tuple[Keyframe, ...]:
 )  # fmt: skip
 def test_a_point_hides_what_more_views_know_behind_it_than_at_it(known, hides: bool):
     points = torch.tensor([[0.0, 0.0, 1.0], [9.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    assert hides_known(points, CAMERA, *views(0.0), views(*known)).tolist() == [hides, False, False]
+    assert is_refuted(points, CAMERA, *views(0.0), views(*known)).tolist() == [hides, False, False]
 
 
 def test_a_view_that_does_not_see_a_point_does_not_vote():
     [seeing], [other] = views(2.0), views(1.0)
     other.T_camera_world[0, 3] = 9.0
-    assert hides_known(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(0.0), [seeing, other])
+    assert is_refuted(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(0.0), [seeing, other])
+
+
+@pytest.mark.parametrize(("ahead", "aside", "left"), [(0.7, 0, 1), (0.5, 0, 0), (0.7, 9, 0)])
+def test_a_guess_is_left_to_a_view_that_sees_it_from_much_nearer(ahead, aside, left):
+    [own], [near] = views(0.0), views(0.0)
+    near.T_camera_world[:3, 3] = torch.tensor([aside, 0, -ahead])
+    point = torch.tensor([[0.0, 0.0, 1.0]])
+    assert is_refuted(point, CAMERA, own, [own, near]).tolist() == [bool(left)]
+    [own] = views(1.0)  # no guess
+    assert not is_refuted(point, CAMERA, own, [own, near])
 
 
 def test_of_many_views_every_nth_votes():
     point = torch.tensor([[0.0, 0.0, 1.0]])
-    assert hides_known(point, CAMERA, *views(0.0), views(2.0, 1.0, 1.0) * VOTERS)
-    assert not hides_known(point, CAMERA, *views(0.0), views(1.0, 2.0, 2.0) * VOTERS)
+    assert is_refuted(point, CAMERA, *views(0.0), views(2.0, 1.0, 1.0) * VOTERS)
+    assert not is_refuted(point, CAMERA, *views(0.0), views(1.0, 2.0, 2.0) * VOTERS)
 
 
 def test_what_its_own_keyframe_measures_stays():
-    assert not hides_known(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(1.0), views(2.0))
+    assert not is_refuted(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(1.0), views(2.0))
 
 
 def test_on_a_gpu_it_is_filled_as_on_the_cpu():
