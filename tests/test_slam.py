@@ -40,7 +40,8 @@ METRICS = [
     "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db",
     "psnr_unseen_db", "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
-    "left_out", "shown_static", "path_length", "reprojection_px", "beyond_turns_px",
+    "left_out", "shown_static", "guessed_depth",
+    "path_length", "reprojection_px", "beyond_turns_px",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0

@@ -106,6 +106,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
         "peak_memory_mb": peak_memory_mb(),
         "left_out": left_out(slam) if slam.config.uncertainty.enabled else None,
         "shown_static": shown_static(slam),
+        "guessed_depth": guessed_depth(slam),
         **_ties(slam),
     }
 
@@ -124,6 +125,12 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
             beta=beta,
             static_psnr=_static_psnr(mapper, keyframe, rendering),
         )
+
+
+def guessed_depth(slam: Slam) -> float | None:
+    """Return the fraction of the map's images whose depth neither views nor a prior told [-]."""
+    unknown = [float((keyframe.depth == 0).float().mean()) for keyframe in slam.mapper.keyframes]
+    return float(np.mean(unknown)) if unknown else None
 
 
 def unseen_psnr(slam: Slam) -> float | None:
