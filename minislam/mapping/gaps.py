@@ -23,7 +23,7 @@ from minislam.records import Keyframe
 
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
 VOTERS = 48  # images of the map that vote at most, evenly spread; of more, at least half as many
-MUCH_NEARER = 0.4  # of the distance from which a keyframe guesses a depth [-]
+MUCH_NEARER = 0.5  # of the distance from which a keyframe guesses a depth [-]
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 
 
@@ -50,7 +50,8 @@ def is_refuted(
     """Tell which guesses, points that their own keyframe has no depth for, are refuted.
 
     Either more views know a surface behind a guess, which it would hide, than one at its depth. Or
-    a view sees it from much nearer: there it would cover the picture, and that view can guess it.
+    a view sees it from less than half the distance: it would cover much there, and that view can
+    guess the place itself.
     """
     own_z, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
     is_guessed = own.depth[row, column] == 0
