@@ -77,7 +77,7 @@ def test_a_view_that_does_not_see_a_point_does_not_vote():
 
 
 @pytest.mark.parametrize(("ahead", "aside", "left"), [(0.7, 0, 1), (0.5, 0, 0), (0.7, 9, 0)])
-def test_a_guess_is_left_to_a_view_that_sees_it_from_less_than_half_the_distance(ahead, aside, left):
+def test_a_guess_is_left_to_a_view_from_less_than_half_the_distance(ahead, aside, left):
     [own], [near] = views(0.0), views(0.0)
     near.T_camera_world[:3, 3] = torch.tensor([aside, 0, -ahead])
     point = torch.tensor([[0.0, 0.0, 1.0]])
