@@ -92,8 +92,8 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
     if (hidden := left_out(slam)) > MOST_LEFT_OUT:
         yield (
             f"beta takes {hidden:.0%} of all pixels for moving, so they are neither in the map nor "
-            "measured. Look at the pictures of beta; if they are bright on what stands still, try "
-            "other --features or --no-uncertainty"
+            "measured. Look at the pictures of beta; if they are bright on what stands still, crop "
+            "what is fixed to the camera, or try other --features or --no-uncertainty"
         )
     yield from _camera_warnings(slam)
     without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
