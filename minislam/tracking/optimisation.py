@@ -26,7 +26,6 @@ from minislam.tracking.safeguards.robust import weighted_median
 FIRST_WIDENING = 8.0
 EVERY = 4  # one cell in so many tells the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
-ALL_STEPS = 100  # keyframes; of more, an online adjustment of all takes fewer steps in proportion
 
 
 def local_ba(graph: KeyframeGraph) -> None:
@@ -50,12 +49,10 @@ def local_ba(graph: KeyframeGraph) -> None:
 
 def online_global_ba(graph: KeyframeGraph) -> None:
     """Adjust all keyframes while the sequence goes on; only the flow of new links is measured."""
-    most = graph.config.global_iterations
-    steps = max(1, min(most, most * ALL_STEPS // len(graph.keyframes)))
     edges = graph.global_edges()
     if edges:
         graph.match(edges)
-    adjust(graph, 0, steps, free_camera=True)
+    adjust(graph, 0, graph.config.global_iterations, free_camera=True)
 
 
 def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:

@@ -38,7 +38,7 @@ from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 LONGEST_TAIL = 2  # frames after the last keyframe that need none behind them
-GROWTH_SHARE = 20  # online all keyframes are adjusted again once one in so many is new
+GROWTH_SHARE = 5  # online all keyframes are adjusted again once one in so many is new
 
 
 class Mode(Enum):
@@ -202,7 +202,7 @@ class Tracker(Stateful):
             self._update_static_weights(first=len(self.keyframes) - 1)
 
     def _adjust_all_if_due(self) -> None:
-        """Close loops; run online global BA if `global_interval` keyframes and a 20th are new."""
+        """Close loops; run online global BA if `global_interval` keyframes and a fifth are new."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
         least = max(config.global_interval, count // GROWTH_SHARE)

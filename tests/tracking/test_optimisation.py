@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
-from minislam.tracking import frame_graph, optimisation
+from minislam.tracking import frame_graph
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.config import TrackingConfig
@@ -18,7 +18,6 @@ from minislam.tracking.optimisation import (
     bundle_problem,
     final_global_ba,
     local_ba,
-    online_global_ba,
     typical_residual,
 )
 from minislam.tracking.safeguards import parts
@@ -169,15 +168,6 @@ def test_a_wrong_prior_does_not_bend_a_new_keyframe_while_the_weight_is_wide():
         local_ba(graph)
     plain, bent = (graph.keyframes.T_camera_world for graph in graphs)
     assert torch.equal(plain, bent)
-
-
-@pytest.mark.parametrize(("full", "expected"), [(9, 4), (4, 4), (2, 2), (1, 1), (0, 1)])
-def test_of_more_keyframes_an_online_adjustment_takes_fewer_steps(monkeypatch, full, expected):
-    graph, taken = matched(count=4, global_iterations=4), []
-    monkeypatch.setattr(optimisation, "ALL_STEPS", full)
-    monkeypatch.setattr(optimisation, "adjust", lambda _, first, steps, **how: taken.append(steps))
-    online_global_ba(graph)
-    assert taken == [expected]
 
 
 def test_the_last_adjustment_keeps_the_truth():
