@@ -128,8 +128,12 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
 
 
 def guessed_depth(slam: Slam) -> float | None:
-    """Return the fraction of the map's images whose depth neither views nor a prior told [-]."""
-    unknown = [float((keyframe.depth == 0).float().mean()) for keyframe in slam.mapper.keyframes]
+    """Return the fraction of the keyframes' static pixels whose depth nothing has told [-]."""
+    mapper, unknown = slam.mapper, []
+    for keyframe in mapper.keyframes:
+        static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
+        if keyframe.inserts and static.any():
+            unknown.append(float((keyframe.depth[static] == 0).float().mean()))
     return float(np.mean(unknown)) if unknown else None
 
 

@@ -54,8 +54,11 @@ def finished(**parts: object) -> SimpleNamespace:
         poses = np.tile(poses[:1], (len(truth), 1, 1)) if parts.pop("stands", False) else poses
         truth = SimpleNamespace(trajectory=Trajectory(np.array(truth), poses))
     shown = parts.pop("shown", [1.0])
-    depth = (torch.arange(20) >= 20 * parts.pop("guessed", 0.0)).float()
-    keyframes = [SimpleNamespace(frame_index=8 * k, depth=depth) for k in range(len(shown))]
+    depth = (torch.arange(10) >= 10 * parts.pop("unknown", 0.0)).float()
+    keyframes = [
+        SimpleNamespace(frame_index=8 * k, depth=depth * (k == 0), inserts=k == 0)
+        for k in range(len(shown))
+    ]
     hidden = torch.arange(10) >= 10 * parts.pop("left_out", 0.0)
     mapper = SimpleNamespace(shown=shown, keyframes=keyframes, camera=CAMERA)
     mapper.beta_of, mapper.static_weight = lambda keyframe: hidden, lambda beta, camera: beta

@@ -26,13 +26,13 @@ def test_without_an_ate_there_is_no_straight_walk(monkeypatch: pytest.MonkeyPatc
 
 
 def test_what_beta_leaves_out_and_what_is_guessed_is_measured(monkeypatch: pytest.MonkeyPatch):
-    run = finished(left_out=0.4, guessed=0.25)
+    run = finished(left_out=0.4, unknown=0.7, shown=[1.0, 1.0])
     run.keyframe_trajectory, run.render = run.trajectory, None
     run.tracker.grid, errors = run.tracker.graph.grid, {"ate_all_cm": 1.0}
     for name, known in (("measure_run", errors), ("unseen_psnr", None), ("_ties", {})):
         monkeypatch.setattr(facts, name, lambda *_, known=known: known)
     measured = facts.measure(run, 1.0, None)
-    assert (measured["left_out"], measured["guessed_depth"]) == pytest.approx((0.4, 0.25))
+    assert (measured["left_out"], measured["guessed_depth"]) == pytest.approx((0.4, 0.5))
     run.config = with_settings(run.config, {"uncertainty.enabled": False})
     assert facts.measure(run, 1.0, None)["left_out"] is None
 
