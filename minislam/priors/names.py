@@ -85,7 +85,7 @@ def published_files() -> dict[str, PublishedFile]:
 
 
 def find_weights(use: str, given: str | None) -> str | None:
-    """Return the path that "--flow droid" reads: given, of a row so named, or of what is there."""
+    """Return the file of "--flow droid": the given path or row's, else the fetched one, if any."""
     row = published_files().get(given or use.split()[-1])
     if row is None or row.use != use or not (given or row.path.exists()):
         return given

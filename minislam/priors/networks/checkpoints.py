@@ -88,10 +88,11 @@ class Weights:
     ) -> Tensor:
         """Apply a convolution."""
         weight = self[f"{name}.weight"]
-        known = " or ".join(map(str, channels))
-        wanted = f"{known} output channels of {self.prefix}{name}.weight in {self.file}"
-        found = f"{len(weight)}; it is another version of the network"
-        require(not channels or len(weight) in channels, wanted, found)
+        if channels and len(weight) not in channels:
+            known = " or ".join(map(str, channels))
+            wanted = f"{known} output channels of {self.prefix}{name}.weight in {self.file}"
+            found = f"{len(weight)}; it is another version of the network"
+            raise InputError(f"expected {wanted}, found {found}")
         padding = weight.shape[-1] // 2 if padding is None else padding
         return functional.conv2d(x, weight, self[f"{name}.bias"] if bias else None, stride, padding)
 
