@@ -2,7 +2,7 @@
 
     frame -> tracker -> keyframe (pose, disparity) -> mapper -> Gaussian map
                 ^                                       |
-                |  beta: what the MLP has learnt        |
+                |  beta: what the MLP has learned        |
                 +---------------------------------------+
 
 The arrow that goes back is a call: the tracker asks `_static_weight` for the weight of each cell,

@@ -23,7 +23,7 @@ MOST_WORDS = 1300  # of README, outside tables
 MOST_LINES = 150  # of README, besides tables
 PAPER_BUDGET = 5_550
 PACKAGE_BUDGET = 21_980
-PAPER_ROOMS = ("splatting", "uncertainty", "tracking", "mapping", "slam.py")
+PAPER_PACKAGES = ("splatting", "uncertainty", "tracking", "mapping", "slam.py")
 BESIDE_THE_PAPER = (
     "tracking/safeguards/",
     "mapping/safeguards.py",
@@ -33,8 +33,8 @@ BESIDE_THE_PAPER = (
 
 LABEL = re.compile(r"Eq\. \((\d)\)")
 LIKE_A_LABEL = re.compile(r"\b([Ee]qs?\b\.?|[Ee]quations?)\s*\(?\d(?![\d.])")
-STATED_SIZES = (  # of the paper's rooms, the package, the reading path
-    r"(paper's rooms have about )[\d,]*\d",
+STATED_SIZES = (  # of the paper's packages, the package, the reading path
+    r"(paper's packages have about )[\d,]*\d",
     r"(the\swhole\spackage\sabout\s)[\d,]*\d",
     r"(to every equation has )[\d,]*\d",
 )
@@ -56,9 +56,10 @@ def in_package(path: Path) -> str:
 
 
 def is_of_the_paper(path: Path) -> bool:
-    """Return whether a module belongs to the rooms of the paper."""
+    """Return whether a module belongs to the paper's packages."""
     name = in_package(path)
-    return name.split("/")[0] in PAPER_ROOMS and not any(part in name for part in BESIDE_THE_PAPER)
+    is_beside = any(part in name for part in BESIDE_THE_PAPER)
+    return name.split("/")[0] in PAPER_PACKAGES and not is_beside
 
 
 def paper_lines() -> int:
@@ -189,4 +190,4 @@ def with_line_counts(readme: str) -> str:
 
 if __name__ == "__main__":
     (ROOT / "README.md").write_text(with_line_counts(README), encoding="utf-8")
-    print(f"the paper's rooms: {paper_lines():,} lines; minislam: {package_lines():,} lines")
+    print(f"the paper's packages: {paper_lines():,} lines; minislam: {package_lines():,} lines")

@@ -29,19 +29,19 @@ def place(path: Path) -> str:
 
 def modules_of(test: Path) -> list[str]:
     """Return the modules that a test file may belong to by its name, the longest name first."""
-    room = test.relative_to(ROOT / "tests").parent
+    folder = test.relative_to(ROOT / "tests").parent
     words = test.stem.removeprefix("test_").split("_")
     names = ["_".join(words[:count]) for count in range(len(words), 0, -1)]
     tops = [ROOT / "minislam", ROOT]  # data_synth stands beside the package
-    return [n for n in names for top in tops if (top / room / f"{n}.py").exists()]
+    return [n for n in names for top in tops if (top / folder / f"{n}.py").exists()]
 
 
 @pytest.mark.parametrize("test", TESTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_every_test_file_is_named_after_a_module(test: Path):
-    room = test.relative_to(ROOT / "tests").parent
-    is_of_the_room = test.stem == f"test_{room.name}"
-    assert is_of_the_room or modules_of(test), (
-        f"expected {test.name} to begin with the name of a module of {room}, found none"
+    folder = test.relative_to(ROOT / "tests").parent
+    is_of_the_folder = test.stem == f"test_{folder.name}"
+    assert is_of_the_folder or modules_of(test), (
+        f"expected {test.name} to begin with the name of a module of {folder}, found none"
     )
 
 

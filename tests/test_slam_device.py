@@ -67,7 +67,7 @@ SHORT = {
     "mapping.pose_refinement.tolerance": 1e3,  # px: such a map would lead the poses anywhere
 }
 # Where tensors come back to the CPU while a run computes: OpenCV, scipy, lists of indices.
-ROOMS_BORDERS = {
+BORDERS = {
     "priors/dense_flow.py", "priors/flow.py", "priors/features.py",
     "tracking/bundle_adjustment.py", "tracking/frame_graph.py", "tracking/keyframe_graph.py",
     "tracking/pose_from_flow.py", "tracking/schur.py", "tracking/trajectory.py",
@@ -210,11 +210,11 @@ def test_the_whole_state_of_a_run_is_on_the_gpu(both: tuple[Run, Run]):
     assert not strays
 
 
-def test_tensors_come_back_to_the_cpu_only_at_the_borders_of_rooms(both: tuple[Run, Run]):
+def test_tensors_come_back_to_the_cpu_only_at_the_borders_of_packages(both: tuple[Run, Run]):
     lines = both[1].transfers
     of_results = ("outside", "runs/", "data/")
     computing = {line.split(":")[0] for line in lines if not line.startswith(of_results)}
-    assert computing <= ROOMS_BORDERS
+    assert computing <= BORDERS
     images = sum(count for line, count in lines.items() if "dense_flow" in line)
     assert images <= 6 * FRAMES  # tracked, as a keyframe, posed twice; how it moved: two
 
@@ -250,11 +250,11 @@ FACTORIES = {
     "arange", "empty", "eye", "full", "linspace", "ones", "rand", "randint", "randn", "randperm",
     "tensor", "as_tensor", "zeros", "empty_strided",
 }  # fmt: skip
-ROOMS = ("tracking", "mapping", "splatting", "uncertainty", "stereo", "geometry", "slam.py")
+FOLDERS = ("tracking", "mapping", "splatting", "uncertainty", "stereo", "geometry", "slam.py")
 MODULES = [
     path
-    for room in ROOMS
-    for path in sorted([*(PACKAGE / room).rglob("*.py"), PACKAGE / room])
+    for folder in FOLDERS
+    for path in sorted([*(PACKAGE / folder).rglob("*.py"), PACKAGE / folder])
     if path.suffix == ".py"
 ]
 

@@ -48,7 +48,7 @@ settings: each is an option, like --tracking.window 8; minislam settings lists t
   Ablations of the paper:
   --no-uncertainty                       the same weight for every pixel
   --uncertainty.lambda_depth 0           no depth term in L_uncer, Eq. (4)
-  --uncertainty.given_masks on           the sequence's own masks instead of the learnt beta
+  --uncertainty.given_masks on           the sequence's own masks instead of the learned beta
   --tracking.lambda_disparity_prior .01  disparity prior in Eq. (5), else with learned flow only
   --tracking.prior_mask off              no mask M
   --tracking.final_prior on              disparity prior also in the final adjustment

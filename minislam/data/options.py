@@ -47,7 +47,7 @@ class InputOptions:
     masks: str | None = parameter(
         None,
         "files:FOLDER of PNG masks, 255 on what moves, named like the images or by number "
-        "(00017.png); used instead of the learnt uncertainty",
+        "(00017.png); used instead of the learned uncertainty",
     )
     depth_scale: float = parameter(
         5000.0, "units of a depth image per metre, TUM RGB-D benchmark [1/m]", least=1e-9

@@ -32,7 +32,7 @@ class MappedView:
     frame_index: int
     color: np.ndarray  # (H, W, 3) rendered, in [0, 1]
     depth: np.ndarray | None = None  # (H, W) rendered z in units of the map, 0 where transparent
-    beta: np.ndarray | None = None  # (H, W), None if no beta was learnt
+    beta: np.ndarray | None = None  # (H, W), None if no beta was learned
     static_psnr: float | None = None  # [dB] against the image itself where beta finds it static
 
 

@@ -60,7 +60,7 @@ class MappingConfig:
     )
     init_iterations: int = parameter(
         150,
-        "on the images that a map is begun with, at least 4 each if beta is learnt, online at most"
+        "on the images that a map is begun with, at least 4 each if beta is learned, online at most"
         " keyframe_iterations each; official 1050",
     )
     keyframe_iterations: int = parameter(12, "iterations per keyframe, online; official 450")

@@ -1,7 +1,7 @@
 """Fill what stands still and no view could measure, such as a plain road or ceiling: ours.
 
 Without a depth network such a pixel has no depth, so nothing is inserted there. By half of the
-refinement, the MLP has learnt what moves. What it calls static and the map leaves transparent then
+refinement, the MLP has learned what moves. What it calls static and the map leaves transparent then
 gets the depth of its surroundings: 1/depth is linear over a plane, and so is the solution of
 Laplace's equation whose border is linear. Between a table and the wall behind it, that is the depth
 of neither: from elsewhere it would float in front of what is known there, so other views vote.

@@ -44,7 +44,7 @@ def insertable_pixels(
 
     The reference depth must be known and not too far, the static weight positive, and the map
     transparent there. Where the map shows a surface at another depth, nothing is added either. A
-    nearer reference may be a dynamic object that the MLP has not learnt yet. A farther one means
+    nearer reference may be a dynamic object that the MLP has not learned yet. A farther one means
     that the map still holds a dynamic object, which `is_on_dynamic_object` finds, or the blurred
     edge of a static one.
     """
@@ -111,7 +111,7 @@ def is_on_dynamic_object(
 ) -> Tensor:  # (N,) bool
     """Tell which Gaussians project to pixels of static weight 0 in their own keyframe.
 
-    They were inserted before the MLP had learnt that the object there moves.
+    They were inserted before the MLP had learned that the object there moves.
     """
     # Optimisation may have moved a Gaussian out of the image: the nearest pixel counts.
     z, row, column, _ = nearest_pixels(means, camera, T_camera_world)

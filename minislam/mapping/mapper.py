@@ -49,7 +49,7 @@ class Mapper(JointOptimisation):
                 release()
             self.background = torch.stack(means).mean(0)
         count = len(self.keyframes)
-        if self.uncertainty.is_learnt:
+        if self.uncertainty.is_learned:
             self._weighted_from = safeguards.FIRST_VIEWS * count
         for position in range(count):
             self._insert(position)
@@ -166,7 +166,7 @@ class Mapper(JointOptimisation):
         Only confirmed images are asked.
         """
         known = [keyframe for keyframe in self.keyframes if keyframe.confirmation is not None]
-        if not known or not self.uncertainty.is_learnt:
+        if not known or not self.uncertainty.is_learned:
             return
         least = safeguards.least_weight(torch.cat([self.beta_of(k).flatten() for k in known]))
         if least <= self.least_weight:

@@ -154,7 +154,7 @@ class JointOptimisation(Stateful):
 
         The mean of n gradients is less noisy, so the step is sqrt(n) times as long.
         """
-        trains = self.uncertainty.is_learnt and self._iteration >= self._frozen_until
+        trains = self.uncertainty.is_learned and self._iteration >= self._frozen_until
         drawn = [self.keyframes[position] for position in positions]
         calls = [self._view_arguments(keyframe, camera, trains) for keyframe in drawn]
         shares: list[ViewGradients] = self._workers.map(view_gradients, calls)

@@ -26,7 +26,7 @@ FIRST_VIEWS = 4
 LEAST_UPPER_MODE = 1.0  # mean raw beta: with less, the upper mode is what the map does not show yet
 UPPER_MODE = 0.75  # of that mean, from which on a raw beta belongs to the mode
 BINS = 50  # of the histogram, per unit of raw beta
-LEAST_VIEWS = 2  # renderings of each keyframe, before which most of a static room may be unlearnt
+LEAST_VIEWS = 2  # renderings of each keyframe, before which most of a static room may be unlearned
 # Of the pixels that show a Gaussian, by blending weight, that must be static [-]: 0.01 to 0.1 take
 # a carried table out of the map; from 0.05 on, they also take a wall that beta doubts.
 LEAST_STATIC = 0.02

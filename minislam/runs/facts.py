@@ -117,7 +117,7 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
     for index, keyframe in enumerate(mapper.keyframes):
         rendering = mapper.render(keyframe.T_camera_world)
         color, depth = rendering.color.clamp(0, 1), surface_depth(rendering)
-        beta = slam.beta_image(index) if slam.config.uncertainty.is_learnt else None
+        beta = slam.beta_image(index) if slam.config.uncertainty.is_learned else None
         yield MappedView(
             keyframe.frame_index,
             color=color.cpu().numpy(),
@@ -159,8 +159,8 @@ def _static_psnr(mapper: Mapper, keyframe: Keyframe, rendering: Rendering) -> fl
 def _ties(slam: Slam) -> dict[str, float | None]:
     """Return how long the path is and how well poses, depths and flow agree, without any truth."""
     graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
-    links = range(len(graph.links))
-    error = typical_residual(bundle_problem(graph, links, 0, 0.0), graph.state) if links else None
+    every = range(len(graph.edges))
+    error = typical_residual(bundle_problem(graph, every, 0, 0.0), graph.state) if every else None
     return {
         "path_length": float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
         "reprojection_px": error,

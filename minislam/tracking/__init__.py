@@ -11,7 +11,7 @@ Reading order:
     keyframes           the store: all that is known of each keyframe
     frame_graph         the edges between keyframes and the flow along them; the flow distance
     pose_from_flow      pose and disparities of a new image
-    keyframe_graph      keyframes and links together: matching, covisibility
+    keyframe_graph      keyframes and edges together: matching, covisibility
     optimisation        local BA, online global BA, final global BA
     initialisation      the first geometry, from flow alone
     keyframe_selection  which frames become keyframes

@@ -28,7 +28,7 @@ AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair
 class FrameGraph(Stateful):
     """Directed edges (source, target) between keyframes, each with its flow measurement."""
 
-    edges: list[tuple[int, int]] = field(default_factory=list)
+    ends: list[tuple[int, int]] = field(default_factory=list)
     targets: list[Tensor] = field(default_factory=list)  # per edge (2, N) px
     confidences: list[Tensor] = field(default_factory=list)  # per edge (2, N) in [0, 1]
     matched_ratios: list[float] = field(default_factory=list)  # per edge, in [0, 1]
@@ -39,7 +39,7 @@ class FrameGraph(Stateful):
         SHELF.put([*self.targets, *self.confidences])
 
     def __len__(self) -> int:
-        return len(self.edges)
+        return len(self.ends)
 
     def record(self, edges: list[tuple[int, int]], matches: FlowMatches) -> None:
         """Store the matches of these edges, adding the edges that are new.
@@ -48,13 +48,13 @@ class FrameGraph(Stateful):
         wrong pose fails, and the old flow is needed to correct that pose.
         """
         flows = SHELF.rows(torch.cat([matches.targets, matches.confidences], 1))
-        position_of = {edge: position for position, edge in enumerate(self.edges)}
+        position_of = {edge: position for position, edge in enumerate(self.ends)}
         ratios = matches.matched_ratios.tolist()
         for edge, flow, ratio in zip(edges, flows, ratios, strict=True):
             target, confidence = flow[:2], flow[2:]
             position = position_of.setdefault(edge, len(self))
             if position == len(self):
-                self.edges.append(edge)
+                self.ends.append(edge)
                 self.targets.append(target)
                 self.confidences.append(confidence)
                 self.matched_ratios.append(ratio)
@@ -64,12 +64,12 @@ class FrameGraph(Stateful):
 
     def remove_newest(self, count: int) -> None:
         """Remove the `count` edges that were added last."""
-        for column in (self.edges, self.targets, self.confidences, self.matched_ratios):
+        for column in (self.ends, self.targets, self.confidences, self.matched_ratios):
             del column[len(column) - count :]
 
     def select(self, first: int) -> list[int]:
         """Return the positions of the edges with an end at keyframe `first` or later."""
-        return [p for p, edge in enumerate(self.edges) if max(edge) >= first]
+        return [p for p, edge in enumerate(self.ends) if max(edge) >= first]
 
 
 def neighbourhood_edges(first: int, count: int, radius: int) -> list[tuple[int, int]]:

@@ -1,6 +1,6 @@
-"""The keyframe graph: which keyframes are linked, and the optical flow along each link.
+"""The keyframe graph: which keyframes are linked, and the optical flow along each edge.
 
-The links of a new keyframe lead to its predecessors (neighbourhood) and, if the flow confirms it in
+The edges of a new keyframe lead to its predecessors (neighbourhood) and, if the flow confirms it in
 both directions, to older keyframes that see the same place (covisibility, by the flow distance).
 """
 
@@ -43,26 +43,26 @@ from minislam.tracking.safeguards.rolling_shutter import RollingShutter
 Edge = tuple[int, int]  # keyframe index of source and target
 
 NEIGHBOURHOOD = 5  # predecessors that every keyframe is linked with
-PROXIMITY_EDGES = 2  # further links of a new keyframe, nearest by flow distance
-PROXIMITY_DISTANCE = 120.0  # px at 320x240, largest flow distance of such a link
-HORIZON = 3  # BA windows of keyframes among which a new one looks for such links
-MIN_LINK_RATIO = 0.1  # least matched ratio of a far link [-]
-MIN_PARALLAX = 2.0  # px at 320x240; with less on all links, flow does not measure depth
-GLOBAL_EDGES = 6  # further links per keyframe in a global BA
-GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such a link
+PROXIMITY_EDGES = 2  # further edges of a new keyframe, nearest by flow distance
+PROXIMITY_DISTANCE = 120.0  # px at 320x240, largest flow distance of such an edge
+HORIZON = 3  # BA windows of keyframes among which a new one looks for such edges
+MIN_EDGE_RATIO = 0.1  # least matched ratio of a far edge [-]
+MIN_PARALLAX = 2.0  # px at 320x240; with less on all edges, flow does not measure depth
+GLOBAL_EDGES = 6  # further edges per keyframe in a global BA
+GLOBAL_DISTANCE = 45.0  # px at 320x240, largest flow distance of such an edge
 ROBUST_NARROWING = 0.5  # for frames between keyframes: the structure is known by then [-]
 LEAST_WEIGHT = 0.01  # mean weight of cells, below which little is known of such a frame's pose [-]
 FULL_FLOW_WEIGHT = 0.75  # eta of the flow distance [-]
 
 
 class KeyframeGraph(Stateful):
-    """The keyframes, the links between them, and the estimator of the flow along the links."""
+    """The keyframes, the edges between them, and the estimator of the flow along the edges."""
 
     grid: Grid
     keyframes: KeyframeStore
     # Keyframe k to k + 1 (E = 1), corrected by the readout known then; None across a loss
     flow_to_next: list[FlowMatches | None]
-    links: FrameGraph
+    edges: FrameGraph
     flow: FlowEstimator
     shutter: RollingShutter
     adjustments: int = 0  # that ran
@@ -78,8 +78,8 @@ class KeyframeGraph(Stateful):
         self.grid = Grid.of(camera, flow.stride, device)
         self.keyframes = KeyframeStore(self.grid.rays[:, 0])
         self.flow_to_next = []
-        self.links = FrameGraph()
-        parts = self.grid, self.keyframes, self.links, self.config.rolling_shutter
+        self.edges = FrameGraph()
+        parts = self.grid, self.keyframes, self.edges, self.config.rolling_shutter
         self.shutter = RollingShutter(*parts)
         self.flow = flow
         self.pixel_scale = pixel_scale(camera)
@@ -119,7 +119,7 @@ class KeyframeGraph(Stateful):
         self.keyframes.start_from_prior()
 
     def remove_newest(self) -> None:
-        """Forget the newest keyframe, which has no links yet."""
+        """Forget the newest keyframe, which has no edges yet."""
         self.flow_to_next.pop()
         self.keyframes.remove_newest()
         self.flow.remove_frame(len(self.keyframes))
@@ -190,7 +190,7 @@ class KeyframeGraph(Stateful):
     def match(self, edges: list[Edge]) -> None:
         """Measure the flow of these edges, started from the present geometry, and store it."""
         for part, matches in self._flow_from_geometry(edges):
-            self.links.record(part, matches)
+            self.edges.record(part, matches)
 
     def match_composed(self, target: int) -> None:
         """Measure the flow between a keyframe and its predecessors, since the last loss.
@@ -208,18 +208,18 @@ class KeyframeGraph(Stateful):
             predictions += [composed.targets, inverted_targets(composed.targets, self.grid)]
         sources, targets = ([edge[end] for edge in edges] for end in (0, 1))
         matches = self.flow.match(sources, targets, torch.cat(predictions))
-        self.links.record(edges, self.shutter.corrected(matches, edges))
+        self.edges.record(edges, self.shutter.corrected(matches, edges))
 
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
         """Return those of these new edges, each with its reverse, that flow matches both ways.
 
-        The flow of a far link starts from poses that may have drifted, and one wrong link can
+        The flow of a far edge starts from poses that may have drifted, and one wrong edge can
         outweigh all right ones.
         """
         ratio: dict[Edge, float] = {}
         for part, matches in self._flow_from_geometry(edges):
             ratio |= zip(part, matches.matched_ratios.tolist(), strict=True)
-        return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= MIN_LINK_RATIO]
+        return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= MIN_EDGE_RATIO]
 
     def _flow_from_geometry(self, edges: list[Edge]) -> Iterator[tuple[list[Edge], FlowMatches]]:
         """Yield some of the edges and their flow, started from what the present geometry predicts.
@@ -257,18 +257,18 @@ class KeyframeGraph(Stateful):
     def _covisible_edges(
         self,
         start: int,  # first keyframe to look at
-        newer: range,  # keyframes that get links
+        newer: range,  # keyframes that get edges
         planned: list[Edge],  # edges about to be added, treated as existing
         limit: float,  # px at 320x240, largest flow distance
-        links: int,  # per keyframe
+        most: int,  # edges per keyframe
     ) -> list[Edge]:
         """Return confirmed edges between covisible keyframes, by increasing flow distance."""
         limit *= self.pixel_scale
         shifted = range(newer.start - start, newer.stop - start)
         distances = self.distances(start, shifted, limit)
-        existing = self.links.edges + planned
+        existing = self.edges.ends + planned
         taken = [(i - start, j - start) for i, j in existing if min(i, j) >= start]
-        pairs = proximity_pairs(distances, taken, shifted, limit, links)
+        pairs = proximity_pairs(distances, taken, shifted, limit, most)
         return self.filter_confirmed(both_directions([(i + start, j + start) for i, j in pairs]))
 
     def distances(self, start: int = 0, rows: range | None = None, limit: float = FAR) -> Tensor:

@@ -44,11 +44,11 @@ def close_loops(graph: KeyframeGraph) -> bool:
         return False
     limits = config.loop_distance * graph.pixel_scale, config.loop_min_gap, config.loop_edges
     distances = graph.distances(rows=range(newest, newest + 1), limit=limits[0])
-    pairs = loop_pairs(distances, graph.links.edges, newest, *limits, LOOP_SUPPRESSION)
+    pairs = loop_pairs(distances, graph.edges.ends, newest, *limits, LOOP_SUPPRESSION)
     edges = graph.filter_confirmed(both_directions(pairs))
     if not edges:
         return False
-    before, known = graph.state, len(graph.links)
+    before, known = graph.state, len(graph.edges)
     graph.match(edges)
     if _residual(graph, known) <= FITTING_LOOP_RESIDUAL * graph.pixel_scale:
         return False
@@ -58,13 +58,13 @@ def close_loops(graph: KeyframeGraph) -> bool:
     if _residual(graph, known) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
         return True
     graph.keyframes.set_geometry(before.T_camera_world, before.disparities)
-    graph.links.remove_newest(len(graph.links) - known)
+    graph.edges.remove_newest(len(graph.edges) - known)
     return False
 
 
 def _residual(graph: KeyframeGraph, first_edge: int) -> float:
     """Return the weighted mean length of the residuals [px], over edges `first_edge` and later."""
-    problem = bundle_problem(graph, range(first_edge, len(graph.links)), first_free=0)
+    problem = bundle_problem(graph, range(first_edge, len(graph.edges)), first_free=0)
     residual, _ = residuals(problem, graph.state)
     weight = problem.weights.mean(1)
     return float((weight * lengths(residual)).sum() / weight.sum().clamp_min(1e-6))

@@ -41,14 +41,14 @@ def local_ba(graph: KeyframeGraph) -> None:
         adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
     edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
     mask_priors(graph.keyframes, graph.grid, edges, config, first=newest)
-    edges += graph.links.edges[max(0, len(graph.links) + len(edges) - config.active_edges) :]
+    edges += graph.edges.ends[max(0, len(graph.edges) + len(edges) - config.active_edges) :]
     for _ in range(config.rounds):
         graph.match(edges)
         adjust(graph, first_free, config.iterations)
 
 
 def online_global_ba(graph: KeyframeGraph) -> None:
-    """Adjust all keyframes while the sequence goes on; only the flow of new links is measured."""
+    """Adjust all keyframes while the sequence goes on; only the flow of new edges is measured."""
     edges = graph.global_edges()
     if edges:
         graph.match(edges)
@@ -58,7 +58,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
 def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:
     """Adjust all keyframes on fresh flow; the prior only if `final_prior`: views know better."""
     config = graph.config
-    edges = graph.links.edges + graph.global_edges()
+    edges = graph.edges.ends + graph.global_edges()
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
     for done in range(config.final_rounds):
         graph.match(edges)
@@ -84,8 +84,8 @@ def adjust(
     free_camera: bool = False,  # refine an unknown focal length, and the readouts
     settled: bool = False,  # poses and depths have, so the robust width follows the residuals
 ) -> None:
-    """Run a bundle adjustment over the links that touch the free keyframes."""
-    positions = graph.links.select(first_free)
+    """Run a bundle adjustment over the edges that touch the free keyframes."""
+    positions = graph.edges.select(first_free)
     problem = bundle_problem(graph, positions, first_free, lambda_prior)
     if problem.robust is not None:
         kernel = problem.robust.widened(widening)
@@ -93,7 +93,7 @@ def adjust(
             kernel = kernel.narrowed(typical_residual(problem, graph.state))
         problem = replace(problem, robust=kernel)
     if free_camera:
-        columns = graph.shutter.link_columns(positions) if graph.shutter.is_found else None
+        columns = graph.shutter.edge_columns(positions) if graph.shutter.is_found else None
         problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
     # Without parallax the flow does not measure depth. In a local BA such a keyframe keeps its
     # disparities, which hold the scale until the camera moves again; where all keyframes are
@@ -154,16 +154,16 @@ def adjust_narrowing(
 
 def bundle_problem(
     graph: KeyframeGraph,
-    positions: Sequence[int],  # of links in the graph
+    positions: Sequence[int],  # of edges in the graph
     first_free: int,
     lambda_prior: float | None = None,  # None: as configured
 ) -> BundleProblem:
-    """Collect links of the graph into the bundle problem of Eq. (5)."""
-    keyframes, links, grid = graph.keyframes, graph.links, graph.grid
-    ends = [links.edges[p] for p in positions]
+    """Collect edges of the graph into the bundle problem of Eq. (5)."""
+    keyframes, edges, grid = graph.keyframes, graph.edges, graph.grid
+    ends = [edges.ends[p] for p in positions]
     sources, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
-    targets = stack([links.targets[p] for p in positions])
-    weights = stack([links.confidences[p] for p in positions])
+    targets = stack([edges.targets[p] for p in positions])
+    weights = stack([edges.confidences[p] for p in positions])
     _weigh_by_cells(graph, weights, sources, edges_target, targets)
     prior = keyframes.prior_disparities
     if lambda_prior is None:
@@ -205,7 +205,7 @@ def _weigh_by_cells(
 
 
 def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool
-    """Tell which keyframes have a link with enough parallax, so that it measures depth."""
+    """Tell which keyframes have an edge with enough parallax, so that it measures depth."""
     most = graph.grid.rays.new_zeros(len(graph.keyframes))
     seen = graph.parallaxes(problem.edges_source, problem.edges_target)
     most.scatter_reduce_(0, problem.edges_source, seen, "amax")

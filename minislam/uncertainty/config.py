@@ -59,7 +59,7 @@ class UncertaintyConfig:
     )
 
     @property
-    def is_learnt(self) -> bool:
+    def is_learned(self) -> bool:
         """Tell whether beta comes from the MLP."""
         return self.enabled and not self.given_masks
 

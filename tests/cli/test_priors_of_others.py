@@ -80,7 +80,7 @@ def test_wrong_priors_are_one_sentence_and_nothing_is_written(here: Path, capsys
         assert words in said[0] and not (here / "out").exists()
 
 
-def test_masks_from_files_replace_the_learnt_uncertainty(here: Path, cache, capsys):
+def test_masks_from_files_replace_the_learned_uncertainty(here: Path, cache, capsys):
     (here / "masks").mkdir()
     assert main(["run", *CLIP, "--masks", "files:masks", "-o", "out"]) == 1
     assert "found none for 4 of 4, such as " in capsys.readouterr().err
@@ -93,6 +93,6 @@ def test_masks_from_files_replace_the_learnt_uncertainty(here: Path, cache, caps
     config = json.loads((here / "out/config.json").read_text())
     assert config["input"]["masks"] == f"files:{here}/masks"
     assert config["uncertainty"]["given_masks"]
-    assert RunFolder("out").read_metrics()["beta_auroc"] is None  # nothing was learnt
+    assert RunFolder("out").read_metrics()["beta_auroc"] is None  # nothing was learned
     found = read_mask(next((here / "out/keyframes").glob("*_beta.png")))
     assert found[:, 104:].all() and not found[:, 60:96].all()

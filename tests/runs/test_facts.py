@@ -82,7 +82,7 @@ def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
         beta_of=lambda keyframe: keyframe.beta,
         static_weight=lambda beta, camera: beta,
     )
-    uncertainty = SimpleNamespace(is_learnt=True)
+    uncertainty = SimpleNamespace(is_learned=True)
     run = SimpleNamespace(mapper=mapper, config=SimpleNamespace(uncertainty=uncertainty))
     run.beta_image = lambda index: 0.5 + index
     first, second = facts.mapped_views(run)
@@ -91,7 +91,7 @@ def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
     assert first.color.max() == pytest.approx(0.4) and second.color.max() == pytest.approx(0.5)
     assert first.depth[0, 0] == 0 and first.depth[1, 1] == pytest.approx(2)
     assert (first.beta, second.beta) == (0.5, 1.5)
-    uncertainty.is_learnt = False
+    uncertainty.is_learned = False
     assert all(view.beta is None for view in facts.mapped_views(run))
 
 

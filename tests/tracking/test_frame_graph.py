@@ -40,7 +40,7 @@ def test_recording_an_edge_again_replaces_its_matches():
     graph = FrameGraph()
     graph.record([(0, 1), (1, 0)], matches_of(1.0, 2))
     graph.record([(1, 0), (0, 2)], matches_of(2.0, 2))
-    assert graph.edges == [(0, 1), (1, 0), (0, 2)] and len(graph) == 3
+    assert graph.ends == [(0, 1), (1, 0), (0, 2)] and len(graph) == 3
     assert [float(t[0, 0]) for t in graph.targets] == [1.0, 2.0, 2.0]
     assert graph.targets[0].shape == graph.confidences[0].shape == (2, len(RAYS))
 

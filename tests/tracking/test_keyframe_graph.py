@@ -19,13 +19,13 @@ def test_a_new_link_needs_both_directions():
     graph = true_graph([0, 1, 2, 3], TrackingConfig(), flow)
     asked = [(0, 3), (3, 0), (1, 3), (3, 1)]
     assert graph.filter_confirmed(asked) == [(1, 3), (3, 1)]
-    assert graph.filter_confirmed([]) == [] and len(graph.links) == 0
+    assert graph.filter_confirmed([]) == [] and len(graph.edges) == 0
 
 
 def test_flow_between_the_newest_keyframe_and_its_predecessors_is_measured_both_ways():
     graph = true_graph([0, 1, 2])
     graph.match_composed(2)
-    assert graph.links.edges == [(1, 2), (2, 1), (0, 2), (2, 0)]
+    assert graph.edges.ends == [(1, 2), (2, 1), (0, 2), (2, 0)]
 
 
 def test_after_a_loss_a_keyframe_is_linked_with_what_was_seen_before_it():
@@ -48,8 +48,8 @@ def test_many_links_are_measured_in_parts_as_all_at_once(monkeypatch: pytest.Mon
     monkeypatch.setattr(frame_graph, "AT_ONCE", 2)
     monkeypatch.setattr(keyframe_graph, "give_back_freed", lambda: given.append(None))
     parted.match(edges)
-    assert parted.links.edges == whole.links.edges == edges
-    pairs = zip(parted.links.targets, whole.links.targets, strict=True)
+    assert parted.edges.ends == whole.edges.ends == edges
+    pairs = zip(parted.edges.targets, whole.edges.targets, strict=True)
     assert all(a.equal(b) for a, b in pairs)
     assert parted.parallaxes(sources, targets).equal(parallaxes)
     assert parted.filter_confirmed(edges) == confirmed == edges
@@ -63,7 +63,7 @@ def test_the_flow_of_links_lies_on_the_shelf_also_when_it_is_restored(
     graph = true_graph([0, 1, 2])
     graph.match([(0, 1), (1, 0), (1, 2)])
     again = FrameGraph()
-    again.restore_state(deepcopy(graph.links.saved_state()), lambda index: None)
-    for links in (graph.links, again):
-        assert all(map(SHELF.holds, (*links.targets, *links.confidences)))
-    assert all(a.equal(b) for a, b in zip(again.targets, graph.links.targets, strict=True))
+    again.restore_state(deepcopy(graph.edges.saved_state()), lambda index: None)
+    for edges in (graph.edges, again):
+        assert all(map(SHELF.holds, (*edges.targets, *edges.confidences)))
+    assert all(a.equal(b) for a, b in zip(again.targets, graph.edges.targets, strict=True))

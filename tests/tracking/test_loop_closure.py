@@ -70,7 +70,7 @@ def test_closing_a_loop_takes_the_drift_away():
     graph = drifted(TrueFlow())
     before = end_error(graph)
     assert close_loops(graph)
-    assert (8, 0) in graph.links.edges and (0, 8) in graph.links.edges
+    assert (8, 0) in graph.edges.ends and (0, 8) in graph.edges.ends
     assert end_error(graph) < 0.2 * before
 
 
@@ -81,17 +81,17 @@ def test_a_loop_that_fits_already_is_linked_and_moves_nothing():
     )
     before = graph.state
     assert not close_loops(graph)
-    assert (8, 0) in graph.links.edges
+    assert (8, 0) in graph.edges.ends
     assert torch.equal(graph.state.T_camera_world, before.T_camera_world)
 
 
 def test_a_loop_that_does_not_fit_leaves_everything_as_it_was():
     graph = drifted(FlowThatNeverFits())
-    state, edges = graph.state, list(graph.links.edges)
+    state, edges = graph.state, list(graph.edges.ends)
     assert not close_loops(graph)
     assert torch.equal(graph.state.T_camera_world, state.T_camera_world)
     assert torch.equal(graph.state.disparities, state.disparities)
-    assert graph.links.edges == edges
+    assert graph.edges.ends == edges
 
 
 def test_a_loop_whose_flow_is_not_confirmed_is_no_loop():

@@ -53,7 +53,7 @@ def move(graph: KeyframeGraph, keyframe: int) -> None:
 
 def test_at_the_truth_all_residuals_are_zero():
     graph = matched()
-    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
     residual, valid = residuals(problem, graph.state)
     assert bool(valid.any()) and float((residual * problem.weights).abs().max()) < 1e-4
 
@@ -63,22 +63,22 @@ def test_weights_are_confidence_times_the_cell_weights_of_both_ends():
     graph.keyframes.static_weights[0] = 0.5
     graph.keyframes.static_weights[1] = 0.25
     problem = bundle_problem(graph, [0, 1], first_free=0)
-    confidences = torch.stack(graph.links.confidences)
+    confidences = torch.stack(graph.edges.confidences)
     torch.testing.assert_close(problem.weights, 0.125 * confidences)
 
 
 def test_weights_are_the_same_however_many_links_are_weighed_at_once(monkeypatch):
     graph = matched()
     graph.keyframes.static_weights[2] = torch.linspace(0, 1, len(graph.grid.rays))
-    whole = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    whole = bundle_problem(graph, range(len(graph.edges)), first_free=0)
     monkeypatch.setattr(frame_graph, "AT_ONCE", 3)
-    split = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    split = bundle_problem(graph, range(len(graph.edges)), first_free=0)
     assert torch.equal(split.weights, whole.weights)
 
 
 def test_the_typical_residual_is_that_of_the_cells_that_weigh():
     graph = matched(3)
-    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
     problem.targets[:, 0] += 0.3
     problem.targets[:, 1] += 0.4
     covered = graph.grid.pixels[:, 1] < CAMERA.height / 2 + 8
@@ -91,7 +91,7 @@ def test_the_typical_residual_is_that_of_the_cells_that_weigh():
 
 def test_the_typical_residual_of_links_in_parts_is_that_of_all(monkeypatch: pytest.MonkeyPatch):
     graph = matched()
-    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
     noise = torch.randn(problem.targets.shape, generator=torch.Generator().manual_seed(0))
     problem = replace(problem, targets=problem.targets + noise)
     whole = typical_residual(problem, graph.state)
@@ -146,12 +146,12 @@ def test_a_displaced_keyframe_finds_its_place():
 
 def test_a_new_keyframe_is_linked_and_adjusted_without_knowing_where_it_is():
     graph = matched()
-    everything = graph.links.edges
+    everything = graph.edges.ends
     fresh = true_graph(list(range(4)))
     fresh.match([edge for edge in everything if 3 not in edge])
     move(fresh, 3)
     local_ba(fresh)
-    assert {(0, 3), (1, 3), (2, 3), (3, 2)} <= set(fresh.links.edges)
+    assert {(0, 3), (1, 3), (2, 3), (3, 2)} <= set(fresh.edges.ends)
     first, last = fresh.keyframes.T_camera_world[0], fresh.keyframes.T_camera_world[3]
     assert torch.equal(first, true_poses()[0])
     # The unit of length may drift: it is the direction of the path that flow fixes.
@@ -182,7 +182,7 @@ def test_the_last_round_leaves_out_what_errs_more_than_flow_does(monkeypatch):
     def error(narrows: bool) -> float:
         graph, told = matched(), []
         covered = graph.grid.pixels[:, 0] < CAMERA.width / 10
-        graph.links.targets = [t + 0.6 * covered for t in graph.links.targets]  # a slow mover
+        graph.edges.targets = [t + 0.6 * covered for t in graph.edges.targets]  # a slow mover
         monkeypatch.setattr(graph, "match", lambda edges: None)
 
         def narrowed(kernel: RobustKernel, residual: float) -> RobustKernel:
@@ -199,7 +199,7 @@ def test_the_last_round_leaves_out_what_errs_more_than_flow_does(monkeypatch):
 
 def test_the_unit_of_length_is_chosen_without_changing_any_image():
     graph = matched()
-    problem = bundle_problem(graph, range(len(graph.links)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
     before, _ = residuals(problem, graph.state)
     graph.keyframes.normalise_scale()
     assert float(graph.keyframes.disparities.median()) == 1.0

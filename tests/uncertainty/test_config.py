@@ -11,10 +11,10 @@ def test_every_constant_says_what_it_means():
     assert all(len(constant.metadata["meaning"]) > 10 for constant in fields(UncertaintyConfig))
 
 
-def test_beta_is_learnt_unless_it_is_switched_off_or_given():
-    assert UncertaintyConfig().is_learnt
-    assert not UncertaintyConfig(enabled=False).is_learnt
-    assert not UncertaintyConfig(given_masks=True).is_learnt
+def test_beta_is_learned_unless_it_is_switched_off_or_given():
+    assert UncertaintyConfig().is_learned
+    assert not UncertaintyConfig(enabled=False).is_learned
+    assert not UncertaintyConfig(given_masks=True).is_learned
 
 
 def test_the_paper_values_are_the_official_ones():

@@ -51,12 +51,12 @@ class KeyframeDiagnostics:
     """How one keyframe is tied to the others, after its adjustment or after the final one."""
 
     frame_index: int
-    matched_ratio: float  # of its cells, in the best of its links [-]
-    parallax: float  # px, the largest mean flow by translation alone among its links
-    explained: float | None  # of the matched flow from its predecessors; None: no link
+    matched_ratio: float  # of its cells, in the best of its edges [-]
+    parallax: float  # px, the largest mean flow by translation alone among its edges
+    explained: float | None  # of the matched flow from its predecessors; None: no edge
     depth_error: float | None  # median relative difference from them; None: they see other things
-    continuity: float | None  # of the match: known before, holds it still [-]; None: no such links
-    agreement: float | None  # of what was known before, in the link that agrees least
+    continuity: float | None  # of the match: known before, holds it still [-]; None: no such edges
+    agreement: float | None  # of what was known before, in the edge that agrees least
     scale_deviation: float | None = None  # of ln(length after / before), at the end [-]
 
 
@@ -95,7 +95,7 @@ class Watch(Stateful):
         if self.only_turned:  # it may see other depths, and be held by something new
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
-            problem = bundle_problem(graph, range(len(graph.links)), 0, 0.0)
+            problem = bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
             told = scale_deviations(problem, graph.state)
             judged = [replace(k, scale_deviation=told.get(i)) for i, k in enumerate(judged)]
             self.diagnostics = judged
@@ -130,35 +130,35 @@ class Watch(Stateful):
 
 
 def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
-    """Judge a keyframe by its links and by its predecessors."""
+    """Judge a keyframe by its edges and by its predecessors."""
     frame_index = graph.keyframes.frames[keyframe].frame_index
-    edges = graph.links.edges
+    edges = graph.edges.ends
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]
     explained, depth_error = tie_to_predecessors(graph, keyframe)
     sources, targets = ([edges[p][end] for p in positions] for end in (0, 1))
-    ratio = max((graph.links.matched_ratios[p] for p in positions), default=0.0)
+    ratio = max((graph.edges.matched_ratios[p] for p in positions), default=0.0)
     parallax = float(graph.parallaxes(sources, targets).max()) if positions else 0.0
     ties = explained, depth_error, *continuity(graph, keyframe)
     return KeyframeDiagnostics(frame_index, ratio, parallax, *ties)
 
 
 def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
-    """Return how a keyframe agrees with the keyframes before it, over the links between them.
+    """Return how a keyframe agrees with the keyframes before it, over the edges between them.
 
     First the part of the flow from there, of what was static so far, that the geometry explains
-    [-]. Then the median relative difference of the depths that both ends of a link see, over cells
-    that count in the adjustment, near ones more: little tells how far the sky is. None: no link, or
+    [-]. Then the median relative difference of the depths that both ends of an edge see, over cells
+    that count in the adjustment, near ones more: little tells how far the sky is. None: no edge, or
     no cell that both see.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
-    edges = graph.links.edges
+    edges = graph.edges.ends
     positions = [p for p, edge in enumerate(edges) if edge in near]
     if not positions:
         return None, None
     problem = bundle_problem(graph, positions, 0, 0.0)
     residual, robust_weights = residuals(problem, graph.state)
     sources, targets = problem.edges_source, problem.edges_target
-    confidences = torch.stack([graph.links.confidences[p][0] for p in positions])
+    confidences = torch.stack([graph.edges.confidences[p][0] for p in positions])
     weights = confidences * torch.stack([weight_so_far(graph, edges[p][0]) for p in positions])
     weights *= (targets == keyframe)[:, None]
     explained = float((weights * fitting(graph, residual)).sum() / weights.sum().clamp_min(1e-6))
@@ -177,30 +177,30 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
     which known ones flow; what has just come into view is not.
 
     Continuity: the mean weight of the cells that are known, matched and fit, motion weight
-    included, in the best link into this keyframe, over the mean confidence of the link from the
+    included, in the best edge into this keyframe, over the mean confidence of the edge from the
     keyframe just before: in a fast turn both are small. Agreement: the part that fits of what is
-    known and matched, without motion weights, in the worst link. Both are None if a link is missing
-    or the camera was lost; agreement is None if no link knows enough.
+    known and matched, without motion weights, in the worst edge. Both are None if an edge is
+    missing or the camera was lost; agreement is None if no edge knows enough.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
     wanted = {(i, end) for i in sources for end in (i + 1, keyframe)}
-    links = {edge: p for p, edge in enumerate(graph.links.edges) if edge in wanted}
-    if before is None or now is None or len(links) < len(wanted):
+    at = {ends: p for p, ends in enumerate(graph.edges.ends) if ends in wanted}
+    if before is None or now is None or len(at) < len(wanted):
         return None, None
-    residual, _ = residuals(bundle_problem(graph, list(links.values()), 0, 0.0), graph.state)
-    fits = dict(zip(links, fitting(graph, residual).float(), strict=True))
+    residual, _ = residuals(bundle_problem(graph, list(at.values()), 0, 0.0), graph.state)
+    fits = dict(zip(at, fitting(graph, residual).float(), strict=True))
     known = {i: fits[i, i + 1] for i in sources[:-1]}
     known[keyframe - 1] = arrived(graph.grid, before, known[keyframe - 2])
     holding, agreeing = [], []
     for i in sources:
-        matched = known[i] * graph.links.confidences[links[i, keyframe]][0]
+        matched = known[i] * graph.edges.confidences[at[i, keyframe]][0]
         matched = matched * graph.keyframes.static_weights[i]
         fitted = matched * fits[i, keyframe]
         holding.append(float((fitted * graph.keyframes.motion_weights[i]).mean()))
         if matched.sum() > max(LEAST_CELLS, MIN_EVIDENCE * len(matched)):
             agreeing.append(float(fitted.sum() / matched.sum()))
-    matched = float(graph.links.confidences[links[keyframe - 1, keyframe]][0].mean())
+    matched = float(graph.edges.confidences[at[keyframe - 1, keyframe]][0].mean())
     return max(holding) / max(matched, 1e-6), min(agreeing, default=None)
 
 

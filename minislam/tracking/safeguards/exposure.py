@@ -2,9 +2,9 @@
 
 A camera adapts to the light. Matched cells that stand still tell the factors a_k of each colour:
 
-    log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of a link.
+    log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of an edge.
 
-All links together are a linear least-squares problem, in which each counts by its cells' weight.
+All edges together are a linear least-squares problem, in which each counts by its cells' weight.
 A common factor is free: the median is 1. Not in the paper; MonoGS optimises such factors.
 """
 
@@ -25,16 +25,16 @@ from minislam.tracking.safeguards.robust import weighted_median
 
 BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the dark
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
-KEPT = 20  # blurred images: most links are among neighbours
+KEPT = 20  # blurred images: most edges are among neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
-LEAST_WEIGHT = 0.015  # of the heaviest link: with less, a few chance matches would tell [-]
-STEADY = 1e-6  # weight of "as bright as the keyframe before", where no link tells more
+LEAST_WEIGHT = 0.015  # of the heaviest edge: with less, a few chance matches would tell [-]
+STEADY = 1e-6  # weight of "as bright as the keyframe before", where no edge tells more
 Shot = TypeVar("Shot", Frame, Keyframe)
 
 
 def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
     """Return each keyframe's exposure (3,) by frame index, with median 1; {} if all are alike."""
-    links, cells, frames = graph.links, graph.keyframes.cell_weights, graph.keyframes.frames
+    edges, cells, frames = graph.edges, graph.keyframes.cell_weights, graph.keyframes.frames
     ratios: list[list[float | None]] = []
     weights: list[float] = []
 
@@ -43,8 +43,8 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
         release()
         return cv2.GaussianBlur(frames[keyframe].image.cpu().numpy(), (0, 0), BLUR)
 
-    for link, (source, target) in enumerate(links.edges):
-        targets, stride = links.targets[link], graph.grid.stride
+    for edge, (source, target) in enumerate(edges.ends):
+        targets, stride = edges.targets[edge], graph.grid.stride
         here = torch.from_numpy(blurred(source)[::stride, ::stride].reshape(-1, 3))
         u, v = targets.cpu().numpy()
         moved = cv2.remap(blurred(target), u, v, cv2.INTER_LINEAR)
@@ -52,17 +52,17 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
         both = torch.cat([here, there], 1)
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
         static = cells[source] * graph.grid.sample(cells[target][:, None], targets.T)[:, 0]
-        weight = visible * (links.confidences[link][0] * static).cpu()
+        weight = visible * (edges.confidences[edge][0] * static).cpu()
         ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
         ratios.append([weighted_median(channel, weight) for channel in ratio.T])
         weights.append(float(weight.mean()))
     least = LEAST_WEIGHT * max(weights, default=0.0)
-    telling = [link for link, weight in enumerate(weights) if weight > least]
+    telling = [edge for edge, weight in enumerate(weights) if weight > least]
     neighbours = list(pairwise(range(len(frames))))
-    edges = [*neighbours, *(links.edges[k] for k in telling)]
+    pairs = [*neighbours, *(edges.ends[k] for k in telling)]
     steps = [[0.0] * 3] * len(neighbours) + [ratios[k] for k in telling]
     counts = [STEADY] * len(neighbours) + [weights[k] for k in telling]
-    levels = _levels(len(frames), edges, np.array(counts), np.array(steps, float))
+    levels = _levels(len(frames), pairs, np.array(counts), np.array(steps, float))
     if np.abs(levels).max() < LEAST_CHANGE:
         return {}
     exposures = torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)

@@ -108,8 +108,8 @@ def lowest_minimum(
     """
     tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
     seeks_focal = graph.seeks_focal and tells_camera
-    workers, links = workers or Workers(), list(range(len(graph.links)))
-    flow_problem = partial(bundle_problem, graph, links, first_free=0, lambda_prior=0.0)
+    workers, positions = workers or Workers(), list(range(len(graph.edges)))
+    flow_problem = partial(bundle_problem, graph, positions, first_free=0, lambda_prior=0.0)
 
     def adjusted(problem: BundleProblem, found: list[Found]) -> list[Found]:
         calls = [(problem, state, WIDENINGS[1:], ITERATIONS) for state, _ in found]
@@ -127,7 +127,7 @@ def lowest_minimum(
         others = (minima(problem, start(log_focal), workers) for log_focal in OTHER_FOCALS)
         found = adjusted(free, [*found, *itertools.chain(*others)])
     chosen = best(found)
-    columns = graph.shutter.link_columns(links) if tells_camera else None
+    columns = graph.shutter.edge_columns(positions) if tells_camera else None
     if columns is not None and columns.any():
         rolled = best(adjusted(replace(free, shutter=columns), found))
         if cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found)):

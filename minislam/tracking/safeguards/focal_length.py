@@ -66,7 +66,7 @@ class FocalLengthFit:
 def check_focal_length(
     graph: KeyframeGraph, workers: Workers | None = None
 ) -> FocalLengthFit | None:
-    """Fit a given focal length to all links, or to half of them if another one fits there.
+    """Fit a given focal length to all edges, or to half of them if another one fits there.
 
     Nothing is changed. A focal length that was found, not given, is checked in the halves alone.
     """
@@ -84,7 +84,7 @@ def check_focal_length(
 
 
 def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) -> FocalLengthFit:
-    """Return the focal length that the links among some keyframes fit."""
+    """Return the focal length that the edges among some keyframes fit."""
     among = problem_among(graph, keyframes)
     if among is None:
         return FocalLengthFit(graph.grid.camera.fx, None, 0.0)
@@ -92,8 +92,8 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
 
 
 def problem_among(graph: KeyframeGraph, keyframes: range) -> Start | None:
-    """Return problem and state of the links among some keyframes, at few cells; None: no link."""
-    edges = enumerate(graph.links.edges)
+    """Return problem and state of the edges among some keyframes, at few cells; None: no edge."""
+    edges = enumerate(graph.edges.ends)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return None
@@ -114,7 +114,7 @@ def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> N
     """Set an unknown focal length to what the flow fits, if motion tells it; then it is free."""
     if not graph.seeks_focal or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
-    problem = bundle_problem(graph, range(len(graph.links)), 0, lambda_prior=0.0)
+    problem = bundle_problem(graph, range(len(graph.edges)), 0, lambda_prior=0.0)
     fit, state = fit_focal_length(problem, graph.state, workers)
     if fit.factor is not None:
         graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
@@ -158,11 +158,11 @@ def seek_readouts(graph: KeyframeGraph) -> None:
 
     If it saves little it stays 0, because it would follow noise and movers.
     """
-    shutter, edges = graph.shutter, enumerate(graph.links.edges)
+    shutter, edges = graph.shutter, enumerate(graph.edges.ends)
     if shutter.is_found or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
     positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
-    columns = shutter.link_columns(positions)
+    columns = shutter.edge_columns(positions)
     if columns is None:
         return
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)

@@ -89,7 +89,7 @@ def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
 
 
 def fit_lens(graph: KeyframeGraph) -> LensFit | None:
-    """Fit k1 and k2 to the links of the first keyframes; None: too few. Nothing is changed."""
+    """Fit k1 and k2 to the edges of the first keyframes; None: too few. Nothing is changed."""
     keyframes = range(min(len(graph.keyframes), MOST_KEYFRAMES))
     is_enough = len(keyframes) >= focal_length.LEAST_KEYFRAMES
     among = focal_length.problem_among(graph, keyframes) if is_enough else None

@@ -83,14 +83,14 @@ class ImageMotion(Stateful):
 
 
 class RollingShutter(Stateful):
-    """The readouts, found from the flow along all links and from the motion of the image."""
+    """The readouts, found from the flow along all edges and from the motion of the image."""
 
     readout: Readout = (0.0, 0.0)
     is_found: bool = False  # the flow has told it, and all later adjustments refine it
     motion: ImageMotion
 
-    def __init__(self, grid: Grid, keyframes: KeyframeStore, links: FrameGraph, is_on: bool):
-        self._grid, self._keyframes, self._links, self.is_on = grid, keyframes, links, is_on
+    def __init__(self, grid: Grid, keyframes: KeyframeStore, edges: FrameGraph, is_on: bool):
+        self._grid, self._keyframes, self._edges, self.is_on = grid, keyframes, edges, is_on
         self.motion = ImageMotion(grid)
 
     def see(self, frame: Frame) -> None:
@@ -127,8 +127,8 @@ class RollingShutter(Stateful):
         columns = self.columns(edges, matches.targets, next_frame)
         return replace(matches, targets=matches.targets + displacements(columns, self.readout))
 
-    def link_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
-        """Return c of the links at these positions in the graph, None if nothing is estimated.
+    def edge_columns(self, positions: list[int]) -> Tensor | None:  # (E, 2, 2, N) px/s
+        """Return c of the edges at these positions in the graph, None if nothing is estimated.
 
         That of the readout along the longer side is 0, so no adjustment moves it.
         """
@@ -136,8 +136,8 @@ class RollingShutter(Stateful):
             return None
         rows: list[Tensor] = []
         for part in at_once(positions):
-            targets = torch.stack([self._links.targets[position] for position in part])
-            columns = self.columns([self._links.edges[position] for position in part], targets)
+            targets = torch.stack([self._edges.targets[position] for position in part])
+            columns = self.columns([self._edges.ends[position] for position in part], targets)
             columns[:, int(self._grid.camera.width < self._grid.camera.height)] = 0
             rows += SHELF.rows(columns)
         return stack(rows)
@@ -148,19 +148,19 @@ class RollingShutter(Stateful):
         self.lengthen(found)
 
     def lengthen(self, seconds: Readout) -> None:
-        """Make the readouts longer, at most a frame's time, and correct the flow of all links."""
+        """Make the readouts longer, at most a frame's time, and correct the flow of all edges."""
         if not any(seconds):
             return
         before, longest = self.readout, self.motion.shortest_step
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
         moved: list[Tensor] = []
-        links = zip(at_once(self._links.edges), at_once(self._links.targets), strict=True)
-        for edges, targets in links:
-            columns = self.columns(edges, positions := torch.stack(targets))
+        parts = zip(at_once(self._edges.ends), at_once(self._edges.targets), strict=True)
+        for ends, targets in parts:
+            columns = self.columns(ends, positions := torch.stack(targets))
             change = displacements(columns, self.readout) - displacements(columns, before)
             moved += SHELF.rows(positions + change)
-        self._links.targets = moved
+        self._edges.targets = moved
 
     def undone(self, frame: Frame) -> Frame:
         """Return a frame as a global shutter would have seen it."""

@@ -83,7 +83,7 @@ class Settling(Stateful):
 def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) px^2
     """Return the information that the flow of its edges gives to a keyframe's disparities."""
     disparities = graph.keyframes.disparities[keyframe]
-    positions = [p for p, edge in enumerate(graph.links.edges) if edge[0] == keyframe]
+    positions = [p for p, edge in enumerate(graph.edges.ends) if edge[0] == keyframe]
     if not positions:
         return torch.zeros_like(disparities)
     problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)

@@ -25,17 +25,17 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     A turn moves all points as if they were infinitely far away. The best one, under a wide robust
     weight, takes the place of any translation that looks like it, so that what is left, in the
     median, tells depth, whatever parallax the poses claim. Under a wrong focal length a turn looks
-    like parallax, so one that is sought and not yet found is free. None: no link has any weight.
+    like parallax, so one that is sought and not yet found is free. None: no edge has any weight.
     """
-    grid, links, keyframes = graph.grid, graph.links, graph.keyframes
-    pairs = [p for p, (source, target) in enumerate(links.edges) if target == source + 1]
+    grid, edges, keyframes = graph.grid, graph.edges, graph.keyframes
+    pairs = [p for p, (source, target) in enumerate(edges.ends) if target == source + 1]
     pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)] if pairs else []
     if not pairs:
         return None
-    weights = [links.confidences[p] * keyframes.cell_weights[links.edges[p][0]] for p in pairs]
+    weights = [edges.confidences[p] * keyframes.cell_weights[edges.ends[p][0]] for p in pairs]
     numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # without translation sources share a pose
-    measured = torch.stack([links.targets[p] for p in pairs]), torch.stack(weights)
+    measured = torch.stack([edges.targets[p] for p in pairs]), torch.stack(weights)
     problem = pose_from_flow.motion_only_problem(grid, *ends, *measured, numbers > 0, None)
     problem = replace(problem, free_focal=graph.seeks_focal and not graph.focal_is_free)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
@@ -56,8 +56,8 @@ def fraction_at_rest(graph: KeyframeGraph) -> float:
 
 
 def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
-    """Tell whether translation moves most cells too little, in all links that still see them."""
-    targets = [target for source, target in graph.links.edges if source == keyframe]
+    """Tell whether translation moves most cells too little, in all edges that still see them."""
+    targets = [target for source, target in graph.edges.ends if source == keyframe]
     if not targets:
         return True
     shift, positions, valid = parallax(*graph.geometry([keyframe] * len(targets), targets))
@@ -68,7 +68,7 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
 
 def adjust_turns(graph: KeyframeGraph) -> None:
     """Adjust the turns of the keyframes alone: all that they see is infinitely far away."""
-    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.links)), 0, 0.0)
+    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
     problem = replace(problem, free_disparities=torch.zeros_like(problem.free_disparities))
     poses = keyframes.T_camera_world.clone()
     poses[:, :3, 3] = 0

@@ -1,4 +1,4 @@
-"""What the links of a keyframe say about it, and where a trajectory is broken."""
+"""What the edges of a keyframe say about it, and where a trajectory is broken."""
 
 import math
 from dataclasses import replace
@@ -65,8 +65,8 @@ def test_what_contradicts_a_pose_counts_although_the_memory_takes_it_for_motion(
     graph = true_graph([0, 1, 2])
     graph.match(neighbourhood_edges(0, 3, 2))
     contradicts = GRID.pixels[:, 0] < 0.7 * CAMERA.width
-    last = [p for p, edge in enumerate(graph.links.edges) if edge[1] == 2]
-    for targets in [*(graph.links.targets[p] for p in last), graph.flow_to_next[1].targets[0]]:
+    last = [p for p, edge in enumerate(graph.edges.ends) if edge[1] == 2]
+    for targets in [*(graph.edges.targets[p] for p in last), graph.flow_to_next[1].targets[0]]:
         targets[:, contradicts] += 8  # px
     graph.config = replace(graph.config, motion_memory=0.5 / graph.pixel_scale)
     judge_all(graph)
@@ -99,10 +99,10 @@ def test_what_holds_a_keyframe_is_known_from_those_before():
     held, agreement = continuity(graph, 3)
     assert agreement == 1 and held == pytest.approx(1, abs=0.05)
     for source in range(3):  # a fast turn: little is matched, but all of it is known
-        graph.links.confidences[graph.links.edges.index((source, 3))] *= 0.1
+        graph.edges.confidences[graph.edges.ends.index((source, 3))] *= 0.1
     assert continuity(graph, 3) == (pytest.approx(held), 1)
     held, _ = continuity(graph, 3)
-    graph.links.confidences[graph.links.edges.index((0, 3))][:] = 0  # the best link counts
+    graph.edges.confidences[graph.edges.ends.index((0, 3))][:] = 0  # the best edge counts
     assert continuity(graph, 3) == (held, 1)
     graph.keyframes.motion_weights[:] = 0.5
     graph.keyframes.static_weights[:, ::2] = 0
@@ -115,11 +115,11 @@ def test_what_holds_a_keyframe_is_known_from_those_before():
 def test_one_cell_does_not_tell_what_a_keyframe_agrees_with(cells: int, agreement: int):
     graph = true_graph([0, 1, 2, 3])
     graph.match(neighbourhood_edges(0, 4, 3))
-    link = graph.links.edges.index((0, 3))
-    certain = graph.links.confidences[link][0].topk(cells).indices
-    graph.links.confidences[link][:] = 0
-    graph.links.confidences[link][:, certain] = 1
-    graph.links.targets[link][0, certain] += 9  # px
+    edge = graph.edges.ends.index((0, 3))
+    certain = graph.edges.confidences[edge][0].topk(cells).indices
+    graph.edges.confidences[edge][:] = 0
+    graph.edges.confidences[edge][:, certain] = 1
+    graph.edges.targets[edge][0, certain] += 9  # px
     assert continuity(graph, 3)[1] == agreement
 
 
@@ -128,8 +128,8 @@ def test_a_dynamic_object_in_place_of_the_scene_is_new():
     graph.match(neighbourhood_edges(0, 4, 3))
     before, _ = continuity(graph, 3)
     rest = GRID.pixels[:, 0] > 0.75 * CAMERA.width
-    confidences = dict(zip(graph.links.edges, graph.links.confidences, strict=True))
-    targets = dict(zip(graph.links.edges, graph.links.targets, strict=True))
+    confidences = dict(zip(graph.edges.ends, graph.edges.confidences, strict=True))
+    targets = dict(zip(graph.edges.ends, graph.edges.targets, strict=True))
     for source in (0, 1):
         confidences[source, 3][:, ~rest] = 0  # behind it
         targets[source, 3][0, rest] += 9  # px: the pose follows it, not what is left of the scene
@@ -226,13 +226,13 @@ def walk_tied_by(cells: int) -> KeyframeGraph:
     """Return a walk between whose halves, up to keyframe 4 and from it on, so many cells match."""
     graph = true_graph(range(10))
     graph.match(neighbourhood_edges(0, 10, 2))
-    few, links = torch.arange(len(GRID.rays)) < cells, graph.links
-    for position, (source, target) in enumerate(links.edges):
-        links.targets[position] = (
-            links.targets[position] + 0.3 * normal(position, 2, len(few)).float()
+    few, edges = torch.arange(len(GRID.rays)) < cells, graph.edges
+    for position, (source, target) in enumerate(edges.ends):
+        edges.targets[position] = (
+            edges.targets[position] + 0.3 * normal(position, 2, len(few)).float()
         )
         if (source < 5) != (target < 5):
-            links.confidences[position] = links.confidences[position] * few
+            edges.confidences[position] = edges.confidences[position] * few
     return graph
 
 

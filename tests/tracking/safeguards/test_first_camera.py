@@ -92,7 +92,7 @@ def test_guesses_that_are_far_off_still_find_the_truth(seed: int):
 
 
 def graph_with_focal(factor: float) -> KeyframeGraph:
-    """Return the links of a walk along a wall under a focal length that is this much too long."""
+    """Return the edges of a walk along a wall under a focal length that is this much too long."""
     graph = true_graph([0, 2, 4, 6, 8, 10])
     graph.match(neighbourhood_edges(0, 6, 5))
     graph.grid.zoom(math.log(factor))
@@ -146,7 +146,7 @@ class RolledFlow(TrueFlow):
 
 
 def rolled_graph(readout: Readout) -> KeyframeGraph:
-    """Return links along the wall whose image moves as it does from frame to frame, 0.1 s each."""
+    """Return edges along the wall whose image moves as it does from frame to frame, 0.1 s each."""
     flow = RolledFlow(readout)
     graph = true_graph([0, 2, 4, 6, 8, 10], flow=flow)
     every = true_graph(list(range(FRAMES)))

@@ -141,14 +141,14 @@ def test_an_unknown_focal_length_is_replaced_and_from_then_on_refined():
     assert graph.focal_is_free
     assert graph.grid.camera.fx == pytest.approx(CAMERA.fx, rel=FOUND)
     graph.grid.zoom(math.log(1.02))
-    warm_up_ba(graph, graph.links.edges, 1)
+    warm_up_ba(graph, graph.edges.ends, 1)
     assert graph.grid.camera.fx == pytest.approx(CAMERA.fx, rel=FOUND)
 
 
 def test_a_given_focal_length_stays():
     graph = turned_graph(1.2)
     seek_focal_length(graph)
-    warm_up_ba(graph, graph.links.edges, 1)
+    warm_up_ba(graph, graph.edges.ends, 1)
     assert not graph.focal_is_free
     assert graph.grid.camera.fx == pytest.approx(1.2 * CAMERA.fx)
 
@@ -163,7 +163,7 @@ def test_the_check_changes_nothing():
 
 
 def test_a_check_adjusts_the_first_keyframes_alone(monkeypatch: pytest.MonkeyPatch):
-    # A pose far off, behind the limit, and its links cannot disturb the check.
+    # A pose far off, behind the limit, and its edges cannot disturb the check.
     expected = check_focal_length(turned_graph(1.2))
     graph = true_graph([0, 2, 4, 6, 8, 10, 11, 9])
     graph.match(neighbourhood_edges(0, 6, 5))
@@ -198,12 +198,12 @@ def zoomed_graph(zooms: list[float]) -> KeyframeGraph:
     edges = neighbourhood_edges(0, len(graph.keyframes), 3)
     graph.match([(i, j) for i, j in edges if i // size == j // size])
     poses = graph.keyframes.T_camera_world
-    for position, (source, target) in enumerate(graph.links.edges):
+    for position, (source, target) in enumerate(graph.edges.ends):
         camera, rays = zoomed(CAMERA, RAYS, math.log(zooms[source // size]))
         disparities = disparities_at(poses[source], rays)[None]
         transforms = relative_transforms(poses, [source], [target])
         seen, _ = reproject(transforms, disparities, rays, camera)
-        graph.links.targets[position] = seen[0].float()
+        graph.edges.targets[position] = seen[0].float()
     return graph
 
 

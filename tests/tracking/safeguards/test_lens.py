@@ -48,13 +48,13 @@ def bent_graph(noise: float = 0.02):
     graph.match(neighbourhood_edges(0, len(NUMBERS), 3))
     u = true_rays(tangents(GRID.pixels).mT, (K1, K2)).mT
     rays = torch.cat([u, torch.ones_like(u[:, :1])], 1)
-    sources, targets = torch.tensor(graph.links.edges).unbind(1)
+    sources, targets = torch.tensor(graph.edges.ends).unbind(1)
     disparities = torch.stack([disparities_at(poses[k], rays) for k in NUMBERS])
     motions = relative_transforms(poses[NUMBERS], sources, targets)
     positions, _ = reproject(motions, disparities[sources], rays, CAMERA)
     u_seen = tangents(positions.mT)
     seen = pixels(u_seen * stretch(u_seen.mT, (K1, K2)).mT).mT.float()
-    graph.links.targets = list(seen + noise * normal(5, *seen.shape).float())
+    graph.edges.targets = list(seen + noise * normal(5, *seen.shape).float())
     return graph
 
 
@@ -137,8 +137,8 @@ def test_a_pinhole_is_none(factor: float):
     graph = true_graph(NUMBERS)
     graph.match(neighbourhood_edges(0, len(NUMBERS), 3))
     graph.grid.zoom(math.log(factor))
-    for index, target in enumerate(graph.links.targets):
-        graph.links.targets[index] = target + 0.05 * normal(index, *target.shape).float()
+    for index, target in enumerate(graph.edges.targets):
+        graph.edges.targets[index] = target + 0.05 * normal(index, *target.shape).float()
     before = graph.keyframes.T_camera_world.clone()
     fit = fit_lens(graph)
     assert not fit.is_bent and abs(fit.bend) < 0.006
@@ -160,7 +160,7 @@ def test_a_lens_is_undone_if_that_saves_much():
 def test_few_keyframes_and_no_links_tell_nothing():
     few = true_graph(NUMBERS[:3])
     few.match(neighbourhood_edges(0, 3, 2))
-    assert few.links.edges and fit_lens(few) is None
+    assert few.edges.ends and fit_lens(few) is None
     assert fit_lens(true_graph(NUMBERS)) is None
 
 

@@ -44,11 +44,11 @@ from tests.tracking.scene import (
 READOUT = 0.03, 0.04  # s
 
 
-def shutter_of(count: int, is_on: bool = True, links: FrameGraph | None = None) -> RollingShutter:
+def shutter_of(count: int, is_on: bool = True, edges: FrameGraph | None = None) -> RollingShutter:
     """Return the shutter of a store with `count` keyframes, at frames 0, 1, 2, ..."""
     store = KeyframeStore(GRID.rays[:, 0])
-    links = FrameGraph() if links is None else links
-    shutter = RollingShutter(GRID, store, links, is_on)
+    edges = FrameGraph() if edges is None else edges
+    shutter = RollingShutter(GRID, store, edges, is_on)
     store.frames = [Frame(index, index / RATE, torch.zeros(120, 160, 3)) for index in range(count)]
     return shutter
 
@@ -182,44 +182,44 @@ def test_readouts_that_are_not_free_stay():
 
 
 def linked(is_on: bool = True) -> tuple[RollingShutter, FrameGraph]:
-    links = FrameGraph()
-    shutter = shutter_of(2, is_on, links)
+    edges = FrameGraph()
+    shutter = shutter_of(2, is_on, edges)
     shutter.motion.velocities = [
         50 * torch.randn(2, len(GRID.pixels), generator=generator(seed)) for seed in range(3)
     ]
     shutter.motion.shortest_step = 1 / RATE
     targets = GRID.pixels.T[None] + torch.ones(2, 1, 1)
-    links.record([(0, 1), (1, 0)], FlowMatches(targets, torch.ones_like(targets), torch.ones(2)))
-    return shutter, links
+    edges.record([(0, 1), (1, 0)], FlowMatches(targets, torch.ones_like(targets), torch.ones(2)))
+    return shutter, edges
 
 
-def test_a_longer_readout_moves_the_targets_of_all_links():
-    shutter, links = linked()
-    before = torch.stack(links.targets)
-    columns = shutter.columns(links.edges, before)
+def test_a_longer_readout_moves_the_targets_of_all_edges():
+    shutter, edges = linked()
+    before = torch.stack(edges.targets)
+    columns = shutter.columns(edges.ends, before)
     shutter.lengthen((0.01, -0.02))
     assert shutter.readout == (0.01, -0.02)
-    moved = torch.stack(links.targets) - before
+    moved = torch.stack(edges.targets) - before
     torch.testing.assert_close(moved, displacements(columns, (0.01, -0.02)), rtol=0, atol=1e-4)
 
 
 def test_links_in_parts_are_corrected_like_all_at_once(monkeypatch: pytest.MonkeyPatch):
-    (shutter, links), (other, split) = linked(), linked()
-    whole = shutter.link_columns([1, 0])
+    (shutter, edges), (other, split) = linked(), linked()
+    whole = shutter.edge_columns([1, 0])
     shutter.lengthen((0.01, -0.02))
     monkeypatch.setattr(frame_graph, "AT_ONCE", 1)
-    assert torch.equal(other.link_columns([1, 0]), whole)
+    assert torch.equal(other.edge_columns([1, 0]), whole)
     other.lengthen((0.01, -0.02))
-    assert all(map(torch.equal, split.targets, links.targets))
+    assert all(map(torch.equal, split.targets, edges.targets))
 
 
 @pytest.mark.parametrize("size", [(160, 120), (160, 200), (160, 160)])
 def test_the_readout_along_the_longer_side_is_held(size: tuple[int, int]):
-    shutter, links = linked()
+    shutter, edges = linked()
     shutter._grid = replace(GRID, camera=replace(GRID.camera, width=size[0], height=size[1]))
     free, held = (0, 1) if size[0] < size[1] else (1, 0)
-    both = shutter.columns(links.edges, torch.stack(links.targets))
-    found = shutter.link_columns([0, 1])
+    both = shutter.columns(edges.ends, torch.stack(edges.targets))
+    found = shutter.edge_columns([0, 1])
     assert both[:, held].any() and not found[:, held].any()
     assert torch.equal(found[:, free], both[:, free])
 
@@ -239,7 +239,7 @@ def test_no_readout_is_longer_than_the_time_between_two_frames():
 
 def test_where_it_is_off_nothing_is_estimated():
     shutter, _ = linked(is_on=False)
-    assert shutter.link_columns([0, 1]) is None
+    assert shutter.edge_columns([0, 1]) is None
     shutter.lengthen((0.0, 0.0))
     assert shutter.readout == (0.0, 0.0)
     shutter.see(picture(0, 0))

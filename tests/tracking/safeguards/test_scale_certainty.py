@@ -27,7 +27,7 @@ KEYFRAMES, SIGMA, DRAWS = 10, 0.3, 100
 
 
 def chain(count: int = KEYFRAMES) -> KnownProblem:
-    """Return a walk whose keyframes have links to the two before and after them, all alike."""
+    """Return a walk whose keyframes have edges to the two before and after them, all alike."""
     known = known_problem(count)
     problem = known.problem
     near = ((problem.edges_source - problem.edges_target).abs() <= 2).nonzero()[:, 0]
@@ -42,7 +42,7 @@ def chain(count: int = KEYFRAMES) -> KnownProblem:
 
 
 def weakly_joined(problem: BundleProblem, middle: int, weight: float) -> BundleProblem:
-    """Return the problem with links of this weight between keyframes before and after one."""
+    """Return the problem with edges of this weight between keyframes before and after one."""
     sides = [(ends > middle).int() - (ends < middle).int() for ends in
              (problem.edges_source, problem.edges_target)]  # fmt: skip
     crossing = sides[0] * sides[1] <= 0

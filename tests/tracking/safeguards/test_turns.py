@@ -28,8 +28,8 @@ def seen_moving(positions: Tensor) -> KeyframeGraph:
     """Return two keyframes between which the cells move to positions (N, 2)."""
     graph = true_graph([0, 1])
     graph.match([(0, 1), (1, 0)])
-    graph.links.targets[0] = positions.T.float()
-    graph.links.confidences[0] = torch.ones_like(graph.links.targets[0])
+    graph.edges.targets[0] = positions.T.float()
+    graph.edges.confidences[0] = torch.ones_like(graph.edges.targets[0])
     return graph
 
 
@@ -74,7 +74,7 @@ def test_a_turn_whose_poses_claim_parallax_may_show_a_flat_scene():
 
 def test_a_keyframe_rests_unless_some_link_that_sees_its_cells_shows_parallax():
     graph = true_graph([0, 0, 2, 2])
-    assert fraction_at_rest(graph) == 1  # without links
+    assert fraction_at_rest(graph) == 1  # without edges
     graph.match([(0, 1), (1, 0), (2, 3), (3, 2)])
     assert fraction_at_rest(graph) == 1
     graph.match([(1, 2)])
@@ -89,7 +89,7 @@ def test_parallax_that_no_sweep_confirms_is_none():
     assert not watch.only_turned
     watch.confirmed = 0.5 * LEAST_CONFIRMED
     assert watch.only_turned
-    watch = Watch(true_graph([0, 1]))  # without links no pose claims parallax
+    watch = Watch(true_graph([0, 1]))  # without edges no pose claims parallax
     watch.conclude()
     assert watch.beyond_turns is None and watch.only_turned and not watch.hardly_walked
 
@@ -141,7 +141,7 @@ def test_turns_are_found_whatever_depth_and_place_were_thought_to_be():
     graph = true_graph([0, 1, 2])
     graph.match(neighbourhood_edges(0, 3, 2))
     turns = [se3_exp(torch.tensor([0, 0, 0, *r], dtype=torch.float64)) for r in TURNS]
-    for (source, target), positions in zip(graph.links.edges, graph.links.targets, strict=True):
+    for (source, target), positions in zip(graph.edges.ends, graph.edges.targets, strict=True):
         rays = graph.grid.rays.double() @ (turns[target] @ se3_inverse(turns[source]))[:3, :3].T
         positions.copy_(CAMERA.project(rays).T)
     adjustments = graph.adjustments
