@@ -1,6 +1,7 @@
 """Optimise the map on L_render and the uncertainty MLP on L_uncer, in turn."""
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -103,6 +104,12 @@ class JointOptimisation(Stateful):
         """Render the map from a pose (4, 4), without gradients."""
         camera = camera or self.camera
         return render(self.gaussians, camera, T_camera_world.float(), self.background)
+
+    def renderings(self, keyframes: list[Keyframe]) -> Iterator[Rendering]:
+        """Yield what the map shows of each keyframe; the workers render side by side."""
+        fixed, unused = (self.gaussians, self.camera), (self.background, None, None)
+        calls = ((*fixed, keyframe.T_camera_world, *unused) for keyframe in keyframes)
+        return (Rendering(*found) for found in self._workers.stream(render, calls))
 
     def predict_beta(self, features: Tensor) -> Tensor:
         """Return the raw beta (h', w') of features (h', w', C)."""

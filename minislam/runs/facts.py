@@ -114,8 +114,8 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
 def mapped_views(slam: Slam) -> Iterator[MappedView]:
     """Yield what the map shows of each of its images, and how well it fits what stands still."""
     mapper = slam.mapper
-    for index, keyframe in enumerate(mapper.keyframes):
-        rendering = mapper.render(keyframe.T_camera_world)
+    shown = zip(mapper.keyframes, mapper.renderings(mapper.keyframes), strict=True)
+    for index, (keyframe, rendering) in enumerate(shown):
         color, depth = rendering.color.clamp(0, 1), surface_depth(rendering)
         beta = slam.beta_image(index) if slam.config.uncertainty.is_learned else None
         yield MappedView(

@@ -137,9 +137,9 @@ def _run(
             interrupted = True
         facts = facts_of(*_ending(slam, interrupted))
         _write_estimates(folder, slam)
-        clip_is_written = slam.workers.start(write_clip, str(folder.path))
         metrics = measure(slam, facts["seconds"]["total"], lpips)
         write_json(folder.path / names.METRICS, metrics)
+        clip_is_written = slam.workers.start(write_clip, str(folder.path))
         write_pictures(folder, slam, metrics, facts)
         clip_is_written()
         write_json(folder.path / names.RUN, facts)

@@ -7,6 +7,7 @@ from minislam.geometry import Camera
 from minislam.mapping import InsertionConfig, Mapper, MappingConfig
 from minislam.records import Keyframe
 from minislam.uncertainty import UncertaintyConfig
+from minislam.workers import Workers
 
 WALL_DEPTH = 2.0  # world units
 CAMERA = Camera(30.0, 30.0, 15.5, 11.5, 32, 24)
@@ -21,9 +22,11 @@ UNCERTAINTY = UncertaintyConfig(learning_rate=5e-3)
 
 
 def make_mapper(
-    config: MappingConfig = CONFIG, uncertainty: UncertaintyConfig = UNCERTAINTY
+    config: MappingConfig = CONFIG,
+    uncertainty: UncertaintyConfig = UNCERTAINTY,
+    workers: Workers | None = None,
 ) -> Mapper:
-    return Mapper(CAMERA, config, uncertainty, feature_dimension=3, seed=0)
+    return Mapper(CAMERA, config, uncertainty, feature_dimension=3, seed=0, workers=workers)
 
 
 def wall_color(x: Tensor, y: Tensor) -> Tensor:

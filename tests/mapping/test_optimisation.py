@@ -8,6 +8,7 @@ from minislam.mapping import optimisation
 from minislam.mapping.config import DensityConfig
 from minislam.mapping.views import view_gradients
 from minislam.uncertainty import UncertaintyConfig
+from minislam.workers import Workers
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 
 # Known answers
@@ -33,6 +34,23 @@ def test_progress_counts_to_the_end():
     mapper.initialise([wall_keyframe(0)], lambda done, total: calls.append((done, total)))
     assert calls == [(2, 5), (4, 5), (5, 5)]  # two views make a step
     assert GRID == tuple(mapper.predict_beta(wall_keyframe(0).features).shape)
+
+
+# Identities
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_workers_render_what_this_process_renders(count: int):
+    with Workers(count) as workers:
+        mapper = make_mapper(CONFIG, workers=workers)
+        mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
+        mapper.background = torch.tensor([0.1, 0.2, 0.3])
+        found = list(mapper.renderings(mapper.keyframes))
+    assert len(found) == 2 and not torch.equal(found[0].color, found[1].color)
+    for keyframe, rendering in zip(mapper.keyframes, found, strict=True):
+        expected = mapper.render(keyframe.T_camera_world)
+        assert all(map(torch.equal, rendering, expected))
+        assert not any(part.requires_grad for part in rendering)
 
 
 # Gradients

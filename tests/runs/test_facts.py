@@ -78,7 +78,9 @@ def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
     mapper = SimpleNamespace(
         keyframes=keyframes,
         camera=CAMERA,
-        render=lambda pose: rendering._replace(color=color + 0.1 * pose),
+        renderings=lambda views: (
+            rendering._replace(color=color + 0.1 * view.T_camera_world) for view in views
+        ),
         beta_of=lambda keyframe: keyframe.beta,
         static_weight=lambda beta, camera: beta,
     )
