@@ -94,9 +94,12 @@ def support(
     empty map. The rendered colour is linear in the colours of the Gaussians, so the blending
     weights are its derivative.
     """
-    colors, static = gaussians.colors.detach().requires_grad_(), weight > 0
+    static, colors = weight > 0, gaussians.colors.detach()
+    colors.requires_grad_(not static.all())
     rendering = render(replace(gaussians, colors=colors), camera, T_camera_world.float())
-    (of_static,) = torch.autograd.grad(rendering.color[..., 0][static].sum(), colors)
+    of_static = rendering.weight_sums
+    if colors.requires_grad:
+        of_static = torch.autograd.grad(rendering.color[..., 0][static].sum(), colors)[0][:, 0]
     shown = rendering.opacity.detach()[static] > OPAQUE
     fraction = float(shown.float().mean()) if len(shown) else float(len(gaussians) > 0)
-    return torch.stack([of_static[:, 0], rendering.weight_sums]), fraction
+    return torch.stack([of_static, rendering.weight_sums]), fraction

@@ -172,6 +172,8 @@ def test_the_blending_weights_of_two_parts_of_a_view_are_those_of_all():
     parts = [support(mapper.gaussians, CAMERA, pose, w)[0] for w in (left, (left == 0) * 1.0)]
     torch.testing.assert_close(parts[0][0] + parts[1][0], parts[0][1], atol=1e-4, rtol=1e-4)
     assert torch.equal(parts[0][1], mapper.render(pose).weight_sums)
+    everywhere = support(mapper.gaussians, CAMERA, pose, torch.ones_like(left))[0]
+    assert torch.equal(everywhere[0], everywhere[1]) and torch.equal(everywhere[1], parts[0][1])
     pixels = CAMERA.project(mapper.gaussians.means.detach() @ pose[:3, :3].T.float() + pose[:3, 3])
     is_far_right = pixels[:, 0] > CAMERA.width / 2
     assert parts[0][0][is_far_right].max() < 1e-3 < parts[1][0][is_far_right].max()
