@@ -26,7 +26,7 @@ def random(source: torch.Generator, *shape: int) -> Tensor:
 
 
 def check_sampling(student: Function) -> Verdict:
-    """Check (number of keyframes N, window, weight) -> the probability of each keyframe (N,)."""
+    """Check (number of keyframes N, window, its probability) -> that of each keyframe (N,)."""
     right = sampling_probabilities
 
     def shared(count: int, window: list[int], inside: float, outside: float) -> Tensor:
@@ -37,31 +37,31 @@ def check_sampling(student: Function) -> Verdict:
     def uniform(count: int, *rest: Any) -> Tensor:
         return torch.full((count,), 1 / count, dtype=torch.float64)
 
-    def unguarded(n: int, window: list[int], weight: float) -> Tensor:
-        return shared(n, window, weight / len(window), (1 - weight) / max(n - len(window), 1))
+    def unguarded(n: int, window: list[int], of_all: float) -> Tensor:
+        return shared(n, window, of_all / len(window), (1 - of_all) / max(n - len(window), 1))
 
     def draw(seed: int) -> Case:
-        count, weight = 20 + seed % 7, (0.3, 0.6, 0.8)[seed % 3]
+        count, of_all = 20 + seed % 7, (0.3, 0.6, 0.8)[seed % 3]
         window = normals(seed, count).argsort()[: 4 + seed % 2].tolist()
-        return Case((count, window, weight), f"the window {window} of {count}, weight {weight}")
+        return Case((count, window, of_all), f"the window {window} of {count}, {of_all}")
 
     cases = [
         Case((30, list(range(29, 19, -1)), 0.5), "30 keyframes, 10 of them in the window"),
         Case((13, list(range(12, 2, -1)), 0.5), "13 keyframes, 10 of them in the window"),
         Case((4, [3, 2, 1, 0], 0.5), "a window that holds all keyframes"),
-        Case((20, [19, 18, 17, 5, 2], 0.3), "the weight 0.3"),
-        Case((20, [19, 18, 17, 16, 15, 14, 13, 12, 11, 10, 3, 2], 0.7), "the weight 0.7"),
+        Case((20, [19, 18, 17, 5, 2], 0.3), "probability 0.3"),
+        Case((20, [19, 18, 17, 16, 15, 14, 13, 12, 11, 10, 3, 2], 0.7), "probability 0.7"),
         *drawn(draw),
     ]
-    at_half = "Compare the window's share of all keyframes with the weight."
+    at_half = "Compare the window's part of all keyframes with its probability."
     mistakes = [
         (unguarded, "While the window is most of the map, all keyframes are equally likely."),
-        (uniform, "The window should get its weight, however many other keyframes there are."),
+        (uniform, "The window should get its probability, however many others there are."),
         (lambda n, w, s: shared(n, w, 1 / len(w), 0), "The others: the map would forget them."),
-        (lambda n, w, s: shared(n, w, s, 1 - s), "The keyframes of the window share its weight."),
-        (lambda n, w, s: right(n, [*{*range(n)} - {*w}], s), "The weight is that of the window."),
-        (lambda n, w, s: unguarded(n, w, 1 - s), "The weight belongs to the window."),
-        (lambda n, w, s: right(n, w, 0.5), "One half is one weight of many."),
+        (lambda n, w, s: shared(n, w, s, 1 - s), "The probability is that of the whole window."),
+        (lambda n, w, s: right(n, [*{*range(n)} - {*w}], s), "It is the window's probability."),
+        (lambda n, w, s: unguarded(n, w, 1 - s), "It belongs to the window."),
+        (lambda n, w, s: right(n, w, 0.5), "One half is one probability of many."),
         (lambda n, w, s: right(n, [*range(n)][-len(w) :], s), "Not the newest, but the window."),
         (lambda n, w, s: (uniform if 2 * len(w) > n else unguarded)(n, w, s), at_half),
     ]

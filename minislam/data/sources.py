@@ -18,6 +18,7 @@ from minislam.records import Trajectory
 
 _OTHER_IMAGES = ".heic .heif .avif .tif .tiff .webp .gif .bmp .dng .cr2 .cr3 .nef .arw".split()
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+_LISTS = b"ffconcat", b"#EXTM3U"  # how texts begin for which FFmpeg opens other files
 
 _ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
 _COUNTED = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
@@ -85,6 +86,9 @@ def read_video(path: Path, limit: int | None) -> Recording:
     """Read a video file; frames after the first `limit` are left alone."""
     found = f"the single image {path}; give the folder it is in"
     require(not is_image(path), "a video or a folder", found)
+    with open(path, "rb") as file:
+        is_list = file.read(8).startswith(_LISTS)
+    require(not is_list, "a video", f"a list of others in {path}; give one of these")
     images = VideoImages(path, limit)
     if len(images) == 0:
         raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")

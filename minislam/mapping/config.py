@@ -112,8 +112,8 @@ class MappingConfig:
 
     def refinement(self, images: float) -> int:
         """Return the iterations at the end, for a map of so many images."""
-        share = images / self.refine_images if self.refine_images else 0.0
-        return math.ceil(self.refine_iterations * max(1.0, share))
+        times = images / self.refine_images if self.refine_images else 0.0
+        return math.ceil(self.refine_iterations * max(1.0, times))
 
     def rates_at(
         self,

@@ -77,8 +77,8 @@ class Mapper(JointOptimisation):
         self._insert(new)
         if new % self.config.keyframe_stride != 0:
             return  # Fast mode: this keyframe waits for the next optimisation.
-        share = self.config.window_probability
-        probabilities = sampling_probabilities(len(self.keyframes), self.window, share)
+        of_window = self.config.window_probability
+        probabilities = sampling_probabilities(len(self.keyframes), self.window, of_window)
         self._optimise([self._online_camera] * self.config.keyframe_iterations, probabilities)
 
     def update_keyframes(self, T_camera_world: Tensor) -> None:

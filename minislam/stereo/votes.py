@@ -89,7 +89,7 @@ def _joined(known: np.ndarray, seeds: np.ndarray) -> np.ndarray:  # (h, w) bool,
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
-    """Return the share of the window around each pixel in which the mask is true."""
+    """Return the fraction of the window around each pixel in which the mask is true."""
     return cv2.blur(mask.astype(np.float32), (SUPPORT_WINDOW, SUPPORT_WINDOW))
 
 

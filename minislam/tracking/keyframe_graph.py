@@ -128,17 +128,17 @@ class KeyframeGraph(Stateful):
         """Tell whether the camera was lost between a keyframe and the one before it."""
         return keyframe > 0 and self.flow_to_next[keyframe - 1] is None
 
-    def start_pose(self, matches: FlowMatches, trust: Tensor) -> Tensor:  # (4, 4)
+    def start_pose(self, matches: FlowMatches, certainty: Tensor) -> Tensor:  # (4, 4)
         """Return T_camera_world of a frame from its flow (E = 1) from the newest keyframe.
 
-        It starts from the pose there, and from the last motion repeated; `trust` weighs cells (N,).
+        It starts from the pose there, and from the last motion repeated; `certainty` is (N,).
         """
         keyframes, newest = self.keyframes, len(self.keyframes) - 1
         last = keyframes.T_camera_world[newest]
         starts = [last]
         if newest > 0 and not self.follows_a_loss(newest):
             starts.append(se3_interpolate(keyframes.T_camera_world[newest - 1], last, 2.0))
-        weights, robust = keyframes.cell_weights[newest] * trust, self.robust
+        weights, robust = keyframes.cell_weights[newest] * certainty, self.robust
         disparities = keyframes.disparities[newest]
         return start_pose(self.grid, matches, disparities, weights, last, starts, robust)
 

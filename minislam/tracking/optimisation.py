@@ -8,13 +8,8 @@ from torch import Tensor
 
 from minislam.records import Progress
 from minislam.state.memory import release, stack
-from minislam.tracking.bundle_adjustment import (
-    BundleProblem,
-    BundleReport,
-    BundleState,
-    bundle_adjust,
-    residuals,
-)
+from minislam.tracking.bundle_adjustment import BundleReport, bundle_adjust, residuals
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.disparity_prior import mask_priors
 from minislam.tracking.frame_graph import at_once
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph

@@ -5,12 +5,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from minislam.priors.interfaces import FlowMatches
-from minislam.tracking.bundle_adjustment import (
-    BundleProblem,
-    BundleState,
-    bundle_adjust,
-    edge_costs,
-)
+from minislam.tracking.bundle_adjustment import bundle_adjust, edge_costs
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.grid import Grid
 from minislam.tracking.reprojection import reproject, scaled_points
 from minislam.tracking.safeguards.robust import RobustKernel

@@ -12,12 +12,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse, transform_points
-from minislam.tracking.bundle_adjustment import (
-    DISPARITY_DAMPING,
-    MIN_DISPARITY,
-    BundleProblem,
-    BundleState,
-)
+from minislam.tracking.bundle_adjustment import DISPARITY_DAMPING, MIN_DISPARITY
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.reprojection import MIN_DEPTH_RATIO
 
 

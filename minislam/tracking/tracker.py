@@ -38,7 +38,7 @@ from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 LONGEST_TAIL = 2  # frames after the last keyframe that need none behind them
-GROWTH_SHARE = 5  # online all keyframes are adjusted again once one in so many is new
+NEW_ONE_IN = 5  # online all keyframes are adjusted again once one in so many is new
 
 
 class Mode(Enum):
@@ -205,7 +205,7 @@ class Tracker(Stateful):
         """Close loops; run online global BA if `global_interval` keyframes and a fifth are new."""
         config, count = self.config, len(self.keyframes)
         closed = config.loop_closure and close_loops(self.graph)
-        least = max(config.global_interval, count // GROWTH_SHARE)
+        least = max(config.global_interval, count // NEW_ONE_IN)
         is_due = config.global_interval > 0 and count - self._last_global >= least
         if is_due and not closed:
             seek_readouts(self.graph)

@@ -30,7 +30,7 @@ def test_a_solution_passes_and_wrong_answers_do_not():
 
 def test_known_mistakes_of_mapping_are_named():
     verdict = check_sampling(lambda n, w, s: torch.full((n,), 1 / n))
-    assert "its weight" in verdict.sentence
+    assert "its probability" in verdict.sentence
     only = check_sampling(lambda n, w, s: torch.tensor([(k in w) / len(w) for k in range(n)]))
     assert "forget them" in only.sentence
 

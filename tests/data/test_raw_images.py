@@ -178,9 +178,15 @@ class Capture:
         return True
 
 
-def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(monkeypatch):
+@pytest.fixture
+def phone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(raw_images.cv2, "VideoCapture", lambda *_: Capture())
-    recording = read_video(Path("phone.mp4"), None)
+    (tmp_path / "phone.mp4").touch()
+    return tmp_path / "phone.mp4"
+
+
+def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(phone: Path):
+    recording = read_video(phone, None)
     np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2, 0.233, 0.4])
     assert [recording.images.read(k)[0, 0, 0] for k in (0, 2, 4, 1)] == [1, 4, 6, 2]
     assert recording.lost == [(pytest.approx(0.15), "phone.mp4 is damaged there")]
@@ -188,30 +194,30 @@ def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(mo
 
 
 @pytest.mark.parametrize("limit", [None, 5])
-def test_a_pause_of_the_recorder_is_no_damage(limit: int | None, monkeypatch):
-    monkeypatch.setattr(raw_images.cv2, "VideoCapture", lambda *_: Capture())
+def test_a_pause_of_the_recorder_is_no_damage(phone: Path, limit: int | None, monkeypatch):
     monkeypatch.setattr(Capture, "stamps", tuple(k / 30 for k in (0, 1, 2, 3, 7, 8)))
-    recording = read_video(Path("phone.mp4"), limit)
+    recording = read_video(phone, limit)
     assert (recording.lost, recording.warnings) == ([], [])
     assert len(recording.images) == (limit or 6)
 
 
-def test_without_timestamps_the_frame_rate_is_taken_and_said(monkeypatch):
-    monkeypatch.setattr(raw_images.cv2, "VideoCapture", lambda *_: Capture())
+def test_without_timestamps_the_frame_rate_is_taken_and_said(phone: Path, monkeypatch):
     monkeypatch.setattr(Capture, "stamps", (0.0,) * 6)
-    recording = read_video(Path("old.avi"), None)
+    recording = read_video(phone, None)
     np.testing.assert_allclose(recording.timestamps, np.arange(6) / 30)
-    assert recording.warnings == ["old.avi has no timestamps: 30 frames per second assumed"]
+    assert recording.warnings == ["phone.mp4 has no timestamps: 30 frames per second assumed"]
 
 
 # Errors
 
 
-@pytest.mark.parametrize("kind", ["zero bytes", "text", "cut"])
+@pytest.mark.parametrize("kind", ["zero bytes", "text", "cut", "list"])
 def test_files_that_are_no_video_are_named(tmp_path: Path, kind: str):
     path = tmp_path / "walk.mp4"
     whole = video(tmp_path / "whole.mp4").read_bytes()
-    path.write_bytes({"zero bytes": b"", "text": b"hello\n" * 99, "cut": whole[:1500]}[kind])
+    of_others = b"ffconcat version 1.0\nfile whole.mp4\n"
+    contents = {"zero bytes": b"", "text": b"hello\n" * 99, "cut": whole[:1500], "list": of_others}
+    path.write_bytes(contents[kind])
     with pytest.raises(InputError, match=r"walk\.mp4"):
         read_video(path, None)
 

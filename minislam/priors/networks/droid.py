@@ -46,14 +46,15 @@ class EncodedFrame:
     """What the encoders make of an image: for a target, and for a source when it becomes one."""
 
     def __init__(self, weights: Weights, image: Tensor) -> None:
-        self.image = image  # (H, W, 3)
-        self._weights, self._normalised = weights, normalise(image.to(weights.device))
-        self.features = net.encode_features(weights, self._normalised)  # (1, 128, h, w)
+        self.image, self._weights = image, weights  # (H, W, 3)
+        normalised = normalise(image.to(weights.device))
+        self.features = net.encode_features(weights, normalised)  # (1, 128, h, w)
 
     @cached_property
     def context(self) -> tuple[Tensor, Tensor]:  # (1, 128, h, w) twice
         """Return the first hidden state and the context of all updates."""
-        return net.encode_context(self._weights, self._normalised)
+        normalised = normalise(self.image.to(self._weights.device))  # anew: it is not kept
+        return net.encode_context(self._weights, normalised)
 
 
 class DroidFlow(Stateful):

@@ -13,12 +13,8 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_inverse
-from minislam.tracking.bundle_adjustment import (
-    BundleProblem,
-    BundleState,
-    normal_equations,
-    residuals,
-)
+from minislam.tracking.bundle_adjustment import normal_equations, residuals
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.safeguards.parts import in_parts
 from minislam.tracking.schur import marginalised
 
