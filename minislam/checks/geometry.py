@@ -82,12 +82,13 @@ def check_warped_photo(student: Function) -> Verdict:
         pose = se3_inverse(pose) if flaw == "inverted" else pose
         points = transform_points(pose, points.flatten(0, 1)).view(points.shape)
         pixels, last = camera.project(points), doubles(camera.width - 1, camera.height - 1)
-        seen = ((pixels >= 0) & (pixels <= last)).all(-1) | (flaw == "unmasked")
-        seen &= (points[..., 2] > 0) | (flaw in ("behind", "unmasked"))
+        seen = ((pixels >= 0) & (pixels <= last)).all(-1) | (flaw in ("unmasked", "faded"))
+        seen &= (points[..., 2] > 0) | (flaw in ("behind", "unmasked", "faded"))
         pixels = 2 * pixels.floor() + 1 - pixels if flaw == "turned" else pixels
         position = (2 * (pixels.round() if flaw == "rounded" else pixels) / last - 1)[None]
         planes, position = photo.permute(2, 0, 1)[None], position.to(photo)
-        sampled = functional.grid_sample(planes, position, "bilinear", "border", True)
+        beyond = "zeros" if flaw == "faded" else "border"
+        sampled = functional.grid_sample(planes, position, "bilinear", beyond, True)
         return torch.where(seen[..., None], sampled[0].permute(1, 2, 0), 0)
 
     def case(pose: Tensor, description: str) -> Case:
@@ -104,6 +105,7 @@ def check_warped_photo(student: Function) -> Verdict:
         ("disparity", "This takes the depth for a disparity: the point is depth times the ray."),
         ("behind", "Points behind the source camera (z <= 0) are not in its photo."),
         ("unmasked", "Where the source sees nothing it is 0: outside its photo, or behind."),
+        ("faded", "Outside, and behind, it is 0 at once: the border does not fade (grid_sample)."),
         ("rounded", "This takes the nearest pixel: mix the four around the position."),
         ("turned", "The weights are exchanged: the nearer of two pixels has the larger weight."),
     ]

@@ -20,11 +20,6 @@ from minislam.mapping.window import sampling_probabilities
 from minislam.splatting import GaussianMap, Rendering, render
 
 
-def random(source: torch.Generator, *shape: int) -> Tensor:
-    """Return numbers in [0, 1)."""
-    return torch.rand(shape, generator=source, dtype=torch.float64)
-
-
 def check_sampling(student: Function) -> Verdict:
     """Check (number of keyframes N, window, its probability) -> that of each keyframe (N,)."""
     right = sampling_probabilities
@@ -128,7 +123,8 @@ def check_insertion(student: Function) -> Verdict:
         return torch.cat([new.means, new.scales[:, :1] / far, new.colors], -1)
 
     shape = CAMERA.height, CAMERA.width
-    values = random(torch.Generator().manual_seed(0), 7, *shape)
+    source = torch.Generator().manual_seed(0)
+    values = torch.rand(7, *shape, generator=source, dtype=torch.float64)
     image, weight, opacity = values[:3].permute(1, 2, 0), values[3], values[4]
     depth = torch.where(values[5] < 0.1, 0, 1 + 2 * values[6])
     weight[20:40, 50:80] = 0
@@ -187,11 +183,11 @@ def check_map_loss(student: Function) -> Verdict:
         gradient = torch.zeros_like(color) if leaf.grad is None else leaf.grad
         return None if value is None else (value, gradient)
 
-    source = torch.Generator().manual_seed(1)
-    (color, image), (weight, hidden) = random(source, 2, 5, 6, 3), random(source, 2, 5, 6)
-    depth, full = 1 + random(source, 2, 5, 6)
+    random = partial(torch.rand, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    (color, image), (weight, hidden) = random(2, 5, 6, 3), random(2, 5, 6)
+    depth, full = 1 + random(2, 5, 6)
     holes = torch.where(hidden < 0.3, 0, full)
-    needles, one = 0.1 * random(source, 4, 3), torch.ones_like(depth)
+    needles, one = 0.1 * random(4, 3), torch.ones_like(depth)
     scales = needles[:, :1].expand(4, 3)
     cases = [
         Case((color, depth, image, full, one, scales), "round Gaussians and equal weights"),
@@ -204,6 +200,7 @@ def check_map_loss(student: Function) -> Verdict:
         (lambda *a: reference(*a[:4], a[4] / a[4].mean(), a[5]), "Divide by the number of pixels."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 0)), "L_iso is missing."),
         (lambda *a: reference(*a, shares=(0.8, 0.2, 1)), "L_iso is multiplied by 10."),
+        (lambda *a: reference(*a, shares=(2.4, 0.2, 10)), "The mean over RGB, not the sum."),
         (lambda *a: reference(*a, shares=(0.2, 0.8, 10)), "0.8 is for colour, 0.2 for depth."),
         ("one mean", "Each Gaussian has its own mean scale."),
         ("of known", "The mean is over all pixels: unknown ones count 0."),
@@ -221,8 +218,8 @@ def check_followed_pose(student: Function) -> Verdict:
     What is compared is where the pose sees the centres of the Gaussians [px].
     """
     camera, count = Camera(24.0, 24.0, 15.5, 11.5, 32, 24), 60
-    source = torch.Generator().manual_seed(23)
-    depth, places, colors = (random(source, count, n) for n in (1, 2, 3))
+    random = partial(torch.rand, generator=torch.Generator().manual_seed(23), dtype=torch.float64)
+    depth, places, colors = (random(count, n) for n in (1, 2, 3))
     z, pixels = 1 + 3 * depth, places * doubles(40, 32) - 4
     means = camera.backproject(pixels, z[:, 0])
     quats = doubles(1, 0, 0, 0).float().expand(count, 4)
@@ -273,9 +270,6 @@ def check_followed_pose(student: Function) -> Verdict:
         settings = PoseRefinementConfig(iterations=steps, tolerance=0.0)
         return pose_refinement.refine_pose(gaussians, camera, *view, black, settings)
 
-    def unweighted(*a: Any) -> Tensor:
-        return refined(*a[:4], torch.ones_like(a[4]), steps=30)
-
     # Its first step is damped by 0.3 times this: by 0.1, as in the exercise.
     one_step = patch.object(pose_refinement, "_FIRST_DAMPING", 1 / 3)(partial(refined, steps=1))
     mistakes = [
@@ -285,7 +279,7 @@ def check_followed_pose(student: Function) -> Verdict:
         (lambda *a: a[2] @ motion(*a), "The twist is applied on the left: exp(twist) @ T."),
         (lambda *a: se3_inverse(motion(*a)) @ a[2], "The pose moves the other way."),
         (one_step, "Repeat the step, each time from the pose of the last one."),
-        (unweighted, "The camera follows the dynamic object: each pixel has its weight."),
+        (lambda *a: refined(*a[:4], a[4] ** 0, steps=30), "Something moves: use the weight."),
     ]
     cases, returns = [case for case, _ in pairs], ("the Gaussians' pixels",)
     return check_function(student, true_pose, cases, 0.02, mistakes, returns, pixels_of)

@@ -58,7 +58,7 @@ def check_stride(student: Function) -> Verdict:
             return flow - (flaw == "shifted") * flow.mean(0)
         turns = turned(rays, flaw != "flat")[..., : 2 if flaw == "no roll" else 3]
         weight, rest = torch.ones_like(flow[:, 0]), flow
-        for _ in range(1 if flaw == "once" else 10):
+        for _ in range({"once": 1, "eleven": 11}.get(flaw, 10)):
             H = torch.einsum("n,nki,nkj->ij", weight, turns, turns)
             g = torch.einsum("n,nki,nk->i", weight, turns, flow)
             rest = flow - turns @ torch.linalg.solve(H, g)
@@ -93,6 +93,7 @@ def check_stride(student: Function) -> Verdict:
     ]
     mistakes = [
         ("once", "Weigh by 1/max(residual, 0.5) and fit anew, ten times in all."),
+        ("eleven", "Ten fits in all: one with equal weights, and nine more."),
         ("squared", "The weight is 1/residual, not 1/residual^2."),
         ("no roll", "The third column, a roll about the viewing axis, is missing."),
         ("flat", "Away from the centre a turn moves a point more: 1 + x^2, 1 + y^2."),

@@ -47,7 +47,6 @@ def check_ate(student: Function) -> Verdict:
         (lambda e, t: reference(e, t) ** 2, "The root is missing."),
         (lambda e, t: reference(e, t) / 3**0.5, "A mean over cameras, not over their 3 N numbers."),
         (lambda e, t: reference(e, t) * len(t) ** 0.5, "The mean is missing: divide by N."),
-        (lambda e, t: distances(e, t).max(), "ATE is no maximum."),
         (lambda e, t: rms(e - t - (e - t).mean(0)), "Centred, but neither turned nor scaled yet."),
     ]
     return check_function(student, reference, cases, 1e-9, mistakes)
@@ -59,9 +58,6 @@ def check_separability(student: Function) -> Verdict:
     def wins(beta: np.ndarray, moving: np.ndarray, tie: float) -> float:
         pairs = beta[moving][:, None] - beta[~moving]
         return float(np.mean(np.where(pairs == 0, tie, pairs > 0)))
-
-    def count(beta: np.ndarray, moving: np.ndarray) -> float:
-        return wins(beta, moving, 0.5) * moving.sum() * (~moving).sum()
 
     def case(beta: Any, moving: Any, description: str) -> Case:
         return Case((np.array(beta), np.array(moving) > 0), description)
@@ -80,8 +76,8 @@ def check_separability(student: Function) -> Verdict:
         (lambda b, m: wins(b, ~m, 0.5), "The other way round: what moves has the larger beta."),
         (lambda b, m: wins(b, m, 0.0), "A pair with equal beta is worth one half."),
         (lambda b, m: wins(b, m, 1.0), "A pair with equal beta is worth one half."),
-        (count, "The number of pairs is missing: divide by it."),
-        (lambda b, m: count(b, m) / len(b) ** 2, "Only pairs of a moving and a static cell count."),
+        (lambda b, m: wins(b, m, 0.5) * m.sum() * (~m).sum(), "Divide by the number of pairs."),
+        (lambda b, m: wins(b, m, 0.5) * m.mean() * (~m).mean(), "Count only mixed pairs."),
         (lambda b, m: b[m].mean() - b[~m].mean(), "This is a difference of means, no fraction."),
         (lambda b, m: ((b > np.median(b)) == m).mean(), "No threshold: compare all pairs."),
     ]
@@ -94,9 +90,9 @@ def check_alignment(student: Function) -> Verdict:
     def aligned(e: np.ndarray, t: np.ndarray, flaw: str = "") -> np.ndarray:
         best, centred = umeyama(e, t), e - e.mean(0)
         R, scale, spread = best.rotation, best.scale, (centred**2).sum()
-        if flaw == "mirrored":
-            u, d, v = np.linalg.svd((t - t.mean(0)).T @ centred)
-            R, scale = u @ v, d.sum() / spread
+        u, d, v = np.linalg.svd((t - t.mean(0)).T @ centred)
+        R = u @ v if flaw == "mirrored" else R
+        scale = d.sum() / spread if flaw in ("mirrored", "unsigned") else scale
         scale = {"spread": np.sqrt(len(t) * t.var(0).sum() / spread), "1": 1.0}.get(flaw, scale)
         A = np.eye(4)
         A[:3, :3] = scale * (R.T if flaw == "transposed" else R)
@@ -119,6 +115,7 @@ def check_alignment(student: Function) -> Verdict:
     mistakes = [
         ("1", "Monocular: the scale is unknown."),
         ("mirrored", "A rotation has determinant +1: turn the last column of U if it is -1."),
+        ("unsigned", "S stands in the scale as well: trace(D S)."),
         ("spread", "With errors s is trace(D S) over the variance of the estimate."),
         (lambda e, t: np.linalg.inv(aligned(e, t)), "This maps the truth to the estimate."),
         (lambda e, t: aligned(t, e), "This maps the truth to the estimate."),

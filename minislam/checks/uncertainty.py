@@ -39,6 +39,7 @@ def check_mapping_weight(student: Function) -> Verdict:
         (lambda b: uncapped(b).clamp_max(5), "Weights below 0.1 must be 0: little adds up."),
         (lambda b: cut(uncapped(b), 1e9), "No weight is above 5, that of a beta of a quarter."),
         (lambda b: uncapped(b).clamp(0.1, 5), "Weights below 0.1 become 0, not 0.1."),
+        (lambda b: cut(0.5 / (adjusted_beta(b, camera) + 0.1631579) ** 2), "Take off 0.1 first."),
         (lambda beta: cut(0.5 / beta**2), "This is 0.5 / beta^2: beta is adjusted first."),
         (lambda beta: cut(0.5 / beta.clamp_min(0.1) ** 2), "beta is cut, but not adjusted yet."),
         (lambda beta: cut(2 * uncapped(beta)), "It is a half by beta_adj^2: 0.5 is missing."),
@@ -57,8 +58,9 @@ def check_best_beta(student: Function) -> Verdict:
         error = torch.cat([doubles(0.0), 2 * normals(seed, 4).square()])
         return Case((error, lambda_log), f"lambda_3 = {lambda_log}")
 
-    cases = [case(2.0), case(0.5), *drawn(lambda seed: case(0.3 + 0.1 * (seed % 9), seed))]
+    cases = [case(3.0), case(0.5), *drawn(lambda seed: case(0.3 + 0.1 * (seed % 9), seed))]
     mistakes = [
+        (lambda L, _: 2 * L.sqrt(), "2 sqrt(L) is for lambda_3 = 0.5 alone: use the argument."),
         (lambda L, _: L.sqrt(), "lambda_3 is not in it: set the derivative to zero and solve."),
         (lambda L, x: (L / x).sqrt(), "A factor 2 is missing: d(L beta^-2) = -2 L beta^-3."),
         (lambda L, x: 2 * L / x, "This is beta squared: take the root."),
@@ -123,7 +125,9 @@ def check_training(student: Function) -> Verdict:
             beta, sample = mlp(features[t]), features[t].flatten(0, 1)
             error = RenderingError(ssim[t], depth[t], opacity[t] + (flaw == "holes"))
             own = beta.clamp_min(0.1) if flaw == "clipped" else beta
-            losses.append(uncertainty_loss(beta, error, own.flatten(), sample, config))
+            share = float((opacity[t] >= 0.9).double().mean()) if flaw == "kept" else 1.0
+            shared = replace(config, lambda_variance=share * config.lambda_variance)
+            losses.append(uncertainty_loss(beta, error, own.flatten(), sample, shared) / share)
             if flaw != "gathered":
                 optimizer.zero_grad()
             losses[-1].backward()
@@ -155,6 +159,7 @@ def check_training(student: Function) -> Verdict:
         ("lambda_variance", "L_reg_V is missing."),
         ("lambda_log", "The price of a large beta is missing: 0.5 log beta."),
         ("holes", "A cell of opacity below 0.9 has no loss."),
+        ("kept", "The mean is over all cells: those of opacity below 0.9 count as 0."),
         ("first", "The views take turns: step s looks at view s modulo T."),
         ("gathered", "Gradients add up: call zero_grad before backward."),
         ("still", "The MLP did not change: call optimizer.step()."),

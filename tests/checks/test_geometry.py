@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from minislam.checks import check_reproject, check_resized_intrinsics, check_warped_photo
 from minislam.geometry import Camera, se3_inverse, transform_points
@@ -74,6 +75,17 @@ def warped_in_loops(photo: Tensor, depth: Tensor, camera: Camera, pose: Tensor) 
     return image
 
 
+def sampled(
+    photo: Tensor, depth: Tensor, camera: Camera, pose: Tensor, align_corners: bool
+) -> Tensor:
+    pixels = camera.pixel_grid(dtype=depth.dtype)
+    points = camera.backproject(pixels, depth) @ pose[:3, :3].T + pose[:3, 3]
+    last = points.new_tensor([camera.width - 1, camera.height - 1])
+    at = 2 * camera.project(points)[None] / last - 1
+    image = functional.grid_sample(photo.permute(2, 0, 1)[None], at, align_corners=align_corners)
+    return image[0].permute(1, 2, 0)
+
+
 def test_a_warped_photo_is_told_from_a_wrong_one():
     wrong = {
         "inverse motion": lambda *a: warped(*a[:3], se3_inverse(a[3])),
@@ -85,3 +97,4 @@ def test_a_warped_photo_is_told_from_a_wrong_one():
         "not masked": partial(warped, flaw="unmasked"),
     }
     assert_variants(check_warped_photo, {"one": warped, "other": warped_in_loops}, wrong)
+    assert "does not fade" in check_warped_photo(partial(sampled, align_corners=True)).hint

@@ -88,6 +88,7 @@ def test_map_loss():
         "by the sum of weights": lambda c, d, i, r, w, s: of_parts(c, d, i, r, w / w.mean(), s),
         "no isotropic part": lambda *a: of_parts(*a, shares=(0.8, 0.2, 0.0)),
         "isotropic part once": lambda *a: of_parts(*a, shares=(0.8, 0.2, 1.0)),
+        "a sum over RGB": lambda *a: of_parts(*a, shares=(2.4, 0.2, 10.0)),
         "shares exchanged": lambda *a: of_parts(*a, shares=(0.2, 0.8, 10.0)),
         "unknown depth too": lambda *a: of_parts(*a, mask=False),
         "one mean of all scales": lambda *a: of_parts(*a, own_mean=False),

@@ -118,6 +118,7 @@ def whole(rays, flows, strides, needed):
 
 WRONG_STRIDES = [
     (options(rounds=1), "ten times"),
+    (options(rounds=11), "Ten fits in all"),
     (options(power=2.0), "1/residual^2"),
     (options(square=0.0), "1 + x^2"),
     (whole, "whole flow"),

@@ -84,7 +84,8 @@ def similarity(estimate, truth, mirror=False, spread=False, **how):
     e, t = estimate - estimate.mean(0), truth - truth.mean(0)
     u, d, v = np.linalg.svd(t.T @ e)
     signs = np.array([1, 1, 1 if mirror else np.sign(np.linalg.det(u @ v))])
-    scale = np.sqrt((t**2).sum() / (e**2).sum()) if spread else (d * signs).sum() / (e**2).sum()
+    trace = d.sum() if how.get("unsigned") else (d * signs).sum()
+    scale = np.sqrt((t**2).sum() / (e**2).sum()) if spread else trace / (e**2).sum()
     A = np.eye(4)
     turn = (u * signs) @ v
     A[:3, :3] = how.get("scale", scale) * (turn.T if how.get("transposed") else turn)
@@ -109,8 +110,9 @@ def test_alignment():
         "inverse": lambda e, t: np.linalg.inv(similarity(e, t)),
         "mean not turned": lambda e, t: similarity(e, t, unturned=True),
         "transposed": lambda e, t: similarity(e, t, transposed=True),
+        "no S in the scale": lambda e, t: similarity(e, t, unsigned=True),
     }
-    assert_variants(check_alignment, {"svd": similarity, "torch": by_umeyama}, wrong)
+    assert_variants(check_alignment, {"svd": similarity, "torch": by_umeyama}, wrong, 1.0)
 
 
 def chance(a, b, slack=1e-12, one_sided=False):

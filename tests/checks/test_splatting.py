@@ -96,7 +96,7 @@ def rendered(means, covariances, opacities, colors, pose, camera, flaw: str = ""
         alpha = opacities[n].clamp_max(1.0 if flaw in ("opaque", "of alpha") else 0.99)
         alpha = alpha * torch.exp(-distances * (1.0 if flaw == "whole" else 0.5))
         alpha = alpha.clamp_max(0.99) if flaw == "of alpha" else alpha
-        alpha = torch.where(alpha > 1 / 255, alpha, 0)
+        alpha = alpha if flaw == "uncut" else torch.where(alpha > 1 / 255, alpha, 0)
         image = image + light * alpha * colors[n]
         light = light if flaw == "added" else light * (1 - alpha)
     return image
@@ -133,6 +133,7 @@ def test_a_rendered_image_is_told_from_a_wrong_one():
         "by distance": partial(rendered, flaw="distance"),
         "by z in the world": partial(rendered, flaw="world"),
         "alpha is capped": partial(rendered, flaw="of alpha"),
+        "above 1/255": partial(rendered, flaw="uncut"),
     }
     assert_variants(check_rendered_image, {"one": rendered, "other": rendered_by_pixels}, wrong)
 

@@ -28,6 +28,7 @@ def test_known_mistakes_of_uncertainty_are_named():
     assert "factor 2" in check_best_beta(lambda error, x: (error / x).sqrt()).sentence
     assert "take the root" in check_best_beta(lambda error, x: 2 * error / x).sentence
     assert "lambda_3 is not" in check_best_beta(lambda error, x: error.sqrt()).sentence
+    assert "2 sqrt(L) is for" in check_best_beta(lambda error, x: 2 * error.sqrt()).sentence
     assert "only similar" in check_feature_variance(lambda b, f: b.var(correction=0)).sentence
 
     def by_dot_product(beta: Tensor, features: Tensor) -> Tensor:
@@ -47,7 +48,8 @@ def trained(mlp, optimizer, features, ssim, depth, opacity, steps, flaw: str = "
         error = ssim[t] + (0 if flaw == "no depth" else 0.2) * depth[t]
         loss = error / beta ** (1 if flaw == "power" else 2)
         loss = loss + (0 if flaw == "no log" else 0.5 * beta.log())
-        loss = loss if flaw == "holes" else torch.where(opacity[t] >= 0.9, loss, 0)
+        loss = loss[opacity[t] >= 0.9] if flaw == "kept" else loss
+        loss = loss if flaw in ("holes", "kept") else torch.where(opacity[t] >= 0.9, loss, 0)
         loss = loss.sum() if flaw == "sum" else loss.mean()
         if flaw != "no reg_V":
             own = beta_raw.clamp_min(0.1) if flaw == "clipped" else beta_raw
@@ -96,3 +98,4 @@ def test_a_training_is_told_from_a_wrong_one():
         "L_reg_V of the clipped beta": partial(trained, flaw="clipped"),
     }
     assert_variants(check_training, {"one": trained, "other": trained_cell_by_cell}, wrong)
+    assert "over all cells" in check_training(partial(trained, flaw="kept")).hint

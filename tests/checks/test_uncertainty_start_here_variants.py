@@ -38,6 +38,7 @@ def in_place(beta):
 def test_mapping_weight():
     right = {"loop": as_loop, "numpy": with_numpy, "in place": in_place}
     wrong = {
+        "0.1 not taken off": lambda b: cut(0.5 / (adjusted(b) + 0.163158) ** 2),
         "uncut": lambda b: (0.5 / adjusted(b) ** 2).clamp_max(5),
         "uncapped": lambda b: torch.where(adjusted(b) > 5**0.5, 0.0, 0.5 / adjusted(b) ** 2),
         "cut to 0.1": lambda b: (0.5 / adjusted(b) ** 2).clamp(0.1, 5),
