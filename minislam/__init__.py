@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from minislam.runs.api import InputOptions, Run, load, open_sequence, run
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["InputOptions", "Run", "__version__", "load", "open_sequence", "run"]
 
 

@@ -106,8 +106,11 @@ def test_the_camera_is_followed_with_a_depth_prior(with_depth: RunFolder):
     assert metrics["ate_keyframes_cm"] < 2.4
 
 
-def test_the_camera_is_followed_without_any_depth(without_depth: RunFolder):
-    assert without_depth.read_metrics()["ate_all_cm"] < 8.0
+def test_without_any_depth_camera_and_room_are_found_and_the_person_is_not(without_depth):
+    metrics = without_depth.read_metrics()  # measured: 1.6 cm, 24.1 dB, .964 and .985
+    assert metrics["ate_all_cm"] < 3.2
+    assert metrics["psnr_masked_db"] > 22 and metrics["shown_static"] > 0.93
+    assert metrics["beta_auroc"] > 0.95
 
 
 def test_without_a_prior_no_keyframe_is_prepared_for_a_map_before_the_end():
@@ -230,8 +233,10 @@ SHORTER = [
 
 
 def start(out: Path, *more: str) -> subprocess.Popen:
-    """Start a run in another process, from another folder, where sets have another order."""
-    command = [sys.executable, "-m", "minislam", *SHORTER, *more, "-o", str(out)]
+    """Start a run in another process and folder, where sets have another order, without network."""
+    program = "import socket, sys; socket.socket.connect = socket.getaddrinfo = None; "
+    program += "from minislam.cli.main import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, *SHORTER, *more, "-o", str(out)]
     environment = os.environ | {"PYTHONHASHSEED": "1"}
     return subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, env=environment, cwd=out.parent
