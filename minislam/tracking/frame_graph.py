@@ -132,7 +132,7 @@ def flow_distances(
     camera: Camera,
     full_flow_weight: float,  # eta
     rows: range | None = None,  # keyframes to compare with all others; None: all
-    limit: float = FAR,  # px: what a few cells put beyond twice this is FAR
+    limit: float = FAR,  # px: pairs that COARSE cells put beyond twice this are FAR
 ) -> Tensor:  # (K, K) px, FAR outside the rows and their columns
     """Return the distances between keyframes, as the mean flow that their geometry predicts.
 

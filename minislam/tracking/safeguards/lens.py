@@ -1,4 +1,4 @@
-"""A lens that bends straight lines although nobody said so: told from the flow.
+"""A lens that bends straight lines although no calibration says so: estimated from the flow.
 
 A wide lens shows the ray u of a pinhole, r = |u|, not at x = c + f u but at
 
@@ -45,7 +45,7 @@ Radial = tuple[float, float]  # k1, k2
 
 @dataclass(frozen=True)
 class LensFit:
-    """The lens that the flow fits best."""
+    """The lens that fits the flow best."""
 
     focal: float  # px, fx at the working size
     radial: Radial  # k1 and k2 [-], with that focal length

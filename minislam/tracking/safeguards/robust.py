@@ -7,7 +7,7 @@ that even far outliers pull. With k = 2 it is that of Geman and McClure, bounded
 few c only the number of outlier cells counts, not how far a dynamic object has moved.
 
 How wide c must be depends on the noise of the flow: .08 px in clean synthetic clips, .2 to .4 px in
-real ones (medians). Poses that have settled tell it by their residuals.
+real ones (medians). The residuals of settled poses measure it.
 """
 
 from dataclasses import dataclass, replace

@@ -86,7 +86,7 @@ class RollingShutter(Stateful):
     """The readouts, found from the flow along all edges and from the motion of the image."""
 
     readout: Readout = (0.0, 0.0)
-    is_found: bool = False  # the flow has told it, and all later adjustments refine it
+    is_found: bool = False  # estimated from the flow; all later adjustments refine it
     motion: ImageMotion
 
     def __init__(self, grid: Grid, keyframes: KeyframeStore, edges: FrameGraph, is_on: bool):
@@ -143,7 +143,7 @@ class RollingShutter(Stateful):
         return stack(rows)
 
     def take(self, found: Readout) -> None:
-        """Set what the flow has told, from where all later adjustments refine it."""
+        """Set the readouts estimated from the flow; all later adjustments refine them."""
         self.is_found = True
         self.lengthen(found)
 
