@@ -170,7 +170,7 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 
 
 def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
-    """Return continuity and agreement [-]: does what held the camera before hold this keyframe?
+    """Return continuity and agreement [-]: do cells that fitted before fit in this keyframe?
 
     A cell of an earlier keyframe is known if its flow to the next keyframe fits. The flow of the
     keyframe just before leads to this one, which is being judged, so there the cells are known to

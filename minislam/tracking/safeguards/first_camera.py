@@ -33,7 +33,7 @@ SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
 # Starts of an unknown focal length beside its guess: each search reaches a third either way.
 OTHER_FOCALS = (math.log(0.5), math.log(2.0))
 # Chosen on five real clips, four in which the camera hardly does more than turn, judged on others.
-FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guess, and before it is freed [-]
+FOCAL_WORTH_SAVING = 0.05  # of the cost: for each doubling of the guess, and to free it [-]
 FARTHEST = math.log(4)  # from the guessed focal length; farther off, the start has failed
 RELIEF_WORTH_SAVING = 0.1  # of the cost, per unit of correlation with the usual disparities [-]
 # More than later (focal_length.py), because in a short pan readout and focal length look alike. In
