@@ -102,7 +102,7 @@ def adjust_confirmed(
     swept: Iterable[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
     progress: Progress | None = None,
 ) -> float:
-    """Adjust all keyframes on fresh flow. Each cell counts as far as it is confirmed.
+    """Adjust all keyframes on flow measured anew, each cell weighted by its confirmation.
 
     Return the fraction of the cells whose swept depth is known.
     """
