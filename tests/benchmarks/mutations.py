@@ -49,7 +49,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/mapper.py", "mapping/test_mapper.py"): [("if not keyframe.inserts", "if False")],
     ("mapping/gaps.py", "mapping/test_gaps.py"): [
-        ("mean / np.maximum(part, 1e-6)", "mean"), ("-(rows[:, ~free]", "(rows[:, ~free]"),
+        ("mean / np.maximum(share, 1e-6)", "mean"), ("-(rows[:, ~free]", "(rows[:, ~free]"),
         ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
         ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
         ("is_guessed & ((votes > 0)", "((votes > 0)"), ("(votes > 0) | is_near", "(votes > 0)"),
@@ -162,7 +162,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/mapper.py", "mapping/test_safeguards.py"): [
         ("static.any() and ", ""), ("self._remove_unsupported()", "pass"),
-        ("static > safeguards.LEAST_STATIC * whole", "static >= safeguards.LEAST_STATIC * whole"),
+        ("static > safeguards.LEAST_STATIC * total", "static >= safeguards.LEAST_STATIC * total"),
     ],
     ("tracking/keyframe_selection.py", "tracking/test_keyframe_selection.py"): [
         ("if not graph.keyframes.has_prior", "if True"),
@@ -250,7 +250,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("stereo/votes.py", "stereo/test_votes.py"): [
         ("expected - 2 * tolerance", "expected"), ("& (other.cost.take(place) < WELL_MATCHED)", ""),
-        ("known &= _joined(", "known |= _joined("),
+        ("known &= _components(", "known |= _components("),
     ],
     ("evaluation/images.py", "evaluation/test_images_separability.py"): [
         ('("left", "right")', '("left", "left")'),
