@@ -1,4 +1,4 @@
-"""Whether an object is what an interface asks for, found out on two small images.
+"""Whether an object conforms to an interface, tested on two small images.
 
 `choice.py` asks before a run begins, and `minislam.checks` gives the same checks to authors: each
 returns nothing, or raises InputError with a sentence that says what is wrong.
@@ -20,7 +20,7 @@ from minislam.state.stateful import Tree, to_tree
 # Not square, so that exchanged axes are noticed; RAFT needs 128 px per side.
 CAMERA = Camera(150.0, 150.0, 111.5, 79.5, 224, 160)
 SHIFT = (-8.0, -4.0)  # px (u, v), from the first to the second of the images
-_STORED = dict | list | Tensor | np.ndarray | str | int | float | None  # by a saved state
+_STORED = dict | list | Tensor | np.ndarray | str | int | float | None  # in a saved state
 
 
 def shifted_images() -> tuple[Tensor, Tensor]:  # each (H, W, 3)
