@@ -174,7 +174,7 @@ def seen_window(
 
 
 class KeptImages:
-    """Keeps prepared images in a temporary file; none more when the disk is full.
+    """Keeps prepared images in a temporary file, until the disk is full.
 
     A run looks at every frame about six times, and not in order. In a video a step back takes ten
     times as long as a step on, because decoding starts again at an earlier complete image.

@@ -48,7 +48,7 @@ class Preview:
 
 
 def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:
-    """Write the report of what is known so far, if it can be written: no run ends of it."""
+    """Write the report of what is known so far; a failure to write it does not end the run."""
     with suppress(Exception):
         shown = _pictures(slam, len(slam.mapper.keyframes) - 1)
         strip = [shown["input"], viz.beta_to_rgb(shown["beta"]), shown["render"]]

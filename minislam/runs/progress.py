@@ -108,7 +108,7 @@ class ProgressLine:
         self._is_open = False  # on a terminal: the line has no end yet
 
     def show(self, stage: str, done: int, total: int) -> None:
-        """Report that `done` of all steps of a stage are done. Stages may take turns."""
+        """Report that `done` of all steps of a stage are done. Stages may alternate."""
         now = time.perf_counter()
         start, done_at_start = self._begun.setdefault(stage, (now, done))
         seconds, steps = now - start, done - done_at_start
@@ -133,9 +133,9 @@ class ProgressLine:
     def _whole(self, name: str, fraction: float, now: float) -> tuple[str, str]:
         """Return which stage of the plan this is, and how long the run takes in all.
 
-        What is left of the plan takes as many times longer than planned as what is done has
-        taken. At first little is done, so TRUST of the whole plan counts as done as planned: the
-        estimate begins with the plan and moves from there slowly.
+        The part that is left is assumed to take as many times its planned time as the part that
+        is done took. At first little is done, so TRUST of the whole plan counts as done in the
+        planned time: the estimate begins with the plan and moves from there slowly.
         """
         if not self.plan:
             return "", ""
