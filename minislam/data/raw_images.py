@@ -46,7 +46,7 @@ class FileImages:
         usual = [index for index in range(len(self.paths)) if index not in self.odd]
         found = self.read(usual[0]).max(2)
         for place in filter(_is_sampled, range(1, len(usual))):
-            with suppress(MinislamError):  # told when it is that frame's turn
+            with suppress(MinislamError):  # raised again when that frame is read
                 image = self.read(usual[place]).max(2)
                 found = np.maximum(found, image) if image.shape == found.shape else found
         return found
@@ -79,9 +79,9 @@ class VideoImages:
                     if decoded:
                         self._brightest = np.maximum(self._brightest, image.max(2))
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-        # Of as many frames as were read, 0 or less if unknown: the container tells it of all.
+        # The container counts all frames: its count says nothing if reading stopped at the limit.
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.promised = 0 if len(stamps) == limit else promised
+        self.promised = 0 if len(stamps) == limit else promised  # 0 or less: unknown
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
         self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
         self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]

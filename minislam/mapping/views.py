@@ -107,6 +107,6 @@ def view_gradients(
     *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.weight_sums, camera)
-    parts = torch.stack([loss.total, loss.color])  # one transfer
+    losses = torch.stack([loss.total, loss.color])  # one transfer from a GPU
     error = keyframe_rendering_error(rendering, comparison) if comparison else None
-    return ViewGradients(by_parameter, screen, parts.tolist(), error)
+    return ViewGradients(by_parameter, screen, losses.tolist(), error)

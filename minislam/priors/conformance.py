@@ -152,8 +152,8 @@ def _saved_state(name: str, thing: Any) -> Tree:
     """Return a state, unless it holds something that no file of a run can hold."""
     state = to_tree(_call(name, thing, "saved_state"))
     wanted = f"{name} to save dictionaries and lists of tensors, arrays, numbers and text"
-    parts = [state]
-    for part in parts:  # grows while it is walked through
-        parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
-        require(isinstance(part, _STORED), wanted, f"a {type(part).__name__}")
+    nodes = [state]
+    for node in nodes:  # grows while it is walked through
+        nodes += node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+        require(isinstance(node, _STORED), wanted, f"a {type(node).__name__}")
     return state

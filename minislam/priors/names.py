@@ -37,8 +37,8 @@ class PriorChoice:
 
     def __post_init__(self) -> None:
         """Refuse a device that is not there, and a precision that it has not."""
-        known = self.device in ("cpu", "cuda")
-        require(known, "--device cpu or cuda", f"{self.device!r}; choose one")
+        is_known = self.device in ("cpu", "cuda")
+        require(is_known, "--device cpu or cuda", f"{self.device!r}; choose one")
         if self.device == "cuda":
             import torch  # only where a GPU is asked for
 

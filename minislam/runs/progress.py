@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-AT_ONCE = 0.1  # second; what a stage reports so early was done together, and tells no rate
+AT_ONCE = 0.1  # second; steps that a stage reports so early were done together: no rate yet
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
 IMAGES_PER_FRAME = 0.4  # of the map: every fifth frame is a keyframe, and one more of every gap
 REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures

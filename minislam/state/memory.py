@@ -23,7 +23,7 @@ FIRST_BLOCK, LARGEST_BLOCK = 1 << 24, 1 << 28  # bytes: each block is as large a
 PIECE = 1 << 20  # bytes that are written at once
 Place = tuple[mmap.mmap, int]  # a block, and the first byte in it
 _BLOCKS: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()  # of all shelves
-ALIGNMENT = 64  # bytes, that of tensors in memory: another one can change the last bits of sums
+ALIGNMENT = 64  # bytes, as tensors in memory: another one can change the last bits of sums
 
 
 class Shelf:

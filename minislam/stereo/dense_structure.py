@@ -53,8 +53,8 @@ def with_swept_depth(
     judging: dict[int, votes.SweptView] = {}
 
     def view(keyframe: Keyframe, depth: Tensor, cost: np.ndarray) -> votes.SweptView:
-        pose, known = keyframe.T_camera_world.cpu().numpy(), _nearest(depth, small)
-        inverse_depth = np.where(known > 0, 1 / np.maximum(known, 1e-6), np.nan)
+        pose, sampled = keyframe.T_camera_world.cpu().numpy(), _nearest(depth, small)
+        inverse_depth = np.where(sampled > 0, 1 / np.maximum(sampled, 1e-6), np.nan)
         return votes.SweptView(inverse_depth, cost, 0.0, pose)
 
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
@@ -77,8 +77,8 @@ def with_swept_depth(
             depth = torch.where((depth > 0) | moves, depth, guess)
         SHELF.put([depth])
         result[index] = replace(found, depth=depth)
-    known = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
-    return list(map(_filled, result)) if fills and np.mean(known) < LEAST_KNOWN else result
+    shares = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
+    return list(map(_filled, result)) if fills and np.mean(shares) < LEAST_KNOWN else result
 
 
 def _filled(keyframe: Keyframe) -> Keyframe:
@@ -153,10 +153,10 @@ def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> l
     """Return the keyframes and, of n frames between two, max(least, n // 8, min(2, n // 3))."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
-        there = [frame for frame in followed if first < frame < last]
-        few = max(min(BETWEEN, len(there) // 3), len(there) // RESTING)
-        number = min(len(there), max(least, few))
-        frames |= {there[len(there) * (k + 1) // (number + 1)] for k in range(number)}
+        gap = [frame for frame in followed if first < frame < last]
+        usual = max(min(BETWEEN, len(gap) // 3), len(gap) // RESTING)
+        number = min(len(gap), max(least, usual))
+        frames |= {gap[len(gap) * (k + 1) // (number + 1)] for k in range(number)}
     return sorted(frames)
 
 

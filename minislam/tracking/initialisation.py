@@ -37,7 +37,7 @@ def first_disparity_hypotheses(
 
     They are the depth prior, if there is one, a wall facing the camera, a ground that is nearer
     below, and walls that are nearer on the left or on the right. The prior comes first, because the
-    first of equal costs wins, as where no flow tells any depth.
+    first of equal costs wins, as where the flow measures no depth.
     """
     camera = grid.camera
     right, below = (grid.pixels / grid.pixels.new_tensor([camera.width, camera.height]) - 0.5).T

@@ -68,7 +68,7 @@ class KeyframeGraph(Stateful):
     adjustments: int = 0  # that ran
     failed_adjustments: int = 0  # of these, which left the state as it was
     seeks_focal: bool = False  # the focal length is only a first guess
-    focal_is_free: bool = False  # the motion has told it; adjustments of all keyframes refine it
+    focal_is_free: bool = False  # it has been estimated; adjustments of all keyframes refine it
 
     def __init__(
         self, camera: Camera, config: TrackingConfig, flow: FlowEstimator, device: str = "cpu"

@@ -24,7 +24,7 @@ from minislam.tracking.safeguards.robust import weighted_median
 
 # Times the robust width: else the cells of a new keyframe, whose error is large, are outliers.
 FIRST_WIDENING = 8.0
-EVERY = 4  # one cell in so many tells the typical residual
+EVERY = 4  # one cell in so many is sampled for the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
 
 

@@ -17,7 +17,7 @@ from minislam.tracking.safeguards.parts import SourceBlocks
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """The normal equations of Eq. (5): pose blocks by edge, disparities, and what couples them."""
+    """The normal equations of Eq. (5): pose blocks by edge, disparity blocks, their coupling."""
 
     cost: float  # px^2, Eq. (5)
     of_edges: list[Tensor]  # J^T W J (E, 6 + G, 6 + G), J^T W r (E, 6 + G), Ad (E, 6, 6), float64

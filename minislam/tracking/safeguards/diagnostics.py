@@ -54,7 +54,7 @@ class KeyframeDiagnostics:
     matched_ratio: float  # of its cells, in the best of its edges [-]
     parallax: float  # px, the largest mean flow by translation alone among its edges
     explained: float | None  # of the matched flow from its predecessors; None: no edge
-    depth_error: float | None  # median relative difference from them; None: they see other things
+    depth_error: float | None  # median relative difference from them; None: no common cell
     continuity: float | None  # see `continuity`; None: an edge is missing [-]
     agreement: float | None  # see `continuity`; None: also if too few cells are known [-]
     scale_deviation: float | None = None  # standard deviation of ln(length after / before) [-]
@@ -96,8 +96,8 @@ class Watch(Stateful):
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
             problem = bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
-            told = scale_deviations(problem, graph.state)
-            judged = [replace(k, scale_deviation=told.get(i)) for i, k in enumerate(judged)]
+            found = scale_deviations(problem, graph.state)
+            judged = [replace(k, scale_deviation=found.get(i)) for i, k in enumerate(judged)]
             self.diagnostics = judged
         self.breaks = find_breaks(judged)
 

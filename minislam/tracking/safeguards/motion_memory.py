@@ -61,8 +61,8 @@ def remember(
         return
     before = keyframes.motion_weights[index]
     motion = T_camera_world @ se3_inverse(keyframes.T_camera_world[index])
-    known = keyframes.disparities[index], motion, before, scale
-    after = update_motion_weight(graph.grid, matches, *known)
+    step = keyframes.disparities[index], motion, before, scale
+    after = update_motion_weight(graph.grid, matches, *step)
     weight = after if settled is None else torch.where(settled, after, before)
     keyframes.motion_weights[index] = weight
 
@@ -149,7 +149,7 @@ def overlay_weights(flow_to_next: Sequence[FlowMatches], grid: Grid) -> Tensor |
 def without_overlay(matches: FlowMatches, overlay: Tensor | None) -> FlowMatches:
     """Return matches in which no cell of an overlay counts, by its `overlay_weights`.
 
-    Its flow would delay keyframes, and count as a motion that wrong matches beside it hand on.
+    Its zero flow would delay keyframes, and its low motion weight would spread by wrong matches.
     """
     if overlay is None:
         return matches

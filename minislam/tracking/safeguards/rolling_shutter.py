@@ -11,7 +11,7 @@ becomes that of a global shutter by
 
     p~ + rho c,    c = s(x) u_i(x) - s(p~) u_j(p~).
 
-The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
+The flow between neighbouring frames gives u, without any pose. The residual of Eq. (5) is linear in
 rho, which is one more unknown with the column c. Sensors are read along the shorter side of the
 image, a phone held upright along x: the readout along the longer side stays 0.
 """
@@ -72,7 +72,7 @@ class ImageMotion(Stateful):
         return torch.stack(around).mean(0) if around else torch.zeros_like(self._grid.pixels.T)
 
     def displacement(self, frame_index: int, readout: Readout) -> np.ndarray | None:  # (H, W, 2)
-        """Return how far from each pixel of a global shutter a frame shows it; None: negligible."""
+        """Return how far the rolling shutter moves each pixel of a frame [px]; None: negligible."""
         grid, camera = self._grid, self._grid.camera
         late = grid.pixels.T / grid.pixels.new_tensor([[camera.width], [camera.height]]) - 0.5
         moved = self.velocity(frame_index) * (grid.pixels.new_tensor(readout) @ late)

@@ -56,7 +56,7 @@ def fraction_at_rest(graph: KeyframeGraph) -> float:
 
 
 def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
-    """Tell whether translation moves most cells too little, in all edges that still see them."""
+    """Tell whether most cells have too little parallax in every edge whose target sees them."""
     targets = [target for source, target in graph.edges.ends if source == keyframe]
     if not targets:
         return True
