@@ -31,7 +31,7 @@ LEAST_VIEWS = 2  # renderings of each keyframe before which beta of a static roo
 # a carried table out of the map; from 0.05 on, they also take a wall that beta doubts.
 LEAST_STATIC = 0.02
 LEAST_WRONG = 0.5  # of the cells of the upper mode, else they are kept [-]
-ASKED = 24  # keyframes at most, evenly spread, whose rendering errors tell that
+ASKED = 24  # most keyframes, evenly spread, whose rendering errors decide that
 OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 

@@ -148,7 +148,7 @@ class KeyframeGraph(Stateful):
         around: list[int],  # keyframes that may show the same
         start: Tensor,  # (4, 4)
     ) -> tuple[Tensor, float]:
-        """Return T_camera_world (4, 4) of an image, while flow and pose alternate, and its support.
+        """Return T_camera_world (4, 4) of an image and its support; flow and pose alternate.
 
         Support is the robust weight of the flow over the weight of the keyframes' cells. So where
         a dynamic object fills the view, the few static cells are enough.
@@ -224,7 +224,7 @@ class KeyframeGraph(Stateful):
     def _flow_from_geometry(self, edges: list[Edge]) -> Iterator[tuple[list[Edge], FlowMatches]]:
         """Yield edges, AT_ONCE a time, with their flow, started from the present reprojection.
 
-        Points near the camera plane project far outside, where flow finds nothing: that is clamped.
+        Points near the camera plane project far outside the image, so that start is clamped.
         """
         for part in at_once(edges):
             sources, targets = ([edge[end] for edge in part] for end in (0, 1))

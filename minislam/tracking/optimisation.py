@@ -31,8 +31,8 @@ FEW_KEYFRAMES = 100  # so few are not worth a selection
 def local_ba(graph: KeyframeGraph) -> None:
     """Link the newest keyframe, then adjust the newest `window` keyframes together.
 
-    The first pose may be wrong, so a classical flow first starts from composed flow, not from the
-    pose, and is adjusted. Then further edges are added, and flow and BA alternate.
+    Its pose may be wrong, so a classical flow is first started from composed flow instead, and
+    adjusted. Then further edges are added, and flow and BA alternate.
     """
     config, newest = graph.config, len(graph.keyframes) - 1
     first_free = max(0, newest + 1 - config.window)

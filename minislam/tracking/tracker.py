@@ -86,7 +86,7 @@ class Tracker(Stateful):
         self.grid = self.graph.grid
         self.tracked, self.watch, self._settling = [], Watch(self.graph), Settling(self.graph)
         self._features = features
-        self._depth_prior = lambda frame: depth_prior(frame, camera)  # given f: one unit of length
+        self._depth_prior = lambda frame: depth_prior(frame, camera)  # f as given keeps the unit
         self._predict_static_weight = predict_static_weight
         self._relocaliser = Relocaliser(self.graph)
         # From the newest keyframe to the newest frame that could be matched with it.

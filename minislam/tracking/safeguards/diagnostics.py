@@ -92,7 +92,7 @@ class Watch(Stateful):
         graph = self._graph
         self.beyond_turns, self.resting = flow_beyond_turns(graph), fraction_at_rest(graph)
         judged = self.diagnostics
-        if self.only_turned:  # depths are arbitrary, and a pan may leave all old cells
+        if self.only_turned:  # depths are arbitrary, and a pan leaves old cells behind
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
             problem = bundle_problem(graph, range(len(graph.edges)), 0, 0.0)

@@ -1,9 +1,9 @@
 """The start with an unknown focal length or readout: which minimum is taken, and its camera.
 
 Hypotheses of the first depths end in several minima. With a wrong camera the right one need not be
-the lowest. Under a focal length that is 6 % too long, inverted depth fits better; and where a far
-hill fits the rolling shutter as parallax, rocks in front become outliers. So the unknowns of the
-camera, its focal length and the readout, are free before costs are compared.
+the lowest. Under a focal length that is 6 % too long, inverted depth fits better; and where the
+rolling shutter of a far hill is fitted as parallax, rocks in front become outliers. So the unknowns
+of the camera, its focal length and the readout, are free before costs are compared.
 
 Under a long lens, or where the camera hardly walks, a scene and its mirror image in depth have
 nearly the same flow. The paper starts from the depth prior, which tells them apart.
