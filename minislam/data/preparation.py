@@ -14,7 +14,7 @@ from minislam.state.memory import Shelf, release
 
 Window = tuple[int, int, int, int]  # left, top, width, height px
 
-# Trackers, networks and feature grids work on cells of 8 px, so both sides are multiples of it.
+# The tracker's grid, classical or DROID's, has cells of 8 px, so both sides are multiples of it.
 SIZE_MULTIPLE = 8  # px
 BLACK = 24  # of 255: the brightest that a codec leaves in a black bar
 BLURRED = 2  # px of the picture, beside a bar, that a codec mixes with it

@@ -185,10 +185,10 @@ class JointOptimisation(Stateful):
         """Take one step of the MLP on the rendering errors of some keyframes; return L_uncer."""
         reach, every = self.uncertainty.neighbour_keyframes, range(len(self.keyframes))
         nearby = {k for at in positions for k in every[max(0, at - reach) : at + reach + 1]}
-        cells = torch.cat([self.keyframes[k].features.flatten(0, 1) for k in sorted(nearby)])
+        around = torch.cat([self.keyframes[k].features.flatten(0, 1) for k in sorted(nearby)])
         features = torch.stack([self.keyframes[position].features for position in positions])
         errors = zip(*(vars(view.error).values() for view in views), strict=True)
-        return self._trainer.step(features, RenderingError(*map(torch.stack, errors)), cells)
+        return self._trainer.step(features, RenderingError(*map(torch.stack, errors)), around)
 
     def _reset_gradients(self) -> None:
         self._gradients = self.gaussians.means.new_zeros(2, len(self.gaussians))
