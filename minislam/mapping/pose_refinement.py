@@ -1,4 +1,4 @@
-"""Refine a pose by re-rendering: move the camera until the map looks like its image (supplement).
+"""Photometric refinement: move the camera until the map looks like its image (supplement).
 
 The official code lets Adam descend along the pose gradient, 100 renderings per frame. Here the
 same gradient is divided by the curvature of the loss, and a few steps suffice. Only the

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-AT_ONCE = 0.1  # second; steps that a stage reports so early were done together: no rate yet
+EARLY = 0.1  # second; steps that a stage reports so early were done together: no rate yet
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
 IMAGES_PER_FRAME = 0.4  # of the map: every fifth frame is a keyframe, and one more of every gap
 REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
@@ -118,7 +118,7 @@ class ProgressLine:
         if done >= total:
             text += f" ({seconds:.0f} s)"
             del self._begun[stage]  # it may come again
-        elif steps and seconds >= AT_ONCE:
+        elif steps and seconds >= EARLY:
             rate = steps / seconds
             left = "" if in_all else f", {(total - done) / rate:.0f} s left"
             text += f" ({rate:.1f}/s{left})"

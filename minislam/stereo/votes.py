@@ -1,4 +1,4 @@
-"""Votes: which swept depths are right, by what the depths of other views say about them.
+"""Geometric consistency: votes of other views for or against each swept depth.
 
 The point of a pixel is projected into another swept view. If the depth found there is the depth of
 the point, the view agrees. If the view has a good match behind the point, it looks through it, and

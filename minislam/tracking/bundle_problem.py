@@ -26,7 +26,7 @@ class BundleProblem:
     robust: RobustKernel | None = None  # None: plain least squares
     disparity_damping: Tensor | None = None  # (K, N) px^2; None: a fraction of the mean diagonal
     free_focal: bool = False  # f is one more unknown, not in the paper
-    shutter: Tensor | None = None  # (E, 2, 2, N) px/s, by the readout; None: that is held
+    shutter: Tensor | None = None  # (E, 2, 2, N) px/s by the readout, in lens.py by k; None: held
 
 
 @dataclass(frozen=True)

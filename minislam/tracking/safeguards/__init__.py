@@ -12,7 +12,7 @@ diagnostics      how well each keyframe is tied to the others
 turns            recognises a camera that stands or only rotates, and adjusts rotations alone
 focal_length     estimates an unknown focal length and the readout, checks a given focal length
 focal_column     the focal length as one more unknown of the bundle adjustment
-lens             finds a lens that bends straight lines although no calibration says so
+lens             estimates a radial distortion that no calibration gives
 scale_certainty  how precisely the flow measures the scale, by the covariance of the poses
 scale_drift      undoes a drift of the scale that a depth prior reveals
 exposure         how bright each keyframe is, from the matches along the edges
