@@ -19,7 +19,7 @@ __all__ = ["InputOptions", "Run", "__version__", "load", "open_sequence", "run"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import the door when it is used first: torch alone takes seconds."""
+    """Import the interface when it is used first: torch alone takes seconds."""
     if name not in __all__:
         raise AttributeError(f"module 'minislam' has no attribute {name!r}")
     return getattr(import_module("minislam.runs.api"), name)

@@ -18,14 +18,14 @@ class InputError(MinislamError):
 def require(is_right: bool, wanted: str, found: object) -> None:
     """Raise InputError unless that is right: "expected WANTED, found FOUND".
 
-    After the finding, and a semicolon, stands what to do.
+    FOUND ends with a semicolon and what to do.
     """
     if not is_right:
         raise InputError(f"expected {wanted}, found {found}")
 
 
 def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Return a hint at the most similar of the known names, or what else to say."""
+    """Return a hint at the most similar of the known names, or `otherwise` if none is similar."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"the nearest is {near[0]}" if near else otherwise
 

@@ -21,7 +21,7 @@ class Pictured:
     """Anything that has an image. It is kept as bytes: floats take four times the memory."""
 
     pixels: Tensor  # (H, W, 3) uint8 RGB; an image in [0, 1] is taken as it is
-    exposure: Tensor | None = None  # (3,) how many times as bright as the map, None: as bright
+    exposure: Tensor | None = None  # (3,) brightness over that of the map; None: 1
 
     @property
     def image(self) -> Tensor:
@@ -45,7 +45,7 @@ class Frame(Pictured):
     frame_index: int  # position in the sequence as it is processed: 0, 1, 2, ...
     timestamp: float  # second, as the source gives it
     pixels: Tensor  # (H, W, 3) uint8 RGB, undistorted, at the working size
-    exposure: Tensor | None = None  # (3,) as of all that has an image
+    exposure: Tensor | None = None  # (3,) see `Pictured`
 
     def to(self, device: torch.device | str) -> "Frame":
         """Return the frame with its image on a device."""
@@ -63,8 +63,8 @@ class Keyframe(Pictured):
     T_camera_world: Tensor  # (4, 4) float64
     moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
-    exposure: Tensor | None = None  # (3,) as of all that has an image
-    inserts: bool = True  # Gaussians; else the map is only compared with it
+    exposure: Tensor | None = None  # (3,) see `Pictured`
+    inserts: bool = True  # whether it adds Gaussians; else it only enters the losses
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,8 @@ class MappingHistory:
     uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
     gaussians: list[int] = field(default_factory=list)  # size of the map
 
-    def add(self, parts: list[float], uncertainty: float, gaussians: int) -> None:
-        """Append one iteration, with L_render and L_color in `parts`."""
-        row = [*parts, uncertainty, gaussians]
+    def add(self, losses: list[float], uncertainty: float, gaussians: int) -> None:
+        """Append one iteration, with L_render and L_color in `losses`."""
+        row = [*losses, uncertainty, gaussians]
         for column, value in zip(vars(self).values(), row, strict=True):
             column.append(value)

@@ -65,7 +65,7 @@ class Slam(Stateful):
     first_frame: FirstFrame
     focal_length: FocalLengthFit | None = None  # what the checks at the end have found
     lens: LensFit | None = None
-    undone_lens: LensFit | None = None  # which the images are freed of since the run began anew
+    undone_lens: LensFit | None = None  # by which images are straightened since the run began anew
     poses: dict[int, Tensor]  # T_camera_world of every frame, once known
 
     def __init__(
@@ -179,14 +179,14 @@ class Slam(Stateful):
     def _rebuild_map(self) -> None:
         """Build map and MLP anew on swept depth, of keyframes and of frames in the gaps."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
-        known = [frame.frame_index for frame in graph.keyframes.frames]
-        frames = swept_frames(known, list(self.poses), least=1)
-        keyframes = self.keyframes(others=sorted({*frames} - {*known}))
+        tracked = [frame.frame_index for frame in graph.keyframes.frames]
+        frames = swept_frames(tracked, list(self.poses), least=1)
+        keyframes = self.keyframes(others=sorted({*frames} - {*tracked}))
         if self.tracker.knows_depth:
-            parts = graph, self.sequence, self.poses, frames, frames
-            swept = sweep_frames(*parts, progress, self.workers)
-            how = {"fills": self.tracker.watch.hardly_walked}
-            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, **how)
+            inputs = graph, self.sequence, self.poses, frames, frames
+            swept = sweep_frames(*inputs, progress, self.workers)
+            fills = self.tracker.watch.hardly_walked
+            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, fills)
         else:
             keyframes = on_backdrop(keyframes)
         exposures = keyframe_exposures(graph)

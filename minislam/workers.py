@@ -117,8 +117,8 @@ class Workers(AbstractContextManager["Workers"]):
     ) -> Iterator[Any]:
         """Yield what `map` returns. Calls are asked for, and results are kept, a few at a time."""
         left = iter(calls)
-        while some := list(islice(left, AT_ONCE)):
-            yield from self.map(function, some)
+        while chunk := list(islice(left, AT_ONCE)):
+            yield from self.map(function, chunk)
 
     def start(self, function: Callable[..., Any], *call: Any) -> Callable[[], Any]:
         """Begin function(*call) in a helper, as for `map`; return what waits for the result.

@@ -91,13 +91,13 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
 
 
 def _run(path: Path, folder: Path, options: list[str]) -> tuple[int, str]:
-    """Run a sequence, or the rest of it, if it is not finished; return exit code and ATE."""
+    """Run a sequence, or resume it, if it is not finished; return exit code and ATE."""
     facts, code = folder / "run.json", 0
     if facts.exists() and str(read_json(facts)["state"]).startswith("finished"):
         code = read_json(facts)["exit_code"]
     else:
-        how = "--resume" if (folder / "checkpoint.npz").exists() else "--overwrite"
-        code = _wait_for(["run", str(path), "-o", str(folder), how, *options])
+        start = "--resume" if (folder / "checkpoint.npz").exists() else "--overwrite"
+        code = _wait_for(["run", str(path), "-o", str(folder), start, *options])
     if code not in (0, LOST_EXIT):
         return code, "F"
     ate_cm = read_json(folder / "metrics.json")["ate_all_cm"]

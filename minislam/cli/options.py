@@ -76,9 +76,9 @@ def add_priors(
 
 def add_talk(parser: argparse.ArgumentParser) -> None:
     """Add how much is said, and how many processes share the work."""
-    how_much = parser.add_mutually_exclusive_group()
-    how_much.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
-    how_much.add_argument("-v", "--verbose", action="store_true", help="a line for every step")
+    loudness = parser.add_mutually_exclusive_group()
+    loudness.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="a line for every step")
     parser.add_argument(
         "--workers",
         type=int,
@@ -108,20 +108,20 @@ def take_settings(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
     behind = arguments[arguments.index("--") + 1 :] if "--" in arguments else []
     if len(behind) > 1:
         raise UsageError(f"expected one name after --, found also {behind[1]}; put options first")
-    rest: list[str] = []
+    others: list[str] = []
     given: dict[str, str] = {}
     todo = iter(arguments)
     for argument in todo:
         if argument == "--":
-            return [*rest, argument, *todo], given
+            return [*others, argument, *todo], given
         name, equals, value = argument.partition("=")
         if name.startswith("--") and "." in name:
             if not equals and re.match("--?[a-z]|$", value := next(todo, "")):
                 raise UsageError(f"expected a value after {name}, found none; give one")
             given[name.removeprefix("--")] = value
         else:
-            rest.append(argument)
-    return rest, given
+            others.append(argument)
+    return others, given
 
 
 def size_of(text: str) -> tuple[int, int]:

@@ -87,9 +87,9 @@ def _run(args: argparse.Namespace) -> int:
             say(f"WARNING: {warning}", "stderr")
         progress.plan = plan_of(config, choice, sequence)
         log.folder = Path(output)
-        how = args.overwrite, args.resume, args.workers
+        mode = args.overwrite, args.resume, args.workers
         with closing(progress), ending_signals(progress.interrupt):
-            metrics, facts = run_in_folder(sequence, config, choice, output, progress, lpips, *how)
+            metrics, facts = run_in_folder(sequence, config, choice, output, progress, lpips, *mode)
         say("\n".join([f"{facts['state']}:", *as_text(summarise(metrics, facts))]))
         for warning in facts["warnings"]:
             if warning not in sequence.warnings and not (args.quiet and warning in progress.warned):

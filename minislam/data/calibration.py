@@ -75,9 +75,9 @@ def read_calibration(path: Path) -> Calibration:
     wanted = "4, 6 or 11 numbers, fx fy cx cy [width height [k1 k2 p1 p2 k3]]"
     found = f"{len(fields)} in {path}; add or remove numbers"
     require(len(fields) in (4, 6, 11), wanted, found)
-    fx, fy, cx, cy, *rest = finite_numbers(fields, str(path))
-    size = (int(rest[0]), int(rest[1])) if rest else None
-    is_whole = size is None or (size == tuple(rest[:2]) and min(size) >= 1)
+    fx, fy, cx, cy, *optional = finite_numbers(fields, str(path))
+    size = (int(optional[0]), int(optional[1])) if optional else None
+    is_whole = size is None or (size == tuple(optional[:2]) and min(size) >= 1)
     found = f"{' and '.join(fields[4:6])} in {path}; correct them"
     require(is_whole, "width and height as positive whole numbers", found)
-    return Calibration(fx, fy, cx, cy, size, BrownDistortion(*rest[2:]), path.name)
+    return Calibration(fx, fy, cx, cy, size, BrownDistortion(*optional[2:]), path.name)

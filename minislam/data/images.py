@@ -133,7 +133,7 @@ def _decode(path: Path, mode: int) -> np.ndarray:
     with _standard_error() as lines, suppress(cv2.error):  # of a header that claims 10^10 px
         if _is_complete(content):
             decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
-    # Only here libjpeg tells of damage. What libpng only warns of, such as a broken colour profile,
+    # Only here libjpeg reports damage. What libpng only warns of, such as a broken colour profile,
     # does not touch the pixels.
     said = b"".join(line for line in lines if not line.startswith(b"libpng warning"))
     if b"extraneous" in said:  # cameras pad some files so, and damage looks like it, too

@@ -95,8 +95,8 @@ def _tags(tiff: memoryview, within: int | None = None) -> dict[int, float]:
         tag, kind, count, place = struct.unpack_from(f"{order}HHII", tiff, at + 2 + 12 * entry)
         if kind in _EXIF_NUMBERS and count == 1:
             start = place if kind == 5 else at + 10 + 12 * entry
-            first, *rest = struct.unpack_from(order + _EXIF_NUMBERS[kind], tiff, start)
-            values[tag] = first / (rest[0] or math.inf) if rest else first
+            number, *divisor = struct.unpack_from(order + _EXIF_NUMBERS[kind], tiff, start)
+            values[tag] = number / (divisor[0] or math.inf) if divisor else number
     return values
 
 

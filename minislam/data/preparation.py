@@ -14,7 +14,7 @@ from minislam.state.memory import Shelf, release
 
 Window = tuple[int, int, int, int]  # left, top, width, height px
 
-# Trackers, networks and feature grids work on cells of 8 px, so both sides are multiples of it.
+# The tracker's grid, classical or DROID's, has cells of 8 px, so both sides are multiples of it.
 SIZE_MULTIPLE = 8  # px
 BLACK = 24  # of 255: the brightest that a codec leaves in a black bar
 BLURRED = 2  # px of the picture, beside a bar, that a codec mixes with it
@@ -174,7 +174,7 @@ def seen_window(
 
 
 class KeptImages:
-    """Keeps prepared images in a temporary file; none more when the disk is full.
+    """Keeps prepared images in a temporary file, until the disk is full.
 
     A run looks at every frame about six times, and not in order. In a video a step back takes ten
     times as long as a step on, because decoding starts again at an earlier complete image.

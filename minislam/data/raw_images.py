@@ -42,11 +42,11 @@ class FileImages:
         return read_color(self.paths[index])
 
     def brightest(self) -> np.ndarray:  # (H, W) uint8
-        """Return the largest value of each pixel in some of the images."""
+        """Return the largest value of each pixel in the sampled images."""
         usual = [index for index in range(len(self.paths)) if index not in self.odd]
         found = self.read(usual[0]).max(2)
-        for place in filter(_is_looked_at, range(1, len(usual))):
-            with suppress(MinislamError):  # told when it is that frame's turn
+        for place in filter(_is_sampled, range(1, len(usual))):
+            with suppress(MinislamError):  # raised again when that frame is read
                 image = self.read(usual[place]).max(2)
                 found = np.maximum(found, image) if image.shape == found.shape else found
         return found
@@ -66,7 +66,7 @@ class VideoImages:
         self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self._brightest = np.zeros((), np.uint8)  # of each pixel, in some of the images
+        self._brightest = np.zeros((), np.uint8)  # of each pixel, in the sampled images
         stamps: list[float] = []
         last = 0  # A failed call is the end of the file, or damage with more frames behind it.
         while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
@@ -74,14 +74,14 @@ class VideoImages:
             if self._capture.grab():
                 last = self._grabbed
                 self._calls.append(self._grabbed)
-                if _is_looked_at(len(stamps)):
+                if _is_sampled(len(stamps)):
                     decoded, image = self._capture.retrieve()
                     if decoded:
                         self._brightest = np.maximum(self._brightest, image.max(2))
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-        # Of as many frames as were read, 0 or less if unknown: the container tells it of all.
+        # The container counts all frames: its count says nothing if reading stopped at the limit.
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.promised = 0 if len(stamps) == limit else promised
+        self.promised = 0 if len(stamps) == limit else promised  # 0 or less: unknown
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
         self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]
         self.names = [f"{path.stem}_{index:06d}" for index in range(len(stamps))]
@@ -105,7 +105,7 @@ class VideoImages:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def brightest(self) -> np.ndarray:  # (H, W) uint8
-        """Return the largest value of each pixel in some of the images."""
+        """Return the largest value of each pixel in the sampled images."""
         return self._brightest
 
     def lost(self) -> np.ndarray:  # (M,) second
@@ -139,8 +139,8 @@ class VideoImages:
             )
 
 
-def _is_looked_at(index: int) -> bool:
-    """Tell whether an image is 0, 1, 2, 4, 8 ...: few, the first, and others far apart."""
+def _is_sampled(index: int) -> bool:
+    """Tell whether an image is sampled: 0, 1, 2, 4, 8, ..., few and far apart."""
     return index & (index - 1) == 0
 
 

@@ -184,8 +184,8 @@ def _doubts(raw: np.ndarray, label: str, fx: float) -> Iterator[str]:
         yield f"{what}: if it holds 10 or 12 bits in 16, multiply all images by 64 or 16"
     angle = 2 * np.degrees(np.arctan(raw.shape[1] / 2 / fx)) if fx else 60
     if not 15 <= angle <= 130:  # degree
-        how = "in millimetres" if angle > 130 else "for larger images"
-        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: check if it is {how}"
+        unit = "in millimetres" if angle > 130 else "for larger images"
+        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: check if it is {unit}"
 
 
 def _calibration(

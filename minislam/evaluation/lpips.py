@@ -36,8 +36,8 @@ class _Trunk:
     name: str
     convs: tuple[tuple[int, ...], ...]  # numbers in the names: features.{number}.weight
     channels: tuple[int, ...]  # of the output of each stage
-    pooled: int  # stages, the first ones behind the first, that begin with a maximum filter ...
-    pool: int  # ... of this size and stride 2
+    pooled: int  # stages 1 to this one begin with max pooling, of stride 2
+    pool: int  # px, side of its window
     first_kernel: int  # px, of features.0
     first_stride: int  # px
     smallest_side: int  # px of an image whose coarsest map has one cell

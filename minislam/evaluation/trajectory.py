@@ -98,7 +98,7 @@ def paired(
 
 
 def doubt_of_units(estimate: Trajectory, truth: Trajectory) -> str:
-    """Return what to do if the times of one are probably no seconds, "" if nothing says so."""
+    """Return advice if the timestamps of one are probably not in seconds, else ""."""
     paths = estimate.timestamps, truth.timestamps
     found, true = (float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in paths)
     counts = len(truth) > 1 and not (paths[1] % 1).any() and (paths[0] % 1).any()  # images

@@ -9,10 +9,10 @@ Read the files in this order:
     insertion          where a keyframe adds Gaussians, and which lie on dynamic objects
     window             the local window of keyframes, and which keyframe each iteration renders
     deformation        the map follows its keyframes when bundle adjustment moves them
-    pose_refinement    the poses between the keyframes, by re-rendering
+    pose_refinement    photometric refinement of the poses between the keyframes
     density            clone, split and prune
-    gaps               ours: what stands still and no view has measured
-    safeguards         ours: what other views, and all betas of a clip, know of dynamic things
+    gaps               ours: fills static surfaces whose depth no view has measured
+    safeguards         ours: dynamic objects by the votes of other views and all betas of a clip
     config             the settings
 """
 

@@ -1,4 +1,4 @@
-"""Fill what stands still and no view could measure, such as a plain road or ceiling: ours.
+"""Fill static surfaces whose depth no view could measure, such as a plain road or ceiling: ours.
 
 Without a depth network such a pixel has no depth, so nothing is inserted there. By half of the
 refinement, the MLP has learned what moves. What it calls static and the map leaves transparent then
@@ -22,7 +22,7 @@ from minislam.mapping.insertion import nearest_pixels
 from minislam.records import Keyframe
 
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
-VOTERS = 48  # images of the map that vote at most, evenly spread; of more, at least half as many
+VOTERS = 48  # most images of the map that vote, evenly spread; at least 24 of more than 48
 MUCH_NEARER = 0.5  # of the distance from which a keyframe guesses a depth [-]
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 
@@ -33,10 +33,10 @@ def filled_depth(depth: Tensor) -> Tensor:
     known = (depth > 0).float().cpu().numpy()
     inverse = torch.where(depth > 0, 1 / depth, 0).cpu().numpy()
     size = -(-width // CELL), -(-height // CELL)
-    part, mean = (cv2.resize(a, size, None, 0, 0, cv2.INTER_AREA) for a in (known, inverse))
-    if not part.any():
+    share, mean = (cv2.resize(a, size, None, 0, 0, cv2.INTER_AREA) for a in (known, inverse))
+    if not share.any():
         return depth
-    cells = membrane(mean / np.maximum(part, 1e-6), part > 0)
+    cells = membrane(mean / np.maximum(share, 1e-6), share > 0)
     smooth = torch.from_numpy(cv2.resize(cells, (width, height))).to(depth)
     return torch.where(depth > 0, depth, 1 / smooth)
 
@@ -73,8 +73,8 @@ def membrane(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     first, second = (
         np.concatenate([ends.ravel() for ends in side]) for side in zip(*pairs, strict=True)
     )
-    links = sparse.coo_array((np.ones(len(first)), (first, second)), shape=2 * (values.size,))
-    laplacian = sparse.csgraph.laplacian(links + links.T).tocsr()
+    upper = sparse.coo_array((np.ones(len(first)), (first, second)), shape=2 * (values.size,))
+    laplacian = sparse.csgraph.laplacian(upper + upper.T).tocsr()
     filled, free = values.astype(np.float64).ravel(), ~known.ravel()
     if free.any():
         rows = laplacian[free]

@@ -1,4 +1,4 @@
-"""The mapper: it decides what the map gets and loses, and when it is optimised.
+"""The mapper: it decides which Gaussians are inserted and removed, and when they are optimised.
 
 Read `initialise`, `integrate` and `refine` first: they are the three moments at which the map is
 built. `update_keyframes` moves it when the tracker has corrected poses.
@@ -103,14 +103,14 @@ class Mapper(JointOptimisation):
         """
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
-        how = cameras, None, progress, self.config.refine_rate_end
+        schedule = cameras, None, progress, self.config.refine_rate_end
         half = iterations // 2 // self.config.views_per_step * self.config.views_per_step
         if done <= half:
-            self._optimise(*how, range(done, half))
+            self._optimise(*schedule, range(done, half))
             if half >= safeguards.LEAST_VIEWS * len(self.keyframes):
                 self._exclude_upper_mode()
                 self._fill_gaps()
-        self._optimise(*how, range(max(done, half), iterations))
+        self._optimise(*schedule, range(max(done, half), iterations))
         self._remove_unsupported()
 
     def refine_poses(
@@ -119,7 +119,7 @@ class Mapper(JointOptimisation):
         images: list[Tensor],  # (H, W, 3) RGB in [0, 1]
         betas: list[Tensor],  # (h', w')
     ) -> list[Tensor]:  # (4, 4) float64
-        """Return the poses near the given ones from which the map looks most like the images."""
+        """Return the poses near the given ones whose renderings are most like the images."""
         weights = [self.static_weight(beta, self.camera) for beta in betas]
         fixed = self.background, self.config.pose_refinement
         views = zip(T_camera_world, images, weights, strict=True)
@@ -163,19 +163,19 @@ class Mapper(JointOptimisation):
     def _exclude_upper_mode(self) -> None:
         """Exclude the upper mode of all betas, if there is one, and the map is wrong there.
 
-        Only confirmed images are asked.
+        Only images with confirmation decide.
         """
-        known = [keyframe for keyframe in self.keyframes if keyframe.confirmation is not None]
-        if not known or not self.uncertainty.is_learned:
+        swept = [keyframe for keyframe in self.keyframes if keyframe.confirmation is not None]
+        if not swept or not self.uncertainty.is_learned:
             return
-        least = safeguards.least_weight(torch.cat([self.beta_of(k).flatten() for k in known]))
+        least = safeguards.least_weight(torch.cat([self.beta_of(k).flatten() for k in swept]))
         if least <= self.least_weight:
             return
-        some = known[:: math.ceil(len(known) / safeguards.ASKED)]
-        calls = (self._view_arguments(k, self._online_camera, trains=True) for k in some)
+        sample = swept[:: math.ceil(len(swept) / safeguards.ASKED)]
+        calls = (self._view_arguments(k, self._online_camera, trains=True) for k in sample)
         errors = [vars(v.error).values() for v in self._workers.stream(view_gradients, calls)]
         error = RenderingError(*map(torch.stack, zip(*errors, strict=True)))
-        beta = torch.stack([self.beta_of(keyframe) for keyframe in some])
+        beta = torch.stack([self.beta_of(keyframe) for keyframe in sample])
         if safeguards.is_wrong(error, beta, least, self.uncertainty.lambda_depth):
             self.least_weight = least
             self._replace_dynamic_gaussians()
@@ -188,9 +188,9 @@ class Mapper(JointOptimisation):
     def _remove_unsupported(self) -> None:
         """Remove Gaussians that hardly any static pixel shows, and note what is shown.
 
-        They were inserted on an object that moves, before the MLP knew, and where it always covers
-        the view no weight has pulled at them since; or steps have carried them out of all views,
-        and they would float in new ones. Where nothing is static, all stay.
+        Some were inserted on a dynamic object before the MLP had learned it, and where it always
+        covers the view they have had no gradient since. Others have moved out of all views, and
+        would be floaters in new ones. Where nothing is static, all stay.
         """
         camera, gaussians, self.shown = self._online_camera, self.gaussians, []
         weights = (self.static_weight(self.beta_of(k), camera) for k in self.keyframes)
@@ -200,9 +200,9 @@ class Mapper(JointOptimisation):
         for of_view, fraction in self._workers.stream(safeguards.support, calls):
             sums += of_view
             self.shown.append(fraction)
-        static, whole = sums
+        static, total = sums
         if static.any() and self.uncertainty.enabled:
-            self._optimizer.prune(static > safeguards.LEAST_STATIC * whole)
+            self._optimizer.prune(static > safeguards.LEAST_STATIC * total)
             self._reset_gradients()
 
     def _replace_dynamic_gaussians(self) -> None:

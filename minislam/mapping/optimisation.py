@@ -164,17 +164,17 @@ class JointOptimisation(Stateful):
         trains = self.uncertainty.is_learned and self._iteration >= self._frozen_until
         drawn = [self.keyframes[position] for position in positions]
         calls = [self._view_arguments(keyframe, camera, trains) for keyframe in drawn]
-        shares: list[ViewGradients] = self._workers.map(view_gradients, calls)
+        views: list[ViewGradients] = self._workers.map(view_gradients, calls)
         for name, values in self._optimizer.gaussians.parameters.items():
-            values.grad = torch.stack([share.by_parameter[name] for share in shares]).mean(0)
-        self._gradients += torch.stack([share.screen for share in shares]).sum(0)
-        factor = rate_factor * math.sqrt(len(shares))
+            values.grad = torch.stack([view.by_parameter[name] for view in views]).mean(0)
+        self._gradients += torch.stack([view.screen for view in views]).sum(0)
+        factor = rate_factor * math.sqrt(len(views))
         self._optimizer.rates = self.config.rates_at(self._iteration, self.median_depth, factor)
         self._optimizer.step()
-        loss = self._train_mlp(positions, shares) if trains else math.nan
-        for share in shares:
-            self.history.add(share.losses, loss, len(self._optimizer.gaussians))
-        self._iteration += len(shares)
+        loss = self._train_mlp(positions, views) if trains else math.nan
+        for view in views:
+            self.history.add(view.losses, loss, len(self._optimizer.gaussians))
+        self._iteration += len(views)
 
     def _view_arguments(self, keyframe: Keyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
         """Return the arguments of `view_gradients`."""
@@ -188,14 +188,14 @@ class JointOptimisation(Stateful):
         view = camera, pose.float(), self.background, view_of(keyframe, camera), weight
         return self.gaussians, *view, self.median_depth, self.config, comparison
 
-    def _train_mlp(self, positions: list[int], shares: list[ViewGradients]) -> float:
+    def _train_mlp(self, positions: list[int], views: list[ViewGradients]) -> float:
         """Take one step of the MLP on the rendering errors of some keyframes; return L_uncer."""
-        reach, known = self.uncertainty.neighbour_keyframes, range(len(self.keyframes))
-        nearby = {k for at in positions for k in known[max(0, at - reach) : at + reach + 1]}
-        cells = torch.cat([self.keyframes[k].features.flatten(0, 1) for k in sorted(nearby)])
+        reach, every = self.uncertainty.neighbour_keyframes, range(len(self.keyframes))
+        nearby = {k for at in positions for k in every[max(0, at - reach) : at + reach + 1]}
+        around = torch.cat([self.keyframes[k].features.flatten(0, 1) for k in sorted(nearby)])
         features = torch.stack([self.keyframes[position].features for position in positions])
-        parts = zip(*(vars(share.error).values() for share in shares), strict=True)
-        return self._trainer.step(features, RenderingError(*map(torch.stack, parts)), cells)
+        errors = zip(*(vars(view.error).values() for view in views), strict=True)
+        return self._trainer.step(features, RenderingError(*map(torch.stack, errors)), around)
 
     def _reset_gradients(self) -> None:
         self._gradients = self.gaussians.means.new_zeros(2, len(self.gaussians))

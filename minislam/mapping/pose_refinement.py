@@ -1,4 +1,4 @@
-"""Refine a pose by re-rendering: move the camera until the map looks like its image (supplement).
+"""Photometric refinement: move the camera until the map looks like its image (supplement).
 
 The official code lets Adam descend along the pose gradient, 100 renderings per frame. Here the
 same gradient is divided by the curvature of the loss, and a few steps suffice. Only the
@@ -16,7 +16,7 @@ from minislam.splatting import GaussianMap, Rendering, render
 from minislam.uncertainty.losses import SURFACE_OPACITY
 
 # Levenberg-Marquardt: the damping as a fraction of the curvature's diagonal, and its factors after
-# a step that failed and after one that succeeded, as the start counts.
+# a step that failed and after one that succeeded; the start counts as a success.
 _FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 1e-3, 10.0, 0.3
 ROUNDING = 0.01  # colour difference below which |r| is rounded off to a parabola, about the noise
 

@@ -1,7 +1,7 @@
-"""Against dynamic things that beta alone leaves in the map. All of this is ours, not the paper's.
+"""Against dynamic objects that beta alone leaves in the map. All of this is ours, not the paper's.
 
-Other views know what stands still: `stereo/votes.py` gives the confirmation of each patch. And the
-betas of a whole clip know how large beta is on what moves there, if anything does.
+Other views confirm what stands still: `stereo/votes.py` gives the confirmation of each patch. And
+the distribution of beta over a whole clip shows how large beta is on the dynamic objects there.
 """
 
 from dataclasses import replace
@@ -21,17 +21,17 @@ CONFIRMED_ERROR = 1.5
 # it excludes may have stood still for a while. [-]
 CONFIRMED_BETA = 0.4
 # Renderings of each keyframe before which beta weights nothing: as long as the map is not fitted,
-# its errors tell what it lacks. What is excluded then is never shown, so its errors stay.
+# its errors are not those of dynamic objects, and what is excluded then would never be fitted.
 FIRST_VIEWS = 4
 LEAST_UPPER_MODE = 1.0  # mean raw beta: with less, the upper mode is what the map does not show yet
 UPPER_MODE = 0.75  # of that mean, from which on a raw beta belongs to the mode
 BINS = 50  # of the histogram, per unit of raw beta
-LEAST_VIEWS = 2  # renderings of each keyframe, before which most of a static room may be unlearned
+LEAST_VIEWS = 2  # renderings of each keyframe before which beta of a static room may still be high
 # Of the pixels that show a Gaussian, by blending weight, that must be static [-]: 0.01 to 0.1 take
 # a carried table out of the map; from 0.05 on, they also take a wall that beta doubts.
 LEAST_STATIC = 0.02
 LEAST_WRONG = 0.5  # of the cells of the upper mode, else they are kept [-]
-ASKED = 24  # keyframes at most, evenly spread, whose rendering errors tell that
+ASKED = 24  # most keyframes, evenly spread, whose rendering errors decide that
 OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 
@@ -69,16 +69,16 @@ def least_weight(beta_raw: Tensor) -> float:
 def is_wrong(error: RenderingError, beta_raw: Tensor, least: float, lambda_depth: float) -> bool:
     """Tell whether the map is wrong in most cells (..., h', w') that a least weight would exclude.
 
-    The MLP tells features, not places: a dark wall, rendered well, gets the beta of a dark dog in
-    front of it. By itself, the error L of a cell asks for a beta of 2 sqrt(L) (`cell_loss`).
+    The MLP sees features, not places: a dark wall, rendered well, gets the beta of a dark dog in
+    front of it. Alone, a cell of error L has its least loss at beta = 2 sqrt(L) (`cell_loss`).
     """
-    asked = 2 * (error.ssim + lambda_depth * error.depth).sqrt()
-    doomed, wrong = (
+    optimal = 2 * (error.ssim + lambda_depth * error.depth).sqrt()
+    excluded, wrong = (
         weights.WEIGHT_SCALE / weights.stretched(weights.clipped_beta(beta)) ** 2 < least
-        for beta in (beta_raw, asked)
+        for beta in (beta_raw, optimal)
     )
-    doomed &= error.opacity >= SURFACE_OPACITY  # a hole says nothing
-    return not doomed.any() or float(wrong[doomed].float().mean()) >= LEAST_WRONG
+    excluded &= error.opacity >= SURFACE_OPACITY  # a hole is no error
+    return not excluded.any() or float(wrong[excluded].float().mean()) >= LEAST_WRONG
 
 
 def support(
@@ -87,12 +87,11 @@ def support(
     T_camera_world: Tensor,  # (4, 4)
     weight: Tensor,  # (H, W) static weight
 ) -> tuple[Tensor, float]:  # (2, N) px, [-]
-    """Return what the static pixels of a view say of the map.
+    """Return the blending weights of the Gaussians in a view, and the fraction that the map shows.
 
-    That is the blending weight of each Gaussian over the static pixels, and over all; and the
-    fraction of the static pixels where the map is opaque: without any static pixel 1, or 0 for an
-    empty map. The rendered colour is linear in the colours of the Gaussians, so the blending
-    weights are its derivative.
+    The weights of each Gaussian are summed over the static pixels, and over all. The fraction is
+    that of the static pixels where the map is opaque: without any static pixel 1, or 0 for an empty
+    map. The rendered colour is linear in the Gaussians' colours: the weights are its derivative.
     """
     static, colors = weight > 0, gaussians.colors.detach()
     colors.requires_grad_(not static.all())

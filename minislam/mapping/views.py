@@ -37,9 +37,9 @@ def view_of(keyframe: Keyframe, camera: Camera) -> View:
 
 
 def median_depth(keyframes: list[Keyframe]) -> float:  # world units
-    """Return the median of all known depths; of many keyframes, some tell it."""
-    some = keyframes[:: math.ceil(len(keyframes) / MOST_DEPTHS)]
-    depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in some])
+    """Return the median of all known depths, of at most MOST_DEPTHS keyframes, evenly spread."""
+    sample = keyframes[:: math.ceil(len(keyframes) / MOST_DEPTHS)]
+    depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in sample])
     if len(depths) == 0:
         raise InputError(
             "expected some known depth in the keyframes, found none; the images hold "
@@ -64,15 +64,15 @@ class Comparison:
 
 
 @torch.no_grad()
-def keyframe_rendering_error(rendering: Rendering, how: Comparison) -> RenderingError:
+def keyframe_rendering_error(rendering: Rendering, by: Comparison) -> RenderingError:
     """Compare a keyframe with its rendering of the same size or a larger one."""
-    size = how.reference.depth.shape
+    size = by.reference.depth.shape
     depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
     depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
-    color, reference = shrink_image(rendering.color, *size), how.reference
-    grid = how.grid_shape, how.depth_unit, how.config
+    color, reference = shrink_image(rendering.color, *size), by.reference
+    grid = by.grid_shape, by.depth_unit, by.config
     error = rendering_error(reference.image, reference.depth, color, depth, opacity, *grid)
-    return doubted_error(error, how.confirmation)
+    return doubted_error(error, by.confirmation)
 
 
 @dataclass(frozen=True)
@@ -101,12 +101,12 @@ def view_gradients(
     gaussians = replace(gaussians, **inputs)
     offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
     rendering = render(gaussians, camera, T_camera_world, background, screen_offsets=offsets)
-    if view.exposure is not None:  # as the camera shows it, at most white
+    if view.exposure is not None:  # as bright as the image, which is at most white
         rendering = rendering._replace(color=(rendering.color * view.exposure).clamp_max(1))
     loss = render_loss(gaussians, rendering, view.image, view.depth, weight, median_depth, config)
     *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.weight_sums, camera)
-    parts = torch.stack([loss.total, loss.color])  # one transfer
+    losses = torch.stack([loss.total, loss.color])  # one transfer from a GPU
     error = keyframe_rendering_error(rendering, comparison) if comparison else None
-    return ViewGradients(by_parameter, screen, parts.tolist(), error)
+    return ViewGradients(by_parameter, screen, losses.tolist(), error)

@@ -1,4 +1,4 @@
-"""Whether an object is what an interface asks for, found out on two small images.
+"""Whether an object conforms to an interface, tested on two small images.
 
 `choice.py` asks before a run begins, and `minislam.checks` gives the same checks to authors: each
 returns nothing, or raises InputError with a sentence that says what is wrong.
@@ -20,7 +20,7 @@ from minislam.state.stateful import Tree, to_tree
 # Not square, so that exchanged axes are noticed; RAFT needs 128 px per side.
 CAMERA = Camera(150.0, 150.0, 111.5, 79.5, 224, 160)
 SHIFT = (-8.0, -4.0)  # px (u, v), from the first to the second of the images
-_STORED = dict | list | Tensor | np.ndarray | str | int | float | None  # by a saved state
+_STORED = dict | list | Tensor | np.ndarray | str | int | float | None  # in a saved state
 
 
 def shifted_images() -> tuple[Tensor, Tensor]:  # each (H, W, 3)
@@ -152,8 +152,8 @@ def _saved_state(name: str, thing: Any) -> Tree:
     """Return a state, unless it holds something that no file of a run can hold."""
     state = to_tree(_call(name, thing, "saved_state"))
     wanted = f"{name} to save dictionaries and lists of tensors, arrays, numbers and text"
-    parts = [state]
-    for part in parts:  # grows while it is walked through
-        parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
-        require(isinstance(part, _STORED), wanted, f"a {type(part).__name__}")
+    nodes = [state]
+    for node in nodes:  # grows while it is walked through
+        nodes += node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+        require(isinstance(node, _STORED), wanted, f"a {type(node).__name__}")
     return state

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-CORNERS, CONTRAST = 1500, 8  # at most, of an image; least difference around them [grey values]
-LEAST_CORNERS, CORNER_ERROR = 12, 4.0  # inliers of a homography, else chance; within so many px
+CORNERS, CONTRAST = 1500, 8  # most corners of an image; their least contrast [grey values]
+LEAST_CORNERS, CORNER_ERROR = 12, 4.0  # least inliers of a homography; their largest error [px]
 
 
 def grayscale(image: Tensor) -> np.ndarray:

@@ -76,7 +76,7 @@ def _describe(
     return np.concatenate([color, *(TEXTURE_WEIGHT * part for part in texture)], -1)
 
 
-def oriented_edges(brightness: np.ndarray) -> list[np.ndarray]:  # (H, W) float32, so each bin's
+def oriented_edges(brightness: np.ndarray) -> list[np.ndarray]:  # (H, W) float32; one a bin
     """Split the gradient magnitude per px among orientation bins over 180 degrees, linearly."""
     # The 3x3 Sobel kernel sums to 8 per unit slope.
     du = cv2.Sobel(brightness, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)

@@ -15,7 +15,7 @@ from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
-# Matched ratio; with less, the motion may be too fast for a chain, and corners tell one more start.
+# Matched ratio; with less, the motion may be too fast for a chain, and corners give one more start.
 # With 0.4 and more, they would follow an umbrella that fills the view. [-]
 WEAK = 0.2
 _THREADS = ThreadPoolExecutor(2)  # compute flows side by side, without effect on the result
@@ -32,7 +32,7 @@ class MeasuredEdge(NamedTuple):
 class ClassicalFlow(Stateful):
     """DIS flow between registered keyframes, started from a predicted reprojection.
 
-    It takes half the time of tracking. So an edge is measured again only if its start has moved.
+    An edge is measured again only if its start has moved, because flow is half the tracking time.
     """
 
     learned_confidence = False
@@ -121,8 +121,8 @@ class ClassicalFlow(Stateful):
     def start_chain(self, image: Tensor) -> "FlowChain":
         """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
         gray = dense_flow.grayscale(image)
-        standing = np.zeros((*gray.shape, 2), np.float32)
-        return FlowChain(gray, gray, standing, standing, self.config)
+        zero = np.zeros((*gray.shape, 2), np.float32)
+        return FlowChain(gray, gray, zero, zero, self.config)
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "FlowChain":
         """Return the chain whose saved state this is."""
@@ -167,5 +167,5 @@ class FlowChain(Stateful):
 
     def restart(self) -> "FlowChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
-        standing = np.zeros_like(self.flow)
-        return FlowChain(self.newest, self.newest, standing, self.increment, self.config)
+        zero = np.zeros_like(self.flow)
+        return FlowChain(self.newest, self.newest, zero, self.increment, self.config)

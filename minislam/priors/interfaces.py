@@ -40,7 +40,7 @@ class FlowEstimator(Protocol):
     """
 
     stride: int  # px between neighbouring grid cells
-    learned_confidence: bool  # learned with a bundle adjustment: only its ratios count
+    learned_confidence: bool  # trained through a bundle adjustment: only its ratios count
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
         """Register the image (H, W, 3) of a keyframe under its index."""
@@ -57,7 +57,7 @@ class FlowEstimator(Protocol):
         """Match every cell of each source frame in the target frame of its edge."""
 
     def disparity_damping(self, keyframes: int) -> Tensor | None:
-        """Return what damps the disparities (K, N) of all keyframes in Eq. (5) [px^2].
+        """Return the damping (K, N) of the disparities of all keyframes in Eq. (5) [px^2].
 
         None: a fraction of the mean diagonal.
         """

@@ -37,8 +37,8 @@ class PriorChoice:
 
     def __post_init__(self) -> None:
         """Refuse a device that is not there, and a precision that it has not."""
-        known = self.device in ("cpu", "cuda")
-        require(known, "--device cpu or cuda", f"{self.device!r}; choose one")
+        is_known = self.device in ("cpu", "cuda")
+        require(is_known, "--device cpu or cuda", f"{self.device!r}; choose one")
         if self.device == "cuda":
             import torch  # only where a GPU is asked for
 
@@ -63,7 +63,7 @@ class PriorChoice:
 class PublishedFile:
     """A row of weights.csv."""
 
-    name: str  # in `minislam weights fetch NAME`; the one that a run takes is called as its network
+    name: str  # in `minislam weights fetch NAME`; a run takes the one named like the network
     use: str  # the flag it is for, like "--flow droid"
     file: str  # its official name
     megabytes: str
@@ -85,7 +85,7 @@ def published_files() -> dict[str, PublishedFile]:
 
 
 def find_weights(use: str, given: str | None) -> str | None:
-    """Return the file of "--flow droid": the given path or row's, else the fetched one, if any."""
+    """Return the file of "--flow droid": the given path or name's, else the fetched one, if any."""
     row = published_files().get(given or use.split()[-1])
     if row is None or row.use != use or not (given or row.path.exists()):
         return given

@@ -1,4 +1,4 @@
-"""The door for Python: `run`, `load`, `open_sequence`, as in `import minislam; minislam.run(...)`.
+"""The Python interface: `run`, `load`, `open_sequence`, as in `import minislam; minislam.run(...)`.
 
 Stable from version to version: the names in `minislam.__all__`, the public attributes of `Run`,
 and the files of a run folder. Everything else may move.

@@ -80,14 +80,14 @@ def focal_length_note(slam: Slam) -> str:
     """Return which focal length was used, and where it comes from."""
     camera, graph = slam.tracker.grid.camera, slam.tracker.graph
     if not graph.seeks_focal:
-        how = "as given"
+        origin = "as given"
     elif graph.focal_is_free:
-        how = f"estimated from the motion, from {slam.sequence.camera.fx:.1f} px on"
+        origin = f"estimated from the motion, from {slam.sequence.camera.fx:.1f} px on"
     elif not slam.tracker.initialised:
-        how = "not sought yet"
+        origin = "not sought yet"
     else:
-        how = "kept as at the start, because the motion does not tell it"
-    return f"{camera.fx:.1f} px for {camera.width}x{camera.height} images, {how}"
+        origin = "kept as at the start, because the motion does not tell it"
+    return f"{camera.fx:.1f} px for {camera.width}x{camera.height} images, {origin}"
 
 
 def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
 
 
 def guessed_depth(slam: Slam) -> float | None:
-    """Return the fraction of the keyframes' static pixels whose depth nothing has told [-]."""
+    """Return the fraction of the keyframes' static pixels without reference depth [-]."""
     mapper, unknown = slam.mapper, []
     for keyframe in mapper.keyframes:
         static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
@@ -141,8 +141,8 @@ def unseen_psnr(slam: Slam) -> float | None:
     """Return the PSNR [dB] of up to 20 frames beside the map's, where beta finds them static."""
     mapper, seen = slam.mapper, {keyframe.frame_index for keyframe in slam.mapper.keyframes}
     others = [index for index in slam.poses if index not in seen]
-    some = others[:: math.ceil(len(others) / MOST_UNSEEN) or 1]
-    keyframes = slam.keyframes(first=len(slam.tracker.keyframes), others=some)
+    sample = others[:: math.ceil(len(others) / MOST_UNSEEN) or 1]
+    keyframes = slam.keyframes(first=len(slam.tracker.keyframes), others=sample)
     views = [with_exposure(keyframe, mapper.exposures) for keyframe in keyframes]
     found = [_static_psnr(mapper, view, mapper.render(view.T_camera_world)) for view in views]
     known = [value for value in found if value is not None]
@@ -157,7 +157,7 @@ def _static_psnr(mapper: Mapper, keyframe: Keyframe, rendering: Rendering) -> fl
 
 
 def _ties(slam: Slam) -> dict[str, float | None]:
-    """Return how long the path is and how well poses, depths and flow agree, without any truth."""
+    """Return the length of the path, and how well poses, depths and flow agree, without truth."""
     graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
     every = range(len(graph.edges))
     error = typical_residual(bundle_problem(graph, every, 0, 0.0), graph.state) if every else None

@@ -48,7 +48,7 @@ class SourceFrame:
     timestamp: float  # second
     source: str  # name of its image file, or of its video with the number in it
     keyframe: bool
-    exposure: list[float] | None = None  # of an image of the map, how many times as bright
+    exposure: list[float] | None = None  # of an image of the map: brightness over the map's
 
 
 def scene_of(slam: Slam) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class Run:
 
     @property
     def warnings_of_breaks(self) -> list[str]:
-        """Return which parts of the run do not belong together, in its own words."""
+        """Return the warnings in run.json that say where the trajectory is broken."""
         return [text for text in self.folder.read_run()["warnings"] if text.startswith(BROKEN)]
 
     def render(

@@ -48,7 +48,7 @@ class Preview:
 
 
 def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:
-    """Write the report of what is known so far, if it can be written: no run ends of it."""
+    """Write the report of what is known so far; a failure to write it does not end the run."""
     with suppress(Exception):
         shown = _pictures(slam, len(slam.mapper.keyframes) - 1)
         strip = [shown["input"], viz.beta_to_rgb(shown["beta"]), shown["render"]]
@@ -93,8 +93,8 @@ def write_pictures(
 
     jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
     middle = _pictures(slam, len(slam.mapper.keyframes) // 2)
-    parts = middle["input"], middle["beta"], middle["render"]
-    overview = figure_png(viz.overview(*parts, estimate, true_path, unit, broken))
+    panels = middle["input"], middle["beta"], middle["render"]
+    overview = figure_png(viz.overview(*panels, estimate, true_path, unit, broken))
     folder.write_picture(f"{PLOTS}/overview.png", overview)
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}

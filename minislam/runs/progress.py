@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-AT_ONCE = 0.1  # second; what a stage reports so early was done together, and tells no rate
+EARLY = 0.1  # second; steps that a stage reports so early were done together: no rate yet
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
 IMAGES_PER_FRAME = 0.4  # of the map: every fifth frame is a keyframe, and one more of every gap
 REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
@@ -108,7 +108,7 @@ class ProgressLine:
         self._is_open = False  # on a terminal: the line has no end yet
 
     def show(self, stage: str, done: int, total: int) -> None:
-        """Report that `done` of all steps of a stage are done. Stages may take turns."""
+        """Report that `done` of all steps of a stage are done. Stages may alternate."""
         now = time.perf_counter()
         start, done_at_start = self._begun.setdefault(stage, (now, done))
         seconds, steps = now - start, done - done_at_start
@@ -118,7 +118,7 @@ class ProgressLine:
         if done >= total:
             text += f" ({seconds:.0f} s)"
             del self._begun[stage]  # it may come again
-        elif steps and seconds >= AT_ONCE:
+        elif steps and seconds >= EARLY:
             rate = steps / seconds
             left = "" if in_all else f", {(total - done) / rate:.0f} s left"
             text += f" ({rate:.1f}/s{left})"
@@ -133,9 +133,9 @@ class ProgressLine:
     def _whole(self, name: str, fraction: float, now: float) -> tuple[str, str]:
         """Return which stage of the plan this is, and how long the run takes in all.
 
-        What is left of the plan takes as many times longer than planned as what is done has
-        taken. At first little is done, so TRUST of the whole plan counts as done as planned: the
-        estimate begins with the plan and moves from there slowly.
+        The part that is left is assumed to take as many times its planned time as the part that
+        is done took. At first little is done, so TRUST of the whole plan counts as done in the
+        planned time: the estimate begins with the plan and moves from there slowly.
         """
         if not self.plan:
             return "", ""

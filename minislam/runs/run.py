@@ -85,8 +85,8 @@ def run_in_folder(
     threads = torch.get_num_threads()
     try:
         with names.locked(output), Workers(count, config.threads, observer.warn) as helpers:
-            how = output, overwrite, sequence.files, bent is not None
-            folder = RunFolder(output) if resume else RunFolder.create(*how)
+            new = output, overwrite, sequence.files, bent is not None
+            folder = RunFolder(output) if resume else RunFolder.create(*new)
             torch.set_num_threads(config.threads)
             checkpoints = Checkpoints(folder, sequence, config, choice)
             preview, said = Preview(folder), set[str]()
@@ -126,7 +126,7 @@ def _run(
     facts_of: Callable[[str, int | None], dict[str, Any]],  # run.json by state and exit code
     lpips: Lpips | None,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Run SLAM, or the rest of it, and write the folder, however the run ends."""
+    """Run SLAM, or what is left of it, and write the folder, however the run ends."""
     interrupted = False
     try:
         try:

@@ -12,8 +12,8 @@ from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import is_unexplained
 from minislam.tracking.safeguards.lens import BentLens
 
-# Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a path
-# that hangs together badly .65.
+# Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a run with
+# an inconsistent path .65.
 LEAST_SHOWN = 0.75
 # Of the images, in their mean [-]: where movers are gone and the room is whole, beta leaves out .02
 # to .23; of a night crowd in rain, whose map has holes, .36.
@@ -23,7 +23,7 @@ _FAR_APART = "If the images lie far apart, give more frames per second (a smalle
 
 
 def alarms(slam: Slam) -> Iterator[str]:
-    """Yield that the camera is lost since the newest frame, and what contradicts a keyframe."""
+    """Yield a warning if tracking is just lost, and if the flow contradicts the last keyframe."""
     tracked, diagnostics = slam.tracker.tracked, slam.tracker.watch.diagnostics
     followed = [frame.status.is_followed for frame in tracked[-2:]]
     if slam.tracker.initialised and followed == [True, False]:
@@ -117,11 +117,11 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map only "
             "as far as beta does, with all that looks like them; crop the images"
         )
-    knows = (keyframes.prior_disparities > 0).any(1).tolist() if depth != "none" else []
-    if not all(knows):
+    known = (keyframes.prior_disparities > 0).any(1).tolist() if depth != "none" else []
+    if not all(known):
         yield (
-            f"--depth {depth} knows nothing of {knows.count(False)} of {len(knows)} keyframes, "
-            f"such as frame {keyframes.frames[knows.index(False)].frame_index}: there depth is "
+            f"--depth {depth} knows nothing of {known.count(False)} of {len(known)} keyframes, "
+            f"such as frame {keyframes.frames[known.index(False)].frame_index}: there depth is "
             "that of the motion alone; give it for all frames"
         )
     if not keyframes.has_prior:

@@ -1,6 +1,6 @@
 """The loop over the tiles of an image: from projected Gaussians to pixels, and back.
 
-Each turn takes one group of tiles: its arrays stay in the cache, and none is as long as all lists.
+One group of tiles at a time: its arrays stay in the cache, and none is as long as all lists.
 """
 
 from typing import NamedTuple

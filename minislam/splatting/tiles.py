@@ -21,7 +21,7 @@ ACTIVE = 16  # tiles of a chunk are a multiple of it: few sizes, so that blocks 
 
 
 class Chunk(NamedTuple):
-    """The next slots of a group, of its last tiles: the lists of those before have ended."""
+    """The next slots of a group, in its last tiles only: the lists of the others have ended."""
 
     slots: int
     tiles: int

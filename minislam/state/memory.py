@@ -20,10 +20,10 @@ from torch import Tensor
 
 SMALLEST = 1 << 12  # bytes, a page: smaller tensors stay in memory
 FIRST_BLOCK, LARGEST_BLOCK = 1 << 24, 1 << 28  # bytes: each block is as large as all before it
-PIECE = 1 << 20  # bytes, written at once
+PIECE = 1 << 20  # bytes that are written at once
 Place = tuple[mmap.mmap, int]  # a block, and the first byte in it
 _BLOCKS: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()  # of all shelves
-ALIGNMENT = 64  # bytes, that of tensors in memory: another one can change the last bits of sums
+ALIGNMENT = 64  # bytes, as tensors in memory: another one can change the last bits of sums
 
 
 class Shelf:

@@ -10,7 +10,7 @@ from minislam.state.stateful import Stateful
 
 
 class Observer(Protocol):
-    """Shows the progress of a run, and may end the run between two steps; the default: neither."""
+    """Shows the progress of a run, and may end it between two steps; by default it does neither."""
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Show that `done` of the `total` steps of a stage are finished."""

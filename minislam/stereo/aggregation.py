@@ -21,12 +21,12 @@ def aggregate(
     gray: np.ndarray,  # (h, w) float32 in [0, 1]
 ) -> np.ndarray:  # (D, h, w) float32
     """Return the sum of L over eight directions."""
-    total, turned = np.zeros_like(cost), np.ascontiguousarray(cost.transpose(0, 2, 1))
-    across = np.zeros_like(turned)
+    total, transposed = np.zeros_like(cost), np.ascontiguousarray(cost.transpose(0, 2, 1))
+    across = np.zeros_like(transposed)
     for flip in (slice(None), slice(None, None, -1)):
         for shift in (-1, 0, 1):
             _add_paths_down(total[:, flip], cost[:, flip], gray[flip], shift)
-        _add_paths_down(across[:, flip], turned[:, flip], gray.T[flip], 0)
+        _add_paths_down(across[:, flip], transposed[:, flip], gray.T[flip], 0)
     return total + across.transpose(0, 2, 1)
 
 
@@ -53,9 +53,9 @@ def _add_paths_down(total: np.ndarray, cost: np.ndarray, gray: np.ndarray, shift
 
 
 def refined_minimum(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return per pixel the plane of least cost, (h, w) int, and how far beyond it the minimum is.
+    """Return per pixel the plane of least cost, (h, w) int, and the sub-plane offset (h, w).
 
-    That is in [-0.5, 0.5] planes (h, w): the minimum of the parabola through three planes.
+    The offset, in [-0.5, 0.5] planes, is the minimum of the parabola through three planes.
     """
     best = total.argmin(0)
     inner = np.clip(best, 1, len(total) - 2)

@@ -31,7 +31,7 @@ DEPTH_RANGE = 1.5  # inverse depth of the nearest plane over the largest of the 
 LARGEST_QUANTILE = 0.98  # of the inverse depths: the few beyond it are taken for outliers [-]
 PLANES = (48, 96)  # fewest and most
 FARTHEST = 0.5  # planes: what matches farther away, even at infinity, is put here
-LEAST_KNOWN = 0.5  # fraction of the pixels of all keyframes: with less, a pan has its holes filled
+LEAST_KNOWN = 0.5  # fraction of the pixels of all keyframes: with less, a pan's holes are filled
 LEAST_COMMON = 100  # px that have both depths; with fewer their scales are not compared
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
 
@@ -47,14 +47,14 @@ def with_swept_depth(
     Where the sweep found nothing, the keyframe's own depth fills in, scaled by the swept depth of
     the same image, because a network errs image by image. Where other views look through that depth
     something moves, and the pixel stays empty. With `fills`, if less than half is known, holes take
-    the depth of the nearest known pixel: a wrong depth costs a turning camera no picture.
+    the depth of the nearest known pixel: where the camera only turns, a wrong depth is not visible.
     """
     small, judges, result = _small(camera, WIDTH), votes.judges(len(keyframes)), []
     judging: dict[int, votes.SweptView] = {}
 
     def view(keyframe: Keyframe, depth: Tensor, cost: np.ndarray) -> votes.SweptView:
-        pose, known = keyframe.T_camera_world.cpu().numpy(), _nearest(depth, small)
-        inverse_depth = np.where(known > 0, 1 / np.maximum(known, 1e-6), np.nan)
+        pose, sampled = keyframe.T_camera_world.cpu().numpy(), _nearest(depth, small)
+        inverse_depth = np.where(sampled > 0, 1 / np.maximum(sampled, 1e-6), np.nan)
         return votes.SweptView(inverse_depth, cost, 0.0, pose)
 
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
@@ -77,8 +77,8 @@ def with_swept_depth(
             depth = torch.where((depth > 0) | moves, depth, guess)
         SHELF.put([depth])
         result[index] = replace(found, depth=depth)
-    known = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
-    return list(map(_filled, result)) if fills and np.mean(known) < LEAST_KNOWN else result
+    shares = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
+    return list(map(_filled, result)) if fills and np.mean(shares) < LEAST_KNOWN else result
 
 
 def _filled(keyframe: Keyframe) -> Keyframe:
@@ -87,8 +87,8 @@ def _filled(keyframe: Keyframe) -> Keyframe:
     unknown = (depth == 0).astype(np.uint8)
     if unknown.all() or not unknown.any():
         return keyframe
-    how = cv2.DIST_L2, cv2.DIST_MASK_5
-    _, nearest = cv2.distanceTransformWithLabels(unknown, *how, labelType=cv2.DIST_LABEL_PIXEL)
+    metric = cv2.DIST_L2, cv2.DIST_MASK_5
+    _, nearest = cv2.distanceTransformWithLabels(unknown, *metric, labelType=cv2.DIST_LABEL_PIXEL)
     filled = torch.from_numpy(depth[unknown == 0][nearest - 1])  # labels count the known pixels
     SHELF.put([filled])
     return replace(keyframe, depth=filled.to(keyframe.depth))
@@ -109,7 +109,7 @@ def _nearest(image: Tensor, camera: Camera) -> np.ndarray:
 
 
 def _small(camera: Camera, width: int) -> Camera:
-    """Return the camera of images that are at most so wide."""
+    """Return the camera of the images shrunk to at most this width."""
     width = min(width, camera.width)
     return camera.resized(width, max(1, round(width * camera.height / camera.width)))
 
@@ -153,10 +153,10 @@ def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> l
     """Return the keyframes and, of n frames between two, max(least, n // 8, min(2, n // 3))."""
     frames = set(keyframes)
     for first, last in pairwise(keyframes):
-        there = [frame for frame in followed if first < frame < last]
-        few = max(min(BETWEEN, len(there) // 3), len(there) // RESTING)
-        number = min(len(there), max(least, few))
-        frames |= {there[len(there) * (k + 1) // (number + 1)] for k in range(number)}
+        gap = [frame for frame in followed if first < frame < last]
+        usual = max(min(BETWEEN, len(gap) // 3), len(gap) // RESTING)
+        number = min(len(gap), max(least, usual))
+        frames |= {gap[len(gap) * (k + 1) // (number + 1)] for k in range(number)}
     return sorted(frames)
 
 
@@ -176,7 +176,7 @@ def swept_view(
     found = ((best + fraction) * step).clip(FARTHEST * step).astype(np.float32)
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
     at_best = np.take_along_axis(cost, best[None], 0)[0]
-    found[(best == 0) & (at_best >= votes.CONFIRMING_COST)] = np.nan  # every plane costs as much
+    found[(best == 0) & (at_best >= votes.CONFIRMING_COST)] = np.nan  # the cost has no minimum
     return votes.SweptView(found, at_best, step, pose)
 
 

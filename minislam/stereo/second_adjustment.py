@@ -68,8 +68,8 @@ def sweep_frames(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
     keyframes = enumerate(graph.keyframes.frames)
-    known = {f.frame_index: agreed_disparities(graph, k).cpu().numpy() for k, f in keyframes}
-    inputs = graph.grid.camera, poses, known, frames, wanted, progress, workers, width
+    agreed = {f.frame_index: agreed_disparities(graph, k).cpu().numpy() for k, f in keyframes}
+    inputs = graph.grid.camera, poses, agreed, frames, wanted, progress, workers, width
     swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
     return ((depth.to(device), confirmation.to(device)) for depth, confirmation in swept)
@@ -102,7 +102,7 @@ def adjust_confirmed(
     swept: Iterable[tuple[Tensor, Tensor]],  # K x depth (H, W) and confirmation (H, W)
     progress: Progress | None = None,
 ) -> float:
-    """Adjust all keyframes on fresh flow. Each cell counts as far as it is confirmed.
+    """Adjust all keyframes on flow measured anew, each cell weighted by its confirmation.
 
     Return the fraction of the cells whose swept depth is known.
     """

@@ -119,11 +119,11 @@ def _mean_of_better_half(
     """Return the mean of the lower half of the costs of the views that see a pixel."""
     number = seen.sum(0, dtype=np.uint8)
     half = np.maximum((number + 1) // 2, 1)
-    rest = [np.where(s, cost, np.float32(2)) for cost, s in zip(costs, seen, strict=True)]
-    total = np.zeros_like(rest[0])
+    left = [np.where(s, cost, np.float32(2)) for cost, s in zip(costs, seen, strict=True)]
+    total = np.zeros_like(left[0])
     for rank in range((len(costs) + 1) // 2):  # each pass takes the lowest cost of each pixel out
-        lowest = rest.pop()
-        for view, cost in enumerate(rest):
-            lowest, rest[view] = np.minimum(lowest, cost), np.maximum(lowest, cost)
+        lowest = left.pop()
+        for view, cost in enumerate(left):
+            lowest, left[view] = np.minimum(lowest, cost), np.maximum(lowest, cost)
         total += lowest * (rank < half)
     return np.where(number >= max(1, MIN_SEEN * len(costs)), total / half, UNSEEN_COST)

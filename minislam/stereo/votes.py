@@ -1,4 +1,4 @@
-"""Votes: which swept depths are right, by what the depths of other views say about them.
+"""Geometric consistency: votes of other views for or against each swept depth.
 
 The point of a pixel is projected into another swept view. If the depth found there is the depth of
 the point, the view agrees. If the view has a good match behind the point, it looks through it, and
@@ -50,7 +50,7 @@ def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> Confirm
     known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)
     known &= _window_share(known) >= MIN_SUPPORT
     static = known & (view.cost < CONFIRMING_COST)
-    known &= _joined(known, static)  # where nothing matches well, aggregation has spread a guess
+    known &= _components(known, static)  # without a good match, aggregation has spread a guess
     return ConfirmedDepth(np.where(known, view.inverse_depth, 0), _window_share(static))
 
 
@@ -65,27 +65,27 @@ def keep_what_stays(
     Around a dropped pixel the confirmation fades too.
     """
 
-    def known_only(index: int) -> SweptView:
+    def confirmed_view(index: int) -> SweptView:
         inverse_depth, cost = depths[index].inverse_depth, 1 - depths[index].confirmation
         inverse_depth = np.where(inverse_depth > 0, inverse_depth, np.nan)
         return replace(views[index], inverse_depth=inverse_depth, cost=cost)
 
-    judging = {index: known_only(index) for index in judges(len(views))}
+    judging = {index: confirmed_view(index) for index in judges(len(views))}
     for index in wanted:
         depth = depths[index]
         others = [view for judge, view in judging.items() if judge != index]
-        agreeing, refuting = count_votes(camera, known_only(index), others)
-        left = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
-        known = (depth.inverse_depth > 0) & ~left
+        agreeing, refuting = count_votes(camera, confirmed_view(index), others)
+        refuted = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
+        known = (depth.inverse_depth > 0) & ~refuted
         known &= _window_share(known) >= MIN_SUPPORT
-        confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(left), 0)
+        confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(refuted), 0)
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
-def _joined(known: np.ndarray, seeds: np.ndarray) -> np.ndarray:  # (h, w) bool, of known ones
-    """Return the connected parts of what is known that hold a seed."""
-    _, parts = cv2.connectedComponents(known.astype(np.uint8), connectivity=4)
-    return np.isin(parts, np.unique(parts[seeds & known]))
+def _components(known: np.ndarray, seeds: np.ndarray) -> np.ndarray:  # 3 x (h, w) bool
+    """Return the connected components of the known pixels that hold a seed."""
+    _, labels = cv2.connectedComponents(known.astype(np.uint8), connectivity=4)
+    return np.isin(labels, np.unique(labels[seeds & known]))
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
@@ -94,7 +94,7 @@ def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) floa
 
 
 def judges(count: int) -> list[int]:
-    """Return the positions of the views, of all times, that tell for `count` views what stays."""
+    """Return the positions of the views, of all times, that vote on what stays in `count` views."""
     return np.unique(np.linspace(0, count - 1, JUDGES).round().astype(int)).tolist()
 
 

@@ -4,11 +4,11 @@ Reading order:
 
     grid                the cells of the image on which everything is measured
     reprojection        where a cell of one keyframe is seen in another, with derivatives
-    bundle_problem      what a bundle adjustment is given, and its unknowns
+    bundle_problem      the constants of a bundle adjustment, and its unknowns
     bundle_adjustment   dense bundle adjustment, Eq. (5); reference.py is its slow twin
-    schur               its normal equations, assembled and freed of the disparities
+    schur               its normal equations, with the disparities marginalised
     disparity_prior     the mask M of the disparity prior, Eq. (8)
-    keyframes           the store: all that is known of each keyframe
+    keyframes           the store: pose, disparities, prior and weights of each keyframe
     frame_graph         the edges between keyframes and the flow along them; the flow distance
     pose_from_flow      pose and disparities of a new image
     keyframe_graph      keyframes and edges together: matching, covisibility

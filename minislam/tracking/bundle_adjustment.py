@@ -70,14 +70,14 @@ def bundle_adjust(
     converged = True
     while accepted < iterations:
         candidate = _damped_step(problem, state, equations, level, absolute_damping)
-        there, trial = equations, math.inf
+        next_equations, next_cost = equations, math.inf
         if candidate is not None:
             is_last = accepted + 1 == iterations  # then the cost is enough
-            there = equations if is_last else normal_equations(problem, candidate)
-            trial = _cost(problem, candidate) if is_last else there.cost
-        if candidate is not None and trial <= cost:
-            saved = cost - trial
-            state, cost, equations = candidate, trial, there
+            next_equations = equations if is_last else normal_equations(problem, candidate)
+            next_cost = _cost(problem, candidate) if is_last else next_equations.cost
+        if candidate is not None and next_cost <= cost:
+            saved = cost - next_cost
+            state, cost, equations = candidate, next_cost, next_equations
             accepted, level = accepted + 1, max(level / 10, damping)
             if saved <= LEAST_SAVING * cost:
                 break
@@ -110,8 +110,8 @@ def _linearised(problem: BundleProblem, state: BundleState) -> Iterator[_Lineari
             weight = weight * part.robust.weight(residual.square().sum(1, keepdim=True))
         # A point behind the target, or too near, counts as a residual of the image's width in u and
         # v. Were it left out, the cheapest camera would be one that looks away from all points.
-        far = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
-        costs = edge_losses(part.weights, far, part.robust)
+        counted = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
+        costs = edge_losses(part.weights, counted, part.robust)
         yield _Linearised(edges, part, costs, residual, weight, reprojection, transforms)
 
 
@@ -123,7 +123,7 @@ def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) fl
 def _cost(
     problem: BundleProblem, state: BundleState, of_edges: list[Tensor] | None = None
 ) -> float:
-    """Return the whole cost in px^2, Eq. (5); those of the edges, (E',) each, may be known."""
+    """Return the cost [px^2] of Eq. (5), from the costs of the edges if these are computed."""
     of_edges = of_edges or [at.costs for at in _linearised(problem, state)]
     difference = state.disparities - problem.prior_disparities
     prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
@@ -167,10 +167,10 @@ def _damped_step(
     C = equations.disparity_diagonal
     observed = C > 0
     # Without this, cells that the flow hardly constrains would take steps far too long.
-    typical = DISPARITY_DAMPING * C.sum() / observed.sum().clamp_min(1)
-    if problem.disparity_damping is not None:  # learned: for cells that nothing else holds
-        typical = problem.disparity_damping * (problem.prior_weights == 0)
-    C = C * (1 + damping) + typical
+    added = DISPARITY_DAMPING * C.sum() / observed.sum().clamp_min(1)
+    if problem.disparity_damping is not None:  # learned, for cells without a prior
+        added = problem.disparity_damping * (problem.prior_weights == 0)
+    C = C * (1 + damping) + added
     inverse_C = torch.where(observed, C, torch.ones_like(C)).reciprocal() * observed
     S, b = marginalised(problem, equations, inverse_C)
     S.diagonal().mul_(1 + damping).add_(absolute_damping)
@@ -191,6 +191,6 @@ def _damped_step(
     disparities = (state.disparities + inverse_C * step).clamp_min(MIN_DISPARITY)
     disparities = torch.where(problem.free_disparities[:, None], disparities, state.disparities)
     zoom = common.pop(0) if problem.free_focal else 0.0
-    later = common if common else (0.0, 0.0)
-    readout = state.readout[0] + later[0], state.readout[1] + later[1]
+    longer = common if common else (0.0, 0.0)
+    readout = state.readout[0] + longer[0], state.readout[1] + longer[1]
     return BundleState(poses, disparities, within_reach(state.log_focal + zoom), readout)

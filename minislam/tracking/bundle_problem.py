@@ -1,4 +1,4 @@
-"""What a bundle adjustment is given, Eq. (5), and its unknowns."""
+"""The constants of a bundle adjustment, Eq. (5), and its unknowns."""
 
 from dataclasses import dataclass
 
@@ -20,13 +20,13 @@ class BundleProblem:
     targets: Tensor  # (E, 2, N) px, flow targets p~
     weights: Tensor  # (E, 2, N) Sigma / beta^2, >= 0
     prior_disparities: Tensor  # (K, N) 1 / D~ [1/world unit]
-    prior_weights: Tensor  # (K, N) lambda_4 M [px^2 per disparity^2], 0 where there is no prior
+    prior_weights: Tensor  # (K, N) lambda_4 fx^2 M [px^2 per disparity^2], 0 without a prior
     free_poses: Tensor  # (K,) bool
     free_disparities: Tensor  # (K,) bool
     robust: RobustKernel | None = None  # None: plain least squares
     disparity_damping: Tensor | None = None  # (K, N) px^2; None: a fraction of the mean diagonal
     free_focal: bool = False  # f is one more unknown, not in the paper
-    shutter: Tensor | None = None  # (E, 2, 2, N) px/s; then the readout is free, too
+    shutter: Tensor | None = None  # (E, 2, 2, N) px/s by the readout, in lens.py by k; None: held
 
 
 @dataclass(frozen=True)
@@ -36,4 +36,4 @@ class BundleState:
     T_camera_world: Tensor  # (K, 4, 4) float64
     disparities: Tensor  # (K, N) 1/world unit
     log_focal: float = 0.0  # s = ln(f / f of the problem's camera)
-    readout: Readout = (0.0, 0.0)  # s, beside that of the problem's targets
+    readout: Readout = (0.0, 0.0)  # s, added to that by which the targets are corrected

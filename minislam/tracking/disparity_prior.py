@@ -43,13 +43,13 @@ def mask_priors(
     config: TrackingConfig,
     first: int = 0,
 ) -> None:
-    """Set the mask of the keyframes from `first` on, from the keyframes that edges link them to."""
+    """Set the masks of the keyframes from `first` on, each by the targets of its edges."""
     if not (config.prior_mask and config.lambda_disparity_prior):
         return
     rows = zip(keyframes.metric_depths, keyframes.features, keyframes.T_camera_world, strict=True)
     views = {
-        index: DepthView(depth, *rest)
-        for index, (depth, *rest) in enumerate(rows)
+        index: DepthView(depth, features, pose)
+        for index, (depth, features, pose) in enumerate(rows)
         if depth is not None
     }
     for index, view in views.items():
@@ -108,8 +108,8 @@ def warp_depth(
     """Warp every pixel of another view to the cells of this one by its own depth.
 
     Several points may fall on one cell. Points whose features differ from the cell's are no
-    correspondences. Of the others the nearest counts, because it hides the rest: otherwise a
-    hidden surface would count as a contradiction.
+    correspondences. Of the others the nearest counts, because it occludes them: otherwise an
+    occluded surface would count as a contradiction.
     """
     camera, stride = grid.camera, grid.stride
     depth = other.metric_depth.reshape(-1)
@@ -133,11 +133,11 @@ def warp_depth(
 
 
 def sample_features(
-    features: Tensor,  # (h', w', C), cells spread evenly over the image
+    features: Tensor,  # (h', w', C), patches spread evenly over the image
     pixels: Tensor,  # (N, 2)
     camera: Camera,
 ) -> Tensor:  # (N, C)
-    """Interpolate features bilinearly at pixels; beyond the outermost cells they are repeated."""
+    """Interpolate features bilinearly at pixels; beyond the outermost patches they are repeated."""
     size = pixels.new_tensor([camera.width, camera.height])
     # The image covers [-0.5, size - 0.5], which grid_sample calls [-1, 1].
     position = ((2 * pixels + 1) / size - 1).to(features.dtype)

@@ -18,7 +18,7 @@ from minislam.tracking.reprojection import lengths, relative_transforms, reproje
 # has no meaningful distance. DROID-SLAM: 0.75
 MIN_VALID_FRACTION = 0.5
 FAR = math.inf  # px, the distance of a pair below this fraction
-COARSE, COARSE_MARGIN = 16, 2.0  # one cell in 16 tells a distance to within a factor of 2
+COARSE, COARSE_MARGIN = 16, 2.0  # one cell in 16 gives a distance to within a factor of 2
 # New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
 KEPT_FRACTION = 0.8
 AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
@@ -132,7 +132,7 @@ def flow_distances(
     camera: Camera,
     full_flow_weight: float,  # eta
     rows: range | None = None,  # keyframes to compare with all others; None: all
-    limit: float = FAR,  # px: what a few cells put beyond twice this is FAR
+    limit: float = FAR,  # px: pairs that COARSE cells put beyond twice this are FAR
 ) -> Tensor:  # (K, K) px, FAR outside the rows and their columns
     """Return the distances between keyframes, as the mean flow that their geometry predicts.
 
@@ -143,8 +143,8 @@ def flow_distances(
     rows = range(count) if rows is None else rows
     near = torch.ones(count, count, dtype=torch.bool, device=disparities.device)
     if limit < FAR:
-        few = disparities[:, ::COARSE], rays[::COARSE], pixels[::COARSE]
-        near = flow_distances(T_camera_world, *few, *view, rows) < COARSE_MARGIN * limit
+        coarse = disparities[:, ::COARSE], rays[::COARSE], pixels[::COARSE]
+        near = flow_distances(T_camera_world, *coarse, *view, rows) < COARSE_MARGIN * limit
     distances = disparities.new_full((count, count), FAR)
     for row in rows:
         near[row, rows.start : row] = False  # known already

@@ -33,16 +33,16 @@ def first_disparity_hypotheses(
     grid: Grid,
     known_disparities: Tensor,  # (K, N) of the depth prior, 0 where there is none
 ) -> list[tuple[Tensor, Tensor]]:
-    """Return guesses (N,) of the first keyframe's disparities, each with what it knows (K, N).
+    """Return guesses (N,) of the first keyframe's disparities, each with its prior (K, N) or 0.
 
     They are the depth prior, if there is one, a wall facing the camera, a ground that is nearer
     below, and walls that are nearer on the left or on the right. The prior comes first, because the
-    first of equal costs wins, as where no flow tells any depth.
+    first of equal costs wins, as where the flow measures no depth.
     """
     camera = grid.camera
     right, below = (grid.pixels / grid.pixels.new_tensor([camera.width, camera.height]) - 0.5).T
-    alone = [torch.ones_like(right), *(SLOPE**slope for slope in (below, -right, right))]
-    guesses = [(disparities, torch.zeros_like(known_disparities)) for disparities in alone]
+    planes = [torch.ones_like(right), *(SLOPE**slope for slope in (below, -right, right))]
+    guesses = [(plane, torch.zeros_like(known_disparities)) for plane in planes]
     first = known_disparities[0]
     known = first > 0
     if bool(known.any()):

@@ -68,7 +68,7 @@ class KeyframeGraph(Stateful):
     adjustments: int = 0  # that ran
     failed_adjustments: int = 0  # of these, which left the state as it was
     seeks_focal: bool = False  # the focal length is only a first guess
-    focal_is_free: bool = False  # the motion has told it; adjustments of all keyframes refine it
+    focal_is_free: bool = False  # it has been estimated; adjustments of all keyframes refine it
 
     def __init__(
         self, camera: Camera, config: TrackingConfig, flow: FlowEstimator, device: str = "cpu"
@@ -79,8 +79,8 @@ class KeyframeGraph(Stateful):
         self.keyframes = KeyframeStore(self.grid.rays[:, 0])
         self.flow_to_next = []
         self.edges = FrameGraph()
-        parts = self.grid, self.keyframes, self.edges, self.config.rolling_shutter
-        self.shutter = RollingShutter(*parts)
+        is_rolling = self.config.rolling_shutter
+        self.shutter = RollingShutter(self.grid, self.keyframes, self.edges, is_rolling)
         self.flow = flow
         self.pixel_scale = pixel_scale(camera)
         self.least_parallax = MIN_PARALLAX * self.pixel_scale  # px, that measures depth
@@ -148,19 +148,19 @@ class KeyframeGraph(Stateful):
         around: list[int],  # keyframes that may show the same
         start: Tensor,  # (4, 4)
     ) -> tuple[Tensor, float]:
-        """Return T_camera_world (4, 4) of an image, in turns with its flow, and its support.
+        """Return T_camera_world (4, 4) of an image and its support; flow and pose alternate.
 
-        That is the weight of the flow over that of the keyframes' cells: where a dynamic object
-        fills the view, the few other cells are enough.
+        Support is the robust weight of the flow over the weight of the keyframes' cells. So where
+        a dynamic object fills the view, the few static cells are enough.
         """
         keyframes, grid, newest, count = self.keyframes, self.grid, len(self.keyframes), len(around)
-        known, weights = keyframes.T_camera_world[around], keyframes.cell_weights[around]
+        poses, weights = keyframes.T_camera_world[around], keyframes.cell_weights[around]
         robust = self.robust and self.robust.widened(ROBUST_NARROWING)
-        numbers = torch.arange(count + 1, device=known.device)
+        numbers = torch.arange(count + 1, device=poses.device)
         ends = numbers[:-1], numbers[-1:].expand(count)
         unused = grid.rays.new_zeros(1, len(grid.rays))  # disparities of the image itself
         disparities = torch.cat([keyframes.disparities[around], unused])
-        state = BundleState(torch.cat([known, start[None]]), disparities)
+        state = BundleState(torch.cat([poses, start[None]]), disparities)
         self.flow.add_frame(newest, frame.image)
         edges = [(keyframe, len(keyframes)) for keyframe in around]
         for _ in range(self.config.pose_rounds):
@@ -172,9 +172,9 @@ class KeyframeGraph(Stateful):
             problem = motion_only_problem(grid, *measured, numbers == count, robust)
             # One keyframe alone: a narrow robust weight may hold on to a dynamic object.
             if count == 1 and not self.is_learned:
-                poses = known[0], list(state.T_camera_world[1:])
-                pose = start_pose(grid, matches, disparities[0], weights[0], *poses, self.robust)
-                state = BundleState(torch.cat([known, pose[None]]), disparities)
+                source, starts = (disparities[0], weights[0], poses[0]), [state.T_camera_world[1]]
+                pose = start_pose(grid, matches, *source, starts, self.robust)
+                state = BundleState(torch.cat([poses, pose[None]]), disparities)
             state, report = bundle_adjust(problem, state, self.config.pose_iterations)
         self.flow.remove_frame(newest)
         self.count_adjustment(report)
@@ -222,9 +222,9 @@ class KeyframeGraph(Stateful):
         return [(i, j) for i, j in edges if min(ratio[i, j], ratio[j, i]) >= MIN_EDGE_RATIO]
 
     def _flow_from_geometry(self, edges: list[Edge]) -> Iterator[tuple[list[Edge], FlowMatches]]:
-        """Yield some of the edges and their flow, started from what the present geometry predicts.
+        """Yield edges, AT_ONCE a time, with their flow, started from the present reprojection.
 
-        Points near the camera plane project to anywhere; a flow started there finds nothing.
+        Points near the camera plane project far outside the image, so that start is clamped.
         """
         for part in at_once(edges):
             sources, targets = ([edge[end] for edge in part] for end in (0, 1))
@@ -234,7 +234,7 @@ class KeyframeGraph(Stateful):
             matches = self.flow.match(sources, targets, predicted)
             yield part, self.shutter.corrected(matches, part)
             if len(part) < len(edges):
-                give_back_freed()  # many edges leave as many holes
+                give_back_freed()  # many edges fragment the memory
 
     def neighbour_edges(self, keyframe: int) -> list[Edge]:
         """Return the edges to the predecessors since the camera was last lost."""
@@ -274,9 +274,9 @@ class KeyframeGraph(Stateful):
     def distances(self, start: int = 0, rows: range | None = None, limit: float = FAR) -> Tensor:
         """Return the flow distances (K', K') [px] of the keyframes from `start` on."""
         poses, disparities = self.keyframes.T_camera_world, self.keyframes.disparities
-        known = poses[start:], disparities[start:], self.grid.rays, self.grid.pixels
+        views = poses[start:], disparities[start:], self.grid.rays, self.grid.pixels
         # On the CPU, because pairs are chosen by one number after the other.
-        return flow_distances(*known, self.grid.camera, FULL_FLOW_WEIGHT, rows, limit).cpu()
+        return flow_distances(*views, self.grid.camera, FULL_FLOW_WEIGHT, rows, limit).cpu()
 
     def parallaxes(self, sources: Tensor | list[int], targets: Tensor | list[int]) -> Tensor:
         """Return the mean parallax (E,) [px] of edges, from the present poses and disparities."""

@@ -5,7 +5,7 @@ from minislam.records import Frame
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import lengths
 
-KEYFRAME_MATCHED_RATIO = 0.2  # below it so little is matched that a new keyframe is needed [-]
+KEYFRAME_MATCHED_RATIO = 0.2  # a frame in which less is matched becomes a keyframe [-]
 
 
 def keyframe_flow(graph: KeyframeGraph, is_initialised: bool) -> float:
@@ -30,7 +30,7 @@ def needs_keyframe(
     graph: KeyframeGraph,
     frame: Frame,
     matches: FlowMatches,  # E = 1, newest keyframe to this frame
-    before: tuple[Frame, FlowMatches] | None,  # the same of the frame before; None: the keyframe
+    before: tuple[Frame, FlowMatches] | None,  # of the frame before; None: the keyframe
     is_initialised: bool,
 ) -> bool:
     """Tell whether a frame moved far, is hardly matched, or is `keyframe_interval` frames away.
@@ -39,11 +39,11 @@ def needs_keyframe(
     steps. So the frame whose mean flow is nearest to the threshold is taken, not the first beyond
     it: the next one is expected to move as far as this one did.
     """
-    flow, enough = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
+    flow, threshold = mean_flow(graph, matches), keyframe_flow(graph, is_initialised)
     if not graph.keyframes.has_prior:
         step = flow - mean_flow(graph, before[1]) if before else flow
-        enough -= step / 2
-    if flow > enough or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
+        threshold -= step / 2
+    if flow > threshold or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
     # Without a depth prior the first keyframes need parallax, so a camera at rest makes none.
     may_rest = is_initialised or graph.keyframes.has_prior

@@ -48,17 +48,17 @@ def close_loops(graph: KeyframeGraph) -> bool:
     edges = graph.filter_confirmed(both_directions(pairs))
     if not edges:
         return False
-    before, known = graph.state, len(graph.edges)
+    before, first_new = graph.state, len(graph.edges)
     graph.match(edges)
-    if _residual(graph, known) <= FITTING_LOOP_RESIDUAL * graph.pixel_scale:
+    if _residual(graph, first_new) <= FITTING_LOOP_RESIDUAL * graph.pixel_scale:
         return False
     adjust(graph, 0, config.global_iterations, widening=FIRST_WIDENING)
     graph.match(edges)
     adjust(graph, 0, config.global_iterations)
-    if _residual(graph, known) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
+    if _residual(graph, first_new) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
         return True
     graph.keyframes.set_geometry(before.T_camera_world, before.disparities)
-    graph.edges.remove_newest(len(graph.edges) - known)
+    graph.edges.remove_newest(len(graph.edges) - first_new)
     return False
 
 

@@ -19,15 +19,15 @@ from minislam.tracking.safeguards.robust import weighted_median
 
 # Times the robust width: else the cells of a new keyframe, whose error is large, are outliers.
 FIRST_WIDENING = 8.0
-EVERY = 4  # one cell in so many tells the typical residual
+EVERY = 4  # one cell in so many is sampled for the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
 
 
 def local_ba(graph: KeyframeGraph) -> None:
     """Link the newest keyframe, then adjust the newest `window` keyframes together.
 
-    Its pose may be wrong. So a classical flow is measured without that pose first, and adjusted on.
-    Then further edges are added, and flow and BA take turns.
+    Its pose may be wrong, so a classical flow is first started from composed flow instead, and
+    adjusted. Then further edges are added, and flow and BA alternate.
     """
     config, newest = graph.config, len(graph.keyframes) - 1
     first_free = max(0, newest + 1 - config.window)
@@ -43,7 +43,7 @@ def local_ba(graph: KeyframeGraph) -> None:
 
 
 def online_global_ba(graph: KeyframeGraph) -> None:
-    """Adjust all keyframes while the sequence goes on; only the flow of new edges is measured."""
+    """Adjust all keyframes while the sequence goes on; flow is measured only on new edges."""
     edges = graph.global_edges()
     if edges:
         graph.match(edges)
@@ -51,7 +51,7 @@ def online_global_ba(graph: KeyframeGraph) -> None:
 
 
 def final_global_ba(graph: KeyframeGraph, progress: Progress | None = None) -> None:
-    """Adjust all keyframes on fresh flow; the prior only if `final_prior`: views know better."""
+    """Adjust all keyframes on flow measured anew, without the prior unless `final_prior`."""
     config = graph.config
     edges = graph.edges.ends + graph.global_edges()
     lambda_prior = config.lambda_disparity_prior if config.final_prior else 0.0
@@ -77,7 +77,7 @@ def adjust(
     lambda_prior: float | None = None,  # None: as configured
     widening: float = 1.0,  # of the robust weight
     free_camera: bool = False,  # refine an unknown focal length, and the readouts
-    settled: bool = False,  # poses and depths have, so the robust width follows the residuals
+    settled: bool = False,  # poses and depths are, so the robust width follows the residuals
 ) -> None:
     """Run a bundle adjustment over the edges that touch the free keyframes."""
     positions = graph.edges.select(first_free)
@@ -94,8 +94,8 @@ def adjust(
     # disparities, which hold the scale until the camera moves again; where all keyframes are
     # adjusted, only one with a prior does.
     worth_keeping = (graph.keyframes.prior_disparities > 0).any(1) | (first_free > 0)
-    measured = _has_parallax(graph, problem) | ~worth_keeping
-    problem = replace(problem, free_disparities=problem.free_disparities & measured)
+    may_change = _has_parallax(graph, problem) | ~worth_keeping
+    problem = replace(problem, free_disparities=problem.free_disparities & may_change)
     state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.grid.zoom(state.log_focal)
@@ -104,7 +104,7 @@ def adjust(
 
 
 def typical_residual(problem: BundleProblem, state: BundleState) -> float | None:
-    """Return the median length of the residuals [px] by weight; None if nothing is weighed."""
+    """Return the weighted median length of the residuals [px]; None if all weights are 0."""
     cells = torch.arange(0, len(problem.rays), EVERY, device=problem.rays.device)
     problem, found = replace(problem, robust=None), []
     for edges, part in in_parts(problem):
@@ -156,10 +156,10 @@ def bundle_problem(
     """Collect edges of the graph into the bundle problem of Eq. (5)."""
     keyframes, edges, grid = graph.keyframes, graph.edges, graph.grid
     ends = [edges.ends[p] for p in positions]
-    sources, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
+    edges_source, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
     targets = stack([edges.targets[p] for p in positions])
     weights = stack([edges.confidences[p] for p in positions])
-    _weigh_by_cells(graph, weights, sources, edges_target, targets)
+    _weigh_by_cells(graph, weights, edges_source, edges_target, targets)
     prior = keyframes.prior_disparities
     if lambda_prior is None:
         lambda_prior = graph.config.lambda_disparity_prior
@@ -170,7 +170,7 @@ def bundle_problem(
     return BundleProblem(
         camera=grid.camera,
         rays=grid.rays,
-        edges_source=sources, edges_target=edges_target,
+        edges_source=edges_source, edges_target=edges_target,
         targets=targets, weights=weights,
         prior_disparities=prior, prior_weights=strength * (prior > 0) * keyframes.prior_masks,
         free_poses=free_poses, free_disparities=free, robust=graph.robust,
@@ -181,7 +181,7 @@ def bundle_problem(
 def _weigh_by_cells(
     graph: KeyframeGraph,
     weights: Tensor,  # (E, 2, N), multiplied in place
-    sources: Tensor,  # (E,) keyframe index
+    edges_source: Tensor,  # (E,) keyframe index
     edges_target: Tensor,  # (E,)
     targets: Tensor,  # (E, 2, N) px
 ) -> None:
@@ -190,11 +190,11 @@ def _weigh_by_cells(
     Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a dynamic
     object covers; a classical one does not, so the weight of the target counts as well.
     """
-    of_cell, columns = graph.keyframes.cell_weights, (weights, sources, edges_target, targets)
+    cells, columns = graph.keyframes.cell_weights, (weights, edges_source, edges_target, targets)
     for weight, source, target, position in zip(*map(at_once, columns), strict=True):
-        static = of_cell[source]
+        static = cells[source]
         if not graph.is_learned:
-            static = static * graph.grid.sample(of_cell[target][..., None], position.mT)[..., 0]
+            static = static * graph.grid.sample(cells[target][..., None], position.mT)[..., 0]
         weight *= static[:, None]
         release()
 

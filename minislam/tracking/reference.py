@@ -2,8 +2,8 @@
 
 Every pose and every disparity is an unknown of one large system; nothing is marginalised and no
 derivative is written by hand. Read it first. It is slow; its fast twin, bundle_adjustment.py, is
-tested against it. It has the unknowns and the damping of the paper: no focal length, no readout,
-no learned damping.
+tested against it. Its unknowns are those of the paper, neither focal length nor readout, and its
+damping is not learned.
 """
 
 from dataclasses import dataclass
@@ -55,8 +55,8 @@ def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseN
 
     Fast twin: the blocks of bundle_adjustment.normal_equations. Eq. (5).
     """
-    more = problem.free_focal, problem.shutter, problem.disparity_damping
-    assert more == (False, None, None), "the twin has no such terms"
+    extensions = problem.free_focal, problem.shutter, problem.disparity_damping
+    assert extensions == (False, None, None), "the twin has no such terms"
     poses = int(problem.free_poses.sum())
     frames = int(problem.free_disparities.sum())
     no_step = problem.rays.new_zeros(6 * poses + frames * len(problem.rays), dtype=torch.float64)

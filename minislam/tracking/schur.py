@@ -1,4 +1,4 @@
-"""The normal equations of the bundle adjustment: assembled, and freed of the disparities.
+"""The normal equations of the bundle adjustment: assembly, and the Schur complement.
 
 Each disparity appears in one source frame only, so its block C is diagonal and cheap to invert:
 
@@ -17,7 +17,7 @@ from minislam.tracking.safeguards.parts import SourceBlocks
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """The normal equations of Eq. (5): pose blocks by edge, disparities, and what couples them."""
+    """The normal equations of Eq. (5): pose blocks by edge, disparity blocks, their coupling."""
 
     cost: float  # px^2, Eq. (5)
     of_edges: list[Tensor]  # J^T W J (E, 6 + G, 6 + G), J^T W r (E, 6 + G), Ad (E, 6, 6), float64
@@ -31,10 +31,10 @@ def marginalised(
     equations: NormalEquations,
     inverse_C: Tensor,  # (K, N)
 ) -> tuple[Tensor, Tensor]:  # (U, U), (U,) float64
-    """Return H - E C^-1 E^T and g - E C^-1 s: what is told of the poses, whatever the depths are.
+    """Return H - E C^-1 E^T and g - E C^-1 s: the equations with the disparities marginalised.
 
-    The unknowns U are 6 per free pose, and the common ones of the camera. This is the Schur
-    complement; its inverse is the covariance of the poses, times the variance of a residual.
+    The unknowns U are 6 per free pose, then those of the camera. The inverse of this Schur
+    complement, times the variance of a residual, is the covariance of the poses.
     """
     S, b = assemble_poses(problem, *equations.of_edges)
     for source, rows, E in equations.source_blocks:
@@ -55,7 +55,7 @@ def assemble_poses(
     """Sum J^T W J = A and J^T W r = b of all edges over the free poses, targets and sources.
 
     With J_source = -J_target Ad: H_st = -Ad^T A, H_ss = Ad^T A Ad, g_s = -Ad^T b. The columns
-    after the poses (G) are common to all edges: rows of A beyond the sixth are just summed.
+    after the poses belong to the G camera parameters, common to all edges: these are just summed.
     """
     width = int(problem.free_poses.sum()) + 1  # the first slot is that of all fixed poses
     slots = _pose_slots(problem) + 1

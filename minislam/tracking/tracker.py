@@ -86,7 +86,7 @@ class Tracker(Stateful):
         self.grid = self.graph.grid
         self.tracked, self.watch, self._settling = [], Watch(self.graph), Settling(self.graph)
         self._features = features
-        self._depth_prior = lambda frame: depth_prior(frame, camera)  # as given: one unit of length
+        self._depth_prior = lambda frame: depth_prior(frame, camera)  # f as given keeps the unit
         self._predict_static_weight = predict_static_weight
         self._relocaliser = Relocaliser(self.graph)
         # From the newest keyframe to the newest frame that could be matched with it.
@@ -111,7 +111,7 @@ class Tracker(Stateful):
 
     @property
     def knows_depth(self) -> bool:
-        """Tell whether a prior or parallax tells depth, once all keyframes have been judged."""
+        """Tell whether a prior or parallax gives depth, once all keyframes have been judged."""
         return self.keyframes.has_prior or not self.watch.only_turned
 
     def track(self, frame: Frame) -> bool:
@@ -125,7 +125,7 @@ class Tracker(Stateful):
         return len(self.keyframes) > count
 
     def end(self) -> None:
-        """Make the last followed frame a keyframe, unless one is near: others are posed between."""
+        """Make the last followed frame a keyframe, unless the last keyframe is near."""
         if self.last_non_keyframe is not None:
             last = self.last_non_keyframe[0].frame_index
             if last - self.keyframes.frames[-1].frame_index > LONGEST_TAIL:
@@ -274,7 +274,7 @@ class Tracker(Stateful):
         self.conclude()
 
     def conclude(self) -> None:
-        """Judge all keyframes, once all are adjusted; without depth, adjust turns."""
+        """Judge all keyframes, once all are adjusted; without depth, adjust rotations alone."""
         self.watch.conclude()
         if not self.knows_depth:
             adjust_turns(self.graph)

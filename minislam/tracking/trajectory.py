@@ -48,7 +48,7 @@ def pose_all_frames(
 
 
 def _around(graph: KeyframeGraph, tracked: TrackedFrame) -> list[int]:
-    """Return the keyframes before and after a frame; one after the last, or before a loss."""
+    """Return the keyframes before and after a frame; before it only, if a loss or none follows."""
     frames = graph.keyframes.frames
     following = sum(frame.frame_index < tracked.frame_index for frame in frames)
     is_between = following < len(frames) and not graph.follows_a_loss(following)

@@ -49,10 +49,10 @@ class UncertaintyMLP(nn.Module):
 
     def _dropout_mask(self, hidden: Tensor, generator: torch.Generator) -> Tensor:
         """Return 0 for dropped units and 1 / (1 - p) for the others, so that the mean stays."""
-        # A byte for each unit, because bytes are drawn faster than floats: p is n / 256.
-        dropped, eights = round(256 * self.dropout), (-(-hidden.numel() // 8),)
+        # A byte for each unit, because bytes are drawn faster than floats: p is rounded to n / 256.
+        dropped, words = round(256 * self.dropout), (-(-hidden.numel() // 8),)  # of 8 bytes
         # Drawn on the generator's device, so that every device drops the same units.
-        place, ends = generator.device, (-(2**63), 2**63 - 1)
-        draw = torch.randint(*ends, eights, generator=generator, device=place).view(torch.uint8)
+        device, ends = generator.device, (-(2**63), 2**63 - 1)
+        draw = torch.randint(*ends, words, generator=generator, device=device).view(torch.uint8)
         kept = (draw[: hidden.numel()].reshape(hidden.shape) >= dropped).to(hidden)
         return kept * (256 / (256 - dropped))

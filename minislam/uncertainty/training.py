@@ -116,8 +116,8 @@ class UncertaintyTrainer(Stateful):
         """Take a step of Adam. Not torch.optim.Adam: that loads torch's compiler, 72 MB."""
         self._steps += 1
         rate, norm = rate / (1 - DECAYS[0] ** self._steps), math.sqrt(1 - DECAYS[1] ** self._steps)
-        moved = zip(self.mlp.parameters(), gradients, self._first, self._second, strict=True)
-        for weight, gradient, first, second in moved:
+        rows = zip(self.mlp.parameters(), gradients, self._first, self._second, strict=True)
+        for weight, gradient, first, second in rows:
             gradient = gradient + self.config.weight_decay * weight
             first.lerp_(gradient, 1 - DECAYS[0])
             second.mul_(DECAYS[1]).addcmul_(gradient, gradient, value=1 - DECAYS[1])

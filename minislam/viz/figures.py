@@ -85,7 +85,7 @@ def map_growth(gaussians: Series[int]) -> Figure:
 def keyframe_health(
     frames: Series[int],  # (K,) frame_index of the keyframes
     explained: Series[float | None],  # (K,) part of the flow that poses and disparities explain [-]
-    agreement: Series[float | None],  # (K,) part of what held the keyframes before that fits [-]
+    agreement: Series[float | None],  # (K,) part that fits of the cells that fitted before [-]
     least: float,  # of a healthy keyframe
     broken: Series[tuple[int, int]],  # first and last frame
     lost: Series[int],  # frame_index
@@ -142,13 +142,13 @@ def _draw_path(
         if path is not None:
             centres = path.T_world_camera[:, :3, 3]
             stands = len(centres) > 0 and bool((np.ptp(centres, axis=0) < _NO_LENGTH).all())
-            how = {"marker": "o", "label": f"{label} (stands)"} if stands else {"label": label}
-            axes.plot(centres[:, 0], centres[:, axis], **style | how)
+            name = {"marker": "o", "label": f"{label} (stands)"} if stands else {"label": label}
+            axes.plot(centres[:, 0], centres[:, axis], **style | name)
     for position, (first, last) in enumerate(broken):
-        times, how = estimate.timestamps, {"label": "" if position else "broken"}
+        times, name = estimate.timestamps, {"label": "" if position else "broken"}
         part = slice(max(0, np.sum(times < first) - 1), np.sum(times <= last) + 1)
         x, _, _ = places = estimate.T_world_camera[part, :3, 3].T
-        axes.plot(x, places[axis], **ESTIMATE_STYLE | how | {"color": "tab:red"})
+        axes.plot(x, places[axis], **ESTIMATE_STYLE | name | {"color": "tab:red"})
     axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[axis]} [{unit}]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.locator_params(nbins=5)  # labels of short paths are long

@@ -1,7 +1,7 @@
 """A flip book: pictures that a notebook plays, in one piece of HTML that needs nothing else.
 
-The player (flipbook.html beside this file) has neither ids nor a script of its own, only what its
-button and its slider do, so that many on one page do not meet. Without scripts the first is seen.
+The player (flipbook.html beside this file) has neither ids nor a script element, only the handlers
+of its button and its slider, so several on a page do not clash. Without scripts the first is shown.
 """
 
 import json

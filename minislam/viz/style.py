@@ -100,7 +100,7 @@ def colour_bar(
     limits: Limits,
     label: str | None = None,  # None: the kind
 ) -> None:
-    """Add the colour bar of pictures that stand in the colours of a kind."""
+    """Add the colour bar of pictures that are drawn in the colours of a kind."""
     norm = (LogNorm if kind == "beta" else Normalize)(*limits)
     colours, label = ScalarMappable(norm, _COLORMAPS[kind]), kind if label is None else label
     if isinstance(axes, Axes):  # as tall as the picture

@@ -69,12 +69,12 @@ class Page:
 
 
 def template(name: str) -> str:
-    """Return an HTML file of this room."""
+    """Return an HTML file of this package."""
     return files("minislam.viz").joinpath(name).read_text(encoding="utf-8")
 
 
 def picture_url(picture: bytes) -> str:
-    """Return a PNG, JPEG or WebP as a page's address of it, the picture itself inside."""
+    """Return a PNG, JPEG or WebP as a data URL, which holds the picture itself."""
     kind = {b"\x89PNG": "png", b"RIFF": "webp"}.get(picture[:4], "jpeg")
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 

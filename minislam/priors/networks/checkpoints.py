@@ -103,7 +103,7 @@ class Weights:
         return self.conv(f"{2 * layers - 2}", x, channels=channels)
 
     def residual_unit(self, x: Tensor) -> Tensor:
-        """Add to a map what two convolutions, each behind a ReLU, make of it."""
+        """Return x + conv2(relu(conv1(relu(x)))), the residual unit of a map."""
         return x + self.conv("conv2", self.conv("conv1", x.relu()).relu())
 
     def upconv(self, name: str, x: Tensor) -> Tensor:
@@ -161,7 +161,7 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
 
 
 def _tensors_in(content: Any) -> dict[str, Tensor]:
-    """Return the tensors inside all wrappers, whatever their order; what is beside goes."""
+    """Return the tensors inside all wrappers, in any order; entries beside them are dropped."""
     entries = {str(k): v for k, v in content.items()} if isinstance(content, dict) else {}
     for wrapper in _WRAPPERS:
         start = f"{wrapper}."

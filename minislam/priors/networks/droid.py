@@ -23,7 +23,7 @@ _TOO_SMALL = net.STRIDE * (2 ** (net.LEVELS - 1) - 1)
 # Least confidence of a matched cell, relative to the mean of its edge: the network learned to weigh
 # cells against each other in a bundle adjustment, so their ratios have a meaning. [-]
 _MATCHED = 0.1
-# The official code adds 0.2 eta to squared cells times 0.001 of the confidence; here it is px^2.
+# The official code adds 0.2 eta to C in cells^2, with 0.001 confidence as weight; our C is in px^2.
 _DAMPING = 0.2 * net.STRIDE**2 / 0.001
 
 

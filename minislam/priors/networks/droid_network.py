@@ -102,8 +102,8 @@ def update(
         moved = parts.below("flow_encoder.").convs(motion).relu()
         unit = parts.below("gru.")
         # Every cell also gets a gated mean over the whole image.
-        whole = (unit.conv("w", hidden).sigmoid() * hidden).mean((2, 3), keepdim=True)
-        offsets = [unit.conv(f"conv{gate}_glo", whole) for gate in "zrq"]  # (E, 128, 1, 1) each
+        mean = (unit.conv("w", hidden).sigmoid() * hidden).mean((2, 3), keepdim=True)
+        offsets = [unit.conv(f"conv{gate}_glo", mean) for gate in "zrq"]  # (E, 128, 1, 1) each
         hidden = unit.gru(hidden, torch.cat([context, compared, moved], 1), offsets)
         revision = parts.below("delta.").convs(hidden, channels=_HEAD)[:, :2]
         confidence = parts.below("weight.").convs(hidden, channels=_HEAD)[:, :2].sigmoid()

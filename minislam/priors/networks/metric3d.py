@@ -30,7 +30,7 @@ from minislam.records import Frame
 CANONICAL_FOCAL = 1000.0  # px, of the camera that all training images were turned into
 LARGEST_SCALED = 300.0  # world units (metre); the official cut of the scaled depth
 NETWORK_SIZE = (616, 1064)  # px (height, width), as in the training
-_SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling of the coarsest map needs an even grid
+_SIZE_STEP = 2 * PATCH  # px; the 3.5-fold upsampling to the finest map needs an even grid
 _ROUNDS = {12: 4, 24: 8}  # of refinement, by the number of blocks of the ViT (S, L)
 _NEAREST, _FARTHEST = 0.1, 200.0  # metre, range of the canonical depth
 _BINS = 256  # of depth, between the two on a logarithmic scale
@@ -96,7 +96,7 @@ class Metric3DDepth:
         return _refine(self._decoder, fused, [fine, middle, coarse], self._rounds)
 
     def maps(self, image: Tensor) -> tuple[Tensor, ...]:  # 4 x (B, C_l, H/s, W/s)
-        """Return maps at s = 3.5, 7, 14 and 14 px, all from the last tokens of (B, 3, H, W)."""
+        """Return maps at s = 4, 7, 14 and 14 px, all from the last tokens of (B, 3, H, W)."""
         tokens = self._transformer(image)[0]
         weights = self._decoder.below("token2feature.")
         readings = []

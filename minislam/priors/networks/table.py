@@ -43,7 +43,7 @@ class Network:
     is_strict: bool = True  # its official loader refuses further tensors, as we do; else we warn
 
 
-# The first row whose marks are all in a file tells what the file is.
+# A checkpoint belongs to the first row whose marks it holds.
 NETWORKS = (
     Network(
         "flow", "droid", "DROID-SLAM", ("update.gru.convz.weight",),
@@ -70,7 +70,7 @@ NETWORKS = (
     Network(
         "depth", "depth-anything", "Depth Anything V2", ("depth_head.scratch.output_conv1.weight",),
         lambda weights, config: DepthAnything(weights, config.depth_anything),
-        # The first unit of the coarsest level has nothing to add, yet it is stored.
+        # Stored, but unused: at the coarsest level there is no map to add.
         unneeded=("mask_token", "refinenet4.resConfUnit1."),
     ),
 )  # fmt: skip

@@ -129,8 +129,8 @@ class DinoFeatures:
         image = frame.image
         whole_patches = [side // PATCH * PATCH for side in image.shape[:2]]
         seen = normalise(image.to(self.device))
-        whole = functional.interpolate(seen, whole_patches, mode="bilinear")
-        return self._transformer(whole)[0].patches[0].permute(1, 2, 0).to(image.device)
+        stretched = functional.interpolate(seen, whole_patches, mode="bilinear")
+        return self._transformer(stretched)[0].patches[0].permute(1, 2, 0).to(image.device)
 
 
 def is_antialiased(weights: Weights) -> bool:
@@ -138,7 +138,7 @@ def is_antialiased(weights: Weights) -> bool:
 
     The file does not state it, but the three published kinds differ in what they contain: FiT3D
     alone lacks the mask token of the training, and DINOv2 has registers or not. A file that has
-    lost such a tensor looks like another kind; then its official name tells.
+    lost such a tensor looks like another kind; then its official name shows it.
     """
     name = Path(weights.file).name
     is_fit3d = "mask_token" not in weights

@@ -1,12 +1,12 @@
-"""How well each keyframe is tied to the others, and where the trajectory hangs together no longer.
+"""How well each keyframe is tied to the others, and where the trajectory breaks.
 
 With a low matched ratio or little parallax the scale can drift while all residuals stay small.
 Where everything is matched, five measurements tell broken keyframes from healthy ones
-(diary/broken_runs.md): a wrong pose does not explain the flow of the keyframes before it; after a
-wrong scale two keyframes see a thing at different depths; where too little hands the scale on,
-lengths before and after are not told (scale_certainty.py); and where a large dynamic object takes
-the place of the scene, hardly anything that held the keyframes before holds this one, or what is
-left of it does not fit.
+(diary/broken_runs.md). A wrong pose does not explain the flow from the keyframes before it. After a
+wrong scale two keyframes see a point at different depths. Where few points hand the scale on, the
+ratio of lengths before and after is uncertain (scale_certainty.py). And where a large dynamic
+object covers the scene, hardly any cell that fitted in the keyframes before fits in this one, or
+those still matched do not fit.
 """
 
 from collections.abc import Sequence
@@ -54,15 +54,15 @@ class KeyframeDiagnostics:
     matched_ratio: float  # of its cells, in the best of its edges [-]
     parallax: float  # px, the largest mean flow by translation alone among its edges
     explained: float | None  # of the matched flow from its predecessors; None: no edge
-    depth_error: float | None  # median relative difference from them; None: they see other things
-    continuity: float | None  # of the match: known before, holds it still [-]; None: no such edges
-    agreement: float | None  # of what was known before, in the edge that agrees least
-    scale_deviation: float | None = None  # of ln(length after / before), at the end [-]
+    depth_error: float | None  # median relative difference from them; None: no common cell
+    continuity: float | None  # see `continuity`; None: an edge is missing [-]
+    agreement: float | None  # see `continuity`; None: also if too few cells are known [-]
+    scale_deviation: float | None = None  # standard deviation of ln(length after / before) [-]
 
 
 @dataclass(frozen=True)
 class Break:
-    """Keyframes whose poses hang together neither with those before nor with those after."""
+    """Keyframes whose poses fit neither those before nor those after."""
 
     first_frame: int
     last_frame: int
@@ -92,12 +92,12 @@ class Watch(Stateful):
         graph = self._graph
         self.beyond_turns, self.resting = flow_beyond_turns(graph), fraction_at_rest(graph)
         judged = self.diagnostics
-        if self.only_turned:  # it may see other depths, and be held by something new
+        if self.only_turned:  # depths are arbitrary, and a pan leaves old cells behind
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
             problem = bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
-            told = scale_deviations(problem, graph.state)
-            judged = [replace(k, scale_deviation=told.get(i)) for i, k in enumerate(judged)]
+            found = scale_deviations(problem, graph.state)
+            judged = [replace(k, scale_deviation=found.get(i)) for i, k in enumerate(judged)]
             self.diagnostics = judged
         self.breaks = find_breaks(judged)
 
@@ -147,8 +147,8 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 
     First the part of the flow from there, of what was static so far, that the geometry explains
     [-]. Then the median relative difference of the depths that both ends of an edge see, over cells
-    that count in the adjustment, near ones more: little tells how far the sky is. None: no edge, or
-    no cell that both see.
+    that count in the adjustment, near ones more, because far depths are hardly measured. None: no
+    edge, or no cell that both see.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
     edges = graph.edges.ends
@@ -170,7 +170,7 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 
 
 def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
-    """Return continuity and agreement [-]: does what held the camera before hold this keyframe?
+    """Return continuity and agreement [-]: do cells that fitted before fit in this keyframe?
 
     A cell of an earlier keyframe is known if its flow to the next keyframe fits. The flow of the
     keyframe just before leads to this one, which is being judged, so there the cells are known to
@@ -178,9 +178,9 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
 
     Continuity: the mean weight of the cells that are known, matched and fit, motion weight
     included, in the best edge into this keyframe, over the mean confidence of the edge from the
-    keyframe just before: in a fast turn both are small. Agreement: the part that fits of what is
-    known and matched, without motion weights, in the worst edge. Both are None if an edge is
-    missing or the camera was lost; agreement is None if no edge knows enough.
+    keyframe just before: in a fast turn both are small. Agreement: the fraction that fits of the
+    known and matched cells, without motion weights, in the worst edge. Both are None if an edge is
+    missing or the camera was lost; agreement is None if all edges have too few known cells.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
@@ -243,9 +243,9 @@ def is_unexplained(newest: KeyframeDiagnostics) -> bool:
 def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
-    One keyframe is a break if it explains very little, sees other depths, does not know the scale,
-    is held by something new or contradicts what held before. LONG keyframes in a row that explain a
-    little too little make one, too. Breaks at most HEALED_AFTER keyframes apart are joined.
+    One keyframe is a break if it explains very little flow, sees other depths, or has an uncertain
+    scale, low continuity or low agreement. LONG keyframes in a row that all explain less than
+    MIN_EXPLAINED_LONG make one, too. Breaks at most HEALED_AFTER keyframes apart are joined.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little

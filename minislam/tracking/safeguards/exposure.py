@@ -1,6 +1,6 @@
 """How much brighter a keyframe is than the map: automatic exposure and white balance.
 
-A camera adapts to the light. Matched cells that stand still tell the factors a_k of each colour:
+A camera adapts to the light. Matched static cells give the factors a_k of each colour channel:
 
     log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of an edge.
 
@@ -25,10 +25,10 @@ from minislam.tracking.safeguards.robust import weighted_median
 
 BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the dark
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
-KEPT = 20  # blurred images: most edges are among neighbours
+KEPT = 20  # blurred images in the cache: most edges join neighbours
 LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
-LEAST_WEIGHT = 0.015  # of the heaviest edge: with less, a few chance matches would tell [-]
-STEADY = 1e-6  # weight of "as bright as the keyframe before", where no edge tells more
+LEAST_WEIGHT = 0.015  # of the heaviest edge: with less, a few chance matches would decide [-]
+STEADY = 1e-6  # weight of "as bright as the keyframe before", for keyframes without an edge
 Shot = TypeVar("Shot", Frame, Keyframe)
 
 
@@ -57,12 +57,12 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
         ratios.append([weighted_median(channel, weight) for channel in ratio.T])
         weights.append(float(weight.mean()))
     least = LEAST_WEIGHT * max(weights, default=0.0)
-    telling = [edge for edge, weight in enumerate(weights) if weight > least]
+    reliable = [edge for edge, weight in enumerate(weights) if weight > least]
     neighbours = list(pairwise(range(len(frames))))
-    pairs = [*neighbours, *(edges.ends[k] for k in telling)]
-    steps = [[0.0] * 3] * len(neighbours) + [ratios[k] for k in telling]
-    counts = [STEADY] * len(neighbours) + [weights[k] for k in telling]
-    levels = _levels(len(frames), pairs, np.array(counts), np.array(steps, float))
+    pairs = [*neighbours, *(edges.ends[k] for k in reliable)]
+    steps = [[0.0] * 3] * len(neighbours) + [ratios[k] for k in reliable]
+    weights = [STEADY] * len(neighbours) + [weights[k] for k in reliable]
+    levels = _levels(len(frames), pairs, np.array(weights), np.array(steps, float))
     if np.abs(levels).max() < LEAST_CHANGE:
         return {}
     exposures = torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)

@@ -1,9 +1,9 @@
-"""The start of a camera of which not everything is known: which minimum is taken, and its camera.
+"""The start with an unknown focal length or readout: which minimum is taken, and its camera.
 
 Hypotheses of the first depths end in several minima. With a wrong camera the right one need not be
-the lowest: under a focal length that is 6 % too long, depth that is inside out fits better, and a
-far hill that takes the rolling shutter for parallax turns rocks in front into outliers. So
-what is unknown of the camera is free before costs are compared: its focal length, and the readout.
+the lowest. Under a focal length that is 6 % too long, inverted depth fits better; and where the
+rolling shutter of a far hill is fitted as parallax, rocks in front become outliers. So the unknowns
+of the camera, its focal length and the readout, are free before costs are compared.
 
 Under a long lens, or where the camera hardly walks, a scene and its mirror image in depth have
 nearly the same flow. The paper starts from the depth prior, which tells them apart.
@@ -33,7 +33,7 @@ SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
 # Starts of an unknown focal length beside its guess: each search reaches a third either way.
 OTHER_FOCALS = (math.log(0.5), math.log(2.0))
 # Chosen on five real clips, four in which the camera hardly does more than turn, judged on others.
-FOCAL_WORTH_SAVING = 0.05  # of the cost, for each doubling of the guess, and before it is freed [-]
+FOCAL_WORTH_SAVING = 0.05  # of the cost: for each doubling of the guess, and to free it [-]
 FARTHEST = math.log(4)  # from the guessed focal length; farther off, the start has failed
 RELIEF_WORTH_SAVING = 0.1  # of the cost, per unit of correlation with the usual disparities [-]
 # More than later (focal_length.py), because in a short pan readout and focal length look alike. In
@@ -77,7 +77,7 @@ def cost_of(found: Found) -> float:  # px^2
 def most_plausible(grid: Grid, known_disparities: Tensor, found: list[Found]) -> Found:
     """Return the result of lowest cost; what is usual decides between nearly equal ones.
 
-    Usual are the guessed focal length, and disparities that grow with the prior's, else downwards.
+    Usual are the guessed focal length, and disparities that grow with the prior's, or else with v.
     """
     known = known_disparities > 0  # (K, N)
     usual, cells = grid.pixels[:, 1].expand_as(known), torch.ones_like(known)
@@ -103,8 +103,8 @@ def lowest_minimum(
 ) -> Found:
     """Return the geometry of the warm-up that is most plausible, adjusted with its camera.
 
-    The focal length stays as guessed if the motion does not tell it and it saves little. A readout
-    that saves little stays 0: it would follow noise or movers. Of few keyframes both stay.
+    The focal length stays as guessed if it is not observable and another saves little cost. A
+    readout that saves little stays 0: it would follow noise or movers. Of few keyframes both stay.
     """
     tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
     seeks_focal = graph.seeks_focal and tells_camera
@@ -137,7 +137,7 @@ def lowest_minimum(
             chosen = adjust_narrowing(free, rolled[0], WIDENINGS[2:], ITERATIONS)
     if not seeks_focal:
         return chosen
-    own = replace(chosen[0], log_focal=0.0), chosen[1]  # its minimum under the guess
+    own = replace(chosen[0], log_focal=0.0), chosen[1]  # the same geometry under the guess
     held = adjusted(problem, [own])
     fit, fitted = fit_focal_length(problem, held[0][0], workers, chosen[0])
     if fit.factor is not None:

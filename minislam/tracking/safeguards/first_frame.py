@@ -18,7 +18,7 @@ class FirstFrame(Stateful):
     """Chooses the first frame of the warm-up, and by that the frame that is tracked next."""
 
     best: int = 0  # first frame of the best start that was given up
-    worth: Worth = (False, 0)  # of that start
+    worth: Worth = (False, 0)  # of the best start
     is_repeated: bool = False  # all starts were tried, the best is the last
 
     def next_frame(self, tracker: Tracker, count: int) -> int | None:

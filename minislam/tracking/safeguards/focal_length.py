@@ -1,4 +1,4 @@
-"""The focal length and the readout that the flow fits.
+"""The focal length and the readout that fit the flow.
 
 A focal length is estimated where it is unknown and checked where it is given.
 
@@ -41,7 +41,7 @@ WORTH_SAYING, WORTH_SAVING = 0.05, 0.02
 # In warm-ups and whole runs of rolling shutters the readout saved 3 to 37 % of the cost, of clips
 # with a global shutter or with hardly any turn at most 1.2 %. [-]
 READOUT_WORTH_SAVING = 0.02
-# Fewer do not tell the camera: of fr1_desk 2, 3, 4 and 6 said 115, 238, 266 and 276 px (275).
+# Fewer do not measure it: of fr1_desk 2, 3, 4 and 6 gave fx = 115, 238, 266, 276 px (true: 275).
 LEAST_KEYFRAMES = 4
 LEAST_HALF = 6  # keyframes of half a clip that is checked alone
 HALF_WORTH_SAVING = 0.1  # zooms of 1.5 saved 14 to 53 %, the right focal length at most 1 % [-]
@@ -49,10 +49,10 @@ HALF_WORTH_SAVING = 0.1  # zooms of 1.5 saved 14 to 53 %, the right focal length
 
 @dataclass(frozen=True)
 class FocalLengthFit:
-    """The focal length that the flow fits best."""
+    """The focal length that fits the flow best."""
 
     present: float  # px, fx at the working size
-    factor: float | None  # best focal length / present one; None: the motion does not tell
+    factor: float | None  # best focal length / present one; None: it is not observable
     saved: float  # fraction of the residual cost that the best one saves [-]
     half: tuple[int, int] | None = None  # first and last frame, if it is of one half alone
 
@@ -111,7 +111,7 @@ def _thinned(graph: KeyframeGraph, problem: BundleProblem, keyframes: range) -> 
 
 
 def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> None:
-    """Set an unknown focal length to what the flow fits, if motion tells it; then it is free."""
+    """Set an unknown focal length to the best fit if it is observable; from then on it is free."""
     if not graph.seeks_focal or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
     problem = bundle_problem(graph, range(len(graph.edges)), 0, lambda_prior=0.0)
@@ -154,7 +154,7 @@ def fit_focal_length(
 
 
 def seek_readouts(graph: KeyframeGraph) -> None:
-    """Set the readout that the flow fits if it saves enough; poses and depths stay.
+    """Set the readout that fits the flow best if it saves enough; poses and depths stay.
 
     If it saves little it stays 0, because it would follow noise and movers.
     """

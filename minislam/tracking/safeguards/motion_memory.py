@@ -50,7 +50,7 @@ def remember(
     matches: FlowMatches,
     T_camera_world: Tensor,  # (4, 4) where the camera moves on to
     index: int = -1,
-    settled: Tensor | None = None,  # (N,) bool, whose disparity is known; None: of all
+    settled: Tensor | None = None,  # (N,) bool, cells whose disparity is measured; None: all
 ) -> None:
     """Lower the motion weight of a keyframe's cells whose flow does not fit the camera motion.
 
@@ -61,8 +61,8 @@ def remember(
         return
     before = keyframes.motion_weights[index]
     motion = T_camera_world @ se3_inverse(keyframes.T_camera_world[index])
-    known = keyframes.disparities[index], motion, before, scale
-    after = update_motion_weight(graph.grid, matches, *known)
+    step = keyframes.disparities[index], motion, before, scale
+    after = update_motion_weight(graph.grid, matches, *step)
     weight = after if settled is None else torch.where(settled, after, before)
     keyframes.motion_weights[index] = weight
 
@@ -85,7 +85,7 @@ def update_motion_weight(
     motion = T_target_source[None].to(disparities.dtype)
     positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
     squared = (positions[0] - matches.targets[0]).square().sum(0)
-    # The flow that depth explains is as wrong as the depth, relatively.
+    # Parallax has the relative error of the depth, so it widens the tolerance.
     turned, _ = reproject(motion, torch.zeros_like(disparities)[None], grid.rays, grid.camera)
     parallax = (positions[0] - turned[0]).square().sum(0)
     agreement = (1 + squared / (scale**2 + DEPTH_ERROR**2 * parallax)) ** -2
@@ -106,7 +106,7 @@ def inherit_motion_weight(grid: Grid, matches: FlowMatches, weight: Tensor) -> T
 
 
 def arrived(grid: Grid, matches: FlowMatches, marks: Tensor) -> Tensor:  # (N,) 0 or 1
-    """Return the marks of the target cells; one without takes the largest of 3 x 3, or 0."""
+    """Return the marks of the target cells; one without takes the largest beside it, or 0."""
     marked = _inherited(grid, matches, marks)
     marked[marked.isinf()] = -1
     beside = max_pool2d(marked[None, None], 3, 1, 1)[0, 0]
@@ -149,7 +149,7 @@ def overlay_weights(flow_to_next: Sequence[FlowMatches], grid: Grid) -> Tensor |
 def without_overlay(matches: FlowMatches, overlay: Tensor | None) -> FlowMatches:
     """Return matches in which no cell of an overlay counts, by its `overlay_weights`.
 
-    Its flow would delay keyframes, and count as a motion that wrong matches beside it hand on.
+    Its zero flow would delay keyframes, and its low motion weight would spread by wrong matches.
     """
     if overlay is None:
         return matches

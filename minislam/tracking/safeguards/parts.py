@@ -1,7 +1,7 @@
-"""A bundle problem of some edges, keyframes or cells alone.
+"""A bundle problem restricted to some edges, keyframes or cells.
 
-Edges in parts, because the derivatives of thousands of edges at once would take gigabytes, and
-because arrays of few megabytes are taken from memory that was used before.
+Edges are processed in parts, because the derivatives of thousands of edges at once would take
+gigabytes, and because arrays of a few megabytes reuse memory that was freed before.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,7 @@ from minislam.state.memory import Shelf, give_back_freed, release
 from minislam.tracking.bundle_problem import BundleProblem, BundleState
 
 CELLS_AT_ONCE = 50_000  # of all edges of a part: 200 bytes a cell
-PARTS_UNTIDIED = 16  # thousands of edges in parts would leave hundreds of MB of holes
+PARTS_UNTIDIED = 16  # parts after which freed memory is given back: it fragments
 CELLS_COUPLED = 3_000_000  # of all edges whose couplings are in memory: 24 bytes a cell
 _OF_EDGES = "edges_source edges_target targets weights shutter"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
@@ -50,13 +50,13 @@ def in_parts(problem: BundleProblem) -> Iterator[tuple[Tensor, BundleProblem]]:
     The edges of one source stay together, because its disparities couple them.
     """
     counts = torch.bincount(problem.edges_source).cumsum(0)
-    number = ((counts - 1) * len(problem.rays) // CELLS_AT_ONCE)[problem.edges_source]
-    for part in (parts := number.unique()):
+    part_of = ((counts - 1) * len(problem.rays) // CELLS_AT_ONCE)[problem.edges_source]
+    for part in (parts := part_of.unique()):
         if len(parts) > PARTS_UNTIDIED and part % PARTS_UNTIDIED == 0:
             give_back_freed()
-        edges = (number == part).nonzero()[:, 0]
-        every = len(edges) == len(number)
-        yield edges, problem if every else replace(problem, **_chosen(problem, _OF_EDGES, edges))
+        edges = (part_of == part).nonzero()[:, 0]
+        is_all = len(edges) == len(part_of)
+        yield edges, problem if is_all else replace(problem, **_chosen(problem, _OF_EDGES, edges))
 
 
 def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:

@@ -68,16 +68,16 @@ def repeats_last(frame: Frame, shown: dict[int, Frame]) -> bool:
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
     """Return a learned flow (E = 1) from the newest keyframe, judged by the best pose for it.
 
-    Its matched ratio is the part of its weight that the pose explains beyond chance, because a
-    network learned only to weigh cells by its confidence.
+    Its matched ratio is the fraction of its weight that the pose explains beyond chance, because
+    the confidence of a network weighs cells and does not tell which are matched.
     """
     pose = graph.start_pose(matches, torch.ones_like(graph.grid.rays[:, 0]))
     ends = torch.stack([graph.keyframes.T_camera_world[-1], pose])
     motion = relative_transforms(ends, [0], [1]).float()
     disparities = graph.keyframes.disparities[-1:]
     predicted, _ = reproject(motion, disparities, graph.grid.rays, graph.grid.camera)
-    way = lengths(matches.targets - graph.grid.pixels.T)
-    allowed = EXPLAINED[0] * graph.pixel_scale + EXPLAINED[1] * way
+    flow = lengths(matches.targets - graph.grid.pixels.T)
+    allowed = EXPLAINED[0] * graph.pixel_scale + EXPLAINED[1] * flow
     weights = matches.confidences.mean(1)
     explained = weights * (lengths(matches.targets - predicted) < allowed)
     ratio = (explained.sum(1) / weights.sum(1) - CHANCE) / (1 - CHANCE)

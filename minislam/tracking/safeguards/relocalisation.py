@@ -49,8 +49,8 @@ class Relocaliser:
     def find(self, image: Tensor, features: Tensor) -> Place | None:
         """Return the place with most inliers: image (H, W, 3), features (h', w', C); or None."""
         seen = _keypoints(image)
-        known = torch.stack([_summary(f) for f in self._graph.keyframes.features])
-        similarity = known @ _summary(features)
+        summaries = torch.stack([_summary(f) for f in self._graph.keyframes.features])
+        similarity = summaries @ _summary(features)
         most_similar = similarity.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
         places = [self._place(seen, index) for index in most_similar]
         found = [place for place in places if place is not None]

@@ -7,7 +7,7 @@ that even far outliers pull. With k = 2 it is that of Geman and McClure, bounded
 few c only the number of outlier cells counts, not how far a dynamic object has moved.
 
 How wide c must be depends on the noise of the flow: .08 px in clean synthetic clips, .2 to .4 px in
-real ones (medians). Poses that have settled tell it by their residuals.
+real ones (medians). The residuals of settled poses measure it.
 """
 
 from dataclasses import dataclass, replace
@@ -55,7 +55,7 @@ def edge_losses(
     residual: Tensor,  # (E, 2, N) px
     robust: RobustKernel | None,
 ) -> Tensor:  # (E,) float64 px^2
-    """Return the cost of each edge in Eq. (5): the sum of weighted squares, or of their losses."""
+    """Return the cost of each edge in Eq. (5): the sum of weighted squares, or of robust losses."""
     if robust is None:
         return (weights * residual.square()).sum((1, 2), dtype=torch.float64)
     loss = robust.loss(residual.square().sum(1))
@@ -63,7 +63,7 @@ def edge_losses(
 
 
 def least_cost(weights: Tensor) -> float:  # (E, 2, N)
-    """Return the cost of residuals that are as small as the flow is exact."""
+    """Return the cost if every residual had the length MIN_RESIDUAL."""
     return MIN_RESIDUAL**2 * float(weights.mean(1).sum())
 
 

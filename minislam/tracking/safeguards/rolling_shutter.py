@@ -11,7 +11,7 @@ becomes that of a global shutter by
 
     p~ + rho c,    c = s(x) u_i(x) - s(p~) u_j(p~).
 
-The flow between neighbouring frames tells u, without any pose. The residual of Eq. (5) is linear in
+The flow between neighbouring frames gives u, without any pose. The residual of Eq. (5) is linear in
 rho, which is one more unknown with the column c. Sensors are read along the shorter side of the
 image, a phone held upright along x: the readout along the longer side stays 0.
 """
@@ -72,7 +72,7 @@ class ImageMotion(Stateful):
         return torch.stack(around).mean(0) if around else torch.zeros_like(self._grid.pixels.T)
 
     def displacement(self, frame_index: int, readout: Readout) -> np.ndarray | None:  # (H, W, 2)
-        """Return how far from each pixel of a global shutter a frame shows it; None: negligible."""
+        """Return how far the rolling shutter moves each pixel of a frame [px]; None: negligible."""
         grid, camera = self._grid, self._grid.camera
         late = grid.pixels.T / grid.pixels.new_tensor([[camera.width], [camera.height]]) - 0.5
         moved = self.velocity(frame_index) * (grid.pixels.new_tensor(readout) @ late)
@@ -86,7 +86,7 @@ class RollingShutter(Stateful):
     """The readouts, found from the flow along all edges and from the motion of the image."""
 
     readout: Readout = (0.0, 0.0)
-    is_found: bool = False  # the flow has told it, and all later adjustments refine it
+    is_found: bool = False  # estimated from the flow; all later adjustments refine it
     motion: ImageMotion
 
     def __init__(self, grid: Grid, keyframes: KeyframeStore, edges: FrameGraph, is_on: bool):
@@ -143,7 +143,7 @@ class RollingShutter(Stateful):
         return stack(rows)
 
     def take(self, found: Readout) -> None:
-        """Set what the flow has told, from where all later adjustments refine it."""
+        """Set the readouts estimated from the flow; all later adjustments refine them."""
         self.is_found = True
         self.lengthen(found)
 

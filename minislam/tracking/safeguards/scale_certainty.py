@@ -1,4 +1,4 @@
-"""How exactly the flow hands the scale of a trajectory on, not in the paper.
+"""How precisely the flow measures the scale along a trajectory, not in the paper.
 
 A single camera knows lengths only as multiples of those before, by points that several keyframes
 see from far enough apart. Where a fast turn, a plain wall or a dynamic object leaves few of them,
@@ -19,8 +19,8 @@ from minislam.tracking.safeguards.parts import in_parts
 from minislam.tracking.schur import marginalised
 
 REACH = 3  # keyframes: the usual distance over so many is the length that is compared
-LEAST_C = 1e-6  # fraction of the mean C, added to all: more would tell depths that no flow tells
-HOLD = 1e-8  # relative damping of the poses: holds the scale of the whole, which nothing tells [-]
+LEAST_C = 1e-6  # fraction of the mean C, added to all: more would act as a prior of the depth [-]
+HOLD = 1e-8  # relative damping of the poses: fixes the scale of the whole, which is free [-]
 
 
 def scale_deviations(problem: BundleProblem, state: BundleState) -> dict[int, float]:

@@ -1,4 +1,4 @@
-"""Undo a drift of the scale that a depth prior tells.
+"""Undo a drift of the scale that a depth prior reveals.
 
 Flow ties the scale of a keyframe to that of its neighbours. Where the camera turns fast, few
 keyframes see the same, and the scales of distant ones are hardly tied at all: to change them
@@ -14,11 +14,11 @@ from minislam.geometry import se3_inverse
 from minislam.tracking.keyframes import KeyframeStore
 
 SMOOTHED = 8.0  # keyframes, standard deviation of the window
-SLOW_ERROR = 0.03  # standard deviation of what a prior errs alike over many keyframes [-]
+SLOW_ERROR = 0.03  # standard deviation of a prior's error that many keyframes share [-]
 
 
 def undo_scale_drift(keyframes: KeyframeStore) -> None:
-    """Rescale the steps of the camera and the disparities by the drift that the prior tells."""
+    """Rescale the steps of the camera and the disparities by the drift against the prior."""
     drift = told_drift(keyframes)
     if not drift.any():
         return
@@ -36,15 +36,15 @@ def told_drift(keyframes: KeyframeStore) -> Tensor:  # (K,) float64
     The prior's own error is taken off the drift's variance: if it explains all, the drift is 0.
     """
     known = (keyframes.prior_disparities > 0) & (keyframes.disparities > 0)
-    told = known.any(1)
+    has_prior = known.any(1)
     ratio = torch.where(known, keyframes.disparities / keyframes.prior_disparities, torch.nan)
-    log_ratio = torch.where(told, ratio.nanmedian(1).values, 1.0).log().double()
+    log_ratio = torch.where(has_prior, ratio.nanmedian(1).values, 1.0).log().double()
     position = torch.arange(len(known), dtype=torch.float64, device=known.device)
-    weights = (-0.5 * ((position[:, None] - position) / SMOOTHED) ** 2).exp() * told
+    weights = (-0.5 * ((position[:, None] - position) / SMOOTHED) ** 2).exp() * has_prior
     weights = weights / weights.sum(1, keepdim=True).clamp_min(1e-300)
     drift = weights @ log_ratio
     drift = drift - drift.mean()
     # What differs from one keyframe to the next is noise, of which the window leaves little.
-    noise = log_ratio[told].diff().square().sum() / 2 / max(1, int(told.sum()) - 1)
+    noise = log_ratio[has_prior].diff().square().sum() / 2 / max(1, int(has_prior.sum()) - 1)
     error = SLOW_ERROR**2 + noise * weights.square().sum(1).mean()
     return drift * (1 - error / torch.maximum(drift.square().mean(), error))

@@ -25,7 +25,7 @@ from minislam.tracking.reprojection import reproject, reproject_with_jacobians
 SETTLED = 25.0  # px^2, information of a disparity that is known to a fifth of itself
 # Neighbouring keyframes see much of the same flow, so information is handed on in part. [-]
 HANDED_ON = 0.5
-MOST = 1e6  # px^2, instead of infinite information
+MOST = 1e6  # px^2, cap of the information: an infinite one could not be interpolated
 LEAST = 0.05  # weight of a cell whose disparity nothing is known of: it still shows a rotation [-]
 
 
@@ -68,13 +68,13 @@ class Settling(Stateful):
         grid, keyframes = self._graph.grid, self._graph.keyframes
         settled = information > SETTLED
         warped = settled | self._has_prior
-        known = keyframes.disparities[-1] * (warped | ~warped.any())
+        sources = keyframes.disparities[-1] * (warped | ~warped.any())
         motion = keyframes.T_camera_world[-1] @ se3_inverse(T_camera_world)
-        disparities = warp_disparities(grid, se3_inverse(motion), known)
-        known = HANDED_ON * torch.where(settled, information, 0).clamp_max(MOST)
+        disparities = warp_disparities(grid, se3_inverse(motion), sources)
+        inherited = HANDED_ON * torch.where(settled, information, 0).clamp_max(MOST)
         motion = motion[None].to(disparities.dtype)
         positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
-        there = grid.sample(known[None, :, None], positions.mT)[0, :, 0]
+        there = grid.sample(inherited[None, :, None], positions.mT)[0, :, 0]
         seen = valid[0] & grid.camera.contains(positions[0].mT)
         self.handed_on = torch.where(seen, there, 0)
         return disparities

@@ -1,4 +1,4 @@
-"""A camera that stands, or only turns: nothing measures depth, so its poses are turns alone."""
+"""A camera that stands, or only turns: no depth is measured, so its poses are pure rotations."""
 
 import math
 from dataclasses import replace
@@ -16,16 +16,16 @@ from minislam.tracking.reprojection import lengths, parallax
 from minislam.tracking.safeguards.robust import weighted_median
 
 TURN_WIDENING = (16.0, 8.0)  # of the robust weight of a turn: narrower, it follows what is far
-MOST_PAIRS = 100  # of neighbouring keyframes, which tell whether a clip shows any depth
+MOST_PAIRS = 100  # of neighbouring keyframes that are tested for parallax
 
 
 def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 image
-    """Return the flow between neighbouring keyframes that no turn of the camera explains.
+    """Return the flow between neighbouring keyframes that no rotation of the camera explains.
 
-    A turn moves all points as if they were infinitely far away. The best one, under a wide robust
-    weight, takes the place of any translation that looks like it, so that what is left, in the
-    median, tells depth, whatever parallax the poses claim. Under a wrong focal length a turn looks
-    like parallax, so one that is sought and not yet found is free. None: no edge has any weight.
+    A rotation moves all points as if they were infinitely far away. The best one, under a wide
+    robust weight, also explains a translation that looks like it. So the median residual measures
+    depth, whatever parallax the poses claim. Under a wrong focal length a rotation looks like
+    parallax, so one that is sought and not yet found is free. None: no edge has any weight.
     """
     grid, edges, keyframes = graph.grid, graph.edges, graph.keyframes
     pairs = [p for p, (source, target) in enumerate(edges.ends) if target == source + 1]
@@ -56,7 +56,7 @@ def fraction_at_rest(graph: KeyframeGraph) -> float:
 
 
 def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
-    """Tell whether translation moves most cells too little, in all edges that still see them."""
+    """Tell whether most cells have too little parallax in every edge whose target sees them."""
     targets = [target for source, target in graph.edges.ends if source == keyframe]
     if not targets:
         return True
@@ -67,7 +67,7 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
 
 
 def adjust_turns(graph: KeyframeGraph) -> None:
-    """Adjust the turns of the keyframes alone: all that they see is infinitely far away."""
+    """Adjust the rotations of the keyframes alone: all that they see is infinitely far away."""
     keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
     problem = replace(problem, free_disparities=torch.zeros_like(problem.free_disparities))
     poses = keyframes.T_camera_world.clone()
