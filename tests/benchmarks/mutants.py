@@ -1,4 +1,4 @@
-"""Break the package one line at a time: does a fast test of the same room notice?
+"""Break the package one line at a time: does a fast test of the same package notice?
 
     python -m tests.benchmarks.mutants [WORD ...]
 
