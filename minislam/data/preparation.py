@@ -20,6 +20,7 @@ BLACK = 24  # of 255: the brightest that a codec leaves in a black bar
 BLURRED = 2  # px of the picture, beside a bar, that a codec mixes with it
 # A scene that leaves less of a side is dark, not barred [-], unless both bars are alike [px].
 LEAST_PICTURE, ALIKE = 0.5, 4
+FADED = 0.5  # of the largest lit area: an image that shows less does not tell where bars end [-]
 
 
 class ImagePreparation:
@@ -124,20 +125,30 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
     return side(width), side(height)
 
 
-def picture_window(brightest: np.ndarray) -> Window:
+def lit_extent(image: np.ndarray) -> list[int]:
+    """Return left, top, right, bottom [px] of what is not black in an image; [] if all is."""
+    is_lit = image.max(2) > BLACK
+    (columns,), (rows,) = np.nonzero(is_lit.any(0)), np.nonzero(is_lit.any(1))
+    return [int(end) for k in (0, -1) for end in (columns[k], rows[k])] if len(rows) else []
+
+
+def picture_window(extents: list[list[int]], width: int, height: int) -> Window:
     """Return the window of the images that no black bar covers; films have such bars.
 
-    `brightest` (H, W) uint8 is the largest value of each pixel in several images. Beta would learn
-    that a bar is no part of the scene, and take all that is black for a part of the bar.
+    The extents are those of several images. A bar ends at the same place in most of them, but for
+    a fade; a thing on a black ground does not. Beta would learn that a bar is no part of the scene,
+    and take all that is black for a part of the bar.
     """
-    window = []
-    for axis, side in ((0, brightest.shape[1]), (1, brightest.shape[0])):
-        (shown,) = np.nonzero(brightest.max(axis) > BLACK)
-        first, last = (int(shown[0]), int(shown[-1])) if len(shown) else (0, side - 1)
+    lit = np.array([extent for extent in extents if extent] or [[0, 0, width - 1, height - 1]])
+    areas, window = (lit[:, 2:] - lit[:, :2]).prod(1), []
+    usual = np.median(lit[areas >= FADED * areas.max()], 0)
+    for axis, side in ((0, width), (1, height)):
+        first, last = int(lit[:, axis].min()), int(lit[:, axis + 2].max())
+        is_steady = np.abs(usual[axis::2] - (first, last)).max() <= ALIKE
         first, last = first + BLURRED * (first > 0), last - BLURRED * (last < side - 1)
         are_alike = abs(first - (side - 1 - last)) <= ALIKE  # an upright film in a wide one
         least = MINIMUM_SIDE if are_alike else max(LEAST_PICTURE * side, MINIMUM_SIDE)
-        is_picture = last + 1 - first >= least
+        is_picture = is_steady and last + 1 - first >= least
         window.append((first, last + 1 - first) if is_picture else (0, side))
     (left, width), (top, height) = window
     return left, top, width, height

@@ -11,6 +11,7 @@ import numpy as np
 
 from minislam.data.images import read_color
 from minislam.data.metadata import noted_size
+from minislam.data.preparation import lit_extent
 from minislam.errors import InputError, MinislamError
 
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
@@ -41,15 +42,16 @@ class FileImages:
         """Return a raw image (H, W, 3) uint8 RGB."""
         return read_color(self.paths[index])
 
-    def brightest(self) -> np.ndarray:  # (H, W) uint8
-        """Return the largest value of each pixel in the sampled images."""
+    @property
+    def lit_extents(self) -> list[list[int]]:
+        """Return the `lit_extent` of each sampled image."""
         usual = [index for index in range(len(self.paths)) if index not in self.odd]
-        found = self.read(usual[0]).max(2)
+        extents = [lit_extent(first := self.read(usual[0]))]
         for place in filter(_is_sampled, range(1, len(usual))):
             with suppress(MinislamError):  # raised again when that frame is read
-                image = self.read(usual[place]).max(2)
-                found = np.maximum(found, image) if image.shape == found.shape else found
-        return found
+                image = self.read(usual[place])
+                extents += [lit_extent(image)] if image.shape == first.shape else []
+        return extents
 
 
 class VideoImages:
@@ -66,7 +68,7 @@ class VideoImages:
         self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self._brightest = np.zeros((), np.uint8)  # of each pixel, in the sampled images
+        self.lit_extents: list[list[int]] = []  # of the sampled images
         stamps: list[float] = []
         last = 0  # A failed call is the end of the file, or damage with more frames behind it.
         while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
@@ -77,7 +79,7 @@ class VideoImages:
                 if _is_sampled(len(stamps)):
                     decoded, image = self._capture.retrieve()
                     if decoded:
-                        self._brightest = np.maximum(self._brightest, image.max(2))
+                        self.lit_extents.append(lit_extent(image))
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         # The container counts all frames: its count says nothing if reading stopped at the limit.
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -103,10 +105,6 @@ class VideoImages:
             self._grabbed += 1
         _, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-    def brightest(self) -> np.ndarray:  # (H, W) uint8
-        """Return the largest value of each pixel in the sampled images."""
-        return self._brightest
 
     def lost(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing: gaps of a constant rate, or calls that failed."""

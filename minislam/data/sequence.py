@@ -72,7 +72,7 @@ class RecordedSequence:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
         self.files = [*recording.images.paths, *self._masks.values()]
         height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
-        picture = picture_window(recording.images.brightest())
+        picture = picture_window(recording.images.lit_extents, width, height)
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
         self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels, picture)

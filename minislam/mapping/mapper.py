@@ -109,7 +109,8 @@ class Mapper(JointOptimisation):
             self._optimise(*schedule, range(done, half))
             if half >= safeguards.LEAST_VIEWS * len(self.keyframes):
                 self._exclude_upper_mode()
-                self._fill_gaps()
+                for position in range(len(self.keyframes)):
+                    self._insert(position, fills=True)  # with the depth of the surroundings
         self._optimise(*schedule, range(max(done, half), iterations))
         self._remove_unsupported()
 
@@ -179,11 +180,6 @@ class Mapper(JointOptimisation):
         if safeguards.is_wrong(error, beta, least, self.uncertainty.lambda_depth):
             self.least_weight = least
             self._replace_dynamic_gaussians()
-
-    def _fill_gaps(self) -> None:
-        """Give what is static and not shown the depth of its surroundings."""
-        for position in range(len(self.keyframes)):
-            self._insert(position, fills=True)
 
     def _remove_unsupported(self) -> None:
         """Remove Gaussians that hardly any static pixel shows, and note what is shown.

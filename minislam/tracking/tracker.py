@@ -38,7 +38,6 @@ from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
 LONGEST_TAIL = 2  # frames after the last keyframe that need none behind them
-NEW_ONE_IN = 5  # online all keyframes are adjusted again once one in so many is new
 
 
 class Mode(Enum):
@@ -202,11 +201,10 @@ class Tracker(Stateful):
             self._update_static_weights(first=len(self.keyframes) - 1)
 
     def _adjust_all_if_due(self) -> None:
-        """Close loops; run online global BA if `global_interval` keyframes and a fifth are new."""
-        config, count = self.config, len(self.keyframes)
-        closed = config.loop_closure and close_loops(self.graph)
-        least = max(config.global_interval, count // NEW_ONE_IN)
-        is_due = config.global_interval > 0 and count - self._last_global >= least
+        """Close loops; run online global BA if `global_interval` keyframes and half are new."""
+        interval, count, last = self.config.global_interval, len(self.keyframes), self._last_global
+        closed = self.config.loop_closure and close_loops(self.graph)
+        is_due = interval > 0 and count - last >= max(interval, last)
         if is_due and not closed:
             seek_readouts(self.graph)
             online_global_ba(self.graph)

@@ -265,11 +265,11 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if index not in self.odd", ""), ("size != usual[0][0]", "False"),
         ("self.promised > len(self) > 1", "len(self) > 1"),
         ("0 if len(stamps) == limit else promised", "promised"),
-        ("index & (index - 1) == 0", "index == 0"), ("np.maximum(found, image)", "image"),
+        ("index & (index - 1) == 0", "index == 0"),
     ],
     ("data/preparation.py", "data/test_preparation.py"): [
         ("> BLACK", "> 0"), ("first + BLURRED * (first > 0)", "first"),
-        ("LEAST_PICTURE * side", "0 * side"),
+        ("LEAST_PICTURE * side", "0 * side"), ("FADED * areas.max()", "0"), ("is_steady and", ""),
         ("(*self._maps, self._window)", "(*self._maps, (0, 0, *self._raw_size))"),
         ("map_y > bottom - 1", "map_y > height - 1"),
     ],

@@ -6,6 +6,7 @@ import torch
 
 from minislam.data.preparation import (
     ImagePreparation,
+    lit_extent,
     picture_window,
     seen_window,
     working_size,
@@ -120,9 +121,13 @@ def test_no_black_bar_remains_after_undistortion():
 
 
 def barred(left: int, top: int, right: int, bottom: int, value: int = 90) -> np.ndarray:
-    brightest = np.full((100, 200), 20, np.uint8)  # black, as a codec leaves it
-    brightest[top : 100 - bottom, left : 200 - right] = value
-    return brightest
+    image = np.full((100, 200, 3), 20, np.uint8)  # black, as a codec leaves it
+    image[top : 100 - bottom, left : 200 - right] = value
+    return image
+
+
+def window_of(*images: np.ndarray) -> tuple[int, int, int, int]:
+    return picture_window([lit_extent(image) for image in images], 200, 100)
 
 
 @pytest.mark.parametrize(
@@ -138,14 +143,24 @@ def barred(left: int, top: int, right: int, bottom: int, value: int = 90) -> np.
     ],
 )
 def test_black_bars_are_no_part_of_the_picture(bars, window: tuple[int, int, int, int]):
-    assert picture_window(barred(*bars)) == window
+    assert window_of(barred(*bars)) == window
 
 
 def test_what_is_dark_is_no_bar():
-    assert picture_window(barred(0, 14, 0, 16, value=24)) == (0, 0, 200, 100)  # all is black
+    assert window_of(barred(0, 14, 0, 16, value=24)) == (0, 0, 200, 100)  # all is black
     lit = barred(0, 14, 0, 16)
     lit[3, 60] = 25  # a star
-    assert picture_window(lit) == (0, 5, 200, 77)
+    assert window_of(lit) == (0, 5, 200, 77)
+
+
+def test_a_thing_on_black_is_not_cut_where_it_reaches_farther_in_one_image():
+    turning = [barred(40 - k, 10 + 3 * k, 40 + 7 * k, 30 - 8 * k) for k in range(4)]
+    assert window_of(*turning) == (0, 0, 200, 100)
+
+
+def test_a_film_that_fades_in_has_its_bars_cut():
+    fading = [barred(0, 14, 0, 16, value=20), barred(80, 40, 70, 30), barred(90, 45, 80, 40)]
+    assert window_of(*fading, *[barred(0, 14, 0, 16)] * 2) == (0, 16, 200, 66)
 
 
 # Errors

@@ -140,17 +140,17 @@ def global_adjustments(monkeypatch, keyframes: int, interval: int, loops: Sequen
     return adjusted
 
 
-def test_all_keyframes_are_adjusted_online_every_interval_and_later_once_a_fifth_is_new(
+def test_all_keyframes_are_adjusted_online_after_an_interval_and_then_once_half_are_new(
     monkeypatch,
 ):
-    assert global_adjustments(monkeypatch, 200, interval=20) == [20, 40, 60, 80, 100, 124, 154, 192]
+    assert global_adjustments(monkeypatch, 200, interval=20) == [20, 40, 80, 160]
     assert global_adjustments(monkeypatch, 200, interval=0) == []
-    assert global_adjustments(monkeypatch, 1000, interval=150) == [150, 300, 450, 600, 750, 937]
+    assert global_adjustments(monkeypatch, 1000, interval=150) == [150, 300, 600]
 
 
 def test_a_closed_loop_counts_as_an_adjustment_of_all(monkeypatch):
     found = global_adjustments(monkeypatch, 160, interval=20, loops=[15, 35, 120])
-    assert found == [55, 75, 95, 118, 149]
+    assert found == [70]
 
 
 def test_blank_images_are_an_error_of_one_sentence():
