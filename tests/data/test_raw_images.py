@@ -107,6 +107,9 @@ def test_images_far_apart_tell_what_is_not_black(tmp_path: Path):
     ):
         expected = [[index, 8, index, 39] for index in sampled]
         np.testing.assert_allclose(images.lit_extents, expected, atol=2)
+    cv2.imwrite(str(tmp_path / "b/00.png"), frames[0][::2])  # of another size than the others
+    folder = read_image_folder(tmp_path / "b")
+    assert folder.images.lit_extents[:2] == [[1, 8, 1, 39], [2, 8, 2, 39]]
 
 
 # Damage
