@@ -148,7 +148,7 @@ def test_on_a_full_disk_the_way_on_is_said(root: Path, monkeypatch, capsys):
 
 
 def test_a_run_that_ends_without_a_map_keeps_its_trajectory(root: Path, monkeypatch):
-    def no_depth(*arguments: object, fills: bool) -> list:
+    def no_depth(*arguments: object) -> list:
         raise InputError("expected some known depth, found none")
 
     monkeypatch.setattr(slam, "with_swept_depth", no_depth)
