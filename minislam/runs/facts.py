@@ -55,6 +55,7 @@ def run_facts(
         "frames": len(slam.tracker.tracked),
         "keyframes": len(slam.tracker.keyframes),
         "lost_frames": len(slam.lost_frames()),
+        "unread_images": len(slam.sequence.lost),
         "adjustments": graph.adjustments,
         "failed_adjustments": graph.failed_adjustments,
         "gaussians": len(slam.mapper.gaussians),

@@ -177,8 +177,10 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
         return "finished, broken", LOST_EXIT
     if has_large_holes(slam):
         return "finished, map with large holes", LOST_EXIT
-    if slam.lost_frames() or slam.sequence.lost:
+    if slam.lost_frames():
         return "finished, partly lost", LOST_EXIT
+    if slam.sequence.lost:
+        return "finished, images left out", LOST_EXIT
     return "finished", 0
 
 

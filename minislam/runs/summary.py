@@ -54,6 +54,8 @@ def _counted(facts: Mapping[str, Any]) -> Iterator[Line]:
     followed = f"{frames - lost:,} of {frames:,}"
     verdict = judge(lost / max(frames, 1), 0.0, 0.1)
     yield Line("frames followed", followed, verdict, "frames with a pose; the others are lost")
+    if unread := facts.get("unread_images"):
+        yield Line("images left out", f"{unread:,}", "poor", "damaged, or of another size")
     if facts["breaks"]:
         where = ", ".join(span(b["first_frame"], b["last_frame"]) for b in facts["breaks"])
         yield Line("broken at frames", where, "poor", "before and after do not belong together")

@@ -33,7 +33,8 @@ def ended(
         ({"shown": (0.0, 0.0)}, ("finished, map with large holes", 3)),
         ({"shown": ()}, ("finished", 0)),
         ({"lost": 1}, ("finished, partly lost", 3)),
-        ({"undecoded": 1}, ("finished, partly lost", 3)),
+        ({"undecoded": 1}, ("finished, images left out", 3)),
+        ({"undecoded": 1, "lost": 1}, ("finished, partly lost", 3)),
     ],
 )
 def test_a_run_that_is_not_whole_ends_with_three(parts: dict, ending: tuple[str, int]):

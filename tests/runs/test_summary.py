@@ -7,6 +7,7 @@ from minislam.runs.summary import as_text, judge, summarise
 FACTS = {
     "frames": 60,
     "lost_frames": 3,
+    "unread_images": 0,
     "breaks": [],
     "keyframes": 14,
     "gaussians": 14083,
@@ -46,6 +47,16 @@ def test_numbers_have_units_words_and_verdicts():
     assert lines({"path_length": 1.0}, unit="world units")["path of the camera"][0] == (
         "1.00 world units"
     )
+
+
+def test_images_left_out_are_said():
+    assert lines(unread_images=11)["images left out"] == ("11", "poor", "")
+
+
+def test_fog_of_guessed_depth_is_poor():
+    verdicts = [lines({"guessed_depth": value}) for value in (0.2, 0.5, 0.96)]
+    what = "static pixels of guessed depth"
+    assert [found[what][1] for found in verdicts] == ["good", "fair", "poor"]
 
 
 def test_a_broken_trajectory_is_said():
