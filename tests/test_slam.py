@@ -41,7 +41,7 @@ METRICS = [
     "psnr_unseen_db", "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
     "left_out", "shown_static", "guessed_depth",
-    "path_length", "reprojection_px", "beyond_turns_px",
+    "path_length", "reprojection_px", "beyond_turns_px", "depth_difference",
 ]  # fmt: skip
 INRIA_HEADER = """ply
 format binary_little_endian 1.0

@@ -166,6 +166,7 @@ def _ties(slam: Slam) -> dict[str, float | None]:
         "path_length": float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
         "reprojection_px": error,
         "beyond_turns_px": slam.tracker.watch.beyond_turns,
+        "depth_difference": slam.tracker.watch.depth_difference,
     }
 
 

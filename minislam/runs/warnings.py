@@ -18,6 +18,8 @@ LEAST_SHOWN = 0.75
 # Of the images, in their mean [-]: where movers are gone and the room is whole, beta leaves out .02
 # to .23; of a night crowd in rain, whose map has holes, .36.
 MOST_LEFT_OUT = 0.3
+# Relative, of depths by earlier and by later keyframes (tests/benchmarks/diary/broken_runs.md).
+MOST_DIFFERENCE = 0.2
 BROKEN = "the trajectory is broken"  # how a warning of breaks begins
 _FAR_APART = "If the images lie far apart, give more frames per second (a smaller --stride)"
 
@@ -110,6 +112,13 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             f"{watch.beyond_turns:.2f} px between neighbouring keyframes (median, for 320x240). "
             "Depth is hardly determined, and near and far may be exchanged; film while you walk "
             "sideways, and look at the pictures of the depth"
+        )
+    elif (watch.depth_difference or 0.0) > MOST_DIFFERENCE and not keyframes.has_prior:
+        yield (
+            f"depths by earlier and by later keyframes differ by {watch.depth_difference:.0%} "
+            "(median): what moves the image is not only a camera that walks through a scene that "
+            "stands still (a stabilised film, water, a zoom?). Near and far may be in disorder; "
+            "look at the pictures of the depth"
         )
     if keyframes.overlay is not None:
         yield (

@@ -40,6 +40,7 @@ def finished(**parts: object) -> SimpleNamespace:
         watch=SimpleNamespace(
             diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
             beyond_turns=0.41,
+            depth_difference=parts.pop("depth_difference", 0.1),
             hardly_walked=parts.pop("hardly_walked", False),
             breaks=parts.pop("breaks", []),
             segments=[(0, 5), (7, 7)],

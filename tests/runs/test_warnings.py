@@ -98,6 +98,15 @@ def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_
     assert "hardly any parallax" in warning
 
 
+def test_depths_that_change_with_the_views_are_warned_of_where_no_prior_tells_depth():
+    changing = {"depth_difference": 0.26}
+    assert not list(warnings(finished(**changing)))
+    warning, _ = warnings(finished(**changing, has_prior=False))
+    assert "differ by 26% (median)" in warning
+    warning, _ = warnings(finished(**changing, has_prior=False, hardly_walked=True))  # said once
+    assert "hardly did more than turn" in warning
+
+
 @pytest.mark.parametrize("broken", [{"lost": 1}, {"failed": 3}])
 def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
     (warning,) = warnings(finished(focal_length=DOUBTFUL, **broken))

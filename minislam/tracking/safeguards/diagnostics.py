@@ -21,6 +21,7 @@ from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
+from minislam.tracking.safeguards.depth_agreement import depth_difference
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.robust import weighted_median
 from minislam.tracking.safeguards.scale_certainty import scale_deviations
@@ -74,6 +75,7 @@ class Watch(Stateful):
     diagnostics: list[KeyframeDiagnostics]
     breaks: list[Break]  # known at the end, because the newest depths are rough
     beyond_turns: float | None = None  # px of a 320x240 image, at the end: `flow_beyond_turns`
+    depth_difference: float | None = None  # at the end: `depth_agreement.py` [-]
     resting: float = 0.0  # fraction of the keyframes, at the end: `fraction_at_rest` [-]
     confirmed: float = 1.0  # fraction of all cells that sweeps confirm, once they have swept [-]
 
@@ -91,6 +93,7 @@ class Watch(Stateful):
         self.judge()
         graph = self._graph
         self.beyond_turns, self.resting = flow_beyond_turns(graph), fraction_at_rest(graph)
+        self.depth_difference = depth_difference(graph)
         judged = self.diagnostics
         if self.only_turned:  # depths are arbitrary, and a pan leaves old cells behind
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]

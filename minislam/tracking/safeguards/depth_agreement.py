@@ -1,0 +1,56 @@
+"""Whether earlier and later views measure the same depths, not in the paper.
+
+What the flow shows need not be the parallax of a scene that stands still: a stabilised film bends
+its images, water runs, a lens zooms. Depths fit such flow as well, but others at other times.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from minislam.tracking.bundle_adjustment import MIN_DISPARITY, normal_equations
+from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.optimisation import bundle_problem
+
+MOST_KEYFRAMES = 100  # evenly spread, whose depths are compared
+LEAST_INFORMATION = 0.05  # of what is usual in the keyframe: a cell with less is not compared [-]
+LEAST_CELLS = 0.15  # fraction of the cells that both sides must see [-]
+
+
+def depth_difference(graph: KeyframeGraph) -> float | None:
+    """Return by how much depths from earlier keyframes differ from those from later ones [-].
+
+    It is |ln(depth / depth)|, the median over the cells of a keyframe, then over the keyframes.
+    None: no keyframe has enough cells that keyframes on both sides see.
+    """
+    step = math.ceil(len(graph.keyframes) / MOST_KEYFRAMES) or 1
+    edges = [(p, *ends) for p, ends in enumerate(graph.edges.ends) if ends[0] % step == 0]
+    earlier = [position for position, source, target in edges if target < source]
+    later = [position for position, source, target in edges if target > source]
+    if not (earlier and later):
+        return None
+    (before, known_before), (after, known_after) = (_measured(graph, p) for p in (earlier, later))
+    information = torch.minimum(known_before, known_after)
+    differences = []
+    for k, row in enumerate(information):
+        seen = row > LEAST_INFORMATION * row[row > 0].median() if (row > 0).any() else row > 0
+        if seen.float().mean() > LEAST_CELLS:
+            differences.append(float((before[k] / after[k])[seen].log().abs().median()))
+    return median(differences) if differences else None
+
+
+def _measured(graph: KeyframeGraph, positions: Sequence[int]) -> tuple[Tensor, Tensor]:  # (K, N)
+    """Return the disparities that some edges alone measure, poses held, and their information.
+
+    It is a Gauss-Newton step of Eq. (5) from the disparities that all edges measure.
+    """
+    problem = bundle_problem(graph, positions, 0, 0.0)
+    problem = replace(problem, free_poses=torch.zeros_like(problem.free_poses))
+    equations = normal_equations(problem, graph.state)
+    C, known = equations.disparity_diagonal, equations.disparity_diagonal > 0
+    moved = equations.disparity_gradient / torch.where(known, C, torch.ones_like(C))
+    return (graph.state.disparities + moved).clamp_min(MIN_DISPARITY), C
