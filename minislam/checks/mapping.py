@@ -52,14 +52,13 @@ def check_sampling(student: Function) -> Verdict:
     at_half = "Compare the window's part of all keyframes with its probability."
     mistakes = [
         (unguarded, "While the window is most of the map, all keyframes are equally likely."),
+        (lambda n, w, s: (uniform if 2 * len(w) > n else unguarded)(n, w, s), at_half),
         (uniform, "The window should get its probability, however many others there are."),
         (lambda n, w, s: shared(n, w, 1 / len(w), 0), "The others: the map would forget them."),
         (lambda n, w, s: shared(n, w, s, 1 - s), "The probability is that of the whole window."),
-        (lambda n, w, s: right(n, [*{*range(n)} - {*w}], s), "It is the window's probability."),
         (lambda n, w, s: unguarded(n, w, 1 - s), "It belongs to the window."),
         (lambda n, w, s: right(n, w, 0.5), "One half is one probability of many."),
         (lambda n, w, s: right(n, [*range(n)][-len(w) :], s), "Not the newest, but the window."),
-        (lambda n, w, s: (uniform if 2 * len(w) > n else unguarded)(n, w, s), at_half),
     ]
     return check_function(student, right, cases, 1e-6, mistakes)
 
