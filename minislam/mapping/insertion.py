@@ -8,30 +8,10 @@ from torch.nn import functional
 
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.mapping.config import InsertionConfig
-from minislam.records import Keyframe
 from minislam.splatting import GaussianMap, Rendering
-from minislam.uncertainty.losses import FAR_FACTOR
 
 EXPLAINED_OPACITY = 0.8  # a pixel of the map that is at least so opaque gets no new Gaussian
 _SMALLEST_SCALE = 1e-8  # world units; a scale must be positive, because its logarithm is stored
-
-
-def gaussians_of_keyframe(
-    keyframe: Keyframe,
-    position: int,  # among the keyframes of the map
-    camera: Camera,
-    rendering: Rendering | None,  # the map from this view, None while it is empty
-    weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
-    median_depth: float,  # world units, of the scene
-    config: InsertionConfig,
-    generator: torch.Generator,
-) -> GaussianMap:
-    """Return the Gaussians that a keyframe adds to the map: at most one per cell."""
-    allowed = insertable_pixels(keyframe.depth, FAR_FACTOR * median_depth, weight, rendering)
-    pixels = draw_pixels(keyframe.depth > 0, config.cell, generator)
-    pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
-    view = keyframe.levelled, keyframe.depth, camera, keyframe.T_camera_world
-    return gaussians_at_pixels(pixels, *view, position, config)
 
 
 def insertable_pixels(

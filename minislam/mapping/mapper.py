@@ -14,7 +14,12 @@ from torch import Tensor
 from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.gaps import filled_depth, is_refuted
-from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
+from minislam.mapping.insertion import (
+    draw_pixels,
+    gaussians_at_pixels,
+    insertable_pixels,
+    is_on_dynamic_object,
+)
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import median_depth, view_gradients
@@ -139,9 +144,13 @@ class Mapper(JointOptimisation):
             farthest = MOST_FAR * FAR_FACTOR * self.median_depth
             keyframe = replace(keyframe, depth=filled_depth(known).clamp_max(farthest))
         weight = self.static_weight(self.beta_of(keyframe), self.camera)
-        scene = self.camera, rendering, weight, self.median_depth
+        far_limit = FAR_FACTOR * self.median_depth
+        allowed = insertable_pixels(keyframe.depth, far_limit, weight, rendering)
+        pixels = draw_pixels(keyframe.depth > 0, self.cell, self._generator)
+        pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
+        view = keyframe.levelled, keyframe.depth, self.camera, keyframe.T_camera_world
         insertion = replace(self.config.insertion, cell=self.cell)
-        new = gaussians_of_keyframe(keyframe, position, *scene, insertion, self._generator)
+        new = gaussians_at_pixels(pixels, *view, position, insertion)
         if fills:
             views = self.keyframes[position], self.keyframes
             new = new.prune(~is_refuted(new.means, self.camera, *views))
