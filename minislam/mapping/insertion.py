@@ -61,10 +61,7 @@ def gaussians_at_pixels(
     position: int,  # of the keyframe that the new Gaussians are anchored to
     config: InsertionConfig,
 ) -> GaussianMap:
-    """Back-project pixels to round Gaussians that just cover their cells.
-
-    The first scale is `config.footprint` times the side of a cell at the depth of the pixel.
-    """
+    """Back-project pixels to round Gaussians that just cover their cells at that depth."""
     column, row = pixels.unbind(-1)
     z = depth[row, column]
     points_camera = camera.backproject(pixels.to(z), z)
@@ -89,10 +86,7 @@ def is_on_dynamic_object(
     T_camera_world: Tensor,  # (4, 4) float64, of the keyframe they were inserted for
     weight: Tensor,  # (H, W) static weight of that keyframe, 0 on dynamic objects
 ) -> Tensor:  # (N,) bool
-    """Tell which Gaussians project to pixels of static weight 0 in their own keyframe.
-
-    They were inserted before the MLP had learned that the object there moves.
-    """
+    """Tell which Gaussians project to pixels of static weight 0 in their own keyframe."""
     # Optimisation may have moved a Gaussian out of the image: the nearest pixel counts.
     z, row, column, _ = nearest_pixels(means, camera, T_camera_world)
     return (z > 0) & (weight[row, column] == 0)

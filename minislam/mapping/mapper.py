@@ -67,10 +67,7 @@ class Mapper(JointOptimisation):
         self._replace_dynamic_gaussians()
 
     def integrate(self, keyframe: Keyframe) -> None:
-        """Add one keyframe: window, removal on dynamic objects, insertion, then optimisation.
-
-        With a `keyframe_stride` of n, map and MLP are optimised at every n-th keyframe only.
-        """
+        """Add one keyframe: window, removal on dynamic objects, insertion, then optimisation."""
         assert self.keyframes, "call initialise first"
         self.keyframes.append(keyframe)
         new = len(self.keyframes) - 1
@@ -171,10 +168,7 @@ class Mapper(JointOptimisation):
         self._reset_gradients()
 
     def _exclude_upper_mode(self) -> None:
-        """Exclude the upper mode of all betas, if there is one, and the map is wrong there.
-
-        Only images with confirmation decide.
-        """
+        """Exclude the upper mode of beta in images with confirmation, if the map is wrong there."""
         swept = [keyframe for keyframe in self.keyframes if keyframe.confirmation is not None]
         if not swept or not self.uncertainty.is_learned:
             return
