@@ -61,8 +61,6 @@ def _copied(value: Any, dtype: torch.dtype | None) -> Any:
     """Return a copy, with all tensors of real numbers in a dtype unless it is None."""
     if isinstance(value, Tensor):
         return value.clone().to(dtype if dtype and value.is_floating_point() else value.dtype)
-    if isinstance(value, torch.Generator):
-        return value.clone_state()
     if type(value) in (list, tuple):
         return type(value)(_copied(part, dtype) for part in value)
     return copy.deepcopy(value)

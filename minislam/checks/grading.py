@@ -95,10 +95,7 @@ def _verdict(status: str, sentence: str, hint: str = "") -> Verdict:
 
 
 def is_written(function: Function) -> bool:
-    """Say whether an exercise's function has a body; where not, print what to do.
-
-    In a notebook, the cell that uses the function begins with `if checks.is_written(NAME):`.
-    """
+    """Say whether an exercise's function has a body; where not, print what to do."""
     steps = list(dis.get_instructions(function))
     is_stub = any(step.argval == "NotImplementedError" for step in steps)
     is_empty = {step.argval for step in steps if step.opname != "RESUME"} <= {None, ""}

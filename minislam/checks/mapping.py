@@ -12,12 +12,13 @@ from minislam.checks.cases import CAMERA, Case, doubles, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 from minislam.mapping import pose_refinement
-from minislam.mapping.config import InsertionConfig, MappingConfig, PoseRefinementConfig
+from minislam.mapping.config import InsertionConfig, PoseRefinementConfig
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.insertion import EXPLAINED_OPACITY, gaussians_at_pixels
-from minislam.mapping.losses import METRIC_MEDIAN, render_loss
+from minislam.mapping.losses import color_loss, isotropic_loss
 from minislam.mapping.window import sampling_probabilities
-from minislam.splatting import GaussianMap, Rendering, render
+from minislam.splatting import GaussianMap, render
+from minislam.uncertainty.losses import depth_loss
 
 
 def check_sampling(student: Function) -> Verdict:
@@ -51,14 +52,13 @@ def check_sampling(student: Function) -> Verdict:
     at_half = "Compare the window's part of all keyframes with its probability."
     mistakes = [
         (unguarded, "While the window is most of the map, all keyframes are equally likely."),
+        (lambda n, w, s: (uniform if 2 * len(w) > n else unguarded)(n, w, s), at_half),
         (uniform, "The window should get its probability, however many others there are."),
         (lambda n, w, s: shared(n, w, 1 / len(w), 0), "The others: the map would forget them."),
         (lambda n, w, s: shared(n, w, s, 1 - s), "The probability is that of the whole window."),
-        (lambda n, w, s: right(n, [*{*range(n)} - {*w}], s), "It is the window's probability."),
         (lambda n, w, s: unguarded(n, w, 1 - s), "It belongs to the window."),
         (lambda n, w, s: right(n, w, 0.5), "One half is one probability of many."),
         (lambda n, w, s: right(n, [*range(n)][-len(w) :], s), "Not the newest, but the window."),
-        (lambda n, w, s: (uniform if 2 * len(w) > n else unguarded)(n, w, s), at_half),
     ]
     return check_function(student, right, cases, 1e-6, mistakes)
 
@@ -156,22 +156,18 @@ def check_map_loss(student: Function) -> Verdict:
 
     The answer is compared together with its derivative by the colour.
     """
-    config = MappingConfig(lambda_ssim=0.0)
 
     def reference(*a: Tensor, shares: Any = (0.8, 0.2, 10.0), flaw: str = "") -> Tensor:
         color, depth, image, reference_depth, weight, scales = a
-        none = depth.new_zeros(len(scales))
-        points, quats = none[:, None].expand(-1, 3), none[:, None].expand(-1, 4)
-        gaussians = GaussianMap(points, quats, scales.log(), none, points, none.long())
-        rendering = Rendering(color, depth, torch.zeros_like(depth), none)
-        view = image, reference_depth, weight
-        loss = render_loss(gaussians, rendering, *view, METRIC_MEDIAN, config)
-        unknown = (reference_depth == 0).double()
-        depth_loss = loss.depth / (1 - unknown.mean()) if flaw == "of known" else loss.depth
+        of_color = weight * color_loss(color, image, 0.0)
+        of_depth = weight * depth_loss(depth, reference_depth, torch.inf)
+        unknown = reference_depth == 0
         if flaw == "with unknown":
-            depth_loss = depth_loss + (weight * unknown * depth).mean()
-        spread = (scales - scales.mean()).abs().mean() if flaw == "one mean" else loss.isotropic
-        return shares[0] * loss.color + shares[1] * depth_loss + shares[2] * spread
+            of_depth = of_depth + weight * unknown * depth
+        of_depth = of_depth[~unknown] if flaw == "of known" else of_depth
+        spread = scales - scales.mean()
+        of_scales = spread.abs().mean() if flaw == "one mean" else isotropic_loss(scales)
+        return shares[0] * of_color.mean() + shares[1] * of_depth.mean() + shares[2] * of_scales
 
     def outcome(loss: Function, color: Tensor, *rest: Tensor) -> Any:
         """Return the loss and its derivative by the colour, 0 if it has none."""

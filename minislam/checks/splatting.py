@@ -136,11 +136,11 @@ def check_rendered_image(student: Function) -> Verdict:
     uncut = patch("minislam.splatting.constants.MIN_ALPHA", 0.0)(rendered)
     mistakes = [
         ("unsorted", "Sort by the depth in the camera frame: the list has no order."),
+        ("world", "Sort by the depth in the camera frame, not by z in the world."),
         ("far first", "This is sorted the wrong way: the nearest Gaussian comes first."),
         ("behind", "A Gaussian behind the camera (z < 0.05) is not seen: leave it out."),
         ("near", "What is nearer than 0.05 m is not seen: leave it out."),
         ("distance", "Sort by the depth z, not by the distance."),
-        ("world", "Sort by the depth in the camera frame, not by z in the world."),
         (uncapped, "No opacity is more than 0.99."),
         (uncut, "Drop each alpha that is not above 1/255."),
         (partial(uncapped, flaw="alpha"), "The opacity is capped at 0.99, not alpha."),

@@ -43,7 +43,6 @@ def check_plane_homography(student: Function) -> Verdict:
         (lambda K, T, q: reference(K, T, -q), "The sign of the translation is the other one."),
         (lambda K, T, q: reference(K, T, 0.0), "The translation is missing."),
         (other_axis, "t stands in the last column, t n^T, not in the last row."),
-        (lambda K, T, q: torch.linalg.inv(reference(K, T, q)), "This maps the other image to us."),
         (lambda K, T, q: reference(K, T, q) @ K @ K, "The last factor is K^-1, not K."),
     ]
     return check_function(student, reference, cases, 1e-9, mistakes)

@@ -113,7 +113,6 @@ def check_suppressed(student: Function) -> Verdict:
         (of_radius(lambda n, most: max(min(n - 2, most), 0), torch.inf), "A diamond: |a| + |b|."),
         (of_radius(lambda n, most: most), "Near the diagonal the radius shrinks: |i - j| - 2."),
         (lambda *a: reference(*a) + reference(*a).T, "Only pairs (newer, older), a > b."),
-        (of_radius(lambda n, most: min(n, most)), "At most |i - j| - 2: take 2 off."),
         (of_radius(lambda n, most: min(n - 2, most)), "A radius is at least 0: the pair itself."),
         (of_radius(lambda n, most: max(min(n - 2, most), 0) - 1), "Up to the radius: <=, not <."),
         (of_radius(lambda n, most: max(n - 2, 0)), "The radius is at most the suppression."),

@@ -41,7 +41,6 @@ def check_mapping_weight(student: Function) -> Verdict:
         (lambda b: uncapped(b).clamp(0.1, 5), "Weights below 0.1 become 0, not 0.1."),
         (lambda b: cut(0.5 / (adjusted_beta(b, camera) + 0.1631579) ** 2), "Take off 0.1 first."),
         (lambda beta: cut(0.5 / beta**2), "This is 0.5 / beta^2: beta is adjusted first."),
-        (lambda beta: cut(0.5 / beta.clamp_min(0.1) ** 2), "beta is cut, but not adjusted yet."),
         (lambda beta: cut(2 * uncapped(beta)), "It is a half by beta_adj^2: 0.5 is missing."),
         (lambda beta: cut((0.5 * uncapped(beta)).sqrt()), "The adjusted beta must be squared."),
     ]
@@ -82,7 +81,7 @@ def check_feature_variance(student: Function) -> Verdict:
         near = (unit @ unit.T > (-2 if flaw == "all" else config.similarity)).to(beta)
         near = near.fill_diagonal_(0) if flaw == "others" else near
         count = near.sum(1, keepdim=True)
-        means = beta.mean() if flaw == "one mean" else near @ beta[:, None] / count
+        means = near @ beta[:, None] / count
         variances = (near * (beta - means) ** 2 / (count - int(flaw == "one less"))).sum(1)
         variances = variances.nan_to_num().sqrt() if flaw == "root" else variances.nan_to_num()
         return variances.sum() if flaw == "sum" else variances.mean()
@@ -100,7 +99,6 @@ def check_feature_variance(student: Function) -> Verdict:
         ("root", "The variance is the square of this."),
         ("others", "A cell is one of its own neighbours."),
         ("one less", "Divide by the number, not by one less."),
-        ("one mean", "The mean is that of the similar cells, not that of all."),
         ("sum", "The mean over the cells is asked for."),
     ]
     return check_function(student, variance, cases, 1e-9, mistakes)

@@ -8,30 +8,10 @@ from torch.nn import functional
 
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.mapping.config import InsertionConfig
-from minislam.records import Keyframe
 from minislam.splatting import GaussianMap, Rendering
-from minislam.uncertainty.losses import FAR_FACTOR
 
 EXPLAINED_OPACITY = 0.8  # a pixel of the map that is at least so opaque gets no new Gaussian
 _SMALLEST_SCALE = 1e-8  # world units; a scale must be positive, because its logarithm is stored
-
-
-def gaussians_of_keyframe(
-    keyframe: Keyframe,
-    position: int,  # among the keyframes of the map
-    camera: Camera,
-    rendering: Rendering | None,  # the map from this view, None while it is empty
-    weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
-    median_depth: float,  # world units, of the scene
-    config: InsertionConfig,
-    generator: torch.Generator,
-) -> GaussianMap:
-    """Return the Gaussians that a keyframe adds to the map: at most one per cell."""
-    allowed = insertable_pixels(keyframe.depth, FAR_FACTOR * median_depth, weight, rendering)
-    pixels = draw_pixels(keyframe.depth > 0, config.cell, generator)
-    pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
-    view = keyframe.levelled, keyframe.depth, camera, keyframe.T_camera_world
-    return gaussians_at_pixels(pixels, *view, position, config)
 
 
 def insertable_pixels(
@@ -81,10 +61,7 @@ def gaussians_at_pixels(
     position: int,  # of the keyframe that the new Gaussians are anchored to
     config: InsertionConfig,
 ) -> GaussianMap:
-    """Back-project pixels to round Gaussians that just cover their cells.
-
-    The first scale is `config.footprint` times the side of a cell at the depth of the pixel.
-    """
+    """Back-project pixels to round Gaussians that just cover their cells at that depth."""
     column, row = pixels.unbind(-1)
     z = depth[row, column]
     points_camera = camera.backproject(pixels.to(z), z)
@@ -109,10 +86,7 @@ def is_on_dynamic_object(
     T_camera_world: Tensor,  # (4, 4) float64, of the keyframe they were inserted for
     weight: Tensor,  # (H, W) static weight of that keyframe, 0 on dynamic objects
 ) -> Tensor:  # (N,) bool
-    """Tell which Gaussians project to pixels of static weight 0 in their own keyframe.
-
-    They were inserted before the MLP had learned that the object there moves.
-    """
+    """Tell which Gaussians project to pixels of static weight 0 in their own keyframe."""
     # Optimisation may have moved a Gaussian out of the image: the nearest pixel counts.
     z, row, column, _ = nearest_pixels(means, camera, T_camera_world)
     return (z > 0) & (weight[row, column] == 0)

@@ -92,10 +92,7 @@ def color_loss(
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
     lambda_ssim: float,  # weight of SSIM in [0, 1]
 ) -> Tensor:  # (H, W)
-    """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM) per pixel, mean over channels. Eq. (7).
-
-    It is 0 on black pixels: they are the border that undistortion leaves.
-    """
+    """Return (1 - lambda) |I^ - I| + lambda (1 - SSIM), mean over RGB, 0 where black. Eq. (7)."""
     absolute = (rendered - image).abs().mean(-1)
     loss = (1 - lambda_ssim) * absolute
     if lambda_ssim > 0:

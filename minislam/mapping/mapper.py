@@ -14,7 +14,12 @@ from torch import Tensor
 from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.gaps import filled_depth, is_refuted
-from minislam.mapping.insertion import gaussians_of_keyframe, is_on_dynamic_object
+from minislam.mapping.insertion import (
+    draw_pixels,
+    gaussians_at_pixels,
+    insertable_pixels,
+    is_on_dynamic_object,
+)
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import median_depth, view_gradients
@@ -62,10 +67,7 @@ class Mapper(JointOptimisation):
         self._replace_dynamic_gaussians()
 
     def integrate(self, keyframe: Keyframe) -> None:
-        """Add one keyframe: window, removal on dynamic objects, insertion, then optimisation.
-
-        With a `keyframe_stride` of n, map and MLP are optimised at every n-th keyframe only.
-        """
+        """Add one keyframe: window, removal on dynamic objects, insertion, then optimisation."""
         assert self.keyframes, "call initialise first"
         self.keyframes.append(keyframe)
         new = len(self.keyframes) - 1
@@ -139,9 +141,13 @@ class Mapper(JointOptimisation):
             farthest = MOST_FAR * FAR_FACTOR * self.median_depth
             keyframe = replace(keyframe, depth=filled_depth(known).clamp_max(farthest))
         weight = self.static_weight(self.beta_of(keyframe), self.camera)
-        scene = self.camera, rendering, weight, self.median_depth
+        far_limit = FAR_FACTOR * self.median_depth
+        allowed = insertable_pixels(keyframe.depth, far_limit, weight, rendering)
+        pixels = draw_pixels(keyframe.depth > 0, self.cell, self._generator)
+        pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
+        view = keyframe.levelled, keyframe.depth, self.camera, keyframe.T_camera_world
         insertion = replace(self.config.insertion, cell=self.cell)
-        new = gaussians_of_keyframe(keyframe, position, *scene, insertion, self._generator)
+        new = gaussians_at_pixels(pixels, *view, position, insertion)
         if fills:
             views = self.keyframes[position], self.keyframes
             new = new.prune(~is_refuted(new.means, self.camera, *views))
@@ -162,10 +168,7 @@ class Mapper(JointOptimisation):
         self._reset_gradients()
 
     def _exclude_upper_mode(self) -> None:
-        """Exclude the upper mode of all betas, if there is one, and the map is wrong there.
-
-        Only images with confirmation decide.
-        """
+        """Exclude the upper mode of beta in images with confirmation, if the map is wrong there."""
         swept = [keyframe for keyframe in self.keyframes if keyframe.confirmation is not None]
         if not swept or not self.uncertainty.is_learned:
             return

@@ -43,6 +43,15 @@ def test_known_mistakes_of_mapping_are_named():
 
     verdict = check_sampling(without_guard)
     assert "for 13 keyframes" in verdict.sentence and "equally likely" in verdict.sentence
+
+    def guarded_at_half(count: int, window: list[int], weight: float) -> Tensor:
+        is_small = 2 * len(window) <= count
+        return without_guard(count, window, weight) if is_small else torch.ones(count) / count
+
+    verdict = check_sampling(guarded_at_half)
+    assert "Compare the window's part" in verdict.sentence
+    verdict = check_sampling(lambda n, w, s: sampling(n, w, s) * (1 + (len(w) == n)))
+    assert "for a window that holds all keyframes" in verdict.sentence
     inverse = check_deformed_means(lambda x, r, a, b: deformed_means(x, r, b, a))
     assert inverse.status == WRONG
     first = check_deformed_means(lambda x, r, a, b: deformed_means(x, 0 * r, a, b))

@@ -136,6 +136,8 @@ def test_a_rendered_image_is_told_from_a_wrong_one():
         "above 1/255": partial(rendered, flaw="uncut"),
     }
     assert_variants(check_rendered_image, {"one": rendered, "other": rendered_by_pixels}, wrong)
+    verdict = check_rendered_image(wrong["by z in the world"])
+    assert "not by z in the world" in verdict.sentence
 
 
 @pytest.mark.parametrize("seed", [106, 125, 132])
