@@ -141,7 +141,29 @@ def test_the_paper_and_the_package_keep_their_budgets():
     assert package_lines() <= PACKAGE_BUDGET
 
 
+@pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy")
+def test_a_notebook_names_every_public_function_of_the_reading_path():
+    cells = [cell for path in NOTEBOOKS for cell in load(path)["cells"]]
+    words = set(re.findall(r"\w+", "\n".join(map(source, cells))))
+    for name, *_ in PATH[:-1]:
+        tree = ast.parse((PACKAGE / name.strip("`")).read_text(encoding="utf-8"))
+        functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        missing = {function for function in functions - words if function[0] != "_"}
+        assert not missing, f"expected a notebook that names {missing} of {name}"
+
+
 # README and the other documents
+
+
+def test_the_tests_of_what_readme_promises_exist():
+    *promises, not_promised = rows_below("| promise | test |")
+    assert not_promised[0].startswith("Not promised: ")
+    for promise, tests in promises:
+        named = re.findall(r"`([\w/]+\.py)(?:: (\w+))?`", tests)
+        assert named, promise
+        for module, function in named:
+            text = (ROOT / "tests" / module).read_text(encoding="utf-8")
+            assert f"\ndef {function}" in text, f"{module} has no {function}"
 
 
 def test_readme_is_short():

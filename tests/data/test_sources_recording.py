@@ -10,7 +10,8 @@ from minislam.data.options import InputOptions
 from minislam.data.sequence import RecordedSequence, open_sequence
 from minislam.data.tum import read_tum_folder
 from minislam.errors import InputError
-from tests.recordings import picture, tum_folder, video
+from minislam.priors.files import FrameFiles
+from tests.recordings import picture, save, tum_folder, video
 
 # Known answers
 
@@ -133,3 +134,43 @@ def test_a_mask_of_another_size_is_refused(tmp_path: Path):
     (tmp_path / "given/a.png").write_bytes(encode_png(np.zeros((9, 9), np.uint8)))
     with pytest.raises(InputError, match=r"of one size, .* found 9x9 in .*a\.png"):
         open_sequence(source, InputOptions(masks=given)).given_mask(0)
+
+
+# Order
+
+LISTINGS = "iterdir", "glob", "rglob"
+
+
+def listed(monkeypatch: pytest.MonkeyPatch, backwards: bool) -> None:
+    """Let the system list the files of a folder in the order of their names, or the other way."""
+    for name in LISTINGS:
+        original = getattr(Path, name)
+
+        def ordered(path: Path, *pattern: str, original=original) -> list[Path]:
+            return sorted(original(path, *pattern), reverse=backwards)
+
+        monkeypatch.setattr(Path, name, ordered)
+
+
+def test_the_order_in_which_the_system_lists_files_changes_nothing(tmp_path: Path, monkeypatch):
+    source = photos(tmp_path / "photos", "b10", "b9", "b11")
+    given = masks(tmp_path / "given", "b9", "b10", "b11")
+    folder = tum_folder(tmp_path / "tum")
+    for name, camera in (("README.md", "freiburg2"), ("README.txt", "freiburg1")):
+        (folder / name).write_text(camera)
+    (folder / "calibration.txt").unlink()
+    for path in (folder / "rgb").iterdir():  # of the shape that the named cameras have
+        save(path, picture(3, 64, 48))
+    (tmp_path / "depth").mkdir()
+    for value, name in enumerate(("0.npz", "0.npy", "1.npy")):
+        (tmp_path / "depth" / name).write_bytes(bytes(value))
+    found = []
+    for backwards in (False, True):
+        with monkeypatch.context() as patch:
+            listed(patch, backwards)
+            sequence = open_sequence(source, InputOptions(masks=given))
+            frames = [frame.pixels.sum().item() for frame in sequence]
+            named = read_tum_folder(folder).calibration
+            files = FrameFiles(tmp_path / "depth", "depth", (".npy", ".npz"))
+            found.append((frames, columns(sequence), named, files.first))
+    assert found[0] == found[1] and found[0][1] == [1, 2, 3] and found[0][2] is not None

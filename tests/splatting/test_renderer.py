@@ -87,6 +87,19 @@ def test_two_runs_give_the_same_bytes():
         assert torch.equal(one, other)
 
 
+def test_two_threads_change_less_than_single_precision_does():
+    gaussians, pose = random_map("ordinary", 600, 8), random_pose(1).float()
+    parts = converted(gaussians, torch.float32), Camera(70.0, 65.0, 60.0, 45.0, 120, 90), pose
+    threads, found = torch.get_num_threads(), []
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        rendering, leaves = gradients(render, *parts, torch.zeros(6), 0)
+        found.append([values.detach() for values in (*rendering[:3], *leaves)])
+    torch.set_num_threads(threads)
+    for one, two in zip(*found, strict=True):
+        assert float((one - two).norm() / one.norm()) < 1e-6  # sums in another order: 2e-7
+
+
 def test_float32_follows_float64():
     gaussians, pose = random_map("ordinary", 300, 3), random_pose(3)
     camera = Camera(70.0, 65.0, 31.0, 25.0, 61, 45)

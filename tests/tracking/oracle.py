@@ -44,6 +44,7 @@ class Skill:
 
 SKILLS = {
     "good network": Skill(),
+    "noise of half a pixel": Skill(noise=0.5),
     "one cell per update": Skill(gain=0.4, cap=1.0),
     "confidence .3": Skill(confidence=0.3),
     "15 % confident": Skill(confidence=0.8, confident=0.15),

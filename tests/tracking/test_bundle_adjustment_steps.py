@@ -155,6 +155,25 @@ def test_a_keyframe_without_edges_follows_its_prior_alone():
     assert (end.disparities[3] - known.truth.disparities[3]).abs().max() < 0.2 * before
 
 
+@pytest.mark.parametrize("robust", [None, RobustKernel(2.0)])
+def test_without_any_edge_poses_stay_and_disparities_follow_their_prior(robust):
+    known = with_prior(known_problem(), weight=3.0)
+    none = torch.zeros(0, dtype=torch.long)
+    problem = replace(
+        known.problem,
+        edges_source=none,
+        edges_target=none,
+        targets=known.problem.targets[:0],
+        weights=known.problem.weights[:0],
+        robust=robust,
+    )
+    start = perturbed(known, 0.02)
+    end, report = bundle_adjust(problem, start, iterations=4)
+    torch.testing.assert_close(end.T_camera_world, start.T_camera_world, rtol=0, atol=1e-14)
+    torch.testing.assert_close(end.disparities, known.truth.disparities)
+    assert report.converged
+
+
 def test_a_held_disparity_of_zero_is_a_point_at_infinity():
     known = known_problem()
     disparities = known.truth.disparities.clone()

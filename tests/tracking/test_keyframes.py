@@ -43,6 +43,12 @@ def test_rows_come_back_as_they_were_given():
         assert (store.metric_depths[index] is None) == bool(index % 2)
 
 
+def test_there_is_no_largest_number_of_keyframes():
+    store = filled(400)  # the official buffer has 350 places
+    assert len(store) == len(store.frames) == len(store.features) == 400
+    assert torch.equal(store.disparities[399], uniform(399, CELLS).float())
+
+
 def test_poses_are_float64_and_cells_float32():
     store = filled(2)
     assert store.T_camera_world.dtype == torch.float64

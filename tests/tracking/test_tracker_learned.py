@@ -20,6 +20,7 @@ pytestmark = pytest.mark.slow
 WARM_UP = 4  # keyframes, so that some follow
 BLACK = range(20, 23)  # frames, after the warm-up
 CASES = [
+    ("laptop", "noise of half a pixel"),  # beside depth that is wrong by 7 %
     ("laptop", "one cell per update"),
     ("laptop", "15 % confident"),
     ("laptop", "8 % confident"),
