@@ -28,10 +28,9 @@ def is_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
-def natural_key(name: str) -> list[tuple[int, int | str]]:
+def natural_key(name: str) -> list[str | int]:  # text and numbers in turns
     """Return a sort key that puts frame9 before frame10."""
-    parts = re.split(r"(\d+)", name)
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -42,10 +41,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def read_color(path: Path) -> np.ndarray:  # (H, W, 3) uint8 RGB
-    """Read a picture. Grey becomes RGB, alpha is dropped, 16 bits are reduced to 8.
-
-    The orientation that phones note in the EXIF header is applied.
-    """
+    """Read any picture as 8-bit RGB without alpha, upright as the EXIF header of phones says."""
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 

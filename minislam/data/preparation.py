@@ -127,9 +127,8 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
 
 def lit_extent(image: np.ndarray) -> list[int]:
     """Return left, top, right, bottom [px] of what is not black in an image; [] if all is."""
-    is_lit = image.max(2) > BLACK
-    (columns,), (rows,) = np.nonzero(is_lit.any(0)), np.nonzero(is_lit.any(1))
-    return [int(end) for k in (0, -1) for end in (columns[k], rows[k])] if len(rows) else []
+    left, top, width, height = cv2.boundingRect((image.max(2) > BLACK).astype(np.uint8))
+    return [left, top, left + width - 1, top + height - 1] if width else []
 
 
 def picture_window(extents: list[list[int]], width: int, height: int) -> Window:
@@ -197,8 +196,10 @@ class KeptImages:
 
     def get(self, number: int, prepare: Callable[[], np.ndarray]) -> np.ndarray:
         """Return image `number` (H, W, 3) uint8; `prepare` makes it when it is asked for first."""
-        image = self._images[number].copy() if number in self._images else prepare()
-        if number not in self._images:
+        if number in self._images:
+            image = self._images[number].copy()
+        else:
+            image = prepare()
             with suppress(OSError):  # the image is prepared again next time
                 place = self._shelf.reserve(image.nbytes).reshape(image.shape)
                 place[:] = image

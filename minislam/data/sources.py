@@ -116,10 +116,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
 
 
 def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
-    """Return the timestamps (N,) of images, and a note that says where they come from.
-
-    Names that are all numbers are the timestamps; otherwise the images are counted.
-    """
+    """Return timestamps (N,): the names if all are numbers, else a count; and a note on that."""
     if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
         return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, _COUNTED
     return np.array([float(path.stem) for path in paths]), "timestamps from the file names"
