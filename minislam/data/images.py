@@ -80,10 +80,7 @@ def encode_jpeg(image: np.ndarray, longest: int) -> bytes:
 
 
 def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float) -> None:
-    """Write images (H, W, 3) RGB in [0, 1], `rate` per second, as .webm or .webp.
-
-    The images may come one by one: a video holds only one of them in memory.
-    """
+    """Write images (H, W, 3) RGB in [0, 1], `rate` per second, as .webm (one by one) or .webp."""
     kind = Path(path).suffix.lower()
     encoders = {".webm": _write_webm, ".webp": _write_webp}
     found = f"{kind or 'neither'}; write .webm, and convert that with ffmpeg if you need .mp4"

@@ -27,10 +27,7 @@ _MOST_COUNTED = 1e6  # larger whole numbers in names are times
 
 @dataclass(frozen=True)
 class Recording:
-    """Raw images with timestamps, and whatever else lies beside them.
-
-    The files that belong to images are kept by the number of the image, where there is such a file.
-    """
+    """Raw images with timestamps, and what lies beside them: files by the number of the image."""
 
     name: str  # short, usable as a folder name
     kind: str  # what it is, for the description
