@@ -132,11 +132,10 @@ def lit_extent(image: np.ndarray) -> list[int]:
 
 
 def picture_window(extents: list[list[int]], width: int, height: int) -> Window:
-    """Return the window of the images that no black bar covers; films have such bars.
+    """Return the window that no black bar covers, as films have, from extents of several images.
 
-    The extents are those of several images. A bar ends at the same place in most of them, but for
-    a fade; a thing on a black ground does not. Beta would learn that a bar is no part of the scene,
-    and take all that is black for a part of the bar.
+    In most images a bar ends at the same place, a thing on a black ground does not. Beta would
+    learn that a bar is no part of the scene, and take all that is black for a part of the bar.
     """
     lit = np.array([extent for extent in extents if extent] or [[0, 0, width - 1, height - 1]])
     areas, window = (lit[:, 2:] - lit[:, :2]).prod(1), []
@@ -186,8 +185,7 @@ def seen_window(
 class KeptImages:
     """Keeps prepared images in a temporary file, until the disk is full.
 
-    A run looks at every frame about six times, and not in order. In a video a step back takes ten
-    times as long as a step on, because decoding starts again at an earlier complete image.
+    A run looks at every frame about six times and not in order, and a video decodes slowly so.
     """
 
     def __init__(self) -> None:

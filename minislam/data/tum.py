@@ -65,8 +65,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
         trajectory = read_trajectory(truth_path)
         if (camera := known_camera(folder.resolve().name)) and camera.origin.startswith("Bonn"):
             trajectory = bonn_camera_trajectory(trajectory)
-        seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
-        notes.append(f"ground truth {seconds:.3g} s")
+        notes.append(f"ground truth {np.ptp(trajectory.timestamps):.3g} s")
     return sources.Recording(
         name=sources.folder_name(folder),
         kind="TUM RGB-D folder",

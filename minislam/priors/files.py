@@ -122,8 +122,7 @@ class FileDepth:
         path = self.files.of(frame)
         if path is None:
             return None
-        is_array = path.suffix.lower() == ".npy"
-        depth = read_array(path, DEPTH) if is_array else self._read_png(path)
+        depth = read_array(path, DEPTH) if path.suffix.lower() == ".npy" else self._read_png(path)
         return as_depth(depth, frame, str(path))
 
 

@@ -27,10 +27,7 @@ ALIGNMENT = 64  # bytes, as tensors in memory: another one can change the last b
 
 
 class Shelf:
-    """Holds tensors in temporary files (of TMPDIR), where the place of one that is gone is reused.
-
-    The files vanish with the shelf and the last of its tensors.
-    """
+    """Holds tensors in temporary files (of TMPDIR), which vanish with it and the last of them."""
 
     def __init__(self) -> None:
         self._blocks: list[mmap.mmap] = []
