@@ -12,13 +12,12 @@ import cv2
 import numpy as np
 
 from minislam.data.files import atomic_write, read_bytes
+from minislam.data.metadata import JPEG, PNG
 from minislam.errors import InputError, require
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _WEBP_QUALITY = 75  # of 100
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_SIGNATURE = b"\xff\xd8\xff"
 _JPEG_QUALITY = 85  # of 100: without visible blocks, a tenth of the bytes of a PNG
 _JPEG_START_OF_SCAN, _JPEG_END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 
@@ -143,9 +142,9 @@ def _decode(path: Path, mode: int) -> np.ndarray:
 
 def _is_complete(content: bytes) -> bool:
     """Tell whether the end marker is there; without it some decoders fill the rest with grey."""
-    if content.startswith(_PNG_SIGNATURE):
+    if content.startswith(PNG):
         return b"IEND" in content
-    if content.startswith(_JPEG_SIGNATURE):
+    if content.startswith(JPEG):
         # A thumbnail in the header has its own end marker, a film that phones append any bytes.
         at = 2  # behind the start marker; then one segment of the header after the other
         while content[at : at + 1] == b"\xff" and content[at : at + 2] != _JPEG_START_OF_SCAN:
