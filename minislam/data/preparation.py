@@ -1,7 +1,5 @@
 """From the raw image to the working image: undistort, cut unseen borders, resize, crop, keep."""
 
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 
 import cv2
@@ -10,7 +8,6 @@ import numpy as np
 from minislam.data.options import MINIMUM_SIDE
 from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion, Camera
-from minislam.state.memory import Shelf, release
 
 Window = tuple[int, int, int, int]  # left, top, width, height px
 
@@ -180,27 +177,3 @@ def seen_window(
         "expected a lens distortion that leaves part of the image visible, but nothing would be "
         "left; check the order k1 k2 p1 p2 k3 and the signs"
     )
-
-
-class KeptImages:
-    """Keeps prepared images in a temporary file, until the disk is full.
-
-    A run looks at every frame about six times and not in order, and a video decodes slowly so.
-    """
-
-    def __init__(self) -> None:
-        self._shelf = Shelf()
-        self._images: dict[int, np.ndarray] = {}  # by number, on the shelf
-
-    def get(self, number: int, prepare: Callable[[], np.ndarray]) -> np.ndarray:
-        """Return image `number` (H, W, 3) uint8; `prepare` makes it when it is asked for first."""
-        if number in self._images:
-            image = self._images[number].copy()
-        else:
-            image = prepare()
-            with suppress(OSError):  # the image is prepared again next time
-                place = self._shelf.reserve(image.nbytes).reshape(image.shape)
-                place[:] = image
-                self._images[number] = place
-        release()
-        return image
