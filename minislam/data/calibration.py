@@ -44,8 +44,9 @@ class Calibration:
 
     def fits(self, width: int, height: int) -> bool:
         """Tell whether images of this size have the aspect that the calibration was made for."""
-        made_for = self.size or (width, height)
-        return abs(made_for[0] * height / (made_for[1] * width) - 1) <= _ASPECT_TOLERANCE
+        if self.size is None:
+            return True
+        return abs(self.size[0] * height / (self.size[1] * width) - 1) <= _ASPECT_TOLERANCE
 
 
 def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibration | None:
@@ -55,12 +56,9 @@ def calibration_beside(folder: Path, name: str = "calibration.txt") -> Calibrati
 
 def rough_calibration(
     picture: tuple[int, int, int, int],  # left, top, width, height [px] between black bars
-    noted: tuple[float, str] | None = None,
+    noted: tuple[float, str] | None = None,  # focal length over the diagonal, and its origin
 ) -> Calibration:
-    """Return rough intrinsics of images: guessed, unless the camera noted its own.
-
-    A note is the focal length over the diagonal of the picture, and its origin.
-    """
+    """Return rough intrinsics of images: guessed, unless the camera noted its own."""
     left, top, width, height = picture
     focal, origin = _GUESSED_FOCAL_RATIO * max(width, height), "guessed intrinsics"
     if noted:

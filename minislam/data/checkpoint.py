@@ -39,11 +39,9 @@ def write_checkpoint(path: Path | str, tree: Any) -> None:
         if isinstance(value, np.ndarray):
             arrays[known] = value
             return {_ARRAY: known}
-        once = value.detach()
-        for dimension, stride in enumerate(once.stride()):
-            if stride == 0:  # an expanded tensor: memory holds its rows only once
-                once = once.narrow(dimension, 0, min(1, once.shape[dimension]))
-        arrays[known] = once.cpu().numpy()
+        # Along a stride of 0, of an expanded tensor, memory holds a single row.
+        rows = tuple(slice(1 if stride == 0 else None) for stride in value.stride())
+        arrays[known] = value.detach()[rows].cpu().numpy()
         return {_TENSOR: [known, list(value.shape), list(value.stride()), str(value.device)]}
 
     text = json.dumps(plain(tree, "")).encode()

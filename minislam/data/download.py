@@ -20,10 +20,7 @@ def download(
     check: Callable[[Path], None],  # raises InputError if the whole file is not the right one
     show: Callable[[int, int], None],  # bytes done, of all
 ) -> None:
-    """Fetch a file to a path; what an interrupted call has left is continued.
-
-    The bytes go to PATH.part, and take their name when all are there and are checked.
-    """
+    """Fetch a file to a path, once all is checked in PATH.part, which the next call continues."""
     part = path.with_name(f"{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,9 +23,8 @@ def atomic_write(path: Path | str, content: bytes) -> None:
 def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
     """Open a file to be written as a whole or not at all.
 
-    The bytes go to a temporary file in the same folder (os.replace is atomic only within one file
-    system), reach the disk, and then take the final name. What a link points to is replaced, not
-    the link. Devices, pipes and folders are refused.
+    The bytes go to a temporary file beside it, reach the disk, and then take the final name. What
+    a link points to is replaced, not the link. Devices, pipes and folders are refused.
     """
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"expected a file to write, but {path} is none; choose another name")

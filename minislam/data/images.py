@@ -12,13 +12,12 @@ import cv2
 import numpy as np
 
 from minislam.data.files import atomic_write, read_bytes
+from minislam.data.metadata import JPEG, PNG
 from minislam.errors import InputError, require
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _WEBP_QUALITY = 75  # of 100
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_SIGNATURE = b"\xff\xd8\xff"
 _JPEG_QUALITY = 85  # of 100: without visible blocks, a tenth of the bytes of a PNG
 _JPEG_START_OF_SCAN, _JPEG_END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 
@@ -28,10 +27,9 @@ def is_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
-def natural_key(name: str) -> list[tuple[int, int | str]]:
+def natural_key(name: str) -> list[str | int]:  # text and numbers in turns
     """Return a sort key that puts frame9 before frame10."""
-    parts = re.split(r"(\d+)", name)
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -42,10 +40,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def read_color(path: Path) -> np.ndarray:  # (H, W, 3) uint8 RGB
-    """Read a picture. Grey becomes RGB, alpha is dropped, 16 bits are reduced to 8.
-
-    The orientation that phones note in the EXIF header is applied.
-    """
+    """Read any picture as 8-bit RGB without alpha, upright as the EXIF header of phones says."""
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
@@ -84,10 +79,7 @@ def encode_jpeg(image: np.ndarray, longest: int) -> bytes:
 
 
 def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float) -> None:
-    """Write images (H, W, 3) RGB in [0, 1], `rate` per second, as .webm or .webp.
-
-    The images may come one by one: a video holds only one of them in memory.
-    """
+    """Write images (H, W, 3) RGB in [0, 1], `rate` per second, as .webm (one by one) or .webp."""
     kind = Path(path).suffix.lower()
     encoders = {".webm": _write_webm, ".webp": _write_webp}
     found = f"{kind or 'neither'}; write .webm, and convert that with ffmpeg if you need .mp4"
@@ -150,9 +142,9 @@ def _decode(path: Path, mode: int) -> np.ndarray:
 
 def _is_complete(content: bytes) -> bool:
     """Tell whether the end marker is there; without it some decoders fill the rest with grey."""
-    if content.startswith(_PNG_SIGNATURE):
+    if content.startswith(PNG):
         return b"IEND" in content
-    if content.startswith(_JPEG_SIGNATURE):
+    if content.startswith(JPEG):
         # A thumbnail in the header has its own end marker, a film that phones append any bytes.
         at = 2  # behind the start marker; then one segment of the header after the other
         while content[at : at + 1] == b"\xff" and content[at : at + 2] != _JPEG_START_OF_SCAN:

@@ -22,7 +22,7 @@ _POINTER, _FILM_EQUIVALENT, _FOCAL_LENGTH, _RESOLUTION, _UNIT, _WIDTH, _HEIGHT, 
 )  # fmt: skip
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution
 _EXIF_NUMBERS = {3: "H", 4: "I", 5: "II"}  # struct codes: short, long, rational
-_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"  # the first bytes
+JPEG, PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"  # the first bytes
 _APP1, _SIZES = 0xE1, {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of JPEG's segments
 _UNREADABLE = OSError, struct.error, LookupError, ValueError, ArithmeticError, RecursionError
 _VIDEO_NUMBERS = {21: ">i", 22: ">I", 67: ">i", 77: ">I", 66: ">h", 76: ">H", 23: ">f", 24: ">d"}
@@ -32,7 +32,7 @@ def noted_focal_length(path: Path) -> tuple[float, str] | None:
     """Return the focal length over the image diagonal and its origin; None if none is noted."""
     try:
         content = _mapped(path)
-        is_photo = content[:2] == _JPEG
+        is_photo = content[:2] == JPEG
         found = _of_exif(_exif(content)) if is_photo else _of_video(content)
     except _UNREADABLE:
         return None  # Damaged notes are no reason to refuse whole images.
@@ -45,9 +45,9 @@ def noted_size(path: Path) -> tuple[int, int] | None:
     """Return (width, height) px of an image file as it is decoded, upright; None if not noted."""
     try:
         content = _mapped(path)
-        if content[:8] == _PNG:
+        if content[:8] == PNG:
             return struct.unpack_from(">II", content, 16)
-        if content[:2] != _JPEG:
+        if content[:2] != JPEG:
             return None
         height, width = next(
             struct.unpack_from(">HH", segment, 1)

@@ -41,10 +41,7 @@ class GaussianArrays:
 
 
 def encode_ply(gaussians: GaussianArrays, sh_degree: int = 0) -> bytes:
-    """Return the bytes of a PLY file of a Gaussian map.
-
-    Some viewers insist on spherical harmonics of degree 3; coefficients above degree 0 are zeros.
-    """
+    """Return the bytes of a PLY file; above degree 0, which some viewers insist on, all is 0."""
     _validate(gaussians, "the map")
     quats = gaussians.quats_wxyz.astype(np.float64)
     zeros = np.zeros((len(gaussians), 3 * ((sh_degree + 1) ** 2 - 1)))

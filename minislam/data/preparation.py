@@ -1,7 +1,5 @@
 """From the raw image to the working image: undistort, cut unseen borders, resize, crop, keep."""
 
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 
 import cv2
@@ -10,7 +8,6 @@ import numpy as np
 from minislam.data.options import MINIMUM_SIDE
 from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion, Camera
-from minislam.state.memory import Shelf, release
 
 Window = tuple[int, int, int, int]  # left, top, width, height px
 
@@ -127,17 +124,15 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
 
 def lit_extent(image: np.ndarray) -> list[int]:
     """Return left, top, right, bottom [px] of what is not black in an image; [] if all is."""
-    is_lit = image.max(2) > BLACK
-    (columns,), (rows,) = np.nonzero(is_lit.any(0)), np.nonzero(is_lit.any(1))
-    return [int(end) for k in (0, -1) for end in (columns[k], rows[k])] if len(rows) else []
+    left, top, width, height = cv2.boundingRect((image.max(2) > BLACK).astype(np.uint8))
+    return [left, top, left + width - 1, top + height - 1] if width else []
 
 
 def picture_window(extents: list[list[int]], width: int, height: int) -> Window:
-    """Return the window of the images that no black bar covers; films have such bars.
+    """Return the window that no black bar covers, as films have, from extents of several images.
 
-    The extents are those of several images. A bar ends at the same place in most of them, but for
-    a fade; a thing on a black ground does not. Beta would learn that a bar is no part of the scene,
-    and take all that is black for a part of the bar.
+    In most images a bar ends at the same place, a thing on a black ground does not. Beta would
+    learn that a bar is no part of the scene, and take all that is black for a part of the bar.
     """
     lit = np.array([extent for extent in extents if extent] or [[0, 0, width - 1, height - 1]])
     areas, window = (lit[:, 2:] - lit[:, :2]).prod(1), []
@@ -182,26 +177,3 @@ def seen_window(
         "expected a lens distortion that leaves part of the image visible, but nothing would be "
         "left; check the order k1 k2 p1 p2 k3 and the signs"
     )
-
-
-class KeptImages:
-    """Keeps prepared images in a temporary file, until the disk is full.
-
-    A run looks at every frame about six times, and not in order. In a video a step back takes ten
-    times as long as a step on, because decoding starts again at an earlier complete image.
-    """
-
-    def __init__(self) -> None:
-        self._shelf = Shelf()
-        self._images: dict[int, np.ndarray] = {}  # by number, on the shelf
-
-    def get(self, number: int, prepare: Callable[[], np.ndarray]) -> np.ndarray:
-        """Return image `number` (H, W, 3) uint8; `prepare` makes it when it is asked for first."""
-        image = self._images[number].copy() if number in self._images else prepare()
-        if number not in self._images:
-            with suppress(OSError):  # the image is prepared again next time
-                place = self._shelf.reserve(image.nbytes).reshape(image.shape)
-                place[:] = image
-                self._images[number] = place
-        release()
-        return image

@@ -57,9 +57,9 @@ class FileImages:
 class VideoImages:
     """Images that are frames of a video. OpenCV applies the rotation that phones note in it.
 
-    The frame count in a container is an estimate, and seeking is inexact for many codecs.
-    Therefore the frames are counted by reading through the file once, and reading an earlier
-    frame starts again at the beginning. What cannot be decoded is passed over.
+    The frame count of a container is an estimate, and seeking is inexact. So the frames are counted
+    by reading through the file, and an earlier frame is looked for from the beginning again. What
+    cannot be decoded is passed over.
     """
 
     def __init__(self, path: Path, limit: int | None = None) -> None:
@@ -94,10 +94,7 @@ class VideoImages:
         return len(self._calls)
 
     def read(self, index: int) -> np.ndarray:
-        """Return a raw image (H, W, 3) uint8 RGB; walking forward decodes every frame once.
-
-        The same frame may be read again at once: an export needs it in two sizes.
-        """
+        """Return a raw image (H, W, 3) uint8 RGB; walking forward decodes every frame once."""
         if self._calls[index] < self._grabbed:
             self._rewind()
         while self._grabbed < self._calls[index]:

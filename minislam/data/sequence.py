@@ -1,6 +1,7 @@
 """Open a folder, a video, or a synthetic sequence by its name."""
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -12,12 +13,13 @@ import torch
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
-from minislam.data.preparation import ImagePreparation, KeptImages, Window, picture_window
+from minislam.data.preparation import ImagePreparation, Window, picture_window
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError, require
 from minislam.parameters import absolute_path, user_path
 from minislam.records import Frame, GroundTruth, Progress
+from minislam.state.memory import Shelf, release
 
 _SYNTHETIC_SIZE = (320, 240)  # px
 
@@ -66,7 +68,8 @@ class RecordedSequence:
         self.lost = [row for row in recording.lost if first < row[0] < last]
         self.lost += [(float(stamps[index]), odd[index]) for index in chosen if index in odd]
         self.checksums: dict[int, int] = {}
-        self._kept = KeptImages()
+        self._shelf = Shelf()
+        self._kept: dict[int, np.ndarray] = {}  # working images on the shelf, by frame index
         self._masks = recording.mask_paths
         if options.masks is not None:
             self._masks = mask_files(recording.images, options.masks, self._chosen)
@@ -121,16 +124,25 @@ class RecordedSequence:
         return (self.frame(frame_index) for frame_index in range(len(self)))
 
     def frame(self, frame_index: int) -> Frame:
-        """Return one frame; timestamps are those of the source, whatever the stride."""
-        index = self._chosen[frame_index]
+        """Return one frame; timestamps are those of the source, whatever the stride.
 
-        def prepare() -> np.ndarray:
+        A run looks at a frame about six times, and a video is slow in any other order than its own:
+        so the working images are kept in a temporary file, until the disk is full.
+        """
+        index = self._chosen[frame_index]
+        if frame_index in self._kept:
+            image = self._kept[frame_index].copy()
+        else:
             raw = self._recording.images.read(index)
             self.checksums[frame_index] = crc32(raw.tobytes())
-            return self.prepare.pixels(raw, self._recording.images.labels[index])
-
-        pixels = torch.from_numpy(self._kept.get(frame_index, prepare))
-        return Frame(frame_index, float(self._recording.timestamps[index]), pixels)
+            image = self.prepare.pixels(raw, self._recording.images.labels[index])
+            with suppress(OSError):  # of a full disk: the image is prepared again next time
+                place = self._shelf.reserve(image.nbytes).reshape(image.shape)
+                place[:] = image
+                self._kept[frame_index] = place
+        release()
+        stamp = float(self._recording.timestamps[index])
+        return Frame(frame_index, stamp, torch.from_numpy(image))
 
     def through_lens(self, fx: float, k1: float, k2: float) -> "RecordedSequence":
         """Return the sequence, straightened: fx [px] is of the working size, fy in proportion."""

@@ -27,10 +27,7 @@ _MOST_COUNTED = 1e6  # larger whole numbers in names are times
 
 @dataclass(frozen=True)
 class Recording:
-    """Raw images with timestamps, and whatever else lies beside them.
-
-    The files that belong to images are kept by the number of the image, where there is such a file.
-    """
+    """Raw images with timestamps, and what lies beside them: files by the number of the image."""
 
     name: str  # short, usable as a folder name
     kind: str  # what it is, for the description
@@ -116,10 +113,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
 
 
 def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
-    """Return the timestamps (N,) of images, and a note that says where they come from.
-
-    Names that are all numbers are the timestamps; otherwise the images are counted.
-    """
+    """Return timestamps (N,): the names if all are numbers, else a count; and a note on that."""
     if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
         return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, _COUNTED
     return np.array([float(path.stem) for path in paths]), "timestamps from the file names"

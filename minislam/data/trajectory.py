@@ -23,10 +23,7 @@ def truth_beside(folder: Path) -> Path | None:
 
 
 def read_trajectory(path: Path | str) -> Trajectory:
-    """Read a TUM trajectory file.
-
-    Of rows with the same timestamp the first is kept: published ground truth has such rows.
-    """
+    """Read a TUM trajectory; of rows of one timestamp, as published truth has, keep the first."""
     rows: list[list[float]] = []
     for where, row in data_rows(read_text(path), str(path)):
         numbers = finite_numbers(row.split(), where)
@@ -48,10 +45,7 @@ def read_trajectory(path: Path | str) -> Trajectory:
 
 
 def write_trajectory(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a TUM trajectory file: 6 decimals of a second, 9 significant digits of the rest.
-
-    An empty trajectory gives a file with the header only.
-    """
+    """Write a TUM trajectory file: 6 decimals of a second, 9 significant digits of the rest."""
     poses = np.asarray(trajectory.T_world_camera, dtype=np.float64).reshape(-1, 4, 4)
     stamps = np.round(trajectory.timestamps, 6)
     is_finite = np.isfinite(poses).all() and np.isfinite(stamps).all()

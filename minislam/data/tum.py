@@ -12,7 +12,7 @@ from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
 from minislam.data.images import list_images, read_color
 from minislam.data.raw_images import FileImages
 from minislam.data.trajectory import read_trajectory, truth_beside
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion
 from minislam.records import Trajectory
 
@@ -65,8 +65,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
         trajectory = read_trajectory(truth_path)
         if (camera := known_camera(folder.resolve().name)) and camera.origin.startswith("Bonn"):
             trajectory = bonn_camera_trajectory(trajectory)
-        seconds = trajectory.timestamps[-1] - trajectory.timestamps[0]
-        notes.append(f"ground truth {seconds:.3g} s")
+        notes.append(f"ground truth {np.ptp(trajectory.timestamps):.3g} s")
     return sources.Recording(
         name=sources.folder_name(folder),
         kind="TUM RGB-D folder",
@@ -103,10 +102,7 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
 
 
 def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
-    """Return the known camera that the folder's name, README or lists name (freiburg1, ...).
-
-    Images of another aspect ratio than the benchmark's come from another camera: None.
-    """
+    """Return the camera that the folder's name, README or lists name, if the images fit it."""
     notes = [folder.resolve().name]
     lists = [folder / "rgb.txt", folder / "groundtruth.txt"]
     for path in [*sorted(folder.glob("README*")), *lists]:
@@ -159,11 +155,9 @@ def _novel_views(folder: Path) -> list[tuple[np.ndarray, Path]]:
         return []
     poses = read_trajectory(folder / "poses.txt")
     by_number = {int(p.stem): p for p in list_images(folder) if p.stem.isdecimal()}
-    missing = [int(stamp) for stamp in poses.timestamps if int(stamp) not in by_number]
-    if missing:
-        raise InputError(
-            f"expected an image for every pose of {folder / 'poses.txt'}, found none for index "
-            f"{missing[0]}; complete the folder or remove the row"
-        )
-    rows = zip(poses.timestamps, poses.T_world_camera, strict=True)
-    return [(T_world_camera, by_number[int(stamp)]) for stamp, T_world_camera in rows]
+    numbers = [int(stamp) for stamp in poses.timestamps]
+    for number in numbers:
+        found = f"none for index {number}; complete the folder or remove the row"
+        require(number in by_number, f"an image for every pose of {folder / 'poses.txt'}", found)
+    rows = zip(poses.T_world_camera, numbers, strict=True)
+    return [(pose, by_number[number]) for pose, number in rows]

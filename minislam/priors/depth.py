@@ -1,6 +1,5 @@
 """Metric depth of single images without a network, each a `DepthPrior`: simulated, sensor, none."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -11,15 +10,13 @@ from torch import Tensor
 from minislam.errors import InputError, require
 from minislam.geometry import Camera
 from minislam.parameters import parameter
-from minislam.records import Frame
+from minislam.records import Frame, FramePicture
 
 _FIELD_CELLS = 4  # bumps of the smooth error along the shorter image side
 _RANGE = (1e-4, 1e5)  # world units; what is nearer or farther is no depth of a scene
 _GROSS_ERROR = 0.3  # relative error at a gross error, of either sign
 _GROSS_RADIUS = 0.12  # shorter image sides, radius of a gross error
 _ASPECT_TOLERANCE = 0.02  # relative; rounding a resized image to whole pixels stays below it
-
-DepthReader = Callable[[int], np.ndarray | None]  # frame_index -> (H, W) world units, 0 = unknown
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,7 @@ class SimulatedDepth:
     The errors of a frame depend on the seed and the frame index alone, not on the order of calls.
     """
 
-    truth: DepthReader
+    truth: FramePicture  # (H, W) world units, 0 unknown
     seed: int
     config: SimulatedDepthConfig = SimulatedDepthConfig()
 
@@ -72,7 +69,7 @@ class SimulatedDepth:
 class SensorDepth:
     """Depth of an RGB-D camera, as the sequence's own reader returns it."""
 
-    reader: DepthReader
+    reader: FramePicture  # (H, W) world units, 0 unknown
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return the sensor's depth of a frame, or None where it has none."""

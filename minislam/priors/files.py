@@ -1,7 +1,4 @@
-"""Features and depth made elsewhere: a folder with one file per frame.
-
-`minislam priors` (cli/priors.py) writes such folders, and so may anything else.
-"""
+"""Features and depth made elsewhere, by `minislam priors` or anything else: one file per frame."""
 
 import re
 from collections.abc import Callable
@@ -57,22 +54,20 @@ class FrameFiles:
         number = frame if numbered is None else int(numbered[1])
         # Of the first images, counted from 1, a file 0 shows that the files are counted from 0.
         is_right = sequence.source_index(frame) == frame and 0 in self._files
-        if number != frame and number in self._files and not is_right:
-            wanted = f"{self.what} files named by the frame of the run, {frame:05d} for {image}"
-            found = f"{self._files[number]}, which has the number of that image"
-            advice = f"rename them, or write {INDEX} beside them, as minislam priors does"
-            raise InputError(f"expected {wanted}, found {found}; {advice}")
+        is_right = is_right or number == frame or number not in self._files
+        wanted = f"{self.what} files named by the frame of the run, {frame:05d} for {image}"
+        found = f"{self._files.get(number)}, which has the number of that image"
+        advice = f"rename them, or write {INDEX} beside them, as minislam priors does"
+        require(is_right, wanted, f"{found}; {advice}")
 
     def of(self, frame: Frame) -> Path | None:
         """Return the file of a frame, or None if the folder has none for it."""
         if self._number_of is None:
             return self._files.get(frame.frame_index)
-        number = self._number_of.get(round(frame.timestamp, 6))
-        if number is None:
-            wanted = f"{self.what} of the frame at {frame.timestamp:.6f} s"
-            found = f"no such frame in {self.folder / INDEX}"
-            raise InputError(f"expected {wanted}, found {found}; {_MAKE}")
-        return self._files.get(number)
+        moment = round(frame.timestamp, 6)
+        found = f"no such frame in {self.folder / INDEX}; {_MAKE}"
+        require(moment in self._number_of, f"{self.what} of the frame at {moment:.6f} s", found)
+        return self._files.get(self._number_of[moment])
 
 
 class FileFeatures:
@@ -127,8 +122,7 @@ class FileDepth:
         path = self.files.of(frame)
         if path is None:
             return None
-        is_array = path.suffix.lower() == ".npy"
-        depth = read_array(path, DEPTH) if is_array else self._read_png(path)
+        depth = read_array(path, DEPTH) if path.suffix.lower() == ".npy" else self._read_png(path)
         return as_depth(depth, frame, str(path))
 
 

@@ -134,8 +134,7 @@ class FlowChain(Stateful):
     """The flow from one reference frame to the newest frame, updated frame by frame.
 
     The flow to the previous frame predicts the flow to the next one, so that long displacements
-    are followed as long as each step is short. The pose is started from this flow. A chain is never
-    changed: the next frame gives a new one, so a bad frame can be skipped.
+    are followed as long as each step is short. A chain never changes: a bad frame can be skipped.
     """
 
     reference: np.ndarray  # (H, W) uint8

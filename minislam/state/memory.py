@@ -21,21 +21,17 @@ from torch import Tensor
 SMALLEST = 1 << 12  # bytes, a page: smaller tensors stay in memory
 FIRST_BLOCK, LARGEST_BLOCK = 1 << 24, 1 << 28  # bytes: each block is as large as all before it
 PIECE = 1 << 20  # bytes that are written at once
-Place = tuple[mmap.mmap, int]  # a block, and the first byte in it
 _BLOCKS: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()  # of all shelves
 ALIGNMENT = 64  # bytes, as tensors in memory: another one can change the last bits of sums
 
 
 class Shelf:
-    """Holds tensors in temporary files (of TMPDIR), where the place of one that is gone is reused.
-
-    The files vanish with the shelf and the last of its tensors.
-    """
+    """Holds tensors in temporary files (of TMPDIR), which vanish with it and the last of them."""
 
     def __init__(self) -> None:
         self._blocks: list[mmap.mmap] = []
         self._used = 0  # bytes of the newest block
-        self._spare: dict[int, list[Place]] = {}  # by bytes
+        self._spare: dict[int, list[tuple[mmap.mmap, int]]] = {}  # by bytes: block, first byte
 
     def put(self, tensors: Iterable[Tensor | None]) -> None:
         """Move tensors (any shape) to the file, for all that hold them; then release.

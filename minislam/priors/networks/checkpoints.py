@@ -153,8 +153,7 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> Wei
         wanted = "a PyTorch checkpoint of plain tensors"
         raise InputError(f"expected {wanted}, found {found}") from error
     found = f"the entries {list(content)}" if isinstance(content, dict) else str(type(content))
-    save = "save the dictionary of its tensors alone to a file"
-    advice = f"give the file with the weights, or {save}"
+    advice = "give the file with the weights, or save the dictionary of its tensors alone to a file"
     require(bool(tensors), f"named tensors in {path}", f"{found[:300]}; {advice}")
     _require_numbers(tensors, path)
     return Weights({name: tensor.float() for name, tensor in tensors.items()}, str(path))

@@ -136,9 +136,8 @@ class DinoFeatures:
 def is_antialiased(weights: Weights) -> bool:
     """Tell whether a features checkpoint was trained with antialiased positions.
 
-    The file does not state it, but the three published kinds differ in what they contain: FiT3D
-    alone lacks the mask token of the training, and DINOv2 has registers or not. A file that has
-    lost such a tensor looks like another kind; then its official name shows it.
+    The three published kinds differ in what they contain: FiT3D alone lacks the mask token, and
+    DINOv2 has registers or not. A file that has lost such a tensor is known by its official name.
     """
     name = Path(weights.file).name
     is_fit3d = "mask_token" not in weights
