@@ -18,6 +18,7 @@ from typing import Any
 import minislam
 from minislam.data.files import read_json, require_new, write_json, write_text
 from minislam.errors import InputError
+from minislam.parameters import require_bounds
 
 SILENCE = 120.0  # seconds without a verdict after which an exercise is given up
 VERDICTS = "verdicts.txt"  # to which the judge appends a line before and after each exercise
@@ -46,8 +47,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def _grade(args: argparse.Namespace) -> int:
     """Grade all notebooks, print and write the points; return the exit code."""
-    if args.seed is not None and args.seed < 0:
-        raise InputError(f"expected --seed N with N at least 0, found {args.seed}; give another")
+    require_bounds("--seed", args.seed, 0, 2**32 - 1)
     require_new([args.json, args.csv], args.overwrite, args.notebooks)
     graded = []
     for name in args.notebooks:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from minislam.errors import require
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Frame
 
@@ -89,8 +90,24 @@ def oriented_edges(brightness: np.ndarray) -> list[np.ndarray]:  # (H, W) float3
 
 
 def with_finer_grid(extractor: FeatureExtractor, factor: int) -> FeatureExtractor:
-    """Return the extractor, on a grid that is `factor` times as fine."""
-    return HighResolutionFeatures(extractor, factor) if factor > 1 else extractor
+    """Return the extractor, on a grid that is `factor` times as fine; it refuses what is NaN."""
+    return FiniteFeatures(HighResolutionFeatures(extractor, factor) if factor > 1 else extractor)
+
+
+class FiniteFeatures:
+    """The features of an extractor if they are finite: one NaN would reach the MLP and the map."""
+
+    def __init__(self, extractor: FeatureExtractor) -> None:
+        self.extractor = extractor
+        self.stride, self.dimension = extractor.stride, extractor.dimension
+
+    def __call__(self, frame: Frame) -> Tensor:  # (h', w', C)
+        """Return the features of a frame, or raise InputError."""
+        features = self.extractor(frame)
+        wanted = f"finite features of frame {frame.frame_index}"
+        advice = "give --precision fp32, or other --features"
+        require(bool(features.isfinite().all()), wanted, f"NaN or infinity; {advice}")
+        return features
 
 
 class HighResolutionFeatures:

@@ -94,8 +94,10 @@ def test_an_endless_judge_is_ended(tmp_path: Path, monkeypatch):
 
 
 def test_strict_needs_full_marks_and_a_seed_is_a_number(tmp_path: Path, capsys):
-    assert main(["grade", "x.ipynb", "--seed", "-1"]) == 1
-    assert "expected --seed N with N at least 0, found -1" in capsys.readouterr().err
+    for seed in ("-1", "9" * 20):  # torch takes no seed as large
+        assert main(["grade", "x.ipynb", "--seed", seed]) == 1
+        assert "expected --seed of at least 0 and at most 4.29" in (err := capsys.readouterr().err)
+        assert f"found {seed};" in err
     full = {"file": "a", "points": 4, "of": 4, "exercises": []}
     for points, code in ((4, 0), (2, 1)):
         with pytest.MonkeyPatch.context() as patch:

@@ -1,11 +1,14 @@
 """Classical features: similar on one surface, different on two, always finite."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from minislam.priors.features import ClassicalFeatures, oriented_edges
+from minislam.errors import InputError
+from minislam.priors.features import ClassicalFeatures, oriented_edges, with_finer_grid
 from tests.helpers import frame_of, generator
 
 
@@ -101,3 +104,18 @@ def test_constant_images_give_finite_features_of_full_length(value: float):
 def test_a_single_cell_works():
     one_cell = frame_of(torch.rand(7, 7, 3, generator=generator(0)))
     assert ClassicalFeatures()(one_cell).shape[:2] == (1, 1)
+
+
+def test_features_that_are_not_finite_are_refused_with_the_number_of_the_frame():
+    class Spoilt(ClassicalFeatures):
+        def __call__(self, frame):
+            features = super().__call__(frame)
+            features[0, 0, 0] = float("nan") if frame.frame_index == 7 else 1.0
+            return features
+
+    features = with_finer_grid(Spoilt(), 1)
+    image = torch.rand(30, 40, 3, generator=generator(0))
+    good, spoilt = (replace(frame_of(image), frame_index=number) for number in (6, 7))
+    assert torch.equal(features(good), Spoilt()(good))
+    with pytest.raises(InputError, match="finite features of frame 7, found NaN or infinity; give"):
+        features(spoilt)
