@@ -74,6 +74,11 @@ class Trajectory:
     timestamps: np.ndarray  # (N,) float64 second, strictly increasing
     T_world_camera: np.ndarray  # (N, 4, 4) float64
 
+    @property
+    def centres(self) -> np.ndarray:
+        """Return the camera centres (N, 3) in the world."""
+        return self.T_world_camera[:, :3, 3]
+
     def __len__(self) -> int:
         return len(self.timestamps)
 

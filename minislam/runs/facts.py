@@ -158,7 +158,7 @@ def _static_psnr(mapper: Mapper, keyframe: Keyframe, rendering: Rendering) -> fl
 
 def _ties(slam: Slam) -> dict[str, float | None]:
     """Return the length of the path, and how well poses, depths and flow agree, without truth."""
-    graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
+    graph, centres = slam.tracker.graph, slam.trajectory().centres
     every = range(len(graph.edges))
     error = typical_residual(bundle_problem(graph, every, 0, 0.0), graph.state) if every else None
     return {
