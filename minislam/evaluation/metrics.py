@@ -55,8 +55,8 @@ def measure_run(
     if truth is not None and (path := truth.trajectory) is not None:
         metrics["ate_all_cm"] = ate_cm(trajectory, path)
         metrics["ate_keyframes_cm"] = ate_cm(keyframe_trajectory, path)
-        metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
         if metrics["ate_all_cm"] is not None:
+            metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
             estimate, path = paired(trajectory, path, MAX_DIFFERENCE)
             scale = umeyama(estimate.centres, path.centres).scale
             errors += _novel_errors(truth.novel_views(), estimate, path, render, lpips)
