@@ -1,6 +1,6 @@
 """The data that one stage gives to another (frozen), and the protocols of the input."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -74,6 +74,11 @@ class Trajectory:
     timestamps: np.ndarray  # (N,) float64 second, strictly increasing
     T_world_camera: np.ndarray  # (N, 4, 4) float64
 
+    @property
+    def centres(self) -> np.ndarray:
+        """Return the camera centres (N, 3) in the world."""
+        return self.T_world_camera[:, :3, 3]
+
     def __len__(self) -> int:
         return len(self.timestamps)
 
@@ -121,7 +126,7 @@ class GroundTruth:
 
 
 class Sequence(Protocol):
-    """A sequence that can be walked through as often as needed, in the same order."""
+    """A sequence whose frames can be read as often as needed, in any order."""
 
     name: str  # short, usable as a folder name
     description: str  # one line: what was found
@@ -139,9 +144,6 @@ class Sequence(Protocol):
 
     def __len__(self) -> int:
         """Return the number of frames."""
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Walk through all frames in order."""
 
     def frame(self, frame_index: int) -> Frame:
         """Return one frame again."""

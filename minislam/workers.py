@@ -34,6 +34,7 @@ from minislam.state.stateful import Tree, from_tree, to_tree
 
 MOST_WORKERS = 4  # by default
 AT_ONCE = 8  # calls of a stream
+_hints = cache(get_type_hints)
 _TENSOR = "tensor"  # key of what stands for a tensor in the JSON of a message
 _START = "import sys; sys.path[:] = sys.argv[2:]; from minislam.workers import serve; serve()"
 
@@ -192,19 +193,13 @@ def serve() -> None:
 
 def _answer(function: Callable[..., Any], arguments: Tree) -> Tree:
     """Return function(*arguments), both as trees: here as in a helper."""
-    *kinds, _ = _kinds(function)
+    *kinds, _ = _hints(function).values()
     values = [from_tree(k, a, _no_frame) for k, a in zip(kinds, arguments, strict=True)]
     return _contiguous(to_tree(function(*values)))
 
 
 def _result(function: Callable[..., Any], answer: Tree) -> Any:
-    return from_tree(_kinds(function)[-1], answer, _no_frame)
-
-
-@cache
-def _kinds(function: Callable[..., Any]) -> list[Any]:
-    """Return the annotated types of the arguments, and last that of the result."""
-    return list(get_type_hints(function).values())
+    return from_tree(_hints(function)["return"], answer, _no_frame)
 
 
 def _no_frame(index: int) -> Frame:

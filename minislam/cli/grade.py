@@ -1,7 +1,5 @@
 """The sub-command `minislam grade`: points for students' notebooks."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import io

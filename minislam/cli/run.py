@@ -14,7 +14,7 @@ from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
 from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
-from minislam.runs.progress import ProgressLine, ending_signals, plan_of, say
+from minislam.runs.progress import ProgressLine, ending_signals, say
 
 DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
 
@@ -70,7 +70,7 @@ def _run(args: argparse.Namespace) -> int:
         choice = options.prior_choice(args, default_depth(source))
         from minislam.data.sequence import open_sequence
         from minislam.runs.resume import NO_WAY_ON, way_on
-        from minislam.runs.run import default_output, run_in_folder
+        from minislam.runs.run import default_output, plan_of, run_in_folder
         from minislam.runs.summary import as_text, summarise
 
         if args.resume and not way_on(args.output):

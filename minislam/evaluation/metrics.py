@@ -1,6 +1,5 @@
 """All measures of one run against the ground truth, as in the paper (Sec. 4)."""
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
@@ -10,7 +9,6 @@ from minislam.errors import InputError
 from minislam.evaluation.images import auroc, depth_l1, psnr, ssim
 from minislam.evaluation.trajectory import (
     absolute_trajectory_error,
-    centres,
     oriented_truth_to_estimate,
     paired,
     straight_line_error,
@@ -52,29 +50,29 @@ def measure_run(
     ]  # fmt: skip
     names += ["lpips_novel", "lpips_input"] if lpips is not None else []
     metrics: dict[str, float | None] = dict.fromkeys(names)
-    values: dict[str, list[float]] = defaultdict(list)  # to be averaged
+    errors: list[tuple[str, float]] = []  # of single views, to be averaged by name
     scale = None
     if truth is not None and (path := truth.trajectory) is not None:
         metrics["ate_all_cm"] = ate_cm(trajectory, path)
         metrics["ate_keyframes_cm"] = ate_cm(keyframe_trajectory, path)
-        metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
         if metrics["ate_all_cm"] is not None:
+            metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
             estimate, path = paired(trajectory, path, MAX_DIFFERENCE)
-            scale = umeyama(centres(estimate), centres(path)).scale
-            for name, value in _novel_errors(truth.novel_views(), estimate, path, render, lpips):
-                values[name].append(value)
+            scale = umeyama(estimate.centres, path.centres).scale
+            errors += _novel_errors(truth.novel_views(), estimate, path, render, lpips)
     betas: list[tuple[np.ndarray, np.ndarray]] = []  # with the true masks
     for view in views:
         if view.static_psnr is not None:
-            values["psnr_static_db"].append(view.static_psnr)
+            errors.append(("psnr_static_db", view.static_psnr))
         if truth is None:
             continue
         moving = truth.moving_mask(view.frame_index)
-        for name, value in _view_errors(view, truth, moving, scale, lpips):
-            values[name].append(value)
+        errors += _view_errors(view, truth, moving, scale, lpips)
         if view.beta is not None and moving is not None:
             betas.append((view.beta, moving))
-    metrics |= {name: float(np.mean(found)) for name, found in values.items()}
+    for name in names:
+        if found := [value for of, value in errors if of == name]:
+            metrics[name] = float(np.mean(found))
     if betas:  # over all images of the map
         beta, masks = (np.stack(parts) for parts in zip(*betas, strict=True))
         if masks.any() and not masks.all():  # else there is nothing to separate
@@ -105,7 +103,7 @@ def _novel_errors(
     """
     if not views:
         return
-    by_centres = umeyama(centres(path), centres(estimate))
+    by_centres = umeyama(path.centres, estimate.centres)
     by_cameras = oriented_truth_to_estimate(estimate, path)
     for pose, image in views:
         rendered = render(by_centres.transform_poses(pose))

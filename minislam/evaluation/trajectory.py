@@ -44,7 +44,7 @@ def absolute_trajectory_error(
     estimate, truth = paired(estimate, truth, max_difference, least)
     similarity = fit_alignment(estimate, truth, alignment)
     aligned = Trajectory(estimate.timestamps, similarity.transform_poses(estimate.T_world_camera))
-    errors = np.linalg.norm(centres(aligned) - centres(truth), axis=1)
+    errors = np.linalg.norm(aligned.centres - truth.centres, axis=1)
     return TrajectoryError(statistics(errors), errors, similarity, aligned, truth)
 
 
@@ -77,8 +77,8 @@ def straight_line_error(truth: Trajectory) -> float:
     """
     time = truth.timestamps - truth.timestamps.mean()
     design = np.stack([np.ones_like(time), time], axis=1)
-    line, *_ = np.linalg.lstsq(design, centres(truth), rcond=None)
-    return statistics(np.linalg.norm(centres(truth) - design @ line, axis=1))["rmse"]
+    line, *_ = np.linalg.lstsq(design, truth.centres, rcond=None)
+    return statistics(np.linalg.norm(truth.centres - design @ line, axis=1))["rmse"]
 
 
 def paired(
@@ -131,7 +131,7 @@ def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     """Return the similarity that maps the paired estimate to the truth."""
     if alignment is Alignment.NONE:
         return Similarity(1.0, np.eye(3), np.zeros(3))
-    fitted = umeyama(centres(estimate), centres(truth), alignment is not Alignment.SE3)
+    fitted = umeyama(estimate.centres, truth.centres, alignment is not Alignment.SE3)
     if alignment is Alignment.SCALE:
         return Similarity(fitted.scale, np.eye(3), np.zeros(3))
     return fitted
@@ -145,7 +145,7 @@ def oriented_truth_to_estimate(estimate: Trajectory, truth: Trajectory) -> Simil
     """
     turned = estimate.T_world_camera[:, :3, :3] @ truth.T_world_camera[:, :3, :3].mT
     rotation = Rotation.from_matrix(turned).mean().as_matrix()
-    source, target = centres(truth), centres(estimate)
+    source, target = truth.centres, estimate.centres
     source_mean, target_mean = source.mean(0), target.mean(0)
     source_turned = (source - source_mean) @ rotation.T
     scale = float((source_turned * (target - target_mean)).sum() / (source_turned**2).sum())
@@ -163,11 +163,6 @@ def statistics(errors: np.ndarray) -> dict[str, float]:
         "sse": float((errors**2).sum()),
         "std": float(errors.std()),
     }
-
-
-def centres(trajectory: Trajectory) -> np.ndarray:
-    """Return the camera centres (N, 3) in the world."""
-    return trajectory.T_world_camera[:, :3, 3]
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -17,8 +17,8 @@ from minislam.errors import InputError, nearest
 from minislam.parameters import user_path, with_values
 from minislam.priors.choice import PriorChoice
 from minislam.runs.loaded import Run
-from minislam.runs.progress import ProgressLine, SilentProgress, ending_signals, plan_of
-from minislam.runs.run import default_output, run_in_folder
+from minislam.runs.progress import ProgressLine, SilentProgress, ending_signals
+from minislam.runs.run import default_output, plan_of, run_in_folder
 
 _INPUTS = {field.name for field in fields(InputOptions)}
 _PRIORS = {field.name for field in fields(PriorChoice)}

@@ -94,11 +94,8 @@ def focal_length_note(slam: Slam) -> str:
 def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
     """Return the content of metrics.json."""
     truth, paths = slam.sequence.ground_truth, (slam.trajectory(), slam.keyframe_trajectory())
-    errors = measure_run(truth, *paths, mapped_views(slam), slam.render, lpips)
-    if errors["ate_all_cm"] is None:  # then there is nothing to compare a straight walk with
-        errors["ate_straight_line_cm"] = None
     return {
-        **errors,
+        **measure_run(truth, *paths, mapped_views(slam), slam.render, lpips),
         **_segment_errors(slam),
         "psnr_unseen_db": unseen_psnr(slam),
         "focal_length_px": slam.tracker.grid.camera.fx,
@@ -159,7 +156,7 @@ def _static_psnr(mapper: Mapper, keyframe: Keyframe, rendering: Rendering) -> fl
 
 def _ties(slam: Slam) -> dict[str, float | None]:
     """Return the length of the path, and how well poses, depths and flow agree, without truth."""
-    graph, centres = slam.tracker.graph, slam.trajectory().T_world_camera[:, :3, 3]
+    graph, centres = slam.tracker.graph, slam.trajectory().centres
     every = range(len(graph.edges))
     error = typical_residual(bundle_problem(graph, every, 0, 0.0), graph.state) if every else None
     return {

@@ -35,16 +35,15 @@ class Preview:
 
     def __init__(self, folder: RunFolder) -> None:
         self._folder = folder
-        self._last, self._cost = 0.0, 0.0  # second: when the last one was written, how long it took
+        self._due = 0.0  # second, when the next one may be written
 
     def update(self, slam: Slam, facts_of: Callable[[str, None], dict[str, Any]]) -> None:
         """Write the report if there is a map and a new one is due; `facts_of` is run.json."""
         begun = time.perf_counter()
-        is_due = begun - self._last >= self._cost / PREVIEW_FRACTION
-        if is_due and slam.mapper.keyframes:
+        if begun >= self._due and slam.mapper.keyframes:
             write_preview(self._folder, slam, facts_of("running", None))
-            self._last = time.perf_counter()
-            self._cost = self._last - begun
+            ended = time.perf_counter()
+            self._due = ended + (ended - begun) / PREVIEW_FRACTION
 
 
 def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:

@@ -1,7 +1,5 @@
 """What a long command shows while it works, and how a signal ends it between two steps."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -11,19 +9,12 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING, TypeVar
-
-if TYPE_CHECKING:
-    from minislam.config import SlamConfig
-    from minislam.priors.names import PriorChoice
-    from minislam.records import Sequence
+from typing import TypeVar
 
 Item = TypeVar("Item")
 
 EARLY = 0.1  # second; steps that a stage reports so early were done together: no rate yet
 PLAIN_STEP = 0.1  # fraction of a stage between two progress lines that are not on a terminal
-IMAGES_PER_FRAME = 0.4  # of the map: every fifth frame is a keyframe, and one more of every gap
-REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
 TRUST = 0.1  # fraction of the plan by which it resists the first measurements
 
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP")  # Ctrl-C, a scheduler, a closed terminal (not Windows)
@@ -57,34 +48,6 @@ def ending_signals(handler: Callable[[int, FrameType | None], object]) -> Iterat
             signal.signal(number, earlier)
 
 
-def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list[dict[str, float]]:
-    """Return the stages of a run: what each shows, and about its seconds on one idle core.
-
-    The figures come from runs of the demo, synth:crowd:61 and synth:table2:61, where about every
-    fifth frame was a keyframe. What the results take at the end is never shown, hence "".
-    """
-    mapping, has_prior, frames = config.mapping, choice.depth != "none", len(sequence)
-    scale = sequence.camera.width * sequence.camera.height / REFERENCE_PIXELS
-    per_frame, iteration = frames * scale, 0.24 * mapping.image_scale * scale
-    online_iterations = mapping.keyframe_iterations * config.tracking.warmup_keyframes
-    first_online = iteration * min(mapping.init_iterations, online_iterations)
-    late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
-    online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
-    coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}
-    stages = [
-        {"tracking and mapping": 0.25 * per_frame + online}
-        | ({"first map": first_online} if has_prior else {}),
-        {"final adjustment": 0.05 * per_frame},
-        coarse | {"second adjustment": 0.06 * per_frame} if config.uncertainty.enabled else {},
-        {"posing all frames": 0.12 * per_frame},
-        {"dense depth": 0.25 * per_frame, "first map": iteration * mapping.init_iterations},
-        {"refining the map": iteration * mapping.refinement(IMAGES_PER_FRAME * frames)},
-        {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
-    ]
-    stages[-1 if stages[-1] else -2][""] = 0.1 * per_frame
-    return [stage for stage in stages if stage]
-
-
 class ProgressLine:
     """One line per stage with its rate, and the time of the whole run if there is a plan.
 
@@ -93,7 +56,7 @@ class ProgressLine:
     """
 
     def __init__(self, is_quiet: bool = False, is_verbose: bool = False) -> None:
-        self.plan: list[dict[str, float]] = []  # see `plan_of`; without it, no time of the whole
+        self.plan: list[dict[str, float]] = []  # of `plan_of`; without it, no time of the whole
         self._begun: dict[str, tuple[float, int]] = {}  # stage: time [s] and steps when first shown
         self._shown: dict[str, float] = defaultdict(float)  # stage: done in the last plain line
         self._stage = 0  # of the plan

@@ -50,8 +50,8 @@ class Checkpoints:
             "settings": asdict(config),
         }  # must be the same for a run to be resumed, as it is read back from JSON
         self._origin: dict[str, Any] = json.loads(json.dumps(origin))
-        self.start = self._last = time.perf_counter()  # of the run and of the last checkpoint
-        self._cost = 0.0  # of the last checkpoint [s]
+        self.start = time.perf_counter()
+        self._due = 0.0  # second, when the next checkpoint may be saved
 
     @property
     def run_seconds(self) -> float:
@@ -64,8 +64,7 @@ class Checkpoints:
         With a checkpoint_fraction of 0 none is saved, forced or not.
         """
         begun = time.perf_counter()
-        is_due = force or (begun - self._last) * self._fraction >= self._cost
-        if self._fraction <= 0 or not is_due:
+        if self._fraction <= 0 or (begun < self._due and not force):
             return
         tree = self._origin | {
             "run_seconds": self.run_seconds,
@@ -79,9 +78,9 @@ class Checkpoints:
         except InputError as error:
             reason = str(error).partition("; ")[0]  # another folder does not help this run
             self.problem = f"the last checkpoint is older than this state: {reason}; free space"
-        self._last = time.perf_counter()
-        self._cost = self._last - begun
-        self.seconds += self._cost
+        ended = time.perf_counter()
+        self._due = ended + (ended - begun) / self._fraction
+        self.seconds += ended - begun
 
     def restore(self, slam: Slam) -> None:
         """Restore the state in the folder; refuse that of another run or of other images.

@@ -34,6 +34,9 @@ from minislam.state.steps import Observer
 from minislam.tracking.safeguards.lens import BentLens
 from minislam.workers import Workers, idle_cores
 
+IMAGES_PER_FRAME = 0.4  # of the map: every fifth frame is a keyframe, and one more of every gap
+REFERENCE_PIXELS = 320 * 240  # of the images of the plan's figures
+
 
 def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -> Priors:
     """Return the priors that are named, their files read and checked."""
@@ -46,6 +49,34 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
         choose_features(choice, sequence.camera, networks, sequence),
         choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
     )
+
+
+def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list[dict[str, float]]:
+    """Return the stages of a run: what each shows, and about its seconds on one idle core.
+
+    The figures come from runs of the demo, synth:crowd:61 and synth:table2:61, where about every
+    fifth frame was a keyframe. What the results take at the end is never shown, hence "".
+    """
+    mapping, has_prior, frames = config.mapping, choice.depth != "none", len(sequence)
+    scale = sequence.camera.width * sequence.camera.height / REFERENCE_PIXELS
+    per_frame, iteration = frames * scale, 0.24 * mapping.image_scale * scale
+    online_iterations = mapping.keyframe_iterations * config.tracking.warmup_keyframes
+    first_online = iteration * min(mapping.init_iterations, online_iterations)
+    late_keyframes = max(0.0, 0.2 * frames - config.tracking.warmup_keyframes)
+    online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
+    coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}
+    stages = [
+        {"tracking and mapping": 0.25 * per_frame + online}
+        | ({"first map": first_online} if has_prior else {}),
+        {"final adjustment": 0.05 * per_frame},
+        coarse | {"second adjustment": 0.06 * per_frame} if config.uncertainty.enabled else {},
+        {"posing all frames": 0.12 * per_frame},
+        {"dense depth": 0.25 * per_frame, "first map": iteration * mapping.init_iterations},
+        {"refining the map": iteration * mapping.refinement(IMAGES_PER_FRAME * frames)},
+        {"refining the poses": 0.3 * per_frame} if mapping.pose_refinement.enabled else {},
+    ]
+    stages[-1 if stages[-1] else -2][""] = 0.1 * per_frame
+    return [stage for stage in stages if stage]
 
 
 def default_output(sequence: Sequence) -> str:

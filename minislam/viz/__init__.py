@@ -9,8 +9,7 @@ from minislam.viz.figures import (
     overview,
     trajectory_plot,
 )
-from minislam.viz.flipbook import flipbook
-from minislam.viz.report import Report, build_report, summary_html
+from minislam.viz.pages import Page, Report, build_report, build_viewer, flipbook, summary_html
 from minislam.viz.style import (
     beta_limits,
     beta_to_rgb,
@@ -24,4 +23,3 @@ from minislam.viz.style import (
     show_image,
     show_map,
 )
-from minislam.viz.viewer import Page, build_viewer

@@ -140,14 +140,14 @@ def _draw_path(
     paths = [(truth, "ground truth", TRUTH_STYLE), (estimate, "estimate", ESTIMATE_STYLE)]
     for path, label, style in paths:
         if path is not None:
-            centres = path.T_world_camera[:, :3, 3]
+            centres = path.centres
             stands = len(centres) > 0 and bool((np.ptp(centres, axis=0) < _NO_LENGTH).all())
             name = {"marker": "o", "label": f"{label} (stands)"} if stands else {"label": label}
             axes.plot(centres[:, 0], centres[:, axis], **style | name)
     for position, (first, last) in enumerate(broken):
         times, name = estimate.timestamps, {"label": "" if position else "broken"}
         part = slice(max(0, np.sum(times < first) - 1), np.sum(times <= last) + 1)
-        x, _, _ = places = estimate.T_world_camera[part, :3, 3].T
+        x, _, _ = places = estimate.centres[part].T
         axes.plot(x, places[axis], **ESTIMATE_STYLE | name | {"color": "tab:red"})
     axes.set(xlabel=f"x [{unit}]", ylabel=f"{'xyz'[axis]} [{unit}]")
     axes.set_aspect("equal", adjustable="datalim")

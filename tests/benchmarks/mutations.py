@@ -293,7 +293,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("2 * without >= len", "2 * without < len"),
         ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),
     ],
-    ("viz/report.py", "viz/test_report.py"): [
+    ("viz/pages.py", "viz/test_pages_report.py"): [
         ("name: escape(getattr(report, name))", "name: getattr(report, name)"),
         ('class="warning">{escape(text)}', 'class="warning">{text}'),
     ],

@@ -106,7 +106,7 @@ def test_poses_at_other_times_have_nothing_in_common():
     truth = walk()
     later = Truth(trajectory=Trajectory(truth.timestamps + 50, truth.T_world_camera))
     metrics = measure_run(later, estimated(truth), estimated(truth), [], lambda pose: grey(0))
-    assert metrics["ate_all_cm"] is None and metrics["ate_keyframes_cm"] is None
+    assert known(metrics) == set()  # nor is there a straight walk to compare with
 
 
 def test_how_well_the_map_fits_what_stands_still_needs_no_truth():

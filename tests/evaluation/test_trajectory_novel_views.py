@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from minislam.evaluation.trajectory import centres, oriented_truth_to_estimate
+from minislam.evaluation.trajectory import oriented_truth_to_estimate
 from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 from tests.helpers import random_transforms
@@ -18,10 +18,10 @@ def test_views_follow_the_similarity_between_the_worlds():
     estimate = Trajectory(
         np.arange(15.0), Similarity(s, R, t).transform_poses(truth.T_world_camera)
     )
-    novel = umeyama(centres(truth), centres(estimate)).transform_poses(poses[15:])
+    novel = umeyama(truth.centres, estimate.centres).transform_poses(poses[15:])
     np.testing.assert_allclose(novel[:, :3, :3], R @ poses[15:, :3, :3], atol=1e-12)
     np.testing.assert_allclose(novel[:, :3, 3], s * poses[15:, :3, 3] @ R.T + t, atol=1e-12)
-    one = umeyama(centres(truth), centres(estimate)).transform_poses(poses[15])
+    one = umeyama(truth.centres, estimate.centres).transform_poses(poses[15])
     np.testing.assert_array_equal(one, novel[0])
 
 
@@ -58,7 +58,7 @@ def test_orientations_find_the_turn_that_noisy_centres_on_a_line_leave_open():
     noisy = exact.copy()
     noisy[:, :3, 3] += 0.01 * source.standard_normal((30, 3))
     estimate = Trajectory(np.arange(30.0), noisy)
-    by_centres = umeyama(centres(truth), centres(estimate))
+    by_centres = umeyama(truth.centres, estimate.centres)
     by_cameras = oriented_truth_to_estimate(estimate, truth)
     assert np.abs(by_centres.rotation - world.rotation).max() > 0.02
     np.testing.assert_allclose(by_cameras.rotation, world.rotation, atol=1e-12)

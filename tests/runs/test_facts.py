@@ -2,27 +2,14 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
 from minislam.config import with_settings
-from minislam.records import Keyframe, Pictured, Trajectory
+from minislam.records import Keyframe, Pictured
 from minislam.runs import facts
 from minislam.splatting import Rendering
 from tests.runs.finished import CAMERA, finished
-
-
-def test_without_an_ate_there_is_no_straight_walk(monkeypatch: pytest.MonkeyPatch):
-    run, path = finished(), Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-    run.trajectory = run.keyframe_trajectory = lambda: path
-    run.tracker.grid, run.render = run.tracker.graph.grid, None
-    monkeypatch.setattr(facts, "_ties", lambda run: {})
-    monkeypatch.setattr(facts, "unseen_psnr", lambda run: None)
-    for ate, line in ((None, None), (0.0, 86.0)):
-        errors = {"ate_all_cm": ate, "ate_straight_line_cm": 86.0}
-        monkeypatch.setattr(facts, "measure_run", lambda *_, found=errors: found)
-        assert facts.measure(run, 1.0, None)["ate_straight_line_cm"] == line
 
 
 def test_what_beta_leaves_out_and_what_is_guessed_is_measured(monkeypatch: pytest.MonkeyPatch):

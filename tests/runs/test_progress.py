@@ -7,15 +7,10 @@ import sys
 import threading
 import time
 from itertools import count, pairwise
-from unittest.mock import MagicMock
 
 import pytest
 
-from minislam.cli.run import DEMO
-from minislam.config import PRESETS, preset
-from minislam.geometry import Camera
-from minislam.priors.names import PriorChoice
-from minislam.runs.progress import ENDING, ProgressLine, ending_signals, plan_of, say
+from minislam.runs.progress import ENDING, ProgressLine, ending_signals, say
 
 
 def test_off_a_terminal_a_stage_prints_a_line_every_tenth(monkeypatch, capsys):
@@ -188,24 +183,3 @@ def test_a_run_that_begins_anew_is_in_its_first_stage_again(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert [int(line[len("stage ")]) for line in lines] == [1, 2, 2, 1, 2]
     assert lines[3].endswith("about 30 s in all")
-
-
-def planned(name: str, choice: PriorChoice, frames: int = 60) -> list[dict[str, float]]:
-    sequence = MagicMock(camera=Camera(300, 300, 160, 120, 320, 240))
-    sequence.__len__.return_value = frames
-    return plan_of(preset(name), choice, sequence)
-
-
-def test_the_demo_is_planned_for_some_two_minutes_of_one_core():
-    plan = planned("laptop", PriorChoice(depth="simulated"), frames=DEMO["max_frames"])
-    assert sum(seconds for stage in plan for seconds in stage.values()) < 150  # 137 today
-
-
-@pytest.mark.parametrize("name", PRESETS)
-@pytest.mark.parametrize("has_prior", [True, False])
-def test_every_run_has_a_plan(name: str, has_prior: bool):
-    plan = planned(name, PriorChoice(depth="sensor" if has_prior else "none"))
-    shown = [part for stage in plan for part in stage if part]
-    assert shown[0] == "tracking and mapping" and "dense depth" in shown
-    assert min(seconds for stage in plan for seconds in stage.values()) >= 0
-    assert shown.count("first map") == 1 + has_prior and len(plan) == 6 + (name == "paper")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from minislam.errors import TrackingLost
-from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error, centres
+from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error
 from minislam.records import Frame, TrackingStatus, Trajectory
 from minislam.tracking.tracker import LONGEST_TAIL, Mode, Tracker
 from tests.tracking.recording import (
@@ -35,7 +35,7 @@ def finished(with_depth: bool) -> Tracker:
 
 
 def path_length(trajectory: Trajectory) -> float:
-    return float(np.linalg.norm(np.diff(centres(trajectory), axis=0), axis=1).sum())
+    return float(np.linalg.norm(np.diff(trajectory.centres, axis=0), axis=1).sum())
 
 
 @pytest.mark.parametrize("with_depth", [True, False])

@@ -11,7 +11,7 @@ import pytest
 
 from minislam.errors import InputError
 from minislam.viz import figure_picture, flipbook, new_figure
-from minislam.viz.flipbook import LARGEST
+from minislam.viz.pages import LARGEST
 
 RNG = np.random.default_rng(0)
 PICTURES = [np.full((12, 16, 3), shade / 4) for shade in range(4)]
