@@ -81,6 +81,8 @@ def adjust(
 ) -> None:
     """Run a bundle adjustment over the edges that touch the free keyframes."""
     positions = graph.edges.select(first_free)
+    if lambda_prior is None:
+        lambda_prior = graph.config.lambda_disparity_prior
     problem = bundle_problem(graph, positions, first_free, lambda_prior)
     if problem.robust is not None:
         kernel = problem.robust.widened(widening)
@@ -150,8 +152,8 @@ def adjust_narrowing(
 def bundle_problem(
     graph: KeyframeGraph,
     positions: Sequence[int],  # of edges in the graph
-    first_free: int,
-    lambda_prior: float | None = None,  # None: as configured
+    first_free: int = 0,  # keyframes from here on move
+    lambda_prior: float = 0.0,  # lambda_4
 ) -> BundleProblem:
     """Collect edges of the graph into the bundle problem of Eq. (5)."""
     keyframes, edges, grid = graph.keyframes, graph.edges, graph.grid
@@ -161,8 +163,6 @@ def bundle_problem(
     weights = stack([edges.confidences[p] for p in positions])
     _weigh_by_cells(graph, weights, edges_source, edges_target, targets)
     prior = keyframes.prior_disparities
-    if lambda_prior is None:
-        lambda_prior = graph.config.lambda_disparity_prior
     strength = lambda_prior * grid.camera.fx**2
     free = torch.arange(len(keyframes), device=prior.device) >= first_free
     free_poses = free.clone()

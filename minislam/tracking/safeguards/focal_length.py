@@ -97,7 +97,7 @@ def problem_among(graph: KeyframeGraph, keyframes: range) -> Start | None:
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return None
-    problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
+    problem = bundle_problem(graph, positions)
     problem, state = _thinned(graph, problem, keyframes)
     problem.free_poses[0] = False  # the first of them is their world
     return problem, state
@@ -114,7 +114,7 @@ def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> N
     """Set an unknown focal length to the best fit if it is observable; from then on it is free."""
     if not graph.seeks_focal or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
-    problem = bundle_problem(graph, range(len(graph.edges)), 0, lambda_prior=0.0)
+    problem = bundle_problem(graph, range(len(graph.edges)))
     fit, state = fit_focal_length(problem, graph.state, workers)
     if fit.factor is not None:
         graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
@@ -165,7 +165,7 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     columns = shutter.edge_columns(positions)
     if columns is None:
         return
-    problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
+    problem = bundle_problem(graph, positions)
     problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
     problem, start = _thinned(graph, problem, range(min(MOST_KEYFRAMES, len(graph.keyframes))))
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)

@@ -68,7 +68,7 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
 
 def adjust_turns(graph: KeyframeGraph) -> None:
     """Adjust the rotations of the keyframes alone: all that they see is infinitely far away."""
-    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
+    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.edges)))
     problem = replace(problem, free_disparities=torch.zeros_like(problem.free_disparities))
     poses = keyframes.T_camera_world.clone()
     poses[:, :3, 3] = 0
