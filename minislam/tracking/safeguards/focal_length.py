@@ -91,23 +91,21 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
     return fit_focal_length(*among, workers)[0]
 
 
-def problem_among(graph: KeyframeGraph, keyframes: range) -> Start | None:
+def problem_among(
+    graph: KeyframeGraph, keyframes: range, with_readout: bool = False
+) -> Start | None:
     """Return problem and state of the edges among some keyframes, at few cells; None: no edge."""
     edges = enumerate(graph.edges.ends)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return None
-    problem = bundle_problem(graph, positions)
-    problem, state = _thinned(graph, problem, keyframes)
-    problem.free_poses[0] = False  # the first of them is their world
-    return problem, state
-
-
-def _thinned(graph: KeyframeGraph, problem: BundleProblem, keyframes: range) -> Start:
-    """Return problem and state of some keyframes, at every EVERY-th cell along each side."""
+    columns = graph.shutter.edge_columns(positions) if with_readout else None
+    problem = replace(bundle_problem(graph, positions), shutter=columns)
     rows = torch.tensor(keyframes, device=problem.rays.device)
     cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
-    return of_cells(*of_rows(problem, graph.state, rows), cells[::EVERY, ::EVERY].flatten())
+    among = of_cells(*of_rows(problem, graph.state, rows), cells[::EVERY, ::EVERY].flatten())
+    among[0].free_poses[0] = False  # the first of them is their world
+    return among
 
 
 def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> None:
@@ -158,16 +156,13 @@ def seek_readouts(graph: KeyframeGraph) -> None:
 
     If it saves little it stays 0, because it would follow noise and movers.
     """
-    shutter, edges = graph.shutter, enumerate(graph.edges.ends)
-    if shutter.is_found or len(graph.keyframes) < LEAST_KEYFRAMES:
+    shutter, count = graph.shutter, len(graph.keyframes)
+    if not shutter.is_on or shutter.is_found or count < LEAST_KEYFRAMES:
         return
-    positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
-    columns = shutter.edge_columns(positions)
-    if columns is None:
+    among = problem_among(graph, range(min(MOST_KEYFRAMES, count)), with_readout=True)
+    if among is None:
         return
-    problem = bundle_problem(graph, positions)
-    problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
-    problem, start = _thinned(graph, problem, range(min(MOST_KEYFRAMES, len(graph.keyframes))))
+    problem, start = replace(among[0], free_focal=graph.focal_is_free), among[1]
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = least_cost(problem.weights)
