@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from statistics import median
+from statistics import fmean, median
 
 import torch
 
@@ -29,9 +29,9 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     """
     grid, edges, keyframes = graph.grid, graph.edges, graph.keyframes
     pairs = [p for p, (source, target) in enumerate(edges.ends) if target == source + 1]
-    pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)] if pairs else []
     if not pairs:
         return None
+    pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)]
     weights = [edges.confidences[p] * keyframes.cell_weights[edges.ends[p][0]] for p in pairs]
     numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # without translation sources share a pose
@@ -51,8 +51,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
 
 def fraction_at_rest(graph: KeyframeGraph) -> float:
     """Return the fraction of the keyframes whose poses claim hardly any parallax [-]."""
-    resting = [_rests(graph, keyframe) for keyframe in range(len(graph.keyframes))]
-    return sum(resting) / max(len(resting), 1)
+    return fmean(_rests(graph, keyframe) for keyframe in range(len(graph.keyframes)))
 
 
 def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
