@@ -1,11 +1,9 @@
 """The focal length and the readout that fit the flow.
 
-A focal length is estimated where it is unknown and checked where it is given.
-
-It is one more unknown of the bundle adjustment (focal_column.py), which converges from 0.75 to 1.3
-times the truth. A camera that does not turn fits its flow with any focal length. So an estimate
-counts only if the cost of the adjusted keyframes rises on both sides of it: by 1.2 %, or by .3 %
-if it saves more than 2 % against the present focal length.
+A focal length is estimated where it is unknown and checked where it is given. It is one more
+unknown of the bundle adjustment (focal_column.py), which converges from 0.75 to 1.3 times the
+truth. A camera that does not turn fits its flow with any. So an estimate counts only if the cost of
+the adjusted keyframes rises on both sides of it, less if it saves much.
 
 If the lens zooms while it films, half of the keyframes fit another focal length than all of them:
 all fit 1.04 times the present one, say, and the second half 1.40 times.
@@ -31,16 +29,11 @@ MOST_KEYFRAMES = 100  # from the first on, that a check adjusts, dozens of times
 EVERY = 2  # cells of a check along each side: it adjusts so often, and few unknowns ask for few
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
-# Smallest mean rise of the cost: with two seconds of real video it rose by 1.3 % and more where the
-# estimate was right, on synthetic clips by 12 % and more. [-]
-MIN_RISE = 0.012
-# The same where it saves much: .006 and more where it was right, .0014 and less where it was wrong.
-MIN_RISE_OF_BETTER = 0.003
+MIN_RISE = 0.012  # smallest mean rise of the cost; where the estimate was right, .013 and more [-]
+MIN_RISE_OF_BETTER = 0.003  # where it saves much; where right, .006 and more, wrong .0014 [-]
 # A warning needs both: a right focal length has looked 5.4 % off, but the other saved 1.3 %. [-]
 WORTH_SAYING, WORTH_SAVING = 0.05, 0.02
-# In warm-ups and whole runs of rolling shutters the readout saved 3 to 37 % of the cost, of clips
-# with a global shutter or with hardly any turn at most 1.2 %. [-]
-READOUT_WORTH_SAVING = 0.02
+READOUT_WORTH_SAVING = 0.02  # of the cost: rolling shutters 3 to 37 %, others at most 1.2 %
 # Fewer do not measure it: of fr1_desk 2, 3, 4 and 6 gave fx = 115, 238, 266, 276 px (true: 275).
 LEAST_KEYFRAMES = 4
 LEAST_HALF = 6  # keyframes of half a clip that is checked alone
