@@ -144,7 +144,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("matches.confidences * overlay", "matches.confidences * (1 - overlay)"),
     ],
     ("tracking/initialisation.py", "tracking/test_tracker_overlay.py"): [
-        ("[without_overlay(matches, keyframes.overlay) for matches", "[matches for matches"),
+        ("[motion_memory.without_overlay(matches, overlay) for matches", "[matches for matches"),
     ],
     ("tracking/tracker.py", "tracking/test_tracker_overlay.py"): [
         ("motion_memory.without_overlay(matches, self.keyframes.overlay)", "matches"),
