@@ -189,8 +189,8 @@ def check_prior_mask(student: Function) -> Verdict:
         same = torch.ones(1, 1, 1).double()
         this = DepthView(depth, same, torch.eye(4).double())
         views = [DepthView(there, same, se3_inverse(T)) for there, T in others]
-        counts = depth_consistency(grid, this, views, rest[-1], -2.0)
-        trusted = (counts.corresponding < seen) | (counts.consistent >= agree)
+        corresponding, consistent = depth_consistency(grid, this, views, rest[-1], -2.0)
+        trusted = (corresponding < seen) | (consistent >= agree)
         return trusted.double().view(grid.shape)
 
     def wall(T_this_other: Tensor) -> Tensor:

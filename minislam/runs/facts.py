@@ -158,7 +158,7 @@ def _ties(slam: Slam) -> dict[str, float | None]:
     """Return the length of the path, and how well poses, depths and flow agree, without truth."""
     graph, centres = slam.tracker.graph, slam.trajectory().centres
     every = range(len(graph.edges))
-    error = typical_residual(bundle_problem(graph, every, 0, 0.0), graph.state) if every else None
+    error = typical_residual(bundle_problem(graph, every), graph.state) if every else None
     return {
         "path_length": float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
         "reprojection_px": error,

@@ -66,13 +66,26 @@ def sweep(
     gray = reference.gray
     mean, variance = _moments(gray)
     spread = np.sqrt(variance + NCC_VARIANCE)
+
+    def dissimilarity(warped: np.ndarray) -> np.ndarray:  # 2 x (h, w), the result in [0, 1]
+        """Return 1 - max(NCC, 0), mixed with the absolute difference, from one warped view.
+
+        One view at a time, because its images stay in the cache.
+        """
+        mean_warped, variance_warped = _moments(warped)
+        covariance = cv2.blur(gray * warped, NCC_WINDOW) - mean * mean_warped
+        ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))
+        difference = cv2.blur(np.abs(gray - warped), DIFFERENCE_WINDOW)
+        absolute = np.minimum(difference / DIFFERENCE_SCALE, 1)
+        return (1 - DIFFERENCE_WEIGHT) * (1 - ncc.clip(0, 1)) + DIFFERENCE_WEIGHT * absolute
+
     cost = np.empty((len(inverse_depths), *gray.shape), np.float32)
     for plane, of_views in enumerate(homographies):
         costs, seen = [], np.empty((len(others), *gray.shape), bool)
         for view, (other, H) in enumerate(zip(others, of_views, strict=True)):
             warped = warp(other.gray, H)
             np.greater_equal(warped, 0, out=seen[view])
-            costs.append(_dissimilarity(gray, mean, spread, np.where(seen[view], warped, gray)))
+            costs.append(dissimilarity(np.where(seen[view], warped, gray)))
         cost[plane] = _mean_of_better_half(costs, seen)
     return cost
 
@@ -92,24 +105,6 @@ def _moments(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and variance (h, w) of the window around each pixel."""
     mean = cv2.blur(image, NCC_WINDOW)
     return mean, np.maximum(cv2.blur(image * image, NCC_WINDOW) - mean * mean, 0)
-
-
-def _dissimilarity(
-    gray: np.ndarray,  # (h, w), this image
-    mean: np.ndarray,  # (h, w) of its windows
-    spread: np.ndarray,  # (h, w) of its windows
-    warped: np.ndarray,  # (h, w), another image on one plane
-) -> np.ndarray:  # (h, w) in [0, 1]
-    """Return 1 - max(NCC, 0), mixed with the absolute difference.
-
-    One view at a time, because its images stay in the cache.
-    """
-    mean_warped, variance_warped = _moments(warped)
-    covariance = cv2.blur(gray * warped, NCC_WINDOW) - mean * mean_warped
-    ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))
-    difference = cv2.blur(np.abs(gray - warped), DIFFERENCE_WINDOW)
-    absolute = np.minimum(difference / DIFFERENCE_SCALE, 1)
-    return (1 - DIFFERENCE_WEIGHT) * (1 - ncc.clip(0, 1)) + DIFFERENCE_WEIGHT * absolute
 
 
 def _mean_of_better_half(

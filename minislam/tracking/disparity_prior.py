@@ -28,14 +28,6 @@ class DepthView:
     T_camera_world: Tensor  # (4, 4)
 
 
-@dataclass(frozen=True)
-class ConsistencyCounts:
-    """Per cell: number of views with a correspondence, and number whose depth agrees."""
-
-    corresponding: Tensor  # (N,) int64, views from which a point with similar features comes
-    consistent: Tensor  # (N,) int64, n_i of Eq. (8)
-
-
 def mask_priors(
     keyframes: KeyframeStore,
     grid: Grid,
@@ -66,11 +58,10 @@ def prior_mask(
 
     Otherwise the cell keeps its prior.
     """
-    counts = depth_consistency(
-        grid, view, others, config.mask_max_depth_error, config.mask_min_similarity
-    )
-    is_judged = counts.corresponding >= config.mask_min_corresponding
-    return ~(is_judged & (counts.consistent < config.mask_min_consistent))
+    limits = config.mask_max_depth_error, config.mask_min_similarity
+    corresponding, consistent = depth_consistency(grid, view, others, *limits)
+    is_judged = corresponding >= config.mask_min_corresponding
+    return ~(is_judged & (consistent < config.mask_min_consistent))
 
 
 def depth_consistency(
@@ -79,8 +70,8 @@ def depth_consistency(
     others: list[DepthView],  # j, the keyframes that the frame graph connects with i
     max_depth_error: float,  # epsilon, relative
     min_similarity: float,  # gamma, cosine
-) -> ConsistencyCounts:
-    """Count the views whose depth, warped into view i, agrees with that of i.
+) -> tuple[Tensor, Tensor]:  # 2 x (N,) int64
+    """Count the views from which a similar point comes, and n_i, those of agreeing depth.
 
     n_i = sum_j [ |D~_i - D~_j->i| / D~_j->i < epsilon  and  cos(F_i, F_j) > gamma ]. Eq. (8).
     """
@@ -95,7 +86,7 @@ def depth_consistency(
         has_correspondence = (depth > 0) & (warped > 0)
         corresponding += has_correspondence
         consistent += has_correspondence & ((depth - warped).abs() < max_depth_error * warped)
-    return ConsistencyCounts(corresponding, consistent)
+    return corresponding, consistent
 
 
 def warp_depth(
@@ -111,20 +102,18 @@ def warp_depth(
     correspondences. Of the others the nearest counts, because it occludes them: otherwise an
     occluded surface would count as a contradiction.
     """
-    camera, stride = grid.camera, grid.stride
-    depth = other.metric_depth.reshape(-1)
+    camera, depth = grid.camera, other.metric_depth.reshape(-1)
     pixels = camera.pixel_grid(dtype=depth.dtype, device=depth.device).reshape(-1, 2)
     points = camera.backproject(pixels, depth)
     points = transform_points(T_view_other.to(points.dtype), points)
     warped = points[:, 2]
     seen = (depth > 0) & (warped > MIN_DEPTH)
     points = torch.where(seen[:, None], points, points.new_ones(3))  # 1/z would not be finite
-    column, row = camera.project(points).round().unbind(1)
-    seen &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    arrived = camera.project(points).round()
     # Only one pixel in stride^2 is a grid cell, whose disparity Eq. (5) estimates.
-    seen &= (column % stride == 0) & (row % stride == 0)
+    seen &= camera.contains(arrived) & (arrived % grid.stride == 0).all(1)
 
-    cell = (row[seen] / stride).long() * grid.shape[1] + (column[seen] / stride).long()
+    cell, _ = grid.cells_at(arrived[seen].T)
     features = sample_features(other.features, pixels[seen], camera)
     similar = functional.cosine_similarity(features, cell_features[cell], dim=1) > min_similarity
     nearest = depth.new_full((len(cell_features),), torch.inf)

@@ -139,41 +139,34 @@ def flow_distances(
     D = eta |flow| + (1 - eta) |flow without rotation|, averaged over the valid cells and
     both directions. Rotation counts less than translation, because it brings no parallax.
     """
-    count, view = len(T_camera_world), (camera, full_flow_weight)
+    count = len(T_camera_world)
     rows = range(count) if rows is None else rows
+
+    def directed(source: Tensor, target: Tensor) -> Tensor:  # 2 x (E,) keyframes -> (E,) px
+        """Return the distance one way, FAR where too few cells lie in front of the target."""
+        whole = relative_transforms(T_camera_world, source, target).to(disparities.dtype)
+        without_rotation = whole.clone()
+        without_rotation[:, :3, :3] = torch.eye(3, device=whole.device)
+        total, valid_cells = disparities.new_zeros(2, len(source))
+        motions = (whole, full_flow_weight), (without_rotation, 1 - full_flow_weight)
+        for motion, weight in motions:
+            positions, valid = reproject(motion, disparities[source], rays, camera)
+            length = lengths(positions - pixels.T)
+            total += weight * (length * valid).sum(1)
+            valid_cells += weight * valid.sum(1)
+        is_enough = valid_cells >= MIN_VALID_FRACTION * len(rays)
+        return torch.where(is_enough, total / valid_cells.clamp_min(1), FAR)
+
     near = torch.ones(count, count, dtype=torch.bool, device=disparities.device)
     if limit < FAR:
         coarse = disparities[:, ::COARSE], rays[::COARSE], pixels[::COARSE]
-        near = flow_distances(T_camera_world, *coarse, *view, rows) < COARSE_MARGIN * limit
+        rough = flow_distances(T_camera_world, *coarse, camera, full_flow_weight, rows)
+        near = rough < COARSE_MARGIN * limit
     distances = disparities.new_full((count, count), FAR)
     for row in rows:
         near[row, rows.start : row] = False  # known already
         others = near[row].nonzero()[:, 0]
         this = torch.full_like(others, row)
-        both = []
-        for source, target in ((this, others), (others, this)):
-            motion = relative_transforms(T_camera_world, source, target).to(disparities.dtype)
-            both.append(_directed_distances(motion, disparities[source], rays, pixels, *view))
-        distances[row, others] = distances[others, row] = 0.5 * (both[0] + both[1])
+        mean = 0.5 * (directed(this, others) + directed(others, this))
+        distances[row, others] = distances[others, row] = mean
     return distances
-
-
-def _directed_distances(
-    T_target_source: Tensor,  # (E, 4, 4)
-    disparities: Tensor,  # (E, N) of the sources
-    rays: Tensor,  # (N, 3)
-    pixels: Tensor,  # (N, 2) px
-    camera: Camera,
-    full_flow_weight: float,
-) -> Tensor:  # (E,) px, FAR where too few cells lie in front of the target
-    without_rotation = T_target_source.clone()
-    without_rotation[:, :3, :3] = torch.eye(3, device=T_target_source.device)
-    total, valid_cells = disparities.new_zeros(2, len(T_target_source))
-    motions = (T_target_source, full_flow_weight), (without_rotation, 1 - full_flow_weight)
-    for motion, weight in motions:
-        positions, valid = reproject(motion, disparities, rays, camera)
-        length = lengths(positions - pixels.T)
-        total += weight * (length * valid).sum(1)
-        valid_cells += weight * valid.sum(1)
-    is_enough = valid_cells >= MIN_VALID_FRACTION * len(rays)
-    return torch.where(is_enough, total / valid_cells.clamp_min(1), FAR)

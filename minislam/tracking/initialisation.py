@@ -17,12 +17,8 @@ from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.grid import Grid
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import start_pose, warp_disparities
+from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.first_camera import lowest_minimum
-from minislam.tracking.safeguards.motion_memory import (
-    inherit_motion_weight,
-    overlay_weights,
-    without_overlay,
-)
 from minislam.tracking.safeguards.robust import RobustKernel
 from minislam.workers import Workers
 
@@ -68,7 +64,7 @@ def chain_state(
         if index > 0:
             starts.append(se3_interpolate(poses[-2], last, 2.0))
         pose = start_pose(grid, matches, of_last, weights, last, starts, robust)
-        weights = inherit_motion_weight(grid, matches, weights)
+        weights = motion_memory.inherit_motion_weight(grid, matches, weights)
         warped = warp_disparities(grid, pose @ se3_inverse(last), of_last)
         known = known_disparities[index + 1]
         poses.append(pose)
@@ -84,8 +80,9 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
     keyframes = graph.keyframes
-    keyframes.overlay = overlay_weights(flow_to_next, graph.grid)
-    flow_to_next = [without_overlay(matches, keyframes.overlay) for matches in flow_to_next]
+    overlay = motion_memory.overlay_weights(flow_to_next, graph.grid)
+    flow_to_next = [motion_memory.without_overlay(matches, overlay) for matches in flow_to_next]
+    keyframes.overlay = overlay
     graph.flow_to_next = [*flow_to_next]
     for target in range(1, len(keyframes)):
         graph.match_composed(target)

@@ -64,7 +64,7 @@ def close_loops(graph: KeyframeGraph) -> bool:
 
 def _residual(graph: KeyframeGraph, first_edge: int) -> float:
     """Return the weighted mean length of the residuals [px], over edges `first_edge` and later."""
-    problem = bundle_problem(graph, range(first_edge, len(graph.edges)), first_free=0)
+    problem = bundle_problem(graph, range(first_edge, len(graph.edges)))
     residual, _ = residuals(problem, graph.state)
     weight = problem.weights.mean(1)
     return float((weight * lengths(residual)).sum() / weight.sum().clamp_min(1e-6))

@@ -44,9 +44,7 @@ def local_ba(graph: KeyframeGraph) -> None:
 
 def online_global_ba(graph: KeyframeGraph) -> None:
     """Adjust all keyframes while the sequence goes on; flow is measured only on new edges."""
-    edges = graph.global_edges()
-    if edges:
-        graph.match(edges)
+    graph.match(graph.global_edges())
     adjust(graph, 0, graph.config.global_iterations, free_camera=True)
 
 
@@ -81,6 +79,8 @@ def adjust(
 ) -> None:
     """Run a bundle adjustment over the edges that touch the free keyframes."""
     positions = graph.edges.select(first_free)
+    if lambda_prior is None:
+        lambda_prior = graph.config.lambda_disparity_prior
     problem = bundle_problem(graph, positions, first_free, lambda_prior)
     if problem.robust is not None:
         kernel = problem.robust.widened(widening)
@@ -93,8 +93,11 @@ def adjust(
     # Without parallax the flow does not measure depth. In a local BA such a keyframe keeps its
     # disparities, which hold the scale until the camera moves again; where all keyframes are
     # adjusted, only one with a prior does.
+    largest = graph.grid.rays.new_zeros(len(graph.keyframes))
+    parallaxes = graph.parallaxes(problem.edges_source, problem.edges_target)
+    largest.scatter_reduce_(0, problem.edges_source, parallaxes, "amax")
     worth_keeping = (graph.keyframes.prior_disparities > 0).any(1) | (first_free > 0)
-    may_change = _has_parallax(graph, problem) | ~worth_keeping
+    may_change = (largest >= graph.least_parallax) | ~worth_keeping
     problem = replace(problem, free_disparities=problem.free_disparities & may_change)
     state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
@@ -150,8 +153,8 @@ def adjust_narrowing(
 def bundle_problem(
     graph: KeyframeGraph,
     positions: Sequence[int],  # of edges in the graph
-    first_free: int,
-    lambda_prior: float | None = None,  # None: as configured
+    first_free: int = 0,  # keyframes from here on move
+    lambda_prior: float = 0.0,  # lambda_4
 ) -> BundleProblem:
     """Collect edges of the graph into the bundle problem of Eq. (5)."""
     keyframes, edges, grid = graph.keyframes, graph.edges, graph.grid
@@ -159,10 +162,18 @@ def bundle_problem(
     edges_source, edges_target = torch.tensor(ends, device=grid.rays.device).unbind(1)
     targets = stack([edges.targets[p] for p in positions])
     weights = stack([edges.confidences[p] for p in positions])
-    _weigh_by_cells(graph, weights, edges_source, edges_target, targets)
+
+    # Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a
+    # dynamic object covers; a classical one does not, so the target's weight counts as well.
+    cells, columns = keyframes.cell_weights, (weights, edges_source, edges_target, targets)
+    for weight, source, target, position in zip(*map(at_once, columns), strict=True):
+        static = cells[source]
+        if not graph.is_learned:
+            static = static * grid.sample(cells[target][..., None], position.mT)[..., 0]
+        weight *= static[:, None]
+        release()
+
     prior = keyframes.prior_disparities
-    if lambda_prior is None:
-        lambda_prior = graph.config.lambda_disparity_prior
     strength = lambda_prior * grid.camera.fx**2
     free = torch.arange(len(keyframes), device=prior.device) >= first_free
     free_poses = free.clone()
@@ -176,32 +187,3 @@ def bundle_problem(
         free_poses=free_poses, free_disparities=free, robust=graph.robust,
         disparity_damping=graph.flow.disparity_damping(len(keyframes)),
     )  # fmt: skip
-
-
-def _weigh_by_cells(
-    graph: KeyframeGraph,
-    weights: Tensor,  # (E, 2, N), multiplied in place
-    edges_source: Tensor,  # (E,) keyframe index
-    edges_target: Tensor,  # (E,)
-    targets: Tensor,  # (E, 2, N) px
-) -> None:
-    """Multiply the weights of edges by those of the cells at both ends, some edges at a time.
-
-    Eq. (5) weighs by beta of the source. A learned confidence also notices a target that a dynamic
-    object covers; a classical one does not, so the weight of the target counts as well.
-    """
-    cells, columns = graph.keyframes.cell_weights, (weights, edges_source, edges_target, targets)
-    for weight, source, target, position in zip(*map(at_once, columns), strict=True):
-        static = cells[source]
-        if not graph.is_learned:
-            static = static * graph.grid.sample(cells[target][..., None], position.mT)[..., 0]
-        weight *= static[:, None]
-        release()
-
-
-def _has_parallax(graph: KeyframeGraph, problem: BundleProblem) -> Tensor:  # (K,) bool
-    """Tell which keyframes have an edge with enough parallax, so that it measures depth."""
-    most = graph.grid.rays.new_zeros(len(graph.keyframes))
-    seen = graph.parallaxes(problem.edges_source, problem.edges_target)
-    most.scatter_reduce_(0, problem.edges_source, seen, "amax")
-    return most >= graph.least_parallax

@@ -62,19 +62,17 @@ def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseN
     no_step = problem.rays.new_zeros(6 * poses + frames * len(problem.rays), dtype=torch.float64)
 
     def predicted(step: Tensor) -> Tensor:
-        return predicted_positions(problem, moved(problem, state, step))[0].reshape(-1)
-
-    def disparities(step: Tensor) -> Tensor:
-        return moved(problem, state, step).disparities.reshape(-1)
+        """Return what the flow and the prior measure: rows of one least-squares problem."""
+        after = moved(problem, state, step)
+        positions, _ = predicted_positions(problem, after)
+        return torch.cat([positions.reshape(-1), after.disparities.reshape(-1)])
 
     positions, valid = predicted_positions(problem, state)
     residual = problem.targets - positions
     weight = problem.weights * valid[:, None]
     if problem.robust is not None:
         weight = weight * problem.robust.weight(residual.square().sum(1, keepdim=True))
-    # The flow and the prior are rows of one least-squares problem.
-    jacrev = torch.func.jacrev
-    J = torch.cat([jacrev(predicted)(no_step), jacrev(disparities)(no_step)])
+    J = torch.func.jacrev(predicted)(no_step)
     prior_residual = problem.prior_disparities - state.disparities
     r = torch.cat([residual.reshape(-1), prior_residual.reshape(-1)])
     w = torch.cat([weight.reshape(-1), problem.prior_weights.reshape(-1)])

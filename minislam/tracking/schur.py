@@ -87,13 +87,10 @@ def source_blocks(
     common columns, so the Schur complement is one small matrix product per source frame.
     """
     slots, targets = _pose_slots(problem).tolist(), problem.edges_target.tolist()
-    edges_of: dict[int, list[int]] = {}
-    for edge, source in enumerate(problem.edges_source.tolist()):
-        edges_of.setdefault(source, []).append(edge)
     common = [6 * (max(slots) + 1) + column for column in range(E_target.shape[1] - 6)]
-    blocks, is_free = [], problem.free_disparities.tolist()
-    for source in sorted(source for source in edges_of if is_free[source]):
-        edges = edges_of[source]
+    blocks, sources = [], problem.edges_source
+    for source in sources[problem.free_disparities[sources]].unique().tolist():
+        edges = (sources == source).nonzero()[:, 0].tolist()
         free = [edge for edge in edges if slots[targets[edge]] >= 0]
         own = [E_source[edges].sum(0)] if slots[source] >= 0 else []
         ends = [slots[source]] * len(own) + [slots[targets[edge]] for edge in free]

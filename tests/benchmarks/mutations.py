@@ -80,7 +80,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("saving <= FOCAL_WORTH_SAVING", "False"),
         ("edge_columns(positions) if tells_camera else None", "edge_columns([])"),
         ("(1 - READOUT_WORTH_SAVING) * min", "2 * min"),
-        ("problem = flow_problem()  # corrected", "pass"),
+        ("problem = bundle_problem(graph, positions)  # corrected", "pass"),
         ("* doublings - RELIEF", "* doublings + RELIEF"),
         ("abs(state.log_focal) / math.log(2)", "state.log_focal / math.log(2)"),
         ("return math.inf", "return 0.0"),
@@ -144,7 +144,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("matches.confidences * overlay", "matches.confidences * (1 - overlay)"),
     ],
     ("tracking/initialisation.py", "tracking/test_tracker_overlay.py"): [
-        ("[without_overlay(matches, keyframes.overlay) for matches", "[matches for matches"),
+        ("[motion_memory.without_overlay(matches, overlay) for matches", "[matches for matches"),
     ],
     ("tracking/tracker.py", "tracking/test_tracker_overlay.py"): [
         ("motion_memory.without_overlay(matches, self.keyframes.overlay)", "matches"),
@@ -212,7 +212,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("tracking/tracker.py", "test_slam_at_rest.py"): [("if not self.knows_depth", "if False")],
     ("tracking/disparity_prior.py", "tracking/test_disparity_prior.py"): [
         ("(depth > 0) & (warped > 0)", "(warped > 0)"), ('"amin"', '"amax"'),
-        ("counts.consistent < ", "counts.consistent <= "),
+        ("(consistent < ", "(consistent <= "),
     ],
     ("tracking/frame_graph.py", "tracking/test_frame_graph.py"): [
         ("(without_rotation, 1 - full_flow_weight)", "(without_rotation, full_flow_weight)"),

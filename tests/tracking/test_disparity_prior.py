@@ -9,7 +9,6 @@ from torch import Tensor
 from minislam.geometry import Camera, se3_exp
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.disparity_prior import (
-    ConsistencyCounts,
     DepthView,
     depth_consistency,
     mask_priors,
@@ -56,7 +55,7 @@ def columns_of(cells: Tensor) -> list[int]:
     return rows[0].nonzero().squeeze(1).tolist()
 
 
-def counted(ours: DepthView, others: list[DepthView]) -> ConsistencyCounts:
+def counted(ours: DepthView, others: list[DepthView]) -> tuple[Tensor, Tensor]:
     return depth_consistency(GRID, ours, others, EPSILON, GAMMA)
 
 
@@ -90,10 +89,11 @@ def test_one_other_view_is_not_enough_to_mask():
 
 def test_two_views_that_agree_outvote_one_that_does_not():
     others = [scaled_depth(view(STEP), 1.03, slice(None)), view(-STEP), view(2 * STEP)]
-    counts, mask = counted(view(0.0), others), prior_mask(GRID, view(0.0), others, CONFIG)
+    corresponding, consistent = counted(view(0.0), others)
+    mask = prior_mask(GRID, view(0.0), others, CONFIG)
     in_all_views = (slice(None), slice(10, 70))
-    assert (counts.corresponding.reshape(SHAPE)[in_all_views] == 3).all()
-    assert (counts.consistent.reshape(SHAPE)[in_all_views] == 2).all()
+    assert (corresponding.reshape(SHAPE)[in_all_views] == 3).all()
+    assert (consistent.reshape(SHAPE)[in_all_views] == 2).all()
     assert mask.reshape(SHAPE)[in_all_views].all()
 
 
@@ -114,20 +114,20 @@ def test_an_occluded_surface_is_not_counted_as_inconsistent(offset: float):
     # point written counted instead of the nearest, one of the two directions would fail.
     box = (0.005, 0.305)
     ours, other = (view(x, box, look=WALL_LOOK) for x in (0.0, offset))
-    counts = counted(ours, [other])
-    assert torch.equal(counts.corresponding, counts.consistent)
+    corresponding, consistent = counted(ours, [other])
+    assert torch.equal(corresponding, consistent)
     on_box = ours.metric_depth.reshape(-1) == BOX
-    assert counts.consistent[on_box].all()
+    assert consistent[on_box].all()
     # And it is true that something is hidden: without the box more wall arrives.
     without_box = replace(other, metric_depth=torch.where(other.metric_depth < WALL, 0, WALL))
-    assert counted(ours, [without_box]).corresponding[on_box].any()
+    assert counted(ours, [without_box])[0][on_box].any()
 
 
 def test_a_moving_thing_with_unlike_features_is_skipped():
     ours = view(0.0)
     others = [view(STEP, box=(0.0, 0.2)), view(-STEP, box=(0.05, 0.25))]
-    counts = counted(ours, others)
-    assert torch.equal(counts.corresponding, counts.consistent)
+    corresponding, consistent = counted(ours, others)
+    assert torch.equal(corresponding, consistent)
     assert prior_mask(GRID, ours, others, CONFIG).all()
     # If it looked like the wall it would be a contradiction.
     blind = replace(CONFIG, mask_min_similarity=-2.0)
@@ -152,23 +152,23 @@ def test_features_are_sampled_where_their_cells_lie():
 
 
 def test_without_other_views_everything_is_kept():
-    counts = counted(view(0.0), [])
-    assert not counts.corresponding.any() and not counts.consistent.any()
+    corresponding, consistent = counted(view(0.0), [])
+    assert not corresponding.any() and not consistent.any()
     assert prior_mask(GRID, view(0.0), [], CONFIG).all()
 
 
 def test_where_no_depth_is_known_nothing_is_judged():
     hole = scaled_depth(view(0.0), 0.0, slice(20, 30))
-    counts = counted(hole, [view(STEP), view(-STEP)])
-    assert columns_of(counts.corresponding == 0) == list(range(20, 30))
+    corresponding, _ = counted(hole, [view(STEP), view(-STEP)])
+    assert columns_of(corresponding == 0) == list(range(20, 30))
     blind = scaled_depth(view(STEP), 0.0, slice(None))
-    assert not counted(view(0.0), [blind]).corresponding.any()
+    assert not counted(view(0.0), [blind])[0].any()
 
 
 def test_cameras_that_look_away_have_no_word():
     turned = torch.tensor([0, 0, 0, 0, torch.pi, 0], dtype=torch.float64)
     behind = replace(view(0.0), T_camera_world=se3_exp(turned))
-    assert not counted(view(0.0), [behind]).corresponding.any()
+    assert not counted(view(0.0), [behind])[0].any()
     looks = WALL_LOOK.expand(len(GRID.pixels), 2)
     assert (warp_depth(GRID, looks, view(0.0), se3_exp(turned), GAMMA) == 0).all()
 
@@ -207,8 +207,9 @@ def test_the_prior_of_a_masked_cell_has_no_weight():
     assert mask[:3].all(), "only the keyframes from `first` on are judged"
     last = mask[3].reshape(graph.grid.shape)
     assert last[:, 5:].all() and not last[2:5, 2:5].any()
-    weights = bundle_problem(graph, range(len(EDGES)), first_free=0).prior_weights
-    strength = CONFIG.lambda_disparity_prior * CAMERA.fx**2
+    lambda_prior = CONFIG.lambda_disparity_prior
+    weights = bundle_problem(graph, range(len(EDGES)), lambda_prior=lambda_prior).prior_weights
+    strength = lambda_prior * CAMERA.fx**2
     assert torch.allclose(weights, strength * mask.float())
 
 

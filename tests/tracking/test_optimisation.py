@@ -53,7 +53,7 @@ def move(graph: KeyframeGraph, keyframe: int) -> None:
 
 def test_at_the_truth_all_residuals_are_zero():
     graph = matched()
-    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)))
     residual, valid = residuals(problem, graph.state)
     assert bool(valid.any()) and float((residual * problem.weights).abs().max()) < 1e-4
 
@@ -62,7 +62,7 @@ def test_weights_are_confidence_times_the_cell_weights_of_both_ends():
     graph = matched(2)
     graph.keyframes.static_weights[0] = 0.5
     graph.keyframes.static_weights[1] = 0.25
-    problem = bundle_problem(graph, [0, 1], first_free=0)
+    problem = bundle_problem(graph, [0, 1])
     confidences = torch.stack(graph.edges.confidences)
     torch.testing.assert_close(problem.weights, 0.125 * confidences)
 
@@ -70,15 +70,15 @@ def test_weights_are_confidence_times_the_cell_weights_of_both_ends():
 def test_weights_are_the_same_however_many_links_are_weighed_at_once(monkeypatch):
     graph = matched()
     graph.keyframes.static_weights[2] = torch.linspace(0, 1, len(graph.grid.rays))
-    whole = bundle_problem(graph, range(len(graph.edges)), first_free=0)
+    whole = bundle_problem(graph, range(len(graph.edges)))
     monkeypatch.setattr(frame_graph, "AT_ONCE", 3)
-    split = bundle_problem(graph, range(len(graph.edges)), first_free=0)
+    split = bundle_problem(graph, range(len(graph.edges)))
     assert torch.equal(split.weights, whole.weights)
 
 
 def test_the_typical_residual_is_that_of_the_cells_that_weigh():
     graph = matched(3)
-    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)))
     problem.targets[:, 0] += 0.3
     problem.targets[:, 1] += 0.4
     covered = graph.grid.pixels[:, 1] < CAMERA.height / 2 + 8
@@ -91,7 +91,7 @@ def test_the_typical_residual_is_that_of_the_cells_that_weigh():
 
 def test_the_typical_residual_of_links_in_parts_is_that_of_all(monkeypatch: pytest.MonkeyPatch):
     graph = matched()
-    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)))
     noise = torch.randn(problem.targets.shape, generator=torch.Generator().manual_seed(0))
     problem = replace(problem, targets=problem.targets + noise)
     whole = typical_residual(problem, graph.state)
@@ -101,7 +101,7 @@ def test_the_typical_residual_of_links_in_parts_is_that_of_all(monkeypatch: pyte
 
 
 def test_the_first_pose_never_moves_and_older_keyframes_stay():
-    problem = bundle_problem(matched(), range(4), first_free=0)
+    problem = bundle_problem(matched(), range(4))
     assert problem.free_poses.tolist() == [False, True, True, True]
     assert problem.free_disparities.tolist() == [True] * 4
     problem = bundle_problem(matched(), range(4), first_free=2)
@@ -110,12 +110,12 @@ def test_the_first_pose_never_moves_and_older_keyframes_stay():
 
 
 def test_the_prior_weighs_where_it_is_known_and_grows_with_the_focal_length():
-    graph = matched(lambda_disparity_prior=0.01)
+    graph = matched()
     graph.keyframes.prior_disparities[1, 3] = 0.2
-    weights = bundle_problem(graph, range(4), first_free=0).prior_weights
+    weights = bundle_problem(graph, range(4), lambda_prior=0.01).prior_weights
     assert float(weights[1, 3]) == torch.tensor(0.01 * CAMERA.fx**2)
     assert int((weights > 0).sum()) == 1
-    assert float(bundle_problem(graph, range(4), 0, lambda_prior=0.0).prior_weights.sum()) == 0
+    assert float(bundle_problem(graph, range(4)).prior_weights.sum()) == 0
 
 
 # What moves
@@ -199,7 +199,7 @@ def test_the_last_round_leaves_out_what_errs_more_than_flow_does(monkeypatch):
 
 def test_the_unit_of_length_is_chosen_without_changing_any_image():
     graph = matched()
-    problem = bundle_problem(graph, range(len(graph.edges)), first_free=0)
+    problem = bundle_problem(graph, range(len(graph.edges)))
     before, _ = residuals(problem, graph.state)
     graph.keyframes.normalise_scale()
     assert float(graph.keyframes.disparities.median()) == 1.0

@@ -98,7 +98,7 @@ class Watch(Stateful):
         if self.only_turned:  # depths are arbitrary, and a pan leaves old cells behind
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
-            problem = bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
+            problem = bundle_problem(graph, range(len(graph.edges)))
             found = scale_deviations(problem, graph.state)
             judged = [replace(k, scale_deviation=found.get(i)) for i, k in enumerate(judged)]
             self.diagnostics = judged
@@ -158,7 +158,7 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     positions = [p for p, edge in enumerate(edges) if edge in near]
     if not positions:
         return None, None
-    problem = bundle_problem(graph, positions, 0, 0.0)
+    problem = bundle_problem(graph, positions)
     residual, robust_weights = residuals(problem, graph.state)
     sources, targets = problem.edges_source, problem.edges_target
     confidences = torch.stack([graph.edges.confidences[p][0] for p in positions])
@@ -191,7 +191,7 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
     at = {ends: p for p, ends in enumerate(graph.edges.ends) if ends in wanted}
     if before is None or now is None or len(at) < len(wanted):
         return None, None
-    residual, _ = residuals(bundle_problem(graph, list(at.values()), 0, 0.0), graph.state)
+    residual, _ = residuals(bundle_problem(graph, list(at.values())), graph.state)
     fits = dict(zip(at, fitting(graph, residual).float(), strict=True))
     known = {i: fits[i, i + 1] for i in sources[:-1]}
     known[keyframe - 1] = arrived(graph.grid, before, known[keyframe - 2])

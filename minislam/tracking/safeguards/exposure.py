@@ -35,8 +35,9 @@ Shot = TypeVar("Shot", Frame, Keyframe)
 def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
     """Return each keyframe's exposure (3,) by frame index, with median 1; {} if all are alike."""
     edges, cells, frames = graph.edges, graph.keyframes.cell_weights, graph.keyframes.frames
-    ratios: list[list[float | None]] = []
-    weights: list[float] = []
+    # A row is a pair of keyframes, its weight, and how much brighter the second is (log, 3).
+    neighbours = [(pair, STEADY, [0.0] * 3) for pair in pairwise(range(len(frames)))]
+    linked = []
 
     @lru_cache(maxsize=KEPT)
     def blurred(keyframe: int) -> np.ndarray:  # (H, W, 3)
@@ -54,15 +55,12 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
         static = cells[source] * graph.grid.sample(cells[target][:, None], targets.T)[:, 0]
         weight = visible * (edges.confidences[edge][0] * static).cpu()
         ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
-        ratios.append([weighted_median(channel, weight) for channel in ratio.T])
-        weights.append(float(weight.mean()))
-    least = LEAST_WEIGHT * max(weights, default=0.0)
-    reliable = [edge for edge, weight in enumerate(weights) if weight > least]
-    neighbours = list(pairwise(range(len(frames))))
-    pairs = [*neighbours, *(edges.ends[k] for k in reliable)]
-    steps = [[0.0] * 3] * len(neighbours) + [ratios[k] for k in reliable]
-    weights = [STEADY] * len(neighbours) + [weights[k] for k in reliable]
-    levels = _levels(len(frames), pairs, np.array(weights), np.array(steps, float))
+        step = [weighted_median(channel, weight) for channel in ratio.T]
+        linked.append(((source, target), float(weight.mean()), step))
+    least = LEAST_WEIGHT * max((weight for _, weight, _ in linked), default=0.0)
+    rows = [*neighbours, *(row for row in linked if row[1] > least)]
+    pairs, pair_weights, steps = map(np.array, zip(*rows, strict=True))
+    levels = _levels(len(frames), pairs, pair_weights, steps)
     if np.abs(levels).max() < LEAST_CHANGE:
         return {}
     exposures = torch.from_numpy(np.exp(levels)).float().to(graph.grid.rays.device)
@@ -71,17 +69,17 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
 
 def _levels(
     count: int,  # K images
-    edges: list[tuple[int, int]],  # E pairs of them
+    pairs: np.ndarray,  # (E, 2) of them
     weights: np.ndarray,  # (E,)
     steps: np.ndarray,  # (E, 3) how much higher the second of a pair is
 ) -> np.ndarray:  # (K, 3) of median 0
     """Return the levels that fit the steps best, by the normal equations: E is up to 20 K."""
-    source, target = np.array(edges, int).reshape(-1, 2).T
+    source, target = pairs.T
     matrix, right = np.zeros((count, count)), np.zeros((count, 3))
     for here, there, sign in ((target, source, 1), (source, target, -1)):
         np.add.at(matrix, (here, here), weights)
         np.add.at(matrix, (here, there), -weights)
-        np.add.at(right, here, sign * weights[:, None] * steps.reshape(-1, 3))
+        np.add.at(right, here, sign * weights[:, None] * steps)
     levels = np.linalg.lstsq(matrix, right, rcond=None)[0]
     return levels - np.median(levels, 0)
 

@@ -13,7 +13,6 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -109,7 +108,6 @@ def lowest_minimum(
     tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
     seeks_focal = graph.seeks_focal and tells_camera
     workers, positions = workers or Workers(), list(range(len(graph.edges)))
-    flow_problem = partial(bundle_problem, graph, positions, first_free=0, lambda_prior=0.0)
 
     def adjusted(problem: BundleProblem, found: list[Found]) -> list[Found]:
         calls = [(problem, state, WIDENINGS[1:], ITERATIONS) for state, _ in found]
@@ -120,7 +118,7 @@ def lowest_minimum(
             return min(found, key=cost_of)
         return most_plausible(graph.grid, graph.keyframes.prior_disparities, found)
 
-    problem = flow_problem()
+    problem = bundle_problem(graph, positions)
     free = replace(problem, free_focal=seeks_focal)
     found = at_guess = minima(problem, start(0.0), workers)
     if seeks_focal:
@@ -132,7 +130,7 @@ def lowest_minimum(
         rolled = best(adjusted(replace(free, shutter=columns), found))
         if cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found)):
             graph.shutter.take(rolled[0].readout)
-            problem = flow_problem()  # corrected
+            problem = bundle_problem(graph, positions)  # corrected
             free = replace(problem, free_focal=seeks_focal)
             chosen = adjust_narrowing(free, rolled[0], WIDENINGS[2:], ITERATIONS)
     if not seeks_focal:

@@ -1,11 +1,9 @@
 """The focal length and the readout that fit the flow.
 
-A focal length is estimated where it is unknown and checked where it is given.
-
-It is one more unknown of the bundle adjustment (focal_column.py), which converges from 0.75 to 1.3
-times the truth. A camera that does not turn fits its flow with any focal length. So an estimate
-counts only if the cost of the adjusted keyframes rises on both sides of it: by 1.2 %, or by .3 %
-if it saves more than 2 % against the present focal length.
+A focal length is estimated where it is unknown and checked where it is given. It is one more
+unknown of the bundle adjustment (focal_column.py), which converges from 0.75 to 1.3 times the
+truth. A camera that does not turn fits its flow with any. So an estimate counts only if the cost of
+the adjusted keyframes rises on both sides of it, less if it saves much.
 
 If the lens zooms while it films, half of the keyframes fit another focal length than all of them:
 all fit 1.04 times the present one, say, and the second half 1.40 times.
@@ -31,16 +29,11 @@ MOST_KEYFRAMES = 100  # from the first on, that a check adjusts, dozens of times
 EVERY = 2  # cells of a check along each side: it adjusts so often, and few unknowns ask for few
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
-# Smallest mean rise of the cost: with two seconds of real video it rose by 1.3 % and more where the
-# estimate was right, on synthetic clips by 12 % and more. [-]
-MIN_RISE = 0.012
-# The same where it saves much: .006 and more where it was right, .0014 and less where it was wrong.
-MIN_RISE_OF_BETTER = 0.003
+MIN_RISE = 0.012  # smallest mean rise of the cost; where the estimate was right, .013 and more [-]
+MIN_RISE_OF_BETTER = 0.003  # where it saves much; where right, .006 and more, wrong .0014 [-]
 # A warning needs both: a right focal length has looked 5.4 % off, but the other saved 1.3 %. [-]
 WORTH_SAYING, WORTH_SAVING = 0.05, 0.02
-# In warm-ups and whole runs of rolling shutters the readout saved 3 to 37 % of the cost, of clips
-# with a global shutter or with hardly any turn at most 1.2 %. [-]
-READOUT_WORTH_SAVING = 0.02
+READOUT_WORTH_SAVING = 0.02  # of the cost: rolling shutters 3 to 37 %, others at most 1.2 %
 # Fewer do not measure it: of fr1_desk 2, 3, 4 and 6 gave fx = 115, 238, 266, 276 px (true: 275).
 LEAST_KEYFRAMES = 4
 LEAST_HALF = 6  # keyframes of half a clip that is checked alone
@@ -91,30 +84,28 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
     return fit_focal_length(*among, workers)[0]
 
 
-def problem_among(graph: KeyframeGraph, keyframes: range) -> Start | None:
+def problem_among(
+    graph: KeyframeGraph, keyframes: range, with_readout: bool = False
+) -> Start | None:
     """Return problem and state of the edges among some keyframes, at few cells; None: no edge."""
     edges = enumerate(graph.edges.ends)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return None
-    problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
-    problem, state = _thinned(graph, problem, keyframes)
-    problem.free_poses[0] = False  # the first of them is their world
-    return problem, state
-
-
-def _thinned(graph: KeyframeGraph, problem: BundleProblem, keyframes: range) -> Start:
-    """Return problem and state of some keyframes, at every EVERY-th cell along each side."""
+    columns = graph.shutter.edge_columns(positions) if with_readout else None
+    problem = replace(bundle_problem(graph, positions), shutter=columns)
     rows = torch.tensor(keyframes, device=problem.rays.device)
     cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
-    return of_cells(*of_rows(problem, graph.state, rows), cells[::EVERY, ::EVERY].flatten())
+    among = of_cells(*of_rows(problem, graph.state, rows), cells[::EVERY, ::EVERY].flatten())
+    among[0].free_poses[0] = False  # the first of them is their world
+    return among
 
 
 def seek_focal_length(graph: KeyframeGraph, workers: Workers | None = None) -> None:
     """Set an unknown focal length to the best fit if it is observable; from then on it is free."""
     if not graph.seeks_focal or len(graph.keyframes) < LEAST_KEYFRAMES:
         return
-    problem = bundle_problem(graph, range(len(graph.edges)), 0, lambda_prior=0.0)
+    problem = bundle_problem(graph, range(len(graph.edges)))
     fit, state = fit_focal_length(problem, graph.state, workers)
     if fit.factor is not None:
         graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
@@ -158,16 +149,13 @@ def seek_readouts(graph: KeyframeGraph) -> None:
 
     If it saves little it stays 0, because it would follow noise and movers.
     """
-    shutter, edges = graph.shutter, enumerate(graph.edges.ends)
-    if shutter.is_found or len(graph.keyframes) < LEAST_KEYFRAMES:
+    shutter, count = graph.shutter, len(graph.keyframes)
+    if not shutter.is_on or shutter.is_found or count < LEAST_KEYFRAMES:
         return
-    positions = [position for position, edge in edges if max(edge) < MOST_KEYFRAMES]
-    columns = shutter.edge_columns(positions)
-    if columns is None:
+    among = problem_among(graph, range(min(MOST_KEYFRAMES, count)), with_readout=True)
+    if among is None:
         return
-    problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
-    problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
-    problem, start = _thinned(graph, problem, range(min(MOST_KEYFRAMES, len(graph.keyframes))))
+    problem, start = replace(among[0], free_focal=graph.focal_is_free), among[1]
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = least_cost(problem.weights)

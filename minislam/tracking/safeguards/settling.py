@@ -86,7 +86,7 @@ def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
     positions = [p for p, edge in enumerate(graph.edges.ends) if edge[0] == keyframe]
     if not positions:
         return torch.zeros_like(disparities)
-    problem = bundle_problem(graph, positions, 0, lambda_prior=0.0)
+    problem = bundle_problem(graph, positions)
     _, weights = residuals(problem, graph.state)
     at = reproject_with_jacobians(*graph.geometry(problem.edges_source, problem.edges_target))
     return disparities.square() * (weights * at.J_disparity.square()).sum((0, 1))

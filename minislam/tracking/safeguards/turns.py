@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from statistics import median
+from statistics import fmean, median
 
 import torch
 
@@ -29,9 +29,9 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     """
     grid, edges, keyframes = graph.grid, graph.edges, graph.keyframes
     pairs = [p for p, (source, target) in enumerate(edges.ends) if target == source + 1]
-    pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)] if pairs else []
     if not pairs:
         return None
+    pairs = pairs[:: math.ceil(len(pairs) / MOST_PAIRS)]
     weights = [edges.confidences[p] * keyframes.cell_weights[edges.ends[p][0]] for p in pairs]
     numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # without translation sources share a pose
@@ -51,8 +51,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
 
 def fraction_at_rest(graph: KeyframeGraph) -> float:
     """Return the fraction of the keyframes whose poses claim hardly any parallax [-]."""
-    resting = [_rests(graph, keyframe) for keyframe in range(len(graph.keyframes))]
-    return sum(resting) / max(len(resting), 1)
+    return fmean(_rests(graph, keyframe) for keyframe in range(len(graph.keyframes)))
 
 
 def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
@@ -68,7 +67,7 @@ def _rests(graph: KeyframeGraph, keyframe: int) -> bool:
 
 def adjust_turns(graph: KeyframeGraph) -> None:
     """Adjust the rotations of the keyframes alone: all that they see is infinitely far away."""
-    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.edges)), 0, 0.0)
+    keyframes, problem = graph.keyframes, bundle_problem(graph, range(len(graph.edges)))
     problem = replace(problem, free_disparities=torch.zeros_like(problem.free_disparities))
     poses = keyframes.T_camera_world.clone()
     poses[:, :3, 3] = 0

@@ -29,7 +29,7 @@ def test_information_is_the_curvature_of_the_cost_in_the_logarithm_of_a_disparit
     graph = true_graph([0, 1, 2, 3])
     graph.match([(3, 0), (3, 1), (3, 2), (0, 3)])
     found = measured_information(graph, 3)
-    problem = bundle_problem(graph, [0, 1, 2], 0)
+    problem = bundle_problem(graph, [0, 1, 2])
     at, cell, step = graph.state, len(GRID.rays) // 2, 1e-2
     shifts = []
     for sign in (-1, 1):
