@@ -120,7 +120,7 @@ class KeyframeGraph(Stateful):
 
     def remove_newest(self) -> None:
         """Forget the newest keyframe, which has no edges yet."""
-        del self.flow_to_next[-1:]  # of the first keyframe there is none
+        self.flow_to_next.pop()
         self.keyframes.remove_newest()
         self.flow.remove_frame(len(self.keyframes))
 

@@ -1,6 +1,7 @@
 """The tracker: estimates the camera's pose frame by frame and keeps keyframes (paper Sec. 3.3)."""
 
 from collections.abc import Callable
+from enum import Enum
 
 import torch
 from torch import Tensor
@@ -39,13 +40,22 @@ MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched
 LONGEST_TAIL = 2  # frames after the last keyframe that need none behind them
 
 
+class Mode(Enum):
+    """What the tracker is doing; the diagram is at Tracker."""
+
+    WAITING = "waiting"
+    WARMING_UP = "warming up"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
 class Tracker(Stateful):
     """Turns frames into keyframes with poses and disparities.
 
-        first frame --> warm-up --initialise()--> followed --no match--> lost
-                                                     ^                     |
-                                                     +----- old view or ---+
-                                                           known place
+        WAITING --first frame--> WARMING_UP --initialise()--> TRACKING --no match--> LOST
+                                                                  ^                    |
+                                                                  +---- old view or ---+
+                                                                       known place
 
     A frame of the warm-up that cannot be matched is lost, too; with many, `FirstFrame` begins anew.
     """
@@ -54,7 +64,7 @@ class Tracker(Stateful):
     tracked: list[TrackedFrame]
     watch: Watch
     _settling: Settling
-    initialised: bool = False  # the warm-up is over: there are poses to start from
+    mode: Mode = Mode.WAITING
     last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
     _last_global: int = 0  # keyframes at the last online global BA
 
@@ -94,6 +104,11 @@ class Tracker(Stateful):
         self._chain = None if chain is None else self.graph.flow.restore_chain(chain, frame_of)
 
     @property
+    def initialised(self) -> bool:
+        """Tell whether the warm-up is over: there are poses to start from."""
+        return self.mode in (Mode.TRACKING, Mode.LOST)
+
+    @property
     def knows_depth(self) -> bool:
         """Tell whether a prior or parallax gives depth, once all keyframes have been judged."""
         return self.keyframes.has_prior or not self.watch.only_turned
@@ -102,7 +117,7 @@ class Tracker(Stateful):
         """Follow the camera into the next frame; tell whether there are new keyframes."""
         count = len(self.keyframes)
         self.graph.shutter.see(frame)
-        if count == 0:
+        if self.mode is Mode.WAITING:
             self._begin(frame)
         else:
             self._follow(frame)
@@ -117,6 +132,7 @@ class Tracker(Stateful):
 
     def _begin(self, frame: Frame) -> None:
         """Make the first frame the first keyframe; its camera frame is the world frame."""
+        self.mode = Mode.WARMING_UP
         self._chain = self.graph.flow.start_chain(frame.image)
         ones = torch.ones_like(self.grid.rays[:, 0])
         world = torch.eye(4, device=ones.device)
@@ -149,6 +165,8 @@ class Tracker(Stateful):
         return chain, judged_by_pose(self.graph, matches) if self.graph.is_learned else matches
 
     def _log_followed(self, frame: Frame, ratio: float) -> None:
+        if self.initialised:
+            self.mode = Mode.TRACKING
         status = TrackingStatus.OK if self.initialised else TrackingStatus.INITIALISING
         self.tracked.append(TrackedFrame(frame.frame_index, frame.timestamp, status, ratio))
 
@@ -196,6 +214,7 @@ class Tracker(Stateful):
     def _handle_loss(self, frame: Frame, ratio: float) -> None:
         """Look for the camera among all keyframes; keep the chain, should the old view return."""
         if self.initialised:
+            self.mode = Mode.LOST
             features = self._features(frame)
             place = self._relocaliser.find(frame.image, features)
             if place is not None and self._resume(frame, place, features):
@@ -228,7 +247,7 @@ class Tracker(Stateful):
             )
         first_geometry(self.graph, workers)
         self._settling.fall_back_on_prior()
-        self.initialised = True
+        self.mode = Mode.TRACKING
         edges = neighbourhood_edges(0, len(self.keyframes), NEIGHBOURHOOD)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds)
         motion_memory.judge_all(self.graph)

@@ -11,7 +11,7 @@ import torch
 from minislam.errors import TrackingLost
 from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error
 from minislam.records import Frame, TrackingStatus, Trajectory
-from minislam.tracking.tracker import LONGEST_TAIL, Tracker
+from minislam.tracking.tracker import LONGEST_TAIL, Mode, Tracker
 from tests.tracking.recording import (
     CONFIG,
     SIZE,
@@ -77,17 +77,17 @@ def test_no_adjustment_failed():
     assert graph.adjustments > 0 == graph.failed_adjustments
 
 
-def test_warm_up_following_and_loss_come_after_each_other():
+def test_the_modes_follow_each_other():
     tracker, images = new_tracker(with_depth=True), frames()
-    assert tracker.track(images[0])
+    assert tracker.mode is Mode.WAITING and not tracker.initialised
+    assert tracker.track(images[0]) and tracker.mode is Mode.WARMING_UP
     assert not tracker.track(images[1]) and len(tracker.keyframes) == 1
-    assert not tracker.initialised
     tracker.initialise()
-    assert tracker.initialised and len(tracker.keyframes) == 2
+    assert tracker.mode is Mode.TRACKING and len(tracker.keyframes) == 2
     tracker.track(Frame(2, 2 / 30, torch.zeros_like(images[0].image)))
+    assert tracker.mode is Mode.LOST and tracker.initialised
     tracker.track(images[3])
-    status = [tracked.status.name for tracked in tracker.tracked]
-    assert status == ["INITIALISING", "INITIALISING", "LOST", "OK"]
+    assert tracker.mode is Mode.TRACKING
 
 
 def test_the_last_frame_becomes_a_keyframe():

@@ -9,7 +9,7 @@ from dataclasses import replace
 from minislam.records import TrackingStatus
 from minislam.state.stateful import Stateful
 from minislam.tracking.keyframe_selection import mean_flow
-from minislam.tracking.tracker import Tracker
+from minislam.tracking.tracker import Mode, Tracker
 
 Worth = tuple[bool, int]  # whether a start can tell depth; the frames that it followed
 
@@ -55,9 +55,11 @@ def can_tell_depth(tracker: Tracker) -> bool:
 def begin_anew(tracker: Tracker, first: int) -> None:
     """Forget all keyframes of the warm-up: frames before `first` have no pose, it comes next."""
     tracked = tracker.tracked
-    while len(tracker.keyframes):
+    while len(tracker.keyframes) > 1:
         tracker.graph.remove_newest()
-    tracker.last_non_keyframe = None
+    tracker.keyframes.remove_newest()
+    tracker.graph.flow.remove_frame(0)
+    tracker.mode, tracker.last_non_keyframe = Mode.WAITING, None
     del tracked[first:]
     for index, frame in enumerate(tracked):
         if frame.status.is_followed:
