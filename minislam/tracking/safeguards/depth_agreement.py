@@ -48,7 +48,7 @@ def _measured(graph: KeyframeGraph, positions: Sequence[int]) -> tuple[Tensor, T
 
     It is a Gauss-Newton step of Eq. (5) from the disparities that all edges measure.
     """
-    problem = bundle_problem(graph, positions, 0, 0.0)
+    problem = bundle_problem(graph, positions)
     problem = replace(problem, free_poses=torch.zeros_like(problem.free_poses))
     equations = normal_equations(problem, graph.state)
     C, known = equations.disparity_diagonal, equations.disparity_diagonal > 0
