@@ -1,6 +1,5 @@
 """Classical optical flow as a `FlowEstimator`: between pairs of keyframes, in chains of frames."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,13 +11,13 @@ from minislam.priors import dense_flow, grid_flow
 from minislam.priors.interfaces import FlowMatches
 from minislam.state.memory import SHELF, release
 from minislam.state.stateful import FrameOf, Stateful, Tree, from_tree
+from minislam.state.threads import side_by_side
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
 # Matched ratio; with less, the motion may be too fast for a chain, and corners give one more start.
 # With 0.4 and more, they would follow an umbrella that fills the view. [-]
 WEAK = 0.2
-_THREADS = ThreadPoolExecutor(2)  # compute flows side by side, without effect on the result
 
 
 class MeasuredEdge(NamedTuple):
@@ -75,8 +74,8 @@ class ClassicalFlow(Stateful):
         moved = [edge for edge, start in starts.items() if self._has_moved(edge, start)]
         # Each direction checks the other, so both are measured anew, or none.
         pairs = dict.fromkeys((min(edge), max(edge)) for edge in moved)
-        both = ({e: starts[e] for e in ((i, j), (j, i)) if e in starts} for i, j in pairs)
-        for measured in _THREADS.map(self._measure, both):
+        both = (({e: starts[e] for e in ((i, j), (j, i)) if e in starts},) for i, j in pairs)
+        for measured in side_by_side(self._measure, both):
             self._measured |= {edge: self._kept(*parts) for edge, parts in measured.items()}
         _, targets, confidences = zip(*(self._measured[edge] for edge in edges), strict=True)
         textures = [self._textures[source] for source in edges_source]
@@ -156,7 +155,8 @@ class FlowChain(Stateful):
 
         # A steady hand continues its motion, a shaking one does not. So both starts are tried, and
         # the more confident flow is kept: a wrong one would spoil the starts of all later frames.
-        measured = [*_THREADS.map(follow, (self.flow, self.flow + self.increment))]
+        starts = (self.flow,), (self.flow + self.increment,)
+        measured = [*side_by_side(follow, starts)]
         if max(m[2].sum() for m in measured) < WEAK * texture.sum():
             step = dense_flow.plane_flow(self.newest, gray)
             measured.append(follow(self.flow + dense_flow.warp(step, self.flow)))

@@ -10,11 +10,14 @@ marginalised (schur.py), which leaves 6 unknowns per free pose.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from minislam.geometry import se3_adjoint, se3_exp, se3_normalised
+from minislam.state.threads import side_by_side
 from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal, within_reach
@@ -98,21 +101,24 @@ def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tenso
 
 def _linearised(problem: BundleProblem, state: BundleState) -> Iterator[_Linearised]:
     """Linearise the edges, part by part."""
-    for edges, part in in_parts(problem):
-        source, dtype = part.edges_source, part.targets.dtype
-        transforms = relative_transforms(state.T_camera_world, source, part.edges_target)
-        view = part.rays, part.camera, state.log_focal, part.free_focal
-        reprojection = reproject_with_focal(transforms.to(dtype), state.disparities[source], *view)
-        reprojection = with_readout(reprojection, part.shutter, state.readout)
-        residual = part.targets - reprojection.positions
-        weight = part.weights * reprojection.valid[:, None]
-        if part.robust is not None:
-            weight = weight * part.robust.weight(residual.square().sum(1, keepdim=True))
-        # A point behind the target, or too near, counts as a residual of the image's width in u and
-        # v. Were it left out, the cheapest camera would be one that looks away from all points.
-        counted = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
-        costs = edge_losses(part.weights, counted, part.robust)
-        yield _Linearised(edges, part, costs, residual, weight, reprojection, transforms)
+    return side_by_side(partial(_linearise, state), in_parts(problem))
+
+
+def _linearise(state: BundleState, edges: Tensor, part: BundleProblem) -> _Linearised:
+    source, dtype = part.edges_source, part.targets.dtype
+    transforms = relative_transforms(state.T_camera_world, source, part.edges_target)
+    view = part.rays, part.camera, state.log_focal, part.free_focal
+    reprojection = reproject_with_focal(transforms.to(dtype), state.disparities[source], *view)
+    reprojection = with_readout(reprojection, part.shutter, state.readout)
+    residual = part.targets - reprojection.positions
+    weight = part.weights * reprojection.valid[:, None]
+    if part.robust is not None:
+        weight = weight * part.robust.weight(residual.square().sum(1, keepdim=True))
+    # A point behind the target, or too near, counts as a residual of the image's width in u and
+    # v. Were it left out, the cheapest camera would be one that looks away from all points.
+    counted = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
+    costs = edge_losses(part.weights, counted, part.robust)
+    return _Linearised(edges, part, costs, residual, weight, reprojection, transforms)
 
 
 def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) float64 px^2
@@ -134,26 +140,32 @@ def normal_equations(problem: BundleProblem, state: BundleState) -> NormalEquati
     """Return the normal equations of Eq. (5) about a state: blocks of edges and of disparities."""
     C = problem.prior_weights * problem.free_disparities[:, None]
     s = C * (problem.prior_disparities - state.disparities)
-    costs, rows, blocks = [], [], SourceBlocks(problem)
-    for at in _linearised(problem, state):
-        costs.append(at.costs)
+
+    def of_part(edges: Tensor, part: BundleProblem) -> tuple[Any, ...]:
+        """Return costs, blocks and couplings; add to the rows of C and s that no other part has."""
+        at, source = _linearise(state, edges, part), part.edges_source
         residual, weight, J = at.residual, at.weight, at.reprojection.J_target
         weighted_J = (J * weight[:, None]).flatten(2)
         A = (weighted_J @ J.flatten(2).mT).double()  # (E, 6 + G, 6 + G)
         b = (weighted_J @ residual.flatten(1)[..., None]).squeeze(-1).double()  # (E, 6 + G)
-        adjoint, source = se3_adjoint(at.transforms), at.problem.edges_source
-        rows.append((at.edges, A, b, adjoint))
+        blocks = edges, A, b, (adjoint := se3_adjoint(at.transforms))
         free = problem.free_disparities[source].to(J.dtype)
         if not free.any():
-            continue
+            return at.costs, blocks, []
         J_disparity = at.reprojection.J_disparity * free[:, None, None]
         weighted_Jd = weight * J_disparity
         E_target = J[:, :, 0] * weighted_Jd[:, None, 0] + J[:, :, 1] * weighted_Jd[:, None, 1]
         E_source = -adjoint.mT.to(J.dtype) @ E_target[:, :6]
         C.index_add_(0, source, (weighted_Jd * J_disparity).sum(1))
         s.index_add_(0, source, (weighted_Jd * residual).sum(1))
-        blocks.add(source_blocks(at.problem, E_target, E_source))
-    return NormalEquations(_cost(problem, state, costs), joined(rows), C, s, blocks)
+        return at.costs, blocks, source_blocks(part, E_target, E_source)
+
+    costs, rows, couplings = [], [], SourceBlocks(problem)
+    for of_edges, blocks, of_sources in side_by_side(of_part, in_parts(problem)):
+        costs.append(of_edges)
+        rows.append(blocks)
+        couplings.add(of_sources)
+    return NormalEquations(_cost(problem, state, costs), joined(rows), C, s, couplings)
 
 
 def _damped_step(

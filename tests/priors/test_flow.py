@@ -8,10 +8,9 @@ import torch
 
 from minislam.geometry import Camera
 from minislam.priors import dense_flow
-from minislam.priors import flow as flow_module
 from minislam.priors.dense_flow import composed_flow, grayscale, pixel_positions
 from minislam.priors.flow import FlowChain
-from minislam.state import memory
+from minislam.state import memory, threads
 from minislam.state.memory import SHELF
 from tests.priors.patterns import (
     CONFIG,
@@ -90,9 +89,9 @@ def test_a_backward_edge_that_is_matched_as_well_is_used(monkeypatch: pytest.Mon
 def test_the_number_of_threads_changes_nothing(other: int, monkeypatch: pytest.MonkeyPatch):
     images = [shifted(3 * d, -d, SIZE) for d in range(4)]
     sources, targets = [0, 1, 1, 2, 3, 0], [1, 0, 2, 3, 2, 3]
-    monkeypatch.setattr(flow_module, "_THREADS", ThreadPoolExecutor(1))
+    monkeypatch.setattr(threads, "_POOL", ThreadPoolExecutor(1))
     one = flow_of(images).match(sources, targets, still(6))
-    monkeypatch.setattr(flow_module, "_THREADS", ThreadPoolExecutor(other))
+    monkeypatch.setattr(threads, "_POOL", ThreadPoolExecutor(other))
     many = flow_of(images).match(sources, targets, still(6))
     assert torch.equal(one.targets, many.targets)
     assert torch.equal(one.confidences, many.confidences)

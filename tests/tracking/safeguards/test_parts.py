@@ -1,11 +1,12 @@
 """A problem in parts or of a part: the same numbers as with all at once."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
 import torch
 
-from minislam.state import memory
+from minislam.state import memory, threads
 from minislam.tracking import optimisation
 from minislam.tracking.bundle_adjustment import (
     bundle_adjust,
@@ -60,6 +61,18 @@ def test_an_adjustment_in_parts_is_that_of_all_edges(monkeypatch: pytest.MonkeyP
     assert again.cost_after == pytest.approx(report.cost_after, rel=1e-12)
     assert torch.equal(edge_costs(problem, start), costs)
     assert all(torch.equal(a, b) for a, b in zip(residuals(problem, start), rest, strict=True))
+
+
+def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch):
+    known = known_problem(6)
+    problem, start = noisy(known, 1.0), perturbed(known, 0.02)
+    monkeypatch.setattr(parts, "CELLS_AT_ONCE", 5 * CELLS)  # six parts, of one source each
+    monkeypatch.setattr(threads, "_POOL", ThreadPoolExecutor(1))
+    one, report = bundle_adjust(problem, start, 4)
+    monkeypatch.setattr(threads, "_POOL", ThreadPoolExecutor(4))
+    many, again = bundle_adjust(problem, start, 4)
+    assert torch.equal(one.T_camera_world, many.T_camera_world)
+    assert torch.equal(one.disparities, many.disparities) and report == again
 
 
 def test_couplings_in_a_file_are_those_in_memory(monkeypatch: pytest.MonkeyPatch):
