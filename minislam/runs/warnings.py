@@ -1,6 +1,7 @@
 """What the user must know of a run: at once when something goes wrong, and all of it at its end."""
 
 from collections.abc import Iterator
+from itertools import dropwhile, pairwise
 
 import numpy as np
 
@@ -56,27 +57,21 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             doubt = f"there is no ATE: {error}"
         yield from filter(None, [doubt])
     if lost:
-        tracked = slam.tracker.tracked
-        since = 1 + max((t.frame_index for t in tracked if t.status.is_followed), default=-1)
-        start = slam.sequence.source_index(since) if since < len(tracked) else None
-        rest = f"If the film is cut there, run the rest by itself: --start {start}. "
+        apart = _as_options(slam, _lost_stretches(slam))
+        rest = f"If the film is cut there, run the rest by itself: {apart}. " if apart else ""
         yield (
-            f"{lost} of {len(tracked)} frames could not be tracked and have no pose; "
-            f"lost_frames.txt lists them. {rest * (start is not None)}{_FAR_APART}"
+            f"{lost} of {len(slam.tracker.tracked)} frames could not be tracked and have no pose; "
+            f"lost_frames.txt lists them. {rest}{_FAR_APART}"
         )
     if watch.breaks:
         where = ", ".join(span(found.first_frame, found.last_frame) for found in watch.breaks)
-        pieces = [
-            f"--start {slam.sequence.source_index(first)} --max-frames {last - first + 1}"
-            for first, last in watch.segments
-            if last - first + 1 >= slam.config.tracking.warmup_keyframes  # else it cannot start
-        ]
-        anew = f"; run each piece anew, with the other options as here: {', or '.join(pieces)}"
+        pieces = _as_options(slam, _followed_pieces(slam))
+        anew = f"; run each piece anew, with the other options as here: {pieces}" if pieces else ""
         yield (
             f"{BROKEN} at frames {where}: motion or depth contradicts the images, there is too "
             "little parallax to carry the scale across, or the camera follows something that came "
             "into view. Before and after, scale and direction do not belong "
-            f"together{anew * bool(pieces)}. {_FAR_APART}"
+            f"together{anew}. {_FAR_APART}"
         )
     if graph.failed_adjustments:
         yield (
@@ -135,6 +130,36 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         )
     if not keyframes.has_prior:
         yield "without a depth prior the unit of length is arbitrary"
+
+
+def _lost_stretches(slam: Slam) -> list[tuple[int, int]]:
+    """Return the first and last of frames that were lost in a row after the start."""
+    frames = dropwhile(lambda frame: not frame.status.is_followed, slam.tracker.tracked)
+    return _stretches([f.frame_index for f in frames if not f.status.is_followed], gap=1)
+
+
+def _followed_pieces(slam: Slam) -> list[tuple[int, int]]:
+    """Return first and last frame of the pieces between breaks and longer losses."""
+    lost = {f.frame_index for f in slam.tracker.tracked if not f.status.is_followed}
+    followed = ({*range(first, last + 1)} - lost for first, last in slam.tracker.watch.segments)
+    gap = slam.config.tracking.warmup_keyframes
+    return [piece for frames in followed for piece in _stretches(sorted(frames), gap)]
+
+
+def _stretches(frames: list[int], gap: int) -> list[tuple[int, int]]:
+    """Return first and last of the frames that follow each other by at most `gap`."""
+    ends = [k for k in range(1, len(frames)) if frames[k] - frames[k - 1] > gap]
+    bounds = pairwise([0, *ends, len(frames)])
+    return [(frames[first], frames[end - 1]) for first, end in bounds if first < end]
+
+
+def _as_options(slam: Slam, stretches: list[tuple[int, int]]) -> str:
+    """Return the options that run each stretch by itself, of those with enough frames to start."""
+    return ", or ".join(
+        f"--start {slam.sequence.source_index(first)} --max-frames {last - first + 1}"
+        for first, last in stretches
+        if last - first + 1 >= slam.config.tracking.warmup_keyframes
+    )
 
 
 def _camera_warnings(slam: Slam) -> Iterator[str]:

@@ -15,7 +15,7 @@ CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
 
 
 def finished(**parts: object) -> SimpleNamespace:
-    """Return a finished run of four frames without anything to warn of, but for these parts."""
+    """Return a finished run of 20 frames without anything to warn of, but for these parts."""
     failed = parts.pop("failed", 0)
     graph = SimpleNamespace(
         adjustments=2 + failed,
@@ -26,11 +26,12 @@ def finished(**parts: object) -> SimpleNamespace:
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
-    lost, ends_lost = parts.pop("lost", 0), parts.pop("ends_lost", False)
-    follows = [k < 4 - lost if ends_lost else k > lost for k in range(4)]
+    lost = parts.pop("lost", range(0))
     frames = [
-        SimpleNamespace(frame_index=k, timestamp=k / 30, status=SimpleNamespace(is_followed=there))
-        for k, there in enumerate(follows)
+        SimpleNamespace(
+            frame_index=k, timestamp=k / 30, status=SimpleNamespace(is_followed=k not in lost)
+        )
+        for k in range(20)
     ]
     tracker = SimpleNamespace(
         initialised=True,
@@ -43,7 +44,7 @@ def finished(**parts: object) -> SimpleNamespace:
             depth_difference=parts.pop("depth_difference", 0.1),
             hardly_walked=parts.pop("hardly_walked", False),
             breaks=parts.pop("breaks", []),
-            segments=[(0, 5), (7, 7)],
+            segments=parts.pop("segments", [(0, 5), (7, 7)]),
         ),
         keyframes=SimpleNamespace(
             has_prior=parts.pop("has_prior", True), overlay=parts.pop("overlay", None)
@@ -69,7 +70,7 @@ def finished(**parts: object) -> SimpleNamespace:
         sequence=SimpleNamespace(
             warnings=[], camera=CAMERA, ground_truth=truth, source_index=lambda k: 10 + 3 * k
         ),
-        lost_frames=lambda: [None] * lost,
+        lost_frames=lambda: [None] * len(lost),
         trajectory=lambda: Trajectory(np.arange(4) / 30, random_transforms(4, "normal", 1).numpy()),
         tracker=tracker,
         focal_length=parts.pop("focal_length", None),

@@ -1,5 +1,6 @@
 """Each thing that the user must know of a run is one warning, and a good run has none."""
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import pytest
@@ -16,19 +17,26 @@ DOUBTFUL = FocalLengthFit(272.0, 1.1, 0.25)
 ZOOMED = FocalLengthFit(272.0, 1.4, 0.52, half=(8, 15))
 WARNINGS = [
     (
-        {"lost": 1},
-        "1 of 4 frames could not be tracked and have no pose; lost_frames.txt lists them",
+        {"lost": [3]},
+        "1 of 20 frames could not be tracked and have no pose; lost_frames.txt lists them. If the",
     ),
-    # The run begins at image 10 and takes every third.
+    # The run begins at image 10 and takes every third. Too few frames cannot start by themselves.
     (
-        {"lost": 2, "ends_lost": True},
-        "film is cut there, run the rest by itself: --start 16",
+        {"lost": range(14, 20)},
+        "film is cut there, run the rest by itself: --start 52 --max-frames 6. If the images lie",
     ),
-    ({"lost": 2, "ends_lost": True}, "16. If the images lie far apart, give more frames"),
+    (
+        {"lost": [*range(2, 9), 11, *range(13, 20)]},
+        "rest by itself: --start 16 --max-frames 7, or --start 49 --max-frames 7. If the",
+    ),
     ({"breaks": [Break(2, 2)]}, "broken at frames 2: motion"),
     (
         {"breaks": [Break(2, 2)]},
         "run each piece anew, with the other options as here: --start 10 --max-frames 6. If",
+    ),
+    (
+        {"breaks": [Break(9, 9)], "segments": [(0, 8), (10, 19)]},
+        "options as here: --start 10 --max-frames 9, or --start 40 --max-frames 10. If",
     ),
     (
         {"truth": [9.0, 9.5]},
@@ -107,12 +115,22 @@ def test_depths_that_change_with_the_views_are_warned_of_where_no_prior_tells_de
     assert "hardly did more than turn" in warning
 
 
-@pytest.mark.parametrize("broken", [{"lost": 1}, {"failed": 3}])
+@pytest.mark.parametrize("broken", [{"lost": [3]}, {"failed": 3}])
 def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
     (warning,) = warnings(finished(focal_length=DOUBTFUL, **broken))
     assert "present focal length" not in warning
 
 
-def test_a_film_that_goes_on_after_a_loss_is_not_called_cut():
-    (warning,) = warnings(finished(lost=1))
+@pytest.mark.parametrize("lost", [[3, 4], range(6), [18, 19]])
+def test_a_film_is_not_called_cut_where_few_frames_are_lost_or_its_start(lost: Sequence[int]):
+    (warning,) = warnings(finished(lost=lost))
     assert "cut" not in warning
+
+
+def test_a_piece_that_is_to_be_run_anew_ends_where_many_frames_are_lost():
+    lost, breaks = [2, *range(9, 14)], [Break(8, 8)]
+    _, warning = warnings(finished(lost=lost, breaks=breaks, segments=[(0, 7), (9, 19)]))
+    assert "here: --start 10 --max-frames 8, or --start 52 --max-frames 6. If" in warning
+    lost = [*range(9, 12), 17]  # fewer in a row than a start needs divide nothing
+    _, warning = warnings(finished(lost=lost, breaks=breaks, segments=[(0, 7), (8, 19)]))
+    assert "here: --start 10 --max-frames 8, or --start 34 --max-frames 12. If" in warning
