@@ -65,6 +65,7 @@ class Keyframe(Pictured):
     confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
     exposure: Tensor | None = None  # (3,) see `Pictured`
     inserts: bool = True  # whether it adds Gaussians; else it only enters the losses
+    filled: Tensor | None = None  # (H, W) bool, True where depth is not measured, but filled in
 
 
 @dataclass(frozen=True)

@@ -126,13 +126,14 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
 
 
 def guessed_depth(slam: Slam) -> float | None:
-    """Return the fraction of the keyframes' static pixels without reference depth [-]."""
-    mapper, unknown = slam.mapper, []
+    """Return the fraction of the keyframes' static pixels whose depth nothing has measured [-]."""
+    mapper, guessed = slam.mapper, []
     for keyframe in mapper.keyframes:
         static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
         if keyframe.inserts and static.any():
-            unknown.append(float((keyframe.depth[static] == 0).float().mean()))
-    return float(np.mean(unknown)) if unknown else None
+            unknown = keyframe.depth == 0 if keyframe.filled is None else keyframe.filled
+            guessed.append(float(unknown[static].float().mean()))
+    return float(np.mean(guessed)) if guessed else None
 
 
 def unseen_psnr(slam: Slam) -> float | None:

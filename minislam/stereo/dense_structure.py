@@ -89,9 +89,10 @@ def _filled(keyframe: Keyframe) -> Keyframe:
         return keyframe
     metric = cv2.DIST_L2, cv2.DIST_MASK_5
     _, nearest = cv2.distanceTransformWithLabels(unknown, *metric, labelType=cv2.DIST_LABEL_PIXEL)
-    filled = torch.from_numpy(depth[unknown == 0][nearest - 1])  # labels count the known pixels
-    SHELF.put([filled])
-    return replace(keyframe, depth=filled.to(keyframe.depth))
+    # The labels count the known pixels.
+    filled, where = torch.from_numpy(depth[unknown == 0][nearest - 1]), keyframe.depth == 0
+    SHELF.put([filled, where])
+    return replace(keyframe, depth=filled.to(keyframe.depth), filled=where)
 
 
 def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:
@@ -99,7 +100,15 @@ def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:
 
     Without parallax every depth explains the images equally well, and no other view confirms any.
     """
-    return [replace(k, depth=k.depth.new_ones(()).expand(k.depth.shape)) for k in keyframes]
+    one, yes = torch.ones(()), torch.tensor(True)
+    return [
+        replace(
+            keyframe,
+            depth=one.to(keyframe.depth).expand(keyframe.depth.shape),
+            filled=yes.to(keyframe.depth.device).expand(keyframe.depth.shape),
+        )
+        for keyframe in keyframes
+    ]
 
 
 def _nearest(image: Tensor, camera: Camera) -> np.ndarray:

@@ -58,7 +58,7 @@ def finished(**parts: object) -> SimpleNamespace:
     shown = parts.pop("shown", [1.0])
     depth = (torch.arange(10) >= 10 * parts.pop("unknown", 0.0)).float()
     keyframes = [
-        SimpleNamespace(frame_index=8 * k, depth=depth * (k == 0), inserts=k == 0)
+        SimpleNamespace(frame_index=8 * k, depth=depth * (k == 0), inserts=k == 0, filled=None)
         for k in range(len(shown))
     ]
     hidden = torch.arange(10) >= 10 * parts.pop("left_out", 0.0)

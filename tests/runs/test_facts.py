@@ -22,6 +22,9 @@ def test_what_beta_leaves_out_and_what_is_guessed_is_measured(monkeypatch: pytes
     assert (measured["left_out"], measured["guessed_depth"]) == pytest.approx((0.4, 0.5))
     run.config = with_settings(run.config, {"uncertainty.enabled": False})
     assert facts.measure(run, 1.0, None)["left_out"] is None
+    run.mapper.keyframes[0].filled = torch.arange(10) < 7  # such depth is no measurement
+    run.mapper.keyframes[0].depth = torch.ones(10)
+    assert facts.measure(run, 1.0, None)["guessed_depth"] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(

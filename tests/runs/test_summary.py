@@ -38,6 +38,7 @@ def test_numbers_have_units_words_and_verdicts():
     assert found["path of the camera"] == ("2.77 m", "", "")
     assert found["reprojection error, median"] == ("0.10 px", "good", "")
     assert found["map against input, static pixels"] == ("17.0 dB", "poor", "")
+    assert lines({"guessed_depth": 0.78})["static pixels of guessed depth"] == ("0.78", "poor", "")
     between = "of a frame's time,"
     assert found["rolling shutter"] == ("79%", "", f"{between} top to bottom")
     across = lines(readout_seconds=[-0.02, 0.0], frame_seconds=0.04)["rolling shutter"]

@@ -167,10 +167,11 @@ def test_the_swept_camera_sees_what_the_camera_sees():
 # Keyframes
 
 
-def test_a_backdrop_is_one_unit_away_and_nothing_confirms_it():
+def test_a_backdrop_is_one_unit_away_and_nothing_measures_or_confirms_it():
     seen = keyframe(8, torch.zeros(()).expand(SIZE[::-1]))
     [flat] = on_backdrop([seen])
     assert torch.equal(flat.depth, torch.ones(SIZE[::-1])) and flat.confirmation is None
+    assert flat.filled is not None and flat.filled.all()
 
 
 def keyframe(index: int, depth: torch.Tensor) -> Keyframe:
@@ -224,7 +225,8 @@ def test_after_a_pan_the_nearest_known_depth_fills_what_is_unknown_if_that_is_mo
     keyframes = [keyframe(8, unknown), keyframe(16, unknown)]
     filled, empty = with_swept_depth(camera(), keyframes, swept, fills=True)
     assert torch.equal(filled.depth, torch.where(column < 75, 2.0, 5.0))
-    assert not empty.depth.any()
+    assert filled.filled is not None and torch.equal(filled.filled, few == 0)
+    assert not empty.depth.any() and empty.filled is None
     assert torch.equal(with_swept_depth(camera(), keyframes, swept)[0].depth, few)
     most = torch.where(column < 100, 2.0, 0.0)
     [after] = with_swept_depth(camera(), keyframes[:1], [(most, most)], fills=True)
