@@ -20,7 +20,7 @@ from minislam.mapping.mapper import Mapper, surface_depth
 from minislam.priors.choice import PriorChoice
 from minislam.records import Keyframe, Trajectory
 from minislam.runs.resume import Checkpoints
-from minislam.runs.warnings import left_out, shown_static, warnings
+from minislam.runs.warnings import guessed_depth, left_out, shown_static, warnings
 from minislam.slam import Slam
 from minislam.splatting import Rendering
 from minislam.state.memory import peak_memory_mb
@@ -123,17 +123,6 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
             beta=beta,
             static_psnr=_static_psnr(mapper, keyframe, rendering),
         )
-
-
-def guessed_depth(slam: Slam) -> float | None:
-    """Return the fraction of the keyframes' static pixels whose depth nothing has measured [-]."""
-    mapper, guessed = slam.mapper, []
-    for keyframe in mapper.keyframes:
-        static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
-        if keyframe.inserts and static.any():
-            unknown = keyframe.depth == 0 if keyframe.filled is None else keyframe.filled
-            guessed.append(float(unknown[static].float().mean()))
-    return float(np.mean(guessed)) if guessed else None
 
 
 def unseen_psnr(slam: Slam) -> float | None:

@@ -21,6 +21,8 @@ LEAST_SHOWN = 0.75
 MOST_LEFT_OUT = 0.3
 # Relative, of depths by earlier and by later keyframes (tests/benchmarks/diary/broken_runs.md).
 MOST_DIFFERENCE = 0.2
+# Of the static pixels [-]: maps that are whole have .11 to .67, fog and lumps .65 to .96.
+MOST_GUESSED = 0.7
 BROKEN = "the trajectory is broken"  # how a warning of breaks begins
 _FAR_APART = "If the images lie far apart, give more frames per second (a smaller --stride)"
 
@@ -91,6 +93,13 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             f"beta takes {hidden:.0%} of all pixels for moving, so they are neither in the map nor "
             "measured. Look at the pictures of beta; if they are bright on what stands still, crop "
             "what is fixed to the camera, or try other --features or --no-uncertainty"
+        )
+    guessed = guessed_depth(slam) if slam.mapper.shown and slam.tracker.knows_depth else None
+    if guessed is not None and guessed > MOST_GUESSED:
+        yield (
+            f"no view measured the depth of {guessed:.0%} of what stands still: it is filled from "
+            "around, so the map can be wrong wherever the camera has not been; move sideways past "
+            "more texture, or give a depth prior"
         )
     yield from _camera_warnings(slam)
     without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
@@ -209,3 +218,14 @@ def left_out(slam: Slam) -> float:
     images = mapper.keyframes if mapper.shown else []
     weights = (mapper.static_weight(mapper.beta_of(k), mapper.camera) for k in images)
     return float(np.mean([float((weight == 0).float().mean()) for weight in weights] or 0.0))
+
+
+def guessed_depth(slam: Slam) -> float | None:
+    """Return the fraction of the keyframes' static pixels whose depth nothing has measured [-]."""
+    mapper, guessed = slam.mapper, []
+    for keyframe in mapper.keyframes:
+        static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
+        if keyframe.inserts and static.any():
+            unknown = keyframe.depth == 0 if keyframe.filled is None else keyframe.filled
+            guessed.append(float(unknown[static].float().mean()))
+    return float(np.mean(guessed)) if guessed else None

@@ -70,6 +70,7 @@ WARNINGS = [
     ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),
     ({"overlay": torch.tensor([0.0, 1, 1, 1])}, "25% of the image stand still while the rest mov"),
     ({"left_out": 0.5}, "beta takes 50% of all pixels for moving"),
+    ({"unknown": 0.8}, "no view measured the depth of 80% of what stands still: it is filled from"),
     ({"has_prior": False}, "the unit of length is arbitrary"),
 ]
 
@@ -134,3 +135,8 @@ def test_a_piece_that_is_to_be_run_anew_ends_where_many_frames_are_lost():
     lost = [*range(9, 12), 17]  # fewer in a row than a start needs divide nothing
     _, warning = warnings(finished(lost=lost, breaks=breaks, segments=[(0, 7), (8, 19)]))
     assert "here: --start 10 --max-frames 8, or --start 34 --max-frames 12. If" in warning
+
+
+def test_guessed_depth_is_not_warned_of_where_much_is_measured_and_on_a_backdrop():
+    assert not list(warnings(finished(unknown=0.7)))
+    assert not list(warnings(finished(unknown=0.8, knows_depth=False)))
