@@ -11,6 +11,7 @@ from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_u
 from minislam.runs.summary import span
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import is_unexplained
+from minislam.tracking.safeguards.focal_length import FocalLengthFit
 from minislam.tracking.safeguards.lens import BentLens
 
 # Of the static pixels, in the mean of the map's images [-]: 78 good runs show .94 to 1, a run with
@@ -173,10 +174,14 @@ def _as_options(slam: Slam, stretches: list[tuple[int, int]]) -> str:
 
 def _camera_warnings(slam: Slam) -> Iterator[str]:
     fit, graph, lens = slam.focal_length, slam.tracker.graph, slam.lens
+    # The flow of a broken run fits whatever focal length.
+    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
+    is_other = fit is not None and fit.is_doubtful and not is_broken
     if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
         yield (
-            "the focal length is unknown and the motion does not tell it: trajectory and map may "
-            "be bent; give --fx or a calibration file"
+            "the focal length is unknown and the motion does not tell it"
+            + (_of_a_half(slam, fit) if fit is not None and is_other else "")
+            + ": trajectory and map may be bent; give --fx or a calibration file"
         )
         return
     if lens is not None and lens.is_bent:
@@ -186,9 +191,7 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
             "in the linear mode of the camera, or give --fx, --k1 and --k2"
         )
         return
-    # The flow of a broken run fits whatever focal length.
-    is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
-    if fit is None or not fit.is_doubtful or is_broken:
+    if fit is None or not is_other:
         return
     better = f"better, with {fit.saved:.0%} less cost"
     found = f"the flow fits {fit.factor:.2f} times the present focal length {better}"
@@ -199,6 +202,14 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
     else:
         advice = f"check the calibration, or give {fit.factor:.2f} times the present --fx and --fy"
         yield f"{found}: {advice}. If {zoomed}"
+
+
+def _of_a_half(slam: Slam, fit: FocalLengthFit) -> str:
+    """Say which focal length of the raw images half of a run tells that as a whole tells none."""
+    where = "from frame {} to {} ".format(*fit.half) if fit.half else ""
+    raw = slam.sequence.preparation["raw_camera"]["fx"] / slam.sequence.camera.fx  # px per px
+    found = raw * fit.present * (fit.factor or 1.0)
+    return f", but {where}the flow fits --fx {found:.0f} best, with {fit.saved:.0%} less cost"
 
 
 def shown_static(slam: Slam) -> float | None:

@@ -68,7 +68,11 @@ def finished(**parts: object) -> SimpleNamespace:
         mapper=mapper,
         config=SlamConfig(),
         sequence=SimpleNamespace(
-            warnings=[], camera=CAMERA, ground_truth=truth, source_index=lambda k: 10 + 3 * k
+            warnings=[],
+            camera=CAMERA,
+            ground_truth=truth,
+            source_index=lambda k: 10 + 3 * k,
+            preparation={"raw_camera": {"fx": 544.0}},
         ),
         lost_frames=lambda: [None] * len(lost),
         trajectory=lambda: Trajectory(np.arange(4) / 30, random_transforms(4, "normal", 1).numpy()),

@@ -64,7 +64,15 @@ WARNINGS = [
     ),
     ({"focal_length": DOUBTFUL}, "the flow fits 1.10 times the present focal length better"),
     ({"focal_length": ZOOMED}, "from frame 8 to 15 the flow fits 1.40 times the present focal"),
-    ({"seeks_focal": True}, "the motion does not tell it"),
+    (
+        {"seeks_focal": True},
+        "the motion does not tell it: trajectory and map may be bent; give --fx",
+    ),
+    # Half of the run tells 1.4 times 272 px of images that are half as large as the raw ones.
+    (
+        {"seeks_focal": True, "focal_length": ZOOMED},
+        "tell it, but from frame 8 to 15 the flow fits --fx 762 best, with 52% less cost: traj",
+    ),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
     ({"parallax": [0.1], "knows_depth": False}, "and all that the map shows is at one depth"),
     ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),
@@ -120,6 +128,11 @@ def test_depths_that_change_with_the_views_are_warned_of_where_no_prior_tells_de
 def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
     (warning,) = warnings(finished(focal_length=DOUBTFUL, **broken))
     assert "present focal length" not in warning
+
+
+def test_an_unknown_focal_length_of_a_broken_run_gets_no_advice_from_its_halves():
+    _, warning = warnings(finished(seeks_focal=True, focal_length=ZOOMED, lost=[3]))
+    assert "the motion does not tell it: trajectory" in warning
 
 
 @pytest.mark.parametrize("lost", [[3, 4], range(6), [18, 19]])
