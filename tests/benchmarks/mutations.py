@@ -289,9 +289,11 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if static.any() else None", "if True else None"),
     ],
     ("runs/warnings.py", "runs/test_warnings.py"): [
-        ("if since < len(tracked)", "if True"), ("since = 1 + max", "since = max"),
+        ("frames[k - 1] > gap", "frames[k - 1] >= gap"),
+        ("if last - first + 1 >= slam", "if last - first >= slam"),
+        ("gap = slam.config.tracking.warmup_keyframes", "gap = 1"),
         ("2 * without >= len", "2 * without < len"),
-        ("not fit.is_doubtful or is_broken", "fit.is_doubtful or is_broken"),
+        ("fit.is_doubtful and not is_broken", "fit.is_doubtful"),
     ],
     ("viz/pages.py", "viz/test_pages_report.py"): [
         ("name: escape(getattr(report, name))", "name: getattr(report, name)"),
