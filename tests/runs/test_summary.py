@@ -1,5 +1,8 @@
 """The summary: what is known in words, with units, and whether it is good."""
 
+import csv
+from importlib.resources import files
+
 import pytest
 
 from minislam.runs.summary import as_text, judge, summarise
@@ -103,3 +106,5 @@ def test_the_terminal_gets_columns_without_explanations():
         == "  time                               94 s                 mapping 20 s, tracking 8 s"
     )
     assert max(map(len, text)) < 100
+    table = files("minislam.runs").joinpath("measures.csv").read_text(encoding="utf-8")
+    assert max(len(row["words"]) for row in csv.DictReader(table.splitlines())) < 35  # a gap
