@@ -46,8 +46,15 @@ def alarms(slam: Slam) -> Iterator[str]:
 
 def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name of the prior
     """Yield what the user must know of a run."""
-    watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
-    diagnostics, lost = watch.diagnostics, len(slam.lost_frames())
+    yield from _input_warnings(slam)
+    yield from _path_warnings(slam)
+    yield from _map_warnings(slam)
+    yield from _camera_warnings(slam)
+    yield from _parallax_warnings(slam)
+    yield from _prior_warnings(slam, depth)
+
+
+def _input_warnings(slam: Slam) -> Iterator[str]:
     yield from slam.sequence.warnings
     if slam.undone_lens:
         yield str(BentLens(slam.undone_lens))
@@ -59,6 +66,10 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
         except InputError as error:
             doubt = f"there is no ATE: {error}"
         yield from filter(None, [doubt])
+
+
+def _path_warnings(slam: Slam) -> Iterator[str]:
+    watch, graph, lost = slam.tracker.watch, slam.tracker.graph, len(slam.lost_frames())
     if lost:
         apart = _as_options(slam, _lost_stretches(slam))
         rest = f"If the film is cut there, run the rest by itself: {apart}. " if apart else ""
@@ -82,6 +93,9 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             "and changed nothing: their poses and depths stay as first guessed, so do not trust "
             "them; try more texture, slower motion, or a smaller --stride"
         )
+
+
+def _map_warnings(slam: Slam) -> Iterator[str]:
     if has_large_holes(slam):
         least = slam.mapper.keyframes[int(np.argmin(slam.mapper.shown))].frame_index
         yield (
@@ -102,44 +116,6 @@ def warnings(slam: Slam, depth: str = "none") -> Iterator[str]:  # depth: name o
             "around, so the map can be wrong wherever the camera has not been; move sideways past "
             "more texture, or give a depth prior"
         )
-    yield from _camera_warnings(slam)
-    without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
-    if without and 2 * without >= len(diagnostics):
-        yield (
-            f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera "
-            "turned or stood still, so the distances it moved are not determined (if it moved, "
-            "crop what is fixed to it, such as a bonnet or a windscreen)"
-            + ("" if slam.tracker.knows_depth else ", and all that the map shows is at one depth")
-        )
-    elif watch.hardly_walked and not keyframes.has_prior:
-        yield (
-            "the camera hardly did more than turn: walking moved the image by only "
-            f"{watch.beyond_turns:.2f} px between neighbouring keyframes (median, for 320x240). "
-            "Depth is hardly determined, and near and far may be exchanged; film while you walk "
-            "sideways, and look at the pictures of the depth"
-        )
-    elif (watch.depth_difference or 0.0) > MOST_DIFFERENCE and not keyframes.has_prior:
-        yield (
-            f"depths by earlier and by later keyframes differ by {watch.depth_difference:.0%} "
-            "(median): what moves the image is not only a camera that walks through a scene that "
-            "stands still (a stabilised film, water, a zoom?). Near and far may be in disorder; "
-            "look at the pictures of the depth"
-        )
-    if keyframes.overlay is not None:
-        yield (
-            f"{float((keyframes.overlay == 0).float().mean()):.0%} of the image stand still while "
-            "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map only "
-            "as far as beta does, with all that looks like them; crop the images"
-        )
-    known = (keyframes.prior_disparities > 0).any(1).tolist() if depth != "none" else []
-    if not all(known):
-        yield (
-            f"--depth {depth} knows nothing of {known.count(False)} of {len(known)} keyframes, "
-            f"such as frame {keyframes.frames[known.index(False)].frame_index}: there depth is "
-            "that of the motion alone; give it for all frames"
-        )
-    if not keyframes.has_prior:
-        yield "without a depth prior the unit of length is arbitrary"
 
 
 def _lost_stretches(slam: Slam) -> list[tuple[int, int]]:
@@ -210,6 +186,52 @@ def _of_a_half(slam: Slam, fit: FocalLengthFit) -> str:
     raw = slam.sequence.preparation["raw_camera"]["fx"] / slam.sequence.camera.fx  # px per px
     found = raw * fit.present * (fit.factor or 1.0)
     return f", but {where}the flow fits --fx {found:.0f} best, with {fit.saved:.0%} less cost"
+
+
+def _parallax_warnings(slam: Slam) -> Iterator[str]:
+    watch, graph, keyframes = slam.tracker.watch, slam.tracker.graph, slam.tracker.keyframes
+    diagnostics = watch.diagnostics
+    without = sum(keyframe.parallax < graph.least_parallax for keyframe in diagnostics)
+    if without and 2 * without >= len(diagnostics):
+        yield (
+            f"{without} of {len(diagnostics)} keyframes show hardly any parallax: the camera "
+            "turned or stood still, so the distances it moved are not determined (if it moved, "
+            "crop what is fixed to it, such as a bonnet or a windscreen)"
+            + ("" if slam.tracker.knows_depth else ", and all that the map shows is at one depth")
+        )
+    elif watch.hardly_walked and not keyframes.has_prior:
+        yield (
+            "the camera hardly did more than turn: walking moved the image by only "
+            f"{watch.beyond_turns:.2f} px between neighbouring keyframes (median, for 320x240). "
+            "Depth is hardly determined, and near and far may be exchanged; film while you walk "
+            "sideways, and look at the pictures of the depth"
+        )
+    elif (watch.depth_difference or 0.0) > MOST_DIFFERENCE and not keyframes.has_prior:
+        yield (
+            f"depths by earlier and by later keyframes differ by {watch.depth_difference:.0%} "
+            "(median): what moves the image is not only a camera that walks through a scene that "
+            "stands still (a stabilised film, water, a zoom?). Near and far may be in disorder; "
+            "look at the pictures of the depth"
+        )
+
+
+def _prior_warnings(slam: Slam, depth: str) -> Iterator[str]:
+    keyframes = slam.tracker.keyframes
+    if keyframes.overlay is not None:
+        yield (
+            f"{float((keyframes.overlay == 0).float().mean()):.0%} of the image stand still while "
+            "the rest moves (a logo, a dashboard, bars?): tracking leaves them out, the map only "
+            "as far as beta does, with all that looks like them; crop the images"
+        )
+    known = (keyframes.prior_disparities > 0).any(1).tolist() if depth != "none" else []
+    if not all(known):
+        yield (
+            f"--depth {depth} knows nothing of {known.count(False)} of {len(known)} keyframes, "
+            f"such as frame {keyframes.frames[known.index(False)].frame_index}: there depth is "
+            "that of the motion alone; give it for all frames"
+        )
+    if not keyframes.has_prior:
+        yield "without a depth prior the unit of length is arbitrary"
 
 
 def shown_static(slam: Slam) -> float | None:
