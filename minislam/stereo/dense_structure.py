@@ -100,15 +100,11 @@ def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:
 
     Without parallax every depth explains the images equally well, and no other view confirms any.
     """
-    one, yes = torch.ones(()), torch.tensor(True)
-    return [
-        replace(
-            keyframe,
-            depth=one.to(keyframe.depth).expand(keyframe.depth.shape),
-            filled=yes.to(keyframe.depth.device).expand(keyframe.depth.shape),
-        )
-        for keyframe in keyframes
-    ]
+    flat = []
+    for keyframe in keyframes:
+        one, shape = keyframe.depth.new_ones(()), keyframe.depth.shape
+        flat.append(replace(keyframe, depth=one.expand(shape), filled=one.bool().expand(shape)))
+    return flat
 
 
 def _nearest(image: Tensor, camera: Camera) -> np.ndarray:

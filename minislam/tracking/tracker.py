@@ -28,7 +28,7 @@ from minislam.tracking.loop_closure import close_loops
 from minislam.tracking.optimisation import final_global_ba, local_ba, online_global_ba, warm_up_ba
 from minislam.tracking.safeguards import motion_memory
 from minislam.tracking.safeguards.diagnostics import Watch
-from minislam.tracking.safeguards.focal_length import seek_readouts
+from minislam.tracking.safeguards.focal_length import seek_focal_length, seek_readouts
 from minislam.tracking.safeguards.pose_support import judged_by_pose
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser, attach_newest
 from minislam.tracking.safeguards.scale_drift import undo_scale_drift
@@ -206,6 +206,8 @@ class Tracker(Stateful):
         closed = self.config.loop_closure and close_loops(self.graph)
         is_due = interval > 0 and count - last >= max(interval, last)
         if is_due and not closed:
+            if not self.graph.focal_is_free:  # in the end, what has drifted may tell none
+                seek_focal_length(self.graph)
             seek_readouts(self.graph)
             online_global_ba(self.graph)
         if is_due or closed:

@@ -11,6 +11,7 @@ import torch
 from minislam.errors import TrackingLost
 from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error
 from minislam.records import Frame, TrackingStatus, Trajectory
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.tracker import LONGEST_TAIL, Mode, Tracker
 from tests.tracking.recording import (
     CONFIG,
@@ -151,6 +152,18 @@ def test_all_keyframes_are_adjusted_online_after_an_interval_and_then_once_half_
 def test_a_closed_loop_counts_as_an_adjustment_of_all(monkeypatch):
     found = global_adjustments(monkeypatch, 160, interval=20, loops=[15, 35, 120])
     assert found == [70]
+
+
+def test_an_untold_focal_length_is_sought_before_all_are_adjusted_until_it_is_free(monkeypatch):
+    sought = []
+
+    def told_by_forty(graph: KeyframeGraph) -> None:
+        sought.append(len(graph.keyframes))
+        graph.focal_is_free = len(graph.keyframes) == 40
+
+    monkeypatch.setattr("minislam.tracking.tracker.seek_focal_length", told_by_forty)
+    assert global_adjustments(monkeypatch, 200, interval=20) == [20, 40, 80, 160]
+    assert sought == [20, 40]
 
 
 def test_blank_images_are_an_error_of_one_sentence():

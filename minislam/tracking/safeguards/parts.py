@@ -49,9 +49,12 @@ def in_parts(problem: BundleProblem) -> Iterator[tuple[Tensor, BundleProblem]]:
 
     The edges of one source stay together, because its disparities couple them.
     """
+    if not len(problem.edges_source):
+        yield problem.edges_source, problem
+        return
     counts = torch.bincount(problem.edges_source).cumsum(0)
     part_of = ((counts - 1) * len(problem.rays) // CELLS_AT_ONCE)[problem.edges_source]
-    for part in (parts := part_of.unique() if len(part_of) else torch.zeros(1)):
+    for part in (parts := part_of.unique()):
         if len(parts) > PARTS_UNTIDIED and part % PARTS_UNTIDIED == 0:
             give_back_freed()
         edges = (part_of == part).nonzero()[:, 0]
