@@ -180,10 +180,12 @@ class Slam(Stateful):
         """Build map and MLP anew on swept depth, of keyframes and of frames in the gaps."""
         graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
         tracked = [frame.frame_index for frame in graph.keyframes.frames]
-        frames = swept_frames(tracked, list(self.poses), least=1)
+        poses = self.tracker.watch.longest_piece(self.poses)
+        frames = swept_frames([index for index in tracked if index in poses], list(poses), least=1)
         keyframes = self.keyframes(others=sorted({*frames} - {*tracked}))
+        keyframes = [keyframe for keyframe in keyframes if keyframe.frame_index in poses]
         if self.tracker.knows_depth:
-            inputs = graph, self.sequence, self.poses, frames, frames
+            inputs = graph, self.sequence, poses, frames, frames
             swept = sweep_frames(*inputs, progress, self.workers)
             fills = self.tracker.watch.hardly_walked
             keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, fills)
@@ -209,7 +211,8 @@ class Slam(Stateful):
         """Refine the poses between the keyframes until the rendered map matches the images."""
         stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
-        others = [index for index in self.poses if index not in keyframes]
+        mapped = self.tracker.watch.longest_piece(self.poses)
+        others = [index for index in mapped if index not in keyframes]
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
             read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
             undone = [self.tracker.graph.shutter.undone(frame) for frame in read]

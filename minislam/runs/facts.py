@@ -128,7 +128,8 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
 def unseen_psnr(slam: Slam) -> float | None:
     """Return the PSNR [dB] of up to 20 frames beside the map's, where beta finds them static."""
     mapper, seen = slam.mapper, {keyframe.frame_index for keyframe in slam.mapper.keyframes}
-    others = [index for index in slam.poses if index not in seen]
+    mapped = slam.tracker.watch.longest_piece(slam.poses)
+    others = [index for index in mapped if index not in seen]
     sample = others[:: math.ceil(len(others) / MOST_UNSEEN) or 1]
     keyframes = slam.keyframes(first=len(slam.tracker.keyframes), others=sample)
     views = [with_exposure(keyframe, mapper.exposures) for keyframe in keyframes]

@@ -54,6 +54,7 @@ class SourceFrame:
 def scene_of(slam: Slam) -> dict[str, Any]:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
+    mapped = slam.tracker.watch.longest_piece(slam.poses)
     exposures = {index: e.tolist() for index, e in slam.mapper.exposures.items()}
     frames = [
         SourceFrame(i, t.timestamp, sequence.source_name(i), i in keyframes, exposures.get(i))
@@ -66,6 +67,7 @@ def scene_of(slam: Slam) -> dict[str, Any]:
         "background": slam.mapper.background.tolist(),
         "least_weight": slam.mapper.least_weight,
         "preparation": sequence.preparation,
+        "mapped_frames": [min(mapped), max(mapped) + 1] if mapped else [None],
         "frames": [asdict(frame) for frame in frames],
     }
 
@@ -95,6 +97,7 @@ class Run:
             self.background = np.array(scene["background"], np.float32).reshape(3)
             self.least_weight = float(scene.get("least_weight", MAPPING_CUT))  # of a static pixel
             self.frames = [SourceFrame(**frame) for frame in scene["frames"]]
+            self._mapped = self.frames[slice(*scene.get("mapped_frames", [None]))]
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"expected camera.json of a run in {self.folder.path}, found {error!r}; repeat the "
@@ -113,16 +116,19 @@ class Run:
 
     @cached_property
     def poses(self) -> dict[int, np.ndarray]:
-        """Return T_world_camera (4, 4) of every frame that has a pose, by frame index."""
+        """Return T_world_camera (4, 4) of the frames that have a pose, by frame index.
+
+        Of a broken run, those of the piece that the map shows; `trajectory` has all.
+        """
         rows = zip(self.trajectory.timestamps, self.trajectory.T_world_camera, strict=True)
         found = {round(stamp, 6): pose for stamp, pose in rows}
-        stamps = {frame.index: round(frame.timestamp, 6) for frame in self.frames}
+        stamps = {frame.index: round(frame.timestamp, 6) for frame in self._mapped}
         return {index: found[stamp] for index, stamp in stamps.items() if stamp in found}
 
     @property
     def keyframes(self) -> list[int]:
-        """Return the frame indices of the keyframes."""
-        return [frame.index for frame in self.frames if frame.keyframe]
+        """Return the frame indices of the keyframes, like `poses`."""
+        return [frame.index for frame in self._mapped if frame.keyframe]
 
     @property
     def warnings_of_breaks(self) -> list[str]:
@@ -169,7 +175,7 @@ class Run:
         """Return one picture of the run: a frame (by default the middle keyframe) and the path."""
         index = self.keyframes[len(self.keyframes) // 2] if frame_index is None else frame_index
         if index not in self.poses:
-            raise InputError(f"expected a frame with a pose, found {index}; see lost_frames.txt")
+            raise InputError(f"expected a frame of the map, found {index}; see run.json")
         image = self.sequence.frame(index).image.numpy()
         color = self.render(self.poses[index])
         stamps, breaks = [f.timestamp for f in self.frames], self.folder.read_run()["breaks"]
@@ -186,7 +192,7 @@ class Run:
 
     def __repr__(self) -> str:
         """Return the facts of the run in a line."""
-        poses = f"{len(self.poses)} of {len(self.frames)} frames with a pose"
+        poses = f"{len(self.trajectory)} of {len(self.frames)} frames with a pose"
         size = f"{len(self.keyframes)} keyframes, {len(self.gaussians)} Gaussians"
         return f"Run of {self.name}: {poses}, {size}; {self.folder.path.name}"
 

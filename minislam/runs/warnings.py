@@ -79,13 +79,16 @@ def _path_warnings(slam: Slam) -> Iterator[str]:
         )
     if watch.breaks:
         where = ", ".join(span(found.first_frame, found.last_frame) for found in watch.breaks)
+        mapped, piece = watch.longest_piece(slam.poses), ""
+        if len(mapped) < len(slam.poses):
+            piece = f", so the map shows frames {span(min(mapped), max(mapped))} alone"
         pieces = _as_options(slam, _followed_pieces(slam))
         anew = f"; run each piece anew, with the other options as here: {pieces}" if pieces else ""
         yield (
             f"{BROKEN} at frames {where}: motion or depth contradicts the images, there is too "
             "little parallax to carry the scale across, or the camera follows something that came "
             "into view. Before and after, scale and direction do not belong "
-            f"together{anew}. {_FAR_APART}"
+            f"together{piece}{anew}. {_FAR_APART}"
         )
     if graph.failed_adjustments:
         yield (

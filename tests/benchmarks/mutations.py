@@ -171,7 +171,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
         ("weak >= LONG or _is", "_is"), ("find_breaks(judged)", "find_breaks(self.diagnostics)"),
-        ("if all(k.parallax <", "if any(k.parallax <"),
+        ("if all(k.parallax <", "if any(k.parallax <"), ("max(pieces, key", "min(pieces, key"),
         (">= LEAST_BEYOND_TURNS and not graph", ">= 0 and not graph"),
         ("and not graph.keyframes.has_prior", ""), ("is_tied and has_scale", "is_tied"),
         ("(k, depth_error=None, ", "(k, explained=None, depth_error=None, "),

@@ -26,7 +26,7 @@ def finished(**parts: object) -> SimpleNamespace:
         grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
-    lost = parts.pop("lost", range(0))
+    lost, mapped = parts.pop("lost", range(0)), parts.pop("mapped", range(20))
     frames = [
         SimpleNamespace(
             frame_index=k, timestamp=k / 30, status=SimpleNamespace(is_followed=k not in lost)
@@ -45,6 +45,7 @@ def finished(**parts: object) -> SimpleNamespace:
             hardly_walked=parts.pop("hardly_walked", False),
             breaks=parts.pop("breaks", []),
             segments=parts.pop("segments", [(0, 5), (7, 7)]),
+            longest_piece=lambda poses: mapped,
         ),
         keyframes=SimpleNamespace(
             has_prior=parts.pop("has_prior", True), overlay=parts.pop("overlay", None)
@@ -66,6 +67,7 @@ def finished(**parts: object) -> SimpleNamespace:
     mapper.beta_of, mapper.static_weight = lambda keyframe: hidden, lambda beta, camera: beta
     return SimpleNamespace(
         mapper=mapper,
+        poses=dict.fromkeys(range(20)),
         config=SlamConfig(),
         sequence=SimpleNamespace(
             warnings=[],

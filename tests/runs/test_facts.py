@@ -108,12 +108,15 @@ def test_the_map_is_compared_with_some_frames_that_it_was_not_fitted_to():
         beta_of=lambda keyframe: (torch.arange(6) < keyframe.frame_index).expand(4, 6),
         static_weight=lambda beta, camera: beta,
     )
-    tracker = SimpleNamespace(keyframes=[None] * 3)
+    watch = SimpleNamespace(longest_piece=lambda poses: poses)
+    tracker = SimpleNamespace(keyframes=[None] * 3, watch=watch)
     run = SimpleNamespace(mapper=mapper, tracker=tracker, keyframes=keyframes)
     run.poses = dict.fromkeys(range(101))
     assert facts.unseen_psnr(run) == pytest.approx(20, abs=1e-3)
     assert len(asked) == facts.MOST_UNSEEN and asked[0] == 1 and asked[-1] == 96
     run.poses = dict.fromkeys(range(9))
     assert facts.unseen_psnr(run) is not None and asked == [1, 2, 3, 4, 5, 6, 7, 8]
-    run.poses = {0: None}
+    tracker.watch.longest_piece = lambda poses: range(3, 6)  # of a broken run
+    assert facts.unseen_psnr(run) is not None and asked == [3, 4, 5]
+    tracker.watch.longest_piece = lambda poses: [0]
     assert facts.unseen_psnr(run) is None

@@ -55,13 +55,23 @@ def test_a_run_is_found_below_the_home_of_the_user(run: minislam.Run, monkeypatc
     assert minislam.load(f"~/{run.folder.path.name}").folder.path == run.folder.path
 
 
-def test_breaks_are_drawn_in_every_picture_of_the_path(tmp_path: Path, monkeypatch):
+def test_a_broken_run_maps_the_longest_piece_and_marks_the_break(tmp_path: Path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(diagnostics, "find_breaks", lambda _: [diagnostics.Break(3, 6)])
+    monkeypatch.setattr(diagnostics, "find_breaks", lambda _: [diagnostics.Break(3, 3)])
     monkeypatch.setattr(figures, "_draw_path", lambda *args: drawn.append(args[-1]))
-    options = {"stride": 3, "max_frames": 8, "size": (96, 72), "preset": "test", "quiet": True}
-    minislam.run("synth:person", tmp_path / "run", **options).plot()
-    assert drawn == 4 * [[(0.3, 0.6)]]  # two planes, overview.png, plot()
+    options = {"stride": 3, "max_frames": 20, "size": (96, 72), "preset": "test", "quiet": True}
+    run = minislam.run("synth:person", tmp_path / "run", **options)
+    run.plot()
+    assert drawn == 4 * [[(0.3, 0.3)]]  # two planes, overview.png, plot()
+    piece = range(run.keyframes[0], run.keyframes[-1] + 1)
+    assert 3 < min(piece) and 14 < max(piece) and list(run.poses) == list(piece)
+    shown = {int(path.name[:6]) for path in (tmp_path / "run/keyframes").glob("*_render.png")}
+    assert {*run.keyframes} <= shown <= {*piece}
+    assert len(run.trajectory) == 20 and "20 of 20 frames with a pose" in repr(run)
+    (warning,) = run.warnings_of_breaks
+    assert f"the map shows frames {min(piece)} to {max(piece)} alone" in warning
+    with pytest.raises(InputError, match=r"expected a frame of the map, found 2; see run\.json"):
+        run.plot(2)
 
 
 def test_depth_is_that_of_the_surface_and_a_camera_can_be_given(run: minislam.Run):
@@ -114,7 +124,7 @@ def test_what_a_notebook_shows(run: minislam.Run):
     assert "10 of 10 frames with a pose" in repr(run)
     assert "frames followed" in shown and run.summary()[0].verdict == "good"
     assert len(run.plot(run.keyframes[0]).axes) == 4
-    with pytest.raises(InputError, match="expected a frame with a pose, found 77"):
+    with pytest.raises(InputError, match="expected a frame of the map, found 77"):
         run.plot(77)
 
 

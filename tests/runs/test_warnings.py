@@ -39,6 +39,11 @@ WARNINGS = [
         "options as here: --start 10 --max-frames 9, or --start 40 --max-frames 10. If",
     ),
     (
+        {"breaks": [Break(9, 9)], "mapped": range(10, 20)},
+        "do not belong together, so the map shows frames 10 to 19 alone; run each piece",
+    ),
+    ({"breaks": [Break(9, 9)]}, "do not belong together; run each piece"),
+    (
         {"truth": [9.0, 9.5]},
         "there is no ATE: expected at least 3 timestamps of estimate and truth",
     ),

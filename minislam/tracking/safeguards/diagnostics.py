@@ -40,6 +40,7 @@ MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
 MAX_SCALE_DEVIATION = 0.1  # of a length, relative; healthy to .06, broken .19 and .40
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
+LEAST_FRAMES = 6  # with a pose, of a piece that gets a map of its own
 
 # A camera that walks; the tables stand in tests/benchmarks/diary/turning_cameras.md.
 LEAST_BEYOND_TURNS = 0.45  # px of a 320x240 image
@@ -130,6 +131,17 @@ class Watch(Stateful):
                 after = sum(b.last_frame < frame for b in self.breaks)
                 segments[after] = segments.get(after, (frame, frame))[0], frame
         return list(segments.values())
+
+    def longest_piece(self, poses: dict[int, Tensor]) -> dict[int, Tensor]:
+        """Return, of the poses by frame index, those of the longest piece between breaks.
+
+        A map shows it alone, because the pieces differ in scale and direction, and each would hide
+        the others. Without a break, or where all pieces are short, all poses are returned.
+        """
+        spans = self.segments if self.breaks else []
+        pieces = [{i: poses[i] for i in poses if first <= i <= last} for first, last in spans]
+        longest = max(pieces, key=len, default=poses)
+        return longest if len(longest) >= LEAST_FRAMES else poses
 
 
 def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:

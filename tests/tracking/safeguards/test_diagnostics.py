@@ -264,3 +264,17 @@ def test_segments_lie_between_breaks():
     assert watch.segments == [(0, 10), (40, 50)]
     watch.breaks = [Break(0, 60)]
     assert watch.segments == []
+
+
+def test_the_longest_piece_is_that_with_most_poses():
+    watch, poses = Watch(true_graph([0])), {frame: torch.eye(4) for frame in range(0, 61, 2)}
+    watch.diagnostics = keyframes(*[HEALTHY] * 7)
+    assert watch.longest_piece(poses) is poses  # without a break, all
+    watch.breaks = [Break(30, 30)]
+    assert list(watch.longest_piece(poses)) == [*range(0, 21, 2)]
+    followed = {frame: poses[frame] for frame in poses if frame > 6}  # the first frames are lost
+    assert list(watch.longest_piece(followed)) == [*range(40, 61, 2)]
+    watch.breaks = [Break(20, 40)]
+    assert list(watch.longest_piece(poses)) == [*range(0, 11, 2)]
+    assert watch.longest_piece(few := {frame: poses[frame] for frame in range(0, 9, 2)}) is few
+    assert watch.longest_piece({}) == {}  # an interrupted run
