@@ -36,8 +36,9 @@ LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .003 to .15, broken .5
 MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
-MIN_AGREEMENT = 0.5  # healthy .62 to 1, broken 0 to .41
+MIN_AGREEMENT = 0.45  # healthy .49 to 1, broken 0 to .41
 MAX_SCALE_DEVIATION = 0.1  # of a length, relative; healthy to .06, broken .19 and .40
+CERTAIN_SCALE_DEVIATION = 0.03  # photos from far apart that were posed well to .013
 MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
 HEALED_AFTER = 3  # healthy keyframes that end a break
 LEAST_FRAMES = 6  # with a pose, of a piece that gets a map of its own
@@ -259,14 +260,15 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
     One keyframe is a break if it explains very little flow, sees other depths, or has an uncertain
-    scale, low continuity or low agreement. LONG keyframes in a row that all explain less than
-    MIN_EXPLAINED_LONG make one, too. Breaks at most HEALED_AFTER keyframes apart are joined.
+    scale, low continuity or low agreement. LONG weak keyframes in a row make one, too: they explain
+    less than MIN_EXPLAINED_LONG, and their scale is not certain. (Of wide photos a third of the
+    flow may be wrong; the rest fixes the poses.) Breaks at most HEALED_AFTER keyframes apart are
+    joined.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little
     for index, keyframe in enumerate(diagnostics):
-        is_weak = keyframe.explained is not None and keyframe.explained < MIN_EXPLAINED_LONG
-        weak = weak + 1 if is_weak else 0
+        weak = weak + 1 if _is_weak(keyframe) else 0
         if weak >= LONG or _is_broken(keyframe):
             start = index - LONG + 1 if weak >= LONG else index
             first = diagnostics[start].frame_index
@@ -275,6 +277,13 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
             found.append(Break(first, keyframe.frame_index))
             last = index
     return found
+
+
+def _is_weak(keyframe: KeyframeDiagnostics) -> bool:
+    if keyframe.explained is None or keyframe.explained >= MIN_EXPLAINED_LONG:
+        return False
+    deviation = keyframe.scale_deviation
+    return deviation is None or deviation >= CERTAIN_SCALE_DEVIATION
 
 
 def _is_broken(keyframe: KeyframeDiagnostics) -> bool:

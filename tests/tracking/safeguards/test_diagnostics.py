@@ -26,9 +26,11 @@ from minislam.tracking.safeguards.motion_memory import judge_all
 from tests.tracking.scene import normal
 from tests.tracking.wall import CAMERA, GRID, true_graph
 
-HEALTHY, WEAK, UNEXPLAINED, DEEP, UNTIED, NEW, LOOSE = (
+HEALTHY, WEAK, FAINT, FIRM, UNEXPLAINED, DEEP, UNTIED, NEW, LOOSE = (
     (0.97, 0.02, 0.2, 0.9, 0.04),
     (0.8, 0.02, 0.2, 0.9),
+    (0.8, 0.02, 0.2, 0.9, 0.04),
+    (0.8, 0.02, 0.2, 0.9, 0.02),
     (0.4, 0.02, 0.2, 0.9),
     (0.97, 0.5, 0.2, 0.9),
     (0.97, 0.02, 0.003, None),
@@ -215,6 +217,8 @@ def test_a_keyframe_without_links_is_reported_as_such():
         ([HEALTHY, LOOSE, HEALTHY], [Break(10, 10)]),
         ([HEALTHY, WEAK, WEAK, HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),
+        ([FAINT] * 3, [Break(0, 20)]),
+        ([FAINT, FIRM, FAINT, FAINT], []),  # wide photos
         ([HEALTHY, DEEP, HEALTHY, WEAK, WEAK, WEAK], [Break(10, 50)]),
     ],
 )
