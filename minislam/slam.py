@@ -130,6 +130,8 @@ class Slam(Stateful):
             except MinislamError:
                 self.steps.save_checkpoint(True)
                 raise
+            if not len(self.tracker.keyframes) and self.mapper.keyframes:
+                self.mapper = self._new_mapper(ONLINE_CELL)  # tracking has begun anew
             yield frame
 
     def _initialise(self) -> None:
@@ -211,8 +213,7 @@ class Slam(Stateful):
         """Refine the poses between the keyframes until the rendered map matches the images."""
         stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
-        mapped = self.tracker.watch.longest_piece(self.poses)
-        others = [index for index in mapped if index not in keyframes]
+        others = [i for i in self.tracker.watch.longest_piece(self.poses) if i not in keyframes]
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
             read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
             undone = [self.tracker.graph.shutter.undone(frame) for frame in read]
@@ -277,9 +278,8 @@ class Slam(Stateful):
 
     def keyframe_trajectory(self) -> Trajectory:
         """Return the poses of the keyframes."""
-        keyframes = self.tracker.keyframes
-        stamps = [frame.timestamp for frame in keyframes.frames]
-        return as_trajectory(stamps, list(keyframes.T_camera_world))
+        stamps = [frame.timestamp for frame in self.tracker.keyframes.frames]
+        return as_trajectory(stamps, list(self.tracker.keyframes.T_camera_world))
 
     def render(self, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the colours (H, W, 3) in [0, 1] of the map, seen from a pose (4, 4)."""

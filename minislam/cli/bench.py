@@ -93,7 +93,7 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
 def _run(path: Path, folder: Path, options: list[str]) -> tuple[int, str]:
     """Run a sequence, or resume it, if it is not finished; return exit code and ATE."""
     facts = folder / "run.json"
-    if facts.exists() and str(read_json(facts)["state"]).startswith("finished"):
+    if facts.exists() and str(read_json(facts).get("state")).startswith("finished"):
         code = read_json(facts)["exit_code"]
     else:
         start = "--resume" if (folder / "checkpoint.npz").exists() else "--overwrite"

@@ -8,6 +8,7 @@ import numpy as np
 from minislam.errors import InputError
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
+from minislam.records import TrackingStatus
 from minislam.runs.summary import span
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import is_unexplained
@@ -122,8 +123,8 @@ def _map_warnings(slam: Slam) -> Iterator[str]:
 
 
 def _lost_stretches(slam: Slam) -> list[tuple[int, int]]:
-    """Return the first and last of frames that were lost in a row after the start."""
-    frames = dropwhile(lambda frame: not frame.status.is_followed, slam.tracker.tracked)
+    """Return the first and last of frames that were given up, or lost later, in a row."""
+    frames = dropwhile(lambda f: f.status is TrackingStatus.LOST, slam.tracker.tracked)
     return _stretches([f.frame_index for f in frames if not f.status.is_followed], gap=1)
 
 

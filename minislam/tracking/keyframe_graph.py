@@ -73,6 +73,7 @@ class KeyframeGraph(Stateful):
     def __init__(
         self, camera: Camera, config: TrackingConfig, flow: FlowEstimator, device: str = "cpu"
     ) -> None:
+        self.given = camera, config, flow, device
         self.is_learned = flow.learned_confidence  # then flow and geometry take turns
         self.config = config.for_learned_flow() if self.is_learned else config
         self.grid = Grid.of(camera, flow.stride, device)

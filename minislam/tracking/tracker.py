@@ -79,15 +79,19 @@ class Tracker(Stateful):
         device: str = "cpu",  # of all tensors; frames must be there, too
     ) -> None:
         """Start without any frame. Online a keyframe keeps the static weight it came with."""
-        self.graph = KeyframeGraph(camera, config, flow, device)
-        self.config = self.graph.config  # for this kind of flow
-        self.keyframes = self.graph.keyframes
-        self.grid = self.graph.grid
-        self.tracked, self.watch, self._settling = [], Watch(self.graph), Settling(self.graph)
         self._features = features
         self._depth_prior = lambda frame: depth_prior(frame, camera)  # f as given keeps the unit
         self._predict_static_weight = predict_static_weight
-        self._relocaliser = Relocaliser(self.graph)
+        self.begin_with(KeyframeGraph(camera, config, flow, device))
+        self.tracked = []
+
+    def begin_with(self, graph: KeyframeGraph) -> None:
+        """Begin, or begin anew, with a graph that has no keyframes yet."""
+        self.graph, self.config = graph, graph.config  # for this kind of flow
+        self.keyframes, self.grid = graph.keyframes, graph.grid
+        self.watch, self._settling = Watch(graph), Settling(graph)
+        self._relocaliser = Relocaliser(graph)
+        self.mode, self.last_non_keyframe, self._last_global = Mode.WAITING, None, 0
         # From the newest keyframe to the newest frame that could be matched with it.
         self._chain: FlowChain | None = None
 

@@ -8,7 +8,7 @@ import torch
 
 from minislam.config import SlamConfig
 from minislam.geometry import Camera
-from minislam.records import Trajectory
+from minislam.records import TrackingStatus, Trajectory
 from tests.helpers import random_transforms
 
 CAMERA = Camera(272.0, 272.0, 160.0, 120.0, 320, 240)
@@ -27,9 +27,10 @@ def finished(**parts: object) -> SimpleNamespace:
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
     lost, mapped = parts.pop("lost", range(0)), parts.pop("mapped", range(20))
+    status = parts.pop("status", TrackingStatus.LOST)
     frames = [
         SimpleNamespace(
-            frame_index=k, timestamp=k / 30, status=SimpleNamespace(is_followed=k not in lost)
+            frame_index=k, timestamp=k / 30, status=status if k in lost else TrackingStatus.OK
         )
         for k in range(20)
     ]

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from minislam.records import TrackingStatus
 from minislam.runs.warnings import warnings
 from minislam.tracking.keyframes import KeyframeStore
 from minislam.tracking.safeguards.diagnostics import Break
@@ -144,6 +145,11 @@ def test_an_unknown_focal_length_of_a_broken_run_gets_no_advice_from_its_halves(
 def test_a_film_is_not_called_cut_where_few_frames_are_lost_or_its_start(lost: Sequence[int]):
     (warning,) = warnings(finished(lost=lost))
     assert "cut" not in warning
+
+
+def test_the_first_part_of_a_cut_film_is_named_if_a_later_one_was_kept():
+    (warning,) = warnings(finished(lost=range(8), status=TrackingStatus.GIVEN_UP))
+    assert "run the rest by itself: --start 10 --max-frames 8. If" in warning
 
 
 def test_a_piece_that_is_to_be_run_anew_ends_where_many_frames_are_lost():

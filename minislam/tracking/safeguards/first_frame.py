@@ -1,15 +1,17 @@
 """Which frame the warm-up begins with, and when it is over.
 
 After a black first frame, a slate or a jump cut, the warm-up begins anew with the first lost frame,
-once as many were lost as followed. If no start has made enough keyframes, the best is repeated.
+once as many were lost as followed; after it, at the end of the film, if more were lost. If a later
+start is worth less, the best is repeated.
 """
 
 from dataclasses import replace
 
 from minislam.records import TrackingStatus
 from minislam.state.stateful import Stateful
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.keyframe_selection import mean_flow
-from minislam.tracking.tracker import Mode, Tracker
+from minislam.tracking.tracker import Tracker
 
 Worth = tuple[bool, int]  # whether a start can tell depth; the frames that it followed
 
@@ -23,13 +25,15 @@ class FirstFrame(Stateful):
 
     def next_frame(self, tracker: Tracker, count: int) -> int | None:
         """Return which of `count` frames the tracker shall see next, None after the last."""
-        tracked = tracker.tracked
-        if len(tracker.keyframes) and not tracker.initialised and not self.is_repeated:
-            start, is_over = tracker.keyframes.frames[0].frame_index, len(tracked) == count
+        tracked, is_over = tracker.tracked, len(tracker.tracked) == count
+        is_open = (is_over or not tracker.initialised) and not self.is_repeated
+        if len(tracker.keyframes) and is_open:
+            start = tracker.keyframes.frames[0].frame_index
             followed = [t.frame_index for t in tracked[start:] if t.status.is_followed]
             worth, lost = (can_tell_depth(tracker), len(followed)), len(tracked) - 1 - followed[-1]
+            as_many = lost >= len(followed) and not tracker.initialised
             # Behind the last frame, the lost ones are tried if they may be worth more.
-            if lost and (lost >= len(followed) or (is_over and (True, lost) > worth)):
+            if lost and (as_many or (is_over and (True, lost) > worth)):
                 if worth > self.worth:
                     self.best, self.worth = start, worth
                 begin_anew(tracker, followed[-1] + 1)
@@ -48,18 +52,17 @@ def can_tell_depth(tracker: Tracker) -> bool:
     """Tell whether depth may be known: by a prior, or from a mean flow of `least_parallax`."""
     graph = tracker.graph
     seen = [*graph.flow_to_next, *(tracker.last_non_keyframe or ())[1:]]
-    lengths = (mean_flow(graph, flow) for flow in seen)
+    lengths = (mean_flow(graph, flow) for flow in seen if flow is not None)
     return graph.keyframes.has_prior or any(px >= graph.least_parallax for px in lengths)
 
 
 def begin_anew(tracker: Tracker, first: int) -> None:
-    """Forget all keyframes of the warm-up: frames before `first` have no pose, it comes next."""
-    tracked = tracker.tracked
-    while len(tracker.keyframes) > 1:
-        tracker.graph.remove_newest()
-    tracker.keyframes.remove_newest()
-    tracker.graph.flow.remove_frame(0)
-    tracker.mode, tracker.last_non_keyframe = Mode.WAITING, None
+    """Forget all keyframes: frames before `first` have no pose, it comes next."""
+    before, tracked = tracker.graph, tracker.tracked
+    for keyframe in range(len(before.keyframes)):
+        before.flow.remove_frame(keyframe)
+    tracker.begin_with(KeyframeGraph(*before.given))
+    tracker.graph.seeks_focal = before.seeks_focal
     del tracked[first:]
     for index, frame in enumerate(tracked):
         if frame.status.is_followed:

@@ -70,6 +70,31 @@ def test_a_start_of_more_frames_than_are_lost_is_kept():
     assert tracker.keyframes.frames[0].frame_index == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("first, second", [(14, 24), (24, 14)])
+def test_of_a_film_that_is_cut_after_the_warm_up_the_longer_part_is_kept(first: int, second: int):
+    images = [frame.image for frame in frames()]
+    film = images[:first] + [image.flip(1) for image in images[:second]]  # mirrored: another scene
+    tracker = new_tracker(with_depth=False)
+    run(tracker, renumbered(film))
+    kept = range(first) if first > second else range(first, first + second)
+    assert [t.frame_index for t in tracker.tracked if t.status.is_followed] == list(kept)
+    assert len(tracker.watch.diagnostics) == len(tracker.keyframes)
+    reason = "lost, matched ratio" if first > second else "start given up"
+    assert all(reason in tracker.tracked[index].reason for index in lost_frames(tracker))
+
+
+@pytest.mark.slow
+def test_a_part_that_is_repeated_because_no_other_is_longer_is_as_it_was():
+    poses = []
+    for number in (5, 16):  # less, and more than are followed
+        tracker = new_tracker(with_depth=False)
+        run(tracker, renumbered([frame.image for frame in frames()[:14]] + black(number)))
+        assert lost_frames(tracker) == list(range(14, 14 + number))
+        poses.append(tracker.keyframes.T_camera_world)
+    assert torch.equal(*poses)
+
+
 @pytest.mark.parametrize("enough", [2, 6])
 def test_the_warm_up_ends_with_its_last_keyframe(enough: int):
     for count in (enough - 1, enough):
