@@ -14,24 +14,30 @@ from minislam.data.metadata import noted_size
 from minislam.data.preparation import lit_extent
 from minislam.errors import InputError, MinislamError
 
+SIMILAR = 0.03  # of a side: images that differ by less are resized [-]
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
 _TEXT = cv2.VideoWriter.fourcc(*"ansi")  # FFmpeg films a text file on a terminal
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
 
 class FileImages:
-    """Images that are files. The size of most of them counts; the others are left out."""
+    """Images that are files. The size of most of them counts.
+
+    Those of nearly that size, as COLMAP undistorts them, are resized; the others are left out.
+    """
 
     def __init__(self, paths: list[Path]) -> None:
         self.paths = paths
         sizes = {k: size for k, path in enumerate(paths) if (size := noted_size(path))}
         usual = Counter(sizes.values()).most_common(1)
-        text = "{} is {}x{} px, others are {}x{}".format
-        self.odd = {  # by number, why an image is left out
-            k: text(paths[k].name, *size, *usual[0][0])
-            for k, size in sizes.items()
-            if size != usual[0][0]
-        }
+        self._size = width, height = usual[0][0] if usual else (0, 0)
+        # By number, what is said of an image that is resized, and of one that is left out.
+        self.resized, self.odd = dict[int, str](), dict[int, str]()
+        for k, (w, h) in sizes.items():
+            change = max(abs(w / width - 1), abs(h / height - 1))
+            said = self.resized if change < SIMILAR else self.odd
+            if change > 0:
+                said[k] = f"{paths[k].name} is {w}x{h} px, others are {width}x{height}"
         self.labels = [str(path) for path in paths]  # how to call the images in a message
         self.names = [path.name for path in paths]
 
@@ -40,7 +46,10 @@ class FileImages:
 
     def read(self, index: int) -> np.ndarray:
         """Return a raw image (H, W, 3) uint8 RGB."""
-        return read_color(self.paths[index])
+        image = read_color(self.paths[index])
+        if index in self.resized:
+            image = cv2.resize(image, self._size, None, 0, 0, cv2.INTER_AREA)
+        return image
 
     @property
     def lit_extents(self) -> list[list[int]]:
@@ -64,7 +73,7 @@ class VideoImages:
 
     def __init__(self, path: Path, limit: int | None = None) -> None:
         self.path, self.paths = path, [path]  # the files that hold the images
-        self.odd: dict[int, str] = {}
+        self.resized, self.odd = dict[int, str](), dict[int, str]()
         self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)

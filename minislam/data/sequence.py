@@ -88,6 +88,10 @@ class RecordedSequence:
         if left_out := [odd[index] for index in chosen if index in odd]:
             text = f"{len(left_out)} of {len(chosen)} images are left out because of their size"
             self.warnings.append(f"{text}, such as {left_out[0]}; crop or resize them")
+        resized = recording.images.resized
+        if similar := [resized[index] for index in chosen if index in resized]:
+            text = f"{len(similar)} of {len(chosen)} images are resized to the size of most"
+            self.warnings.append(f"{text}, such as {similar[0]}")
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
         knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None

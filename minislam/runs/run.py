@@ -28,7 +28,7 @@ from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
 from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints, way_on
-from minislam.runs.warnings import alarms, has_large_holes
+from minislam.runs.warnings import alarms, has_large_holes, leaves_nearly_all_out
 from minislam.slam import Priors, Slam
 from minislam.state.steps import Observer
 from minislam.tracking.safeguards.lens import BentLens
@@ -206,7 +206,7 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
         return "finished, most bundle adjustments failed", LOST_EXIT
     if slam.tracker.watch.breaks:
         return "finished, broken", LOST_EXIT
-    if has_large_holes(slam):
+    if has_large_holes(slam) or leaves_nearly_all_out(slam):
         return "finished, map with large holes", LOST_EXIT
     if slam.lost_frames():
         return "finished, partly lost", LOST_EXIT

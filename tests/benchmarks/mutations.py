@@ -262,7 +262,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("<= max_difference", "<= 2 * max_difference"),
     ],
     ("data/raw_images.py", "data/test_raw_images.py data/test_sequence.py"): [
-        ("if index not in self.odd", ""), ("size != usual[0][0]", "False"),
+        ("if index not in self.odd", ""), ("if change < SIMILAR", "if True"),
         ("self.promised > len(self) > 1", "len(self) > 1"),
         ("0 if len(stamps) == limit else promised", "promised"),
         ("index & (index - 1) == 0", "index == 0"),

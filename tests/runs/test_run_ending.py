@@ -1,10 +1,14 @@
 """How a run says that it ended: the state in run.json, and the exit code of README."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+import torch
 
+from minislam.config import SlamConfig
 from minislam.runs.run import _ending
+from minislam.uncertainty import UncertaintyConfig
 
 
 def ended(
@@ -13,11 +17,16 @@ def ended(
     failed: int = 0,
     broken: bool = False,
     shown: tuple[float, ...] = (1.0, 0.9),
+    left_out: float = 0.6,
+    **uncertainty: bool,
 ) -> object:
     graph = SimpleNamespace(adjustments=5, failed_adjustments=failed)
     tracker = SimpleNamespace(graph=graph, watch=SimpleNamespace(breaks=broken))
     sequence = SimpleNamespace(lost=[(0.1, "damaged")] * undecoded)
-    parts = {"tracker": tracker, "sequence": sequence, "mapper": SimpleNamespace(shown=shown)}
+    mapper = SimpleNamespace(shown=shown, keyframes=[None], camera=None, beta_of=lambda _: None)
+    mapper.static_weight = lambda beta, camera: (torch.arange(100) >= 100 * left_out).float()
+    config = replace(SlamConfig(), uncertainty=UncertaintyConfig(**uncertainty))
+    parts = {"tracker": tracker, "sequence": sequence, "mapper": mapper, "config": config}
     return SimpleNamespace(**parts, lost_frames=lambda: [None] * lost)
 
 
@@ -32,6 +41,9 @@ def ended(
         ({"shown": (1.0, 0.6)}, ("finished", 0)),
         ({"shown": (0.0, 0.0)}, ("finished, map with large holes", 3)),
         ({"shown": ()}, ("finished", 0)),
+        ({"left_out": 0.8}, ("finished, map with large holes", 3)),
+        ({"left_out": 0.8, "given_masks": True}, ("finished", 0)),
+        ({"left_out": 0.8, "enabled": False}, ("finished", 0)),
         ({"lost": 1}, ("finished, partly lost", 3)),
         ({"undecoded": 1}, ("finished, images left out", 3)),
         ({"undecoded": 1, "lost": 1}, ("finished, partly lost", 3)),

@@ -31,6 +31,7 @@ from minislam.tracking.safeguards.focal_length import ITERATIONS, WIDENINGS
 from minislam.tracking.safeguards.robust import least_cost
 
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
+WIDENINGS_AGAIN = [8.0, 4.0, 1.0]  # of the robust weight: a path that was bent lets go of its flow
 ROUNDS = 16  # of straightening and adjusting, at most
 SETTLED = 0.001  # a round that bends a corner by no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
@@ -97,14 +98,15 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
         return None
     problem, state = replace(among[0], free_focal=True), among[1]
     _, pinhole = adjust_narrowing(problem, state, WIDENINGS, ITERATIONS)
-    radial, widenings = (0.0, 0.0), WIDENINGS
-    for _ in range(ROUNDS):
-        lens = straightened(problem, radial)
-        found, _ = adjust_narrowing(lens, state, widenings, ITERATIONS)
-        state, widenings = replace(found, readout=(0.0, 0.0)), [1.0]
-        before, radial = radial, _without_fold(problem.camera, radial, found.readout)
-        if abs(bend_of(problem.camera, radial) - bend_of(problem.camera, before)) < SETTLED:
-            break
+    radial = (0.0, 0.0)
+    for widenings in (WIDENINGS, WIDENINGS_AGAIN):
+        for _ in range(ROUNDS):
+            lens = straightened(problem, radial)
+            found, _ = adjust_narrowing(lens, state, widenings, ITERATIONS)
+            state, widenings = replace(found, readout=(0.0, 0.0)), [1.0]
+            before, radial = radial, _without_fold(problem.camera, radial, found.readout)
+            if abs(bend_of(problem.camera, radial) - bend_of(problem.camera, before)) < SETTLED:
+                break
     lens = replace(straightened(problem, radial), shutter=None)
     state, held = adjust_narrowing(lens, state, [1.0], ITERATIONS)
     floor = least_cost(problem.weights)
