@@ -74,10 +74,11 @@ def _path_warnings(slam: Slam) -> Iterator[str]:
     watch, graph, lost = slam.tracker.watch, slam.tracker.graph, len(slam.lost_frames())
     if lost:
         apart = _as_options(slam, _lost_stretches(slam))
-        rest = f"If the film is cut there, run the rest by itself: {apart}. " if apart else ""
+        rest = f". If the film is cut there, run the rest by itself: {apart}" if apart else ""
+        is_lost = any(frame.status is TrackingStatus.LOST for frame in slam.tracker.tracked)
         yield (
             f"{lost} of {len(slam.tracker.tracked)} frames could not be tracked and have no pose; "
-            f"lost_frames.txt lists them. {rest}{_FAR_APART}"
+            f"lost_frames.txt lists them{rest}{f'. {_FAR_APART}' if is_lost else ''}"
         )
     if watch.breaks:
         where = ", ".join(span(found.first_frame, found.last_frame) for found in watch.breaks)
