@@ -28,7 +28,8 @@ class FileImages:
 
     def __init__(self, paths: list[Path]) -> None:
         self.paths = paths
-        sizes = {k: size for k, path in enumerate(paths) if (size := noted_size(path))}
+        noted = enumerate(map(noted_size, paths))
+        sizes = {k: size for k, size in noted if size is not None and min(size) > 0}
         usual = Counter(sizes.values()).most_common(1)
         self._size = width, height = usual[0][0] if usual else (0, 0)
         # By number, what is said of an image that is resized, and of one that is left out.
@@ -46,10 +47,16 @@ class FileImages:
 
     def read(self, index: int) -> np.ndarray:
         """Return a raw image (H, W, 3) uint8 RGB."""
-        image = read_color(self.paths[index])
-        if index in self.resized:
-            image = cv2.resize(image, self._size, None, 0, 0, cv2.INTER_AREA)
-        return image
+        return self.as_usual(index, read_color(self.paths[index]))
+
+    def as_usual(self, index: int, image: np.ndarray) -> np.ndarray:
+        """Return an image, or the mask (H, W) bool that belongs to it, at the size of most."""
+        if index not in self.resized:
+            return image
+        is_mask = image.ndim == 2
+        method = cv2.INTER_NEAREST_EXACT if is_mask else cv2.INTER_AREA
+        resized = cv2.resize(image.astype(np.uint8), self._size, None, 0, 0, method)
+        return resized > 0 if is_mask else resized
 
     @property
     def lit_extents(self) -> list[list[int]]:

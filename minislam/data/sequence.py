@@ -14,6 +14,7 @@ from minislam.data.calibration import Calibration, read_calibration, rough_calib
 from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
 from minislam.data.preparation import ImagePreparation, Window, picture_window
+from minislam.data.raw_images import FileImages
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError, require
@@ -182,10 +183,12 @@ class RecordedSequence:
         self, paths: dict[int, Path], read: Callable[[Path], np.ndarray], frame_index: int
     ) -> np.ndarray | None:
         """Return what the file that belongs to a frame shows, None if there is no such file."""
-        path = paths.get(self._chosen[frame_index])
-        if path is None:
+        images, index = self._recording.images, self._chosen[frame_index]
+        if (path := paths.get(index)) is None:
             return None
         raw = read(path)
+        if isinstance(images, FileImages):
+            raw = images.as_usual(index, raw)
         return (self.prepare.color if raw.ndim == 3 else self.prepare.nearest)(raw, str(path))
 
     def _novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -67,8 +67,8 @@ def sweep_frames(
     width: int = WIDTH,  # px of the images that are swept, at most
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
-    keyframes = enumerate(graph.keyframes.frames)
-    agreed = {f.frame_index: agreed_disparities(graph, k).cpu().numpy() for k, f in keyframes}
+    keyframes = [(k, f.frame_index) for k, f in enumerate(graph.keyframes.frames)]
+    agreed = {i: agreed_disparities(graph, k).cpu().numpy() for k, i in keyframes if i in poses}
     inputs = graph.grid.camera, poses, agreed, frames, wanted, progress, workers, width
     swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
     device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV

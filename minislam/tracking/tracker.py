@@ -57,7 +57,7 @@ class Tracker(Stateful):
                                                                   +---- old view or ---+
                                                                        known place
 
-    A frame of the warm-up that cannot be matched is lost, too; with many, `FirstFrame` begins anew.
+    A frame of the warm-up that cannot be matched is lost, too. With many, `FirstFrame` begins anew.
     """
 
     graph: KeyframeGraph

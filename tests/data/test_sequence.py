@@ -227,41 +227,6 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch):
         open_sequence("synth:static", InputOptions(max_frames=2, size=(32, 24)))
 
 
-def test_images_of_another_size_are_left_out(tmp_path: Path):
-    save(tmp_path / "1.png", picture(1))
-    save(tmp_path / "2.png", picture(1, 32, 48))
-    save(tmp_path / "3.png", picture(1))
-    sequence = open_sequence(str(tmp_path))
-    assert [frame.timestamp for frame in sequence] == pytest.approx([1 / 30, 3 / 30])
-    assert sequence.lost == [(pytest.approx(2 / 30), "2.png is 32x48 px, others are 48x32")]
-    assert "1 of 3 images are left out because of their size" in sequence.warnings[-1]
-    sequence = open_sequence(str(tmp_path), InputOptions(stride=2))  # without the odd one
-    assert len(sequence) == 2 and not sequence.lost
-
-
-def test_the_size_of_most_images_counts_not_that_of_the_first(tmp_path: Path):
-    save(tmp_path / "1.png", picture(1, 32, 48))
-    for name in "23":
-        save(tmp_path / f"{name}.png", picture(1))
-    sequence = open_sequence(str(tmp_path))
-    assert len(sequence) == 2 and len(sequence.lost) == 1
-
-
-def test_images_of_nearly_the_usual_size_are_resized(tmp_path: Path):
-    for name, size in (("1", (100, 66)), ("2", (99, 65)), ("3", (100, 66)), ("4", (100, 64))):
-        save(tmp_path / f"{name}.png", picture(1, *size))
-    sequence = open_sequence(str(tmp_path), InputOptions(size=(100, 66)))
-    assert len(sequence) == 3  # the fourth differs by 3 % in one side, and is left out
-    assert {frame.image.shape for frame in sequence} == {(66, 100, 3)}
-    odd, resized = sequence.warnings[-2:]
-    assert "such as 4.png is 100x64 px, others are 100x66; crop" in odd
-    assert resized == (
-        "1 of 4 images are resized to the size of most, such as 2.png is 99x65 px, others are "
-        "100x66"
-    )
-    assert "resized" not in str(open_sequence(str(tmp_path), InputOptions(stride=2)).warnings)
-
-
 def test_one_pixel_images_are_refused(tmp_path: Path):
     for number in range(2):
         save(tmp_path / f"{number}.png", picture(1, 1, 1))

@@ -69,6 +69,7 @@ def finished(**parts: object) -> SimpleNamespace:
     return SimpleNamespace(
         mapper=mapper,
         poses=dict.fromkeys(range(20)),
+        first_frame=SimpleNamespace(best=0, worth=parts.pop("worth", (False, 0))),
         config=SlamConfig(),
         sequence=SimpleNamespace(
             warnings=[],

@@ -148,10 +148,14 @@ def test_a_film_is_not_called_cut_where_few_frames_are_lost_or_its_start(lost: S
 
 
 def test_the_first_part_of_a_cut_film_is_named_if_a_later_one_was_kept():
-    (warning,) = warnings(finished(lost=range(8), status=TrackingStatus.GIVEN_UP))
+    given_up = {"lost": range(8), "status": TrackingStatus.GIVEN_UP}
+    (warning,) = warnings(finished(**given_up, worth=(True, 8)))
     assert warning.endswith("run the rest by itself: --start 10 --max-frames 8")
-    (warning,) = warnings(finished(lost=range(2), status=TrackingStatus.GIVEN_UP))  # a fade-in
-    assert warning.endswith("; lost_frames.txt lists them")
+    for worth in ((False, 8), (True, 1)):  # a title that stands; a fade-in
+        (warning,) = warnings(finished(**given_up, worth=worth))
+        assert warning.endswith("; lost_frames.txt lists them")
+    (warning,) = warnings(finished(lost=[3], worth=(True, 8)))  # the first part was repeated
+    assert "cut" not in warning
 
 
 def test_a_piece_that_is_to_be_run_anew_ends_where_many_frames_are_lost():

@@ -32,7 +32,7 @@ from minislam.tracking.safeguards.robust import least_cost
 
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
 WIDENINGS_AGAIN = [8.0, 4.0, 1.0]  # of the robust weight: a path that was bent lets go of its flow
-ROUNDS = 16  # of straightening and adjusting, at most
+ROUNDS = 16  # of straightening and adjusting, at most, from either first width
 SETTLED = 0.001  # a round that bends a corner by no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]

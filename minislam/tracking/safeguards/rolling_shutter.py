@@ -42,6 +42,7 @@ NEGLIGIBLE = 0.1  # px; an image that is displaced by less is left as it is
 class ImageMotion(Stateful):
     """The velocity of each cell of the image in each frame seen."""
 
+    first: int = 0  # frame that was seen first
     velocities: list[Tensor]  # per frame u (2, N) px/s, by the frame before it
     shortest_step: float = math.inf  # s between two frames: no readout is longer
     _newest: Frame | None = None
@@ -50,13 +51,10 @@ class ImageMotion(Stateful):
         self._grid, self.velocities = grid, []
 
     def see(self, frame: Frame) -> None:
-        """Measure how the image has moved since the frame before, unless that is known already.
-
-        Frames come in their order, but a start that is given up lets some come again.
-        """
-        if frame.frame_index < len(self.velocities):
-            return
+        """Measure how the image has moved since the frame before. Frames come in their order."""
         before, self._newest = self._newest, frame
+        if before is None:
+            self.first = frame.frame_index
         velocity = torch.zeros_like(self._grid.pixels.T)
         if before is not None:
             seconds = frame.timestamp - before.timestamp
@@ -68,7 +66,8 @@ class ImageMotion(Stateful):
 
     def velocity(self, frame_index: int) -> Tensor:  # (2, N) px/s
         """Return how fast the image of a frame moves: the mean of before and after it."""
-        around = self.velocities[max(frame_index, 1) : frame_index + 2]  # none before the first
+        at = frame_index - self.first
+        around = self.velocities[max(at, 1) : at + 2]  # none before the first
         return torch.stack(around).mean(0) if around else torch.zeros_like(self._grid.pixels.T)
 
     def displacement(self, frame_index: int, readout: Readout) -> np.ndarray | None:  # (H, W, 2)

@@ -76,7 +76,9 @@ def test_of_a_film_that_is_cut_after_the_warm_up_the_longer_part_is_kept(first: 
     images = [frame.image for frame in frames()]
     film = images[:first] + [image.flip(1) for image in images[:second]]  # mirrored: another scene
     tracker = new_tracker(with_depth=False)
+    tracker.graph.seeks_focal = True
     run(tracker, renumbered(film))
+    assert tracker.graph.seeks_focal
     kept = range(first) if first > second else range(first, first + second)
     assert [t.frame_index for t in tracker.tracked if t.status.is_followed] == list(kept)
     assert len(tracker.watch.diagnostics) == len(tracker.keyframes)
