@@ -237,17 +237,6 @@ def test_no_readout_is_longer_than_the_time_between_two_frames():
     assert shutter.readout == pytest.approx((1 / RATE, -1 / RATE))
 
 
-def test_the_motion_of_a_frame_does_not_depend_on_how_many_came_before_the_start():
-    velocities = []
-    for first in (0, 7):
-        shutter = shutter_of(0)
-        for index in range(3):
-            shutter.see(picture(first + index, 3 * index))
-        velocities.append([shutter.motion.velocity(first + index) for index in range(3)])
-    assert all(torch.allclose(*pair, atol=1e-3) for pair in zip(*velocities, strict=True))
-    assert velocities[0][1].abs().max() > 30
-
-
 def test_where_it_is_off_nothing_is_estimated():
     shutter, _ = linked(is_on=False)
     assert shutter.edge_columns([0, 1]) is None
