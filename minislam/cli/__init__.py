@@ -1,1 +1,1 @@
-"""The commands, one file each; `main` lists them."""
+"""The commands, one file each; its `add_parser` adds them, and `main` lists the files."""

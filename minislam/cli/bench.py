@@ -24,7 +24,6 @@ RMSE of the ATE over all frames, for minislam after a Sim(3) alignment. F: faile
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `bench` to the commands."""
     parser = commands.add_parser(
         "bench",
         help="run the sequences of benchmarks, and compare with the published errors",

@@ -15,7 +15,6 @@ MAX_SELF_TEST_ERROR = 0.1  # px
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `doctor` to the commands."""
     parser = commands.add_parser("doctor", help="show what is installed and check that it works")
     parser.set_defaults(run=_doctor)
 

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `eval` to the commands."""
     parser = commands.add_parser(
         "eval",
         help="compare an estimated trajectory with the truth",

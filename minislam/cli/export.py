@@ -19,7 +19,6 @@ Beside poses, both are as a global shutter would have seen them; --masks alone f
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `export` to the commands."""
     parser = commands.add_parser(
         "export",
         help="write a run for COLMAP, nerfstudio and other programs",

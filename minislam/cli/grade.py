@@ -24,7 +24,6 @@ COLUMNS = "file key check status points of seconds sentence".split()
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `grade` to the commands."""
     parser = commands.add_parser(
         "grade",
         help="points for the exercises of students' notebooks",

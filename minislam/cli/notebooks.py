@@ -15,7 +15,6 @@ SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `notebooks` to the commands."""
     parser = commands.add_parser("notebooks", help="copy the course's notebooks into a folder")
     parser.add_argument("folder", metavar="DIR", help="where to; made if it does not exist")
     kind = parser.add_mutually_exclusive_group()

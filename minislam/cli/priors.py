@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `priors` to the commands."""
     what = "write features and depth of every frame to files, to run SLAM on elsewhere"
     usage = "SEQUENCE --out DIR [--features NAME] [--depth NAME]"
     parser = add_command(commands, "priors", what, usage, epilog=None)

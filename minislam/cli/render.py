@@ -8,7 +8,6 @@ from minislam.runs.progress import ProgressLine, say
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `render` to the commands."""
     parser = commands.add_parser(
         "render",
         help="film the static map of a finished run",

@@ -20,7 +20,6 @@ DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `demo` and `run` to the commands."""
     what = "make a synthetic clip with moving people and run everything on it"
     demo = add_command(commands, "demo", what, "[-o OUTPUT]", SHORT_EPILOG)
     where = partial(demo.add_argument, "-o", "--output", type=expanduser, metavar="DIR")

@@ -9,7 +9,6 @@ from minislam.errors import nearest, require
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `settings` to the commands."""
     parser = commands.add_parser(
         "settings",
         help="list the constants, each of which is an option of run",

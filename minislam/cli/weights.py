@@ -14,7 +14,6 @@ CHECKPOINT_ENDINGS = (".pth", ".pt", ".ckpt", ".bin")
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add `weights` to the commands."""
     parser = commands.add_parser("weights", help="list, fetch or check official checkpoints")
     actions = parser.add_subparsers(required=True, metavar="list | fetch | check")
     actions.add_parser("list", help="what there is").set_defaults(run=_list)

@@ -164,11 +164,9 @@ class RecordedSequence:
         return self.prepare.undistort(images.read(index), images.labels[index])
 
     def source_name(self, frame_index: int) -> str:
-        """Return the name of a frame's image file, or of its video with the number in it."""
         return self._recording.images.names[self._chosen[frame_index]]
 
     def source_index(self, frame_index: int) -> int:
-        """Return the number of a frame among all images of the source."""
         return self._chosen[frame_index]
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
@@ -176,7 +174,6 @@ class RecordedSequence:
         return self._picture(self._masks, read_mask, frame_index)
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
-        """Return the depth sensor's z-depth (H, W) float32 [m], 0 where unknown, or None."""
         return self._picture(self._recording.depth_paths, self.read_depth, frame_index)
 
     def _picture(

@@ -73,7 +73,6 @@ class JointOptimisation(Stateful):
         self._reset_gradients()
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
         super().restore_state(state, frame_of)
         for keyframe in self.keyframes:
             SHELF.put([keyframe.pixels, keyframe.features, keyframe.depth])

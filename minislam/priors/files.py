@@ -86,7 +86,6 @@ class FileFeatures:
         self.stride = max(1, round(camera.height / rows))
 
     def __call__(self, frame: Frame) -> Tensor:  # (h', w', C) float32
-        """Read the features of a frame."""
         path = self.files.of(frame)
         if path is None:
             wanted = f"features of every frame in {self.files.folder}"

@@ -51,24 +51,20 @@ class ClassicalFlow(Stateful):
         return {"measured": [[*edge, *measured] for edge, measured in self._measured.items()]}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
         self._measured = {(i, j): self._kept(*parts) for i, j, *parts in state["measured"]}
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
-        """Register the image (H, W, 3) of a keyframe under its index."""
         gray = dense_flow.grayscale(image)
         self._images[keyframe_index] = SHELF.array(gray)
         self._textures[keyframe_index] = grid_flow.texture_confidence(gray, self.stride)
 
     def remove_frame(self, keyframe_index: int) -> None:
-        """Forget a keyframe."""
         del self._images[keyframe_index], self._textures[keyframe_index]
         self._measured = {e: flow for e, flow in self._measured.items() if keyframe_index not in e}
 
     def match(
         self, edges_source: list[int], edges_target: list[int], predicted_targets: Tensor
     ) -> FlowMatches:
-        """Match every grid cell of each source in its target; see FlowEstimator.match."""
         edges = list(zip(edges_source, edges_target, strict=True))
         starts = dict(zip(edges, predicted_targets.cpu().numpy().astype(np.float32), strict=True))
         moved = [edge for edge, start in starts.items() if self._has_moved(edge, start)]
@@ -118,13 +114,11 @@ class ClassicalFlow(Stateful):
         return MeasuredEdge(*(values.reshape(part.shape) for values, part in kept))
 
     def start_chain(self, image: Tensor) -> "FlowChain":
-        """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
         gray = dense_flow.grayscale(image)
         zero = np.zeros((*gray.shape, 2), np.float32)
         return FlowChain(gray, gray, zero, zero, self.config)
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "FlowChain":
-        """Return the chain whose saved state this is."""
         return from_tree(FlowChain, state, frame_of)
 
 
@@ -143,7 +137,6 @@ class FlowChain(Stateful):
     config: grid_flow.ClassicalFlowConfig
 
     def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
-        """Return the chain and the matches (E = 1) from the reference to this next image."""
         gray, stride = dense_flow.grayscale(image), self.config.stride
         texture = grid_flow.texture_confidence(self.reference, stride)
 

@@ -112,7 +112,6 @@ class MapOptimizer(Stateful):
         self.gaussians = GaussianMap(*[*leaves, gaussians.anchor_keyframe])
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
         super().restore_state(state, frame_of)
         self._set_rows(self.gaussians)
 

@@ -34,7 +34,6 @@ class FrameGraph(Stateful):
     matched_ratios: list[float] = field(default_factory=list)  # per edge, in [0, 1]
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
         super().restore_state(state, frame_of)
         SHELF.put([*self.targets, *self.confidences])
 

@@ -33,7 +33,6 @@ class KeyframeStore(Stateful):
         self.prior_masks = self.disparities.bool()
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
         super().restore_state(state, frame_of)
         for frame, *images in zip(self.frames, self.features, self.metric_depths, strict=True):
             SHELF.put([frame.pixels, *images])

@@ -87,7 +87,6 @@ class UncertaintyTrainer(Stateful):
         return {**super().saved_state(), "mlp": to_tree(self.mlp.state_dict())}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Go on from a saved state."""
         super().restore_state(state, frame_of)
         self.mlp.load_state_dict(state["mlp"])
 

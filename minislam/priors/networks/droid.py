@@ -83,11 +83,9 @@ class DroidFlow(Stateful):
         return self._newest
 
     def add_frame(self, keyframe_index: int, image: Tensor) -> None:
-        """Register the image (H, W, 3) of a keyframe under its index."""
         self._frames[keyframe_index] = self.encode(image)
 
     def remove_frame(self, keyframe_index: int) -> None:
-        """Forget a keyframe and the edges that touch it."""
         del self._frames[keyframe_index]
         self._dampings.pop(keyframe_index, None)
         self._edges = {e: state for e, state in self._edges.items() if keyframe_index not in e}
@@ -98,7 +96,6 @@ class DroidFlow(Stateful):
         return {"edges": edges, "dampings": [list(item) for item in self._dampings.items()]}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Take up a saved state."""
         self._edges = {(i, j): (hidden, where) for i, j, hidden, where in state["edges"]}
         self._dampings = dict(state["dampings"])
 
@@ -128,7 +125,6 @@ class DroidFlow(Stateful):
         return as_matches(targets, torch.cat(confidences), predicted_targets)
 
     def disparity_damping(self, keyframes: int) -> Tensor:  # (K, N) px^2
-        """Return the damping of the disparities of all keyframes; see FlowEstimator."""
         unknown = torch.zeros_like(next(iter(self._dampings.values())))
         return torch.stack([self._dampings.get(k, unknown) for k in range(keyframes)])
 
@@ -144,11 +140,9 @@ class DroidFlow(Stateful):
         return self.update(features, of_targets, hidden, context, expected, last_target)
 
     def start_chain(self, image: Tensor) -> "DroidChain":
-        """Return a chain of flows from this image (H, W, 3) to the frames that follow it."""
         return DroidChain(self, self.encode(image), self.encode(image))
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "DroidChain":
-        """Return the chain whose saved state this is."""
         reference, newest = (self.encode(image) for image in state["_images"])
         return DroidChain(self, reference, newest, state["_target"])
 
@@ -168,7 +162,6 @@ class DroidChain(Stateful):
 
     @torch.no_grad()
     def advance(self, image: Tensor) -> tuple["DroidChain", FlowMatches]:
-        """Return the chain and the matches (E = 1) from the reference to this next image."""
         flow, reference, newest = self.flow, self.reference, self.flow.encode(image)
         hidden, context = reference.context
         features = reference.features, newest.features
@@ -181,7 +174,6 @@ class DroidChain(Stateful):
         return DroidChain(flow, reference, newest, target), as_matches(target, confidence, image)
 
     def restart(self) -> "DroidChain":
-        """Return a chain that starts at the newest frame."""
         return DroidChain(self.flow, self.newest, self.newest)
 
 
