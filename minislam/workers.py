@@ -2,12 +2,11 @@
 
 A helper is a second Python that runs `serve`. Calls and results go through its standard input and
 output: the name of a function of this package, plain values, and the bytes of tensors. It never
-imports the script of the user, as `multiprocessing` does under spawn, so neither a script nor a
-notebook needs `if __name__ == "__main__"`, and there is no shared memory that somebody must free.
+imports the script of the user, as `multiprocessing` does under spawn.
 
-A helper keeps nothing between two calls. So only the time depends on the helpers, never the
-result: a call whose helper has ended is computed in this process. A helper ends when its input
-does, that is at the latest with this process, however that ends.
+A helper keeps nothing between two calls, so the result never depends on the helpers: a call whose
+helper has ended is computed in this process. A helper ends when its input does, at the latest with
+this process.
 """
 
 import importlib

@@ -45,9 +45,8 @@ def with_swept_depth(
     """Return the keyframes with swept depth and confirmation.
 
     Where the sweep found nothing, the keyframe's own depth fills in, scaled by the swept depth of
-    the same image, because a network errs image by image. Where other views look through that depth
-    something moves, and the pixel stays empty. With `fills`, if less than half is known, holes take
-    the depth of the nearest known pixel: where the camera only turns, a wrong depth is not visible.
+    the same image, because a network errs image by image; where other views look through it, the
+    pixel stays empty. With `fills`, if less than half is known, holes take the nearest known depth.
     """
     small, judges, result = _small(camera, WIDTH), votes.judges(len(keyframes)), []
     judging: dict[int, votes.SweptView] = {}

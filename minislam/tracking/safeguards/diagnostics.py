@@ -1,12 +1,8 @@
 """How well each keyframe is tied to the others, and where the trajectory breaks.
 
 With a low matched ratio or little parallax the scale can drift while all residuals stay small.
-Where everything is matched, five measurements tell broken keyframes from healthy ones
-(diary/broken_runs.md). A wrong pose does not explain the flow from the keyframes before it. After a
-wrong scale two keyframes see a point at different depths. Where few points hand the scale on, the
-ratio of lengths before and after is uncertain (scale_certainty.py). And where a large dynamic
-object covers the scene, hardly any cell that fitted in the keyframes before fits in this one, or
-those still matched do not fit.
+Where everything is matched, five measurements tell broken keyframes from healthy ones: those of
+`KeyframeDiagnostics` from `explained` on (tests/benchmarks/diary/broken_runs.md).
 """
 
 from collections.abc import Sequence
@@ -159,12 +155,11 @@ def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
 
 
 def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
-    """Return how a keyframe agrees with the keyframes before it, over the edges between them.
+    """Return how a keyframe agrees with the keyframes before it, over the edges between them [-].
 
-    First the part of the flow from there, of what was static so far, that the geometry explains
-    [-]. Then the median relative difference of the depths that both ends of an edge see, over cells
-    that count in the adjustment, near ones more, because far depths are hardly measured. None: no
-    edge, or no cell that both see.
+    First the part of the flow from there, of what was static so far, that the geometry explains.
+    Then the median relative difference of the depths that both ends of an edge see; near cells
+    count more. None: no edge, or no cell that both see.
     """
     near = set(neighbourhood_edges(keyframe, keyframe + 1, LOOK_BACK))
     edges = graph.edges.ends
@@ -188,15 +183,13 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
 def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float | None]:
     """Return continuity and agreement [-]: do cells that fitted before fit in this keyframe?
 
-    A cell of an earlier keyframe is known if its flow to the next keyframe fits. The flow of the
-    keyframe just before leads to this one, which is being judged, so there the cells are known to
-    which known ones flow; what has just come into view is not.
+    A cell of an earlier keyframe is known if its flow to the next keyframe fits; in the keyframe
+    just before, the cells are known to which known ones flow.
 
-    Continuity: the mean weight of the cells that are known, matched and fit, motion weight
-    included, in the best edge into this keyframe, over the mean confidence of the edge from the
-    keyframe just before: in a fast turn both are small. Agreement: the fraction that fits of the
-    known and matched cells, without motion weights, in the worst edge. Both are None if an edge is
-    missing or the camera was lost; agreement is None if all edges have too few known cells.
+    Continuity: the mean weight of the known cells that are matched and fit, in the best edge into
+    this keyframe, over the mean confidence of the edge from the keyframe just before. Agreement:
+    the fraction that fits of the known and matched cells, without motion weights, in the worst
+    edge. None: an edge is missing or the camera was lost, or for agreement too few cells are known.
     """
     before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
@@ -260,10 +253,8 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
     One keyframe is a break if it explains very little flow, sees other depths, or has an uncertain
-    scale, low continuity or low agreement. LONG weak keyframes in a row make one, too: they explain
-    less than MIN_EXPLAINED_LONG, and their scale is not certain. (Of wide photos a third of the
-    flow may be wrong; the rest fixes the poses.) Breaks at most HEALED_AFTER keyframes apart are
-    joined.
+    scale, low continuity or low agreement. LONG weak keyframes in a row make one, too. Breaks at
+    most HEALED_AFTER keyframes apart are joined.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little

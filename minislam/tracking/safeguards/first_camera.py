@@ -1,9 +1,8 @@
 """The start with an unknown focal length or readout: which minimum is taken, and its camera.
 
 Hypotheses of the first depths end in several minima. With a wrong camera the right one need not be
-the lowest. Under a focal length that is 6 % too long, inverted depth fits better; and where the
-rolling shutter of a far hill is fitted as parallax, rocks in front become outliers. So the unknowns
-of the camera, its focal length and the readout, are free before costs are compared.
+the lowest. So the unknowns of the camera, its focal length and the readout, are free before costs
+are compared (tests/benchmarks/diary/focal_length.md and rolling_shutter.md).
 
 Under a long lens, or where the camera hardly walks, a scene and its mirror image in depth have
 nearly the same flow. The paper starts from the depth prior, which tells them apart.
@@ -49,9 +48,8 @@ def minima(
 ) -> list[Found]:
     """Adjust every hypothesis on the same measurements; return where they end, of equals the first.
 
-    A wide robust weight lets a bad guess leave its wrong minimum, but under the widest one a large
-    dynamic object may outvote the room. So each is adjusted from the widest and from the second.
-    Costs are compared under a narrow one, which a compromise of room and mover does not fit.
+    Each is adjusted from the widest robust weight and from the second widest: under a wide one a
+    bad guess leaves its wrong minimum, but a large dynamic object may outvote the room.
     """
     starts = [WIDENINGS, WIDENINGS[1:]] if problem.robust else [[1.0]]
     calls = [(problem, *pair, ITERATIONS) for pair in itertools.product(states, starts)]

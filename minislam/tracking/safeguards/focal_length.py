@@ -5,8 +5,7 @@ unknown of the bundle adjustment (focal_column.py), which converges from 0.75 to
 truth. A camera that does not turn fits its flow with any. So an estimate counts only if the cost of
 the adjusted keyframes rises on both sides of it, less if it saves much.
 
-If the lens zooms while it films, half of the keyframes fit another focal length than all of them:
-all fit 1.04 times the present one, say, and the second half 1.40 times.
+If the lens zooms while it films, half of the keyframes fit another focal length than all of them.
 """
 
 import math

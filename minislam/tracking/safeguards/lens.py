@@ -4,10 +4,9 @@ A wide lens shows the ray u of a pinhole, r = |u|, not at x = c + f u but at
 
     x + k1 d_1(x) + k2 d_2(x),    d_n(x) = r^(2 n) f u    (Brown's model).
 
-No pinhole fits its flow, so focal length and poses absorb half of it. With k1 and k2 known, cells
-and flow are straightened and Eq. (5) is that of a pinhole. By a further k a straightened point x
-moves by -d_n(x) / (1 + 3 k1 r^2 + 5 k2 r^4), which is -D_n(x). While the image turns little from
-one keyframe to the other, the flow from x to p~ is then that of a pinhole at
+With k1 and k2 known, cells and flow are straightened and Eq. (5) is that of a pinhole. By a further
+k a straightened point x moves by -d_n(x) / (1 + 3 k1 r^2 + 5 k2 r^4), which is -D_n(x). While the
+image turns little from one keyframe to the other, the flow from x to p~ is that of a pinhole at
 
     p~ + k1 (D_1(x) - D_1(p~)) + k2 (D_2(x) - D_2(p~)),
 

@@ -1,7 +1,6 @@
 """A rolling shutter: an image whose rows are not exposed at the same time.
 
-The paper's cameras have a global shutter; phones, webcams and a Kinect have a rolling one. Let rho
-be the readout, the seconds from the first row to the last. The point x in row v is seen
+Let rho be the readout, the seconds from the first row to the last. The point x in row v is seen
 
     rho s(x),    s(x) = v / H - 1/2,
 

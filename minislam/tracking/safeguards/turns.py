@@ -22,10 +22,9 @@ MOST_PAIRS = 100  # of neighbouring keyframes that are tested for parallax
 def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 image
     """Return the flow between neighbouring keyframes that no rotation of the camera explains.
 
-    A rotation moves all points as if they were infinitely far away. The best one, under a wide
-    robust weight, also explains a translation that looks like it. So the median residual measures
-    depth, whatever parallax the poses claim. Under a wrong focal length a rotation looks like
-    parallax, so one that is sought and not yet found is free. None: no edge has any weight.
+    A rotation moves all points as if they were infinitely far away. What the best one leaves, in
+    the median, measures depth, whatever parallax the poses claim. A focal length that is sought and
+    not yet found is free (diary/focal_length.md). None: no edge has any weight.
     """
     grid, edges, keyframes = graph.grid, graph.edges, graph.keyframes
     pairs = [p for p, (source, target) in enumerate(edges.ends) if target == source + 1]
