@@ -28,7 +28,3 @@ def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return a hint at the most similar of the known names, or `otherwise` if none is similar."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"the nearest is {near[0]}" if near else otherwise
-
-
-class TrackingLost(MinislamError):
-    """The camera could not be followed through any usable part of the sequence."""

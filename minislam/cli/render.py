@@ -44,12 +44,12 @@ def _render(args: argparse.Namespace) -> None:
     rate, count, progress = flythrough.frame_rate(run), len(run.poses), ProgressLine()
     for warning in run.warnings_of_breaks:
         progress.warn(warning)
-    if args.path == "trajectory":
-        images = flythrough.fly_along(run, camera)
+    if args.path == "orbit":
+        images = flythrough.fly_around(run, camera)
+        rate, count = flythrough.ORBIT_RATE, flythrough.ORBIT_IMAGES
     elif args.path == "side-by-side":
         images = flythrough.side_by_side(run, camera)
     else:
-        images = flythrough.fly_around(run, camera)
-        rate, count = flythrough.ORBIT_RATE, flythrough.ORBIT_IMAGES
+        images = (run.render(pose, camera) for pose in run.poses.values())
     write_animation(args.output, progress.over("rendering", images, count), rate)
     say(f"{count} images at {rate:.0f} per second in {args.output}")

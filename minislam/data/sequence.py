@@ -120,7 +120,9 @@ class RecordedSequence:
             depth=self.sensor_depth,
             novel_views=self._novel_views,
         )
-        self.ground_truth = truth if recording.has_truth() else None
+        files = recording.mask_paths or recording.static_paths or recording.novel_views
+        has_truth = recording.trajectory is not None or files  # a sensor's depth is an input
+        self.ground_truth = truth if has_truth else None
 
     def __len__(self) -> int:
         return len(self._chosen)

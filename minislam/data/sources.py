@@ -54,11 +54,6 @@ class Recording:
                 f"{' before '.join(found)}; sort, remove or rename them"
             )
 
-    def has_truth(self) -> bool:
-        """Tell whether there is anything to compare with; sensor depth alone is an input."""
-        views = self.mask_paths or self.static_paths or self.novel_views
-        return self.trajectory is not None or bool(views)
-
 
 def read_image_folder(folder: Path) -> Recording:
     """Read a folder of images, in natural order; they may lie in `images/` or `rgb/`."""

@@ -1,4 +1,4 @@
-"""Images of a finished run in motion: along its trajectory, in a circle, or beside the input."""
+"""Images of a finished run in motion: in a circle, or beside the input."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -27,11 +27,6 @@ def frame_rate(run: Run) -> float:
     """Return how many of the run's frames there are per second, between 5 and 30."""
     steps = np.diff([frame.timestamp for frame in run.frames])
     return float(np.clip(1 / np.median(steps), *_RATES)) if len(steps) else _RATES[0]
-
-
-def fly_along(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
-    """Return the static map from the pose of each frame."""
-    return (run.render(pose, camera) for pose in run.poses.values())
 
 
 def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)

@@ -6,7 +6,7 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from minislam.errors import TrackingLost
+from minislam.errors import MinislamError
 from minislam.geometry import Camera
 from minislam.priors.interfaces import (
     DepthPrior,
@@ -247,7 +247,7 @@ class Tracker(Stateful):
         if len(self.keyframes) == 1 and self.last_non_keyframe is not None:
             self._insert(*self.last_non_keyframe)
         if len(self.keyframes) < 2:
-            raise TrackingLost(
+            raise MinislamError(
                 "expected at least two frames that show the same scene, found none among "
                 f"{len(self.tracked)} frames; check that the images are not blank and overlap"
             )

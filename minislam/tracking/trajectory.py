@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.errors import TrackingLost
+from minislam.errors import MinislamError
 from minislam.geometry import se3_interpolate, se3_inverse
 from minislam.records import Progress, Sequence, TrackedFrame, TrackingStatus, Trajectory
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -68,6 +68,6 @@ def _interpolate(graph: KeyframeGraph, tracked: TrackedFrame) -> Tensor:  # (4, 
 def as_trajectory(timestamps: list[float], T_camera_world: list[Tensor]) -> Trajectory:
     """Return poses (4, 4) and their timestamps [s], at least one, as a trajectory."""
     if not T_camera_world:
-        raise TrackingLost("expected at least one frame with a pose, found none")
+        raise MinislamError("expected at least one frame with a pose, found none")
     T_world_camera = se3_inverse(torch.stack(T_camera_world)).cpu().numpy()
     return Trajectory(np.array(timestamps), T_world_camera)

@@ -7,7 +7,7 @@ import pytest
 
 from minislam.cli.main import main
 from minislam.data.run_folder import RunFolder
-from minislam.runs import flythrough
+from minislam.runs.loaded import Run
 from minislam.runs.warnings import BROKEN
 
 pytestmark = pytest.mark.slow
@@ -84,7 +84,7 @@ def test_a_file_is_replaced_only_if_asked_for_and_the_source_never(
 def test_a_folder_that_is_not_there_is_said_before_the_film_is_made(
     folder: str, tmp_path: Path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(flythrough, "fly_along", lambda *_: pytest.fail("it renders"))
+    monkeypatch.setattr(Run, "render", lambda *_: pytest.fail("it renders"))
     assert main(["render", folder, "-o", str(tmp_path / "new/x/a.webm")]) == 1
     said = capsys.readouterr().err
     assert f"{tmp_path}/new/x is no writable folder; make it, or choose another" in said

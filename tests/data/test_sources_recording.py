@@ -36,12 +36,11 @@ def test_the_truth_has_the_working_size(tmp_path: Path):
 
 def test_depth_alone_is_an_input_and_no_truth(tmp_path: Path):
     folder = tum_folder(tmp_path)
-    assert read_tum_folder(folder).has_truth()
+    assert open_sequence(str(folder)).ground_truth is not None
     (folder / "groundtruth.txt").unlink()
     for name in ("masks", "static", "novel"):
         (folder / name).rename(tmp_path / f"without_{name}")
-    recording = read_tum_folder(folder)
-    assert recording.depth_paths and not recording.has_truth()
+    assert read_tum_folder(folder).depth_paths
     assert open_sequence(str(folder)).ground_truth is None
 
 

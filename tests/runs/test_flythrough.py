@@ -41,11 +41,8 @@ class FakeRun:
         return np.full((48, 64), 0.1 if index < 3 else 5.0, np.float32)
 
 
-def test_along_the_trajectory_every_pose_is_visited_in_order():
-    run = FakeRun()
-    assert len(list(flythrough.fly_along(run, CAMERA))) == 7
-    np.testing.assert_array_equal([pose[0, 3] for pose in run.seen], range(7))
-    assert flythrough.frame_rate(run) == pytest.approx(12)
+def test_a_film_shows_as_many_images_per_second_as_the_run_has():
+    assert flythrough.frame_rate(FakeRun()) == pytest.approx(12)
 
 
 def test_the_circle_looks_at_one_point_from_one_distance():
@@ -65,6 +62,7 @@ def test_the_circle_looks_at_one_point_from_one_distance():
 def test_panels_beside_each_other_in_one_scale_of_beta():
     run = FakeRun()
     rows = list(flythrough.side_by_side(run, CAMERA))
+    np.testing.assert_array_equal([pose[0, 3] for pose in run.seen], range(7))
     assert rows[4].shape == (48, 3 * 64, 3)
     assert rows[4][40, 30] == pytest.approx([0.4] * 3, abs=0.01)
     assert rows[4][40, 160] == pytest.approx([0.25] * 3, abs=0.01)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.errors import TrackingLost
+from minislam.errors import MinislamError
 from minislam.evaluation.trajectory import Alignment, absolute_trajectory_error
 from minislam.records import Frame, TrackingStatus, Trajectory
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -169,6 +169,6 @@ def test_an_untold_focal_length_is_sought_before_all_are_adjusted_until_it_is_fr
 def test_blank_images_are_an_error_of_one_sentence():
     tracker = new_tracker(with_depth=False)
     blank = torch.full((SIZE[1], SIZE[0], 3), 0.5)
-    with pytest.raises(TrackingLost, match="found none among 3 frames"):
+    with pytest.raises(MinislamError, match="found none among 3 frames"):
         run(tracker, [Frame(index, 0.1 * index, blank) for index in range(3)])
     assert lost_frames(tracker) == [0, 1]  # each time the next one may be the first

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from minislam.data.checkpoint import read_checkpoint, write_checkpoint
-from minislam.errors import TrackingLost
+from minislam.errors import MinislamError
 from minislam.priors.depth import NoDepth
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import TrackingStatus
@@ -56,7 +56,7 @@ def test_an_unusable_start_is_lost_and_the_rest_is_followed(start, lost):
 @pytest.mark.slow
 def test_where_nothing_can_be_matched_with_anything_the_run_ends_in_words():
     tracker = new_tracker(with_depth=True, shown=[0] * 6)
-    with pytest.raises(TrackingLost, match="found none among 6 frames"):
+    with pytest.raises(MinislamError, match="found none among 6 frames"):
         run(tracker, renumbered(black(6)))
 
 
