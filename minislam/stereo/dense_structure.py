@@ -18,6 +18,7 @@ from minislam.state.memory import SHELF
 from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
+from minislam.tracking.pose_from_flow import filled_from_nearest
 from minislam.workers import Workers
 
 WIDTH = 160  # px of the images that are swept for the map
@@ -82,16 +83,12 @@ def with_swept_depth(
 
 def _filled(keyframe: Keyframe) -> Keyframe:
     """Return a keyframe whose unknown depth is that of the nearest pixel that has one."""
-    depth = keyframe.depth.cpu().numpy()
-    unknown = (depth == 0).astype(np.uint8)
-    if unknown.all() or not unknown.any():
+    unknown = keyframe.depth == 0
+    if bool(unknown.all()) or not bool(unknown.any()):
         return keyframe
-    metric = cv2.DIST_L2, cv2.DIST_MASK_5
-    _, nearest = cv2.distanceTransformWithLabels(unknown, *metric, labelType=cv2.DIST_LABEL_PIXEL)
-    # The labels count the known pixels.
-    filled, where = torch.from_numpy(depth[unknown == 0][nearest - 1]), keyframe.depth == 0
-    SHELF.put([filled, where])
-    return replace(keyframe, depth=filled.to(keyframe.depth), filled=where)
+    filled = filled_from_nearest(keyframe.depth, unknown).reshape(unknown.shape)
+    SHELF.put([filled, unknown])
+    return replace(keyframe, depth=filled, filled=unknown)
 
 
 def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:
