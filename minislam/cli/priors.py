@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 from minislam.cli import options
 from minislam.cli.help import add_command
 from minislam.data.files import atomic_file, make_folder, read_text, write_text
-from minislam.data.options import require_source
 from minislam.errors import require
 from minislam.parameters import user_path
 from minislam.runs.progress import ProgressLine
@@ -49,7 +48,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def _priors(args: argparse.Namespace) -> None:
     source, inputs = options.source_of(args), options.input_options(args)
     choice = options.prior_choice(args, "none")
-    require_source(source)
     is_named = args.features is not None or choice.depth != "none"
     require(is_named, "--features or --depth", "neither; name at least one to write")
     import torch
