@@ -52,10 +52,8 @@ def _bench(args: argparse.Namespace) -> int:
     settings(run), input_options(run), prior_choice(run, "none"), lpips_of(run)  # or refuse them
     make_folder(given.output)
     if noted.exists() and (then := read_json(noted)) != options:
-        raise InputError(
-            f"expected the options of the bench in {given.output}, {then}, found {options}; repeat "
-            "those, because a table is of one kind of run, or give another -o"
-        )
+        wanted = f"the options of the bench in {given.output}, {then}"
+        raise InputError(f"expected {wanted}, found {options}; repeat those, or give another -o")
     write_json(noted, options)
     ours: dict[str, str] = {}
     tables, code = "", 0

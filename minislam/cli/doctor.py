@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 
 import minislam
-from minislam.errors import MinislamError
+from minislam.errors import require
 
 MAX_SELF_TEST_ERROR = 0.1  # px
 
@@ -45,11 +45,9 @@ def _doctor(args: argparse.Namespace) -> None:
     error = flow_error(flow.start_chain(first).advance(second)[1], flow.stride)
     seconds = time.perf_counter() - start
     print(f"  self-test   flow of a shifted image, off by {error:.3f} px, {seconds:.1f} s")
-    if not error <= MAX_SELF_TEST_ERROR:
-        raise MinislamError(
-            f"expected the self-test to be exact to {MAX_SELF_TEST_ERROR} px, found "
-            f"{error:.3f} px; reinstall opencv-python-headless"
-        )
+    found = f"{error:.3f} px; reinstall opencv-python-headless"
+    wanted = f"the self-test to be exact to {MAX_SELF_TEST_ERROR} px"
+    require(error <= MAX_SELF_TEST_ERROR, wanted, found)
 
 
 def installation_warnings(torch_sees_a_gpu: bool) -> Iterator[str]:

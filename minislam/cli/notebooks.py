@@ -44,8 +44,7 @@ def _notebooks(args: argparse.Namespace) -> None:
     make_folder(folder)
     if there := [name for name in copies if (folder / name).exists()]:
         raise InputError(
-            f"expected a folder without these notebooks, found {there[0]} in {folder}; give "
-            "another one, so that nobody's work is lost"
+            f"expected a folder without these notebooks, found {there[0]} in {folder}; give another"
         )
     for name, content in copies.items():
         make_folder((folder / name).parent)

@@ -74,7 +74,5 @@ def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
 
         return json.loads(arrays.pop(_TREE).tobytes(), object_hook=whole)
     except Exception as error:  # damaged bytes fail inside zipfile and numpy in many ways
-        raise InputError(
-            f"expected a checkpoint in {path}, but the file cannot be read; it is damaged or from "
-            "another program: start again with --overwrite"
-        ) from error
+        found = "a damaged or another file; start again with --overwrite"
+        raise InputError(f"expected a checkpoint in {path}, found {found}") from error

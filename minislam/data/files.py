@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 
 
 def atomic_write(path: Path | str, content: bytes) -> None:
@@ -41,20 +41,16 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
             temporary.unlink()
         if not isinstance(error, OSError):
             raise
-        raise InputError(
-            f"expected to be able to write {path}, but the system says: {error.strerror or error}; "
-            "choose an output folder that is writable and has space left"
-        ) from error
+        reason = f"{error.strerror or error}; choose a writable folder with space left"
+        raise InputError(f"expected to be able to write {path}, but: {reason}") from error
 
 
 def require_free(folder: Path | str, overwrite: bool, also: str = "") -> None:
     """Refuse an output folder that holds files, unless it may be overwritten."""
     require_no_file(folder := Path(folder))
-    if os.path.isdir(folder) and any(folder.iterdir()) and not overwrite:
-        raise InputError(
-            f"expected a new or empty output folder, but {folder} holds files; choose another name "
-            f"or add --overwrite{also}"
-        )
+    is_free = overwrite or not os.path.isdir(folder) or not any(folder.iterdir())
+    found = f"files in {folder}; choose another name or add --overwrite{also}"
+    require(is_free, "a new or empty output folder", found)
 
 
 def require_new(files: Iterable[Any], overwrite: bool, inputs: Iterable[Path | str]) -> None:
@@ -122,10 +118,8 @@ def read_text(path: Path | str) -> str:
     try:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"expected a UTF-8 text file, but byte {error.start} of {path} is not text; "
-            "check that this is the right file"
-        ) from error
+        found = f"byte {error.start} of {path} is not text; check the path"
+        raise InputError(f"expected a UTF-8 text file, but {found}") from error
 
 
 def read_json(path: Path | str) -> Any:

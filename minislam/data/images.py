@@ -88,10 +88,8 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
         file = Path(folder) / f"animation{kind}"
         encoders[kind](file, map(_bgr, images), rate)
         if not file.is_file() or not (content := file.read_bytes()):
-            raise InputError(
-                f"expected this OpenCV ({cv2.__version__}) to write {kind}, but it does not; "
-                "choose the other kind, .webm or .webp, or install a newer one"
-            )
+            found = f"OpenCV {cv2.__version__}, which cannot; choose .webm or .webp, the other one"
+            raise InputError(f"expected an OpenCV that writes {kind}, found {found}")
     atomic_write(path, content)
 
 
@@ -133,10 +131,8 @@ def _decode(path: Path, mode: int) -> np.ndarray:
     elif said:
         decoded = None  # libjpeg has filled the rest with grey
     if decoded is None:
-        raise InputError(
-            f"expected a whole PNG or JPEG image, but {path} ({len(content)} bytes) is damaged, "
-            "cut short or of another kind; replace or remove it"
-        )
+        found = f"{path} ({len(content)} bytes) is damaged; replace or remove it"
+        raise InputError(f"expected a whole PNG or JPEG image, but {found}")
     return decoded
 
 

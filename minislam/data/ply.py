@@ -114,8 +114,7 @@ def _parse_header(header: bytes, name: str) -> tuple[int, list[str]]:
     if missing or not counted or len(set(names)) != len(names):
         raise InputError(
             "expected 'element vertex N' and the float properties of 3D Gaussians, found a header "
-            f"without {', '.join(missing[:3]) or 'them, or with doubles'} in {name}; "
-            "give a map.ply"
+            f"without {', '.join(missing[:3]) or 'them, or with doubles'} in {name}; give a map.ply"
         )
     return int(element[2]), names
 

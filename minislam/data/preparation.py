@@ -174,6 +174,5 @@ def seen_window(
         right -= worst == 2
         bottom -= worst == 3
     raise InputError(
-        "expected a lens distortion that leaves part of the image visible, but nothing would be "
-        "left; check the order k1 k2 p1 p2 k3 and the signs"
+        "expected a lens distortion that leaves part of the image, found none; check k1 k2 p1 p2 k3"
     )

@@ -48,10 +48,8 @@ def locked(path: Path | str) -> Iterator[None]:
             try:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise InputError(
-                    f"expected {path} for this run alone, but another one is writing into it; wait "
-                    "for its end, or choose another --output"
-                ) from None
+                found = "another one in it; wait for its end, or choose another --output"
+                raise InputError(f"expected {path} for this run alone, found {found}") from None
         yield
 
 
@@ -61,11 +59,8 @@ class RunFolder:
     def __init__(self, path: Path | str) -> None:
         """Refer to an existing run folder."""
         self.path = user_path(path)
-        if not os.path.isdir(self.path):
-            raise InputError(
-                f"expected a run folder, but {self.path} does not exist or is no folder; give the "
-                "--output of an earlier run"
-            )
+        found = f"no folder at {self.path}; give the --output of an earlier run"
+        require(os.path.isdir(self.path), "a run folder", found)
 
     @classmethod
     def create(
@@ -133,10 +128,8 @@ class RunFolder:
         try:
             return torch.load(content, weights_only=True)
         except Exception as error:  # damaged bytes fail inside torch in many ways
-            raise InputError(
-                f"expected the weights of the MLP in {self.path / MLP}, found damaged or other "
-                "content; repeat the run with --overwrite"
-            ) from error
+            wanted = f"the weights of the MLP in {self.path / MLP}"
+            raise InputError(f"expected {wanted}, found other content; repeat the run") from error
 
 
 def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:

@@ -254,10 +254,8 @@ def _open_synthetic(
     try:
         folder = data_synth.cached_sequence(name, int(seed or 0), frames, size, progress, phone)
     except (data_synth.SynthError, OSError) as error:
-        raise InputError(
-            f"expected to render {source} into the cache, but: {error}; set MINISLAM_CACHE to a "
-            "folder that is writable and has space left"
-        ) from error
+        reason = f"{error}; set MINISLAM_CACHE to a writable folder with space left"
+        raise InputError(f"expected to render {source} into the cache, but: {reason}") from error
     recording = replace(
         read_tum_folder(folder),
         name=f"{name}-{seed or 0}{'-phone' if is_filmed else ''}",

@@ -93,11 +93,8 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
         stamp, *name = row.split(maxsplit=1)
         stamps += finite_numbers([stamp], where)
         paths.append(folder.joinpath(*name))
-        if not os.path.isfile(paths[-1]):
-            raise InputError(
-                f"expected 'timestamp filename' of an image in {where}, but {paths[-1]} does not "
-                "exist or is none; complete the folder or remove the line"
-            )
+        found = f"no file {paths[-1]}; complete the folder or remove the line"
+        require(os.path.isfile(paths[-1]), f"'timestamp filename' of an image in {where}", found)
     return np.array(stamps), paths
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.geometry import Camera
 from minislam.images import shrink_depth, shrink_image
 from minislam.mapping.config import MappingConfig
@@ -40,11 +40,8 @@ def median_depth(keyframes: list[Keyframe]) -> float:  # world units
     """Return the median of all known depths, of at most MOST_DEPTHS keyframes, evenly spread."""
     sample = keyframes[:: math.ceil(len(keyframes) / MOST_DEPTHS)]
     depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in sample])
-    if len(depths) == 0:
-        raise InputError(
-            "expected some known depth in the keyframes, found none; the images hold "
-            "too little texture or parallax: move the camera more, or give a depth prior"
-        )
+    advice = "move the camera more, past more texture, or give a depth prior"
+    require(len(depths) > 0, "some known depth in the keyframes", f"none; {advice}")
     return float(depths.median())
 
 

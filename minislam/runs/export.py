@@ -130,10 +130,8 @@ def _make_apart(run: Run, folder: Path, *parts: str) -> None:
         raise InputError(f"expected a folder of no run, found {RUN} in {folder}; choose another")
     if any(folder.iterdir()):  # only then, because depth can be written without the source
         if inside := [f for f in run.sequence.files if f.resolve().is_relative_to(folder)]:
-            raise InputError(
-                f"expected a folder without images of the sequence itself, found {inside[0]} in "
-                f"{folder}; choose another folder"
-            )
+            wanted = "a folder without images of the sequence itself"
+            raise InputError(f"expected {wanted}, found {inside[0]}; choose another")
     for part in parts:
         make_folder(folder / part)
 

@@ -99,10 +99,8 @@ class Run:
             self.frames = [SourceFrame(**frame) for frame in scene["frames"]]
             self._mapped = self.frames[slice(*scene.get("mapped_frames", [None]))]
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"expected camera.json of a run in {self.folder.path}, found {error!r}; repeat the "
-                "run, or restore the file"
-            ) from error
+            found = f"{error!r} in {path}; repeat the run, or restore the file"
+            raise InputError(f"expected camera.json of a run, found {found}") from error
         self._betas: dict[int, Tensor] = {}  # raw beta (h', w') of frames asked for so far
         self.trajectory: Trajectory = self.folder.read_trajectory()
         self.gaussians: GaussianArrays = read_ply(self.folder.path / MAP)

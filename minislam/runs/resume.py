@@ -99,11 +99,9 @@ class Checkpoints:
             # What else of the input differs shows in the images, whose checksums are compared.
             if any(n[:6] != "input." or n == "input.depth_scale" for n in differing):
                 name = differing[0]
-                raise InputError(
-                    f"expected {name} = {then.get(name)} like the interrupted run in {where}, "
-                    f"found {present[name]}; repeat its command with --resume, or start anew in "
-                    "another folder"
-                )
+                wanted = f"{name} = {then.get(name)} like the interrupted run in {where}"
+                advice = "repeat its command with --resume, or start anew in another folder"
+                raise InputError(f"expected {wanted}, found {present[name]}; {advice}")
             for index, checksum in found["checksums"].items():
                 slam.sequence.frame(int(index))
                 wanted = f"frame {index} as the interrupted run in {where} read it"
@@ -115,7 +113,6 @@ class Checkpoints:
         except MinislamError:
             raise
         except Exception as error:  # parts are missing, or have another type or shape
-            raise InputError(
-                f"expected the whole state of a run in the checkpoint of {where}, found {error!r}; "
-                "it is damaged or of another program: start again with --overwrite"
-            ) from error
+            wanted = f"the whole state of a run in the checkpoint of {where}"
+            found = f"{error!r}; it is damaged or of another program: start again with --overwrite"
+            raise InputError(f"expected {wanted}, found {found}") from error

@@ -50,7 +50,7 @@ def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
         ([], "expected at least one of --colmap"),
         (["--points", "mine.ply"], "expected a new file, but mine.ply exists"),
         (["--points", "new/sub/p.ply"], "new/sub is no writable folder; make it, or"),
-        (["--depth", "mine"], "expected a new or empty output folder, but mine holds files"),
+        (["--depth", "mine"], "expected a new or empty output folder, found files in mine"),
         (["--masks", "mine.ply", "--overwrite"], "but mine.ply is a file"),
         (["--nerfstudio", "mine.ply/a/b"], "but mine.ply is a file; choose another name"),
     ],

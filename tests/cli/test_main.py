@@ -183,7 +183,7 @@ def test_an_output_that_is_a_file_is_refused(tmp_path: Path, capsys):
 def test_an_output_that_holds_files_is_refused(tmp_path: Path, capsys):
     save(tmp_path / "out/mine.png", texture(0))
     assert run(images(tmp_path / "input", [texture(0)]), "-o", tmp_path / "out") == 1
-    assert "holds files; choose another name or add --overwrite" in the_sentence(capsys)
+    assert "; choose another name or add --overwrite" in the_sentence(capsys)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine.png"]
 
 

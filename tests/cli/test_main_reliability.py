@@ -98,5 +98,5 @@ def test_a_folder_with_a_run_in_it_is_refused(tmp_path: Path, capsys):
     source = images(tmp_path / "in", [texture(0), texture(3)])
     with locked(tmp_path / "out"):
         assert run(source, "-o", tmp_path / "out") == 1
-    assert "another one is writing into it" in the_sentence(capsys)
+    assert "for this run alone, found another one in it" in the_sentence(capsys)
     assert not list((tmp_path / "out").iterdir())

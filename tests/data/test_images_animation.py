@@ -41,6 +41,6 @@ def test_another_kind_and_nothing_to_show_are_said(tmp_path: Path):
     with pytest.raises(InputError, match=r"ends in \.webm or \.webp, found \.mp4"):
         write_animation(tmp_path / "a.mp4", images(), 10.0)
     for kind in (".webm", ".webp"):
-        with pytest.raises(InputError, match="expected this OpenCV"):
+        with pytest.raises(InputError, match="expected an OpenCV"):
             write_animation(tmp_path / f"a{kind}", [], 10.0)
     assert not list(tmp_path.iterdir())

@@ -173,5 +173,5 @@ def test_tiny_images_are_refused():
 
 def test_a_distortion_that_leaves_nothing_is_refused():
     maps = np.full((48, 64), -1, np.float32), np.full((48, 64), -1, np.float32)
-    with pytest.raises(InputError, match="order k1 k2 p1 p2 k3"):
+    with pytest.raises(InputError, match="check k1 k2 p1 p2 k3"):
         seen_window(*maps, WHOLE)

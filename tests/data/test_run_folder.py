@@ -167,7 +167,7 @@ def test_only_names_that_a_run_writes_are_removed(tmp_path: Path):
 
 def test_a_folder_is_locked_for_one_run_and_unlocked_by_its_end(tmp_path: Path):
     with locked(tmp_path / "out"):
-        with pytest.raises(InputError, match="another one is writing"), locked(tmp_path / "out"):
+        with pytest.raises(InputError, match="found another one in it"), locked(tmp_path / "out"):
             pass
         with locked(tmp_path / "other"):
             pass

@@ -243,7 +243,7 @@ def test_images_of_the_sequence_are_never_written_over(run, tmp_path: Path):
     assert not (tmp_path / "masks").exists()
     before = {path.name: path.read_bytes() for path in (tmp_path / "images").iterdir()}
     for write in (export.export_masks, export.export_depth, export.export_nerfstudio):
-        with pytest.raises(InputError, match=r"found .*images/0\.png in .*; choose another"):
+        with pytest.raises(InputError, match=r"found .*images/0\.png; choose another"):
             write(run, tmp_path / "images", FRAMES)
     assert {path.name: path.read_bytes() for path in (tmp_path / "images").iterdir()} == before
 

@@ -260,14 +260,14 @@ def change_the_settings(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
-        (truncate, "expected a checkpoint in .*checkpoint.npz, but the file cannot be read"),
+        (truncate, "expected a checkpoint in .*checkpoint.npz, found a damaged or another file"),
         (grow_older, f"expected version = 0.0 .* found {minislam.__version__}"),
         (change_an_image, "expected frame 1 as the interrupted run in .* read it, found another"),
         (change_the_settings, "expected settings.tracking.window = 10 like .* found 4"),
         (partial(remove, "checkpoint.npz"), "an interrupted run in .*, found no checkpoint.npz"),
         (partial(remove, "config.json"), "expected a readable file .*config.json"),
         *[(partial(tamper, change), "expected the whole state of a run") for change in TAMPERED],
-        (shutil.rmtree, "expected a run folder, but .* does not exist"),
+        (shutil.rmtree, "expected a run folder, found no folder at .*"),
     ],
 )
 def test_a_harmed_folder_is_refused(
