@@ -48,16 +48,11 @@ class ImagePreparation:
         width, height = size or working_size(seen_width, seen_height, pixels)
         # The smallest scale at which the image covers the wanted size; the rest is cropped.
         scale = max(width / seen_width, height / seen_height)
-        self._resized = (
-            max(round(scale * seen_width), width),
-            max(round(scale * seen_height), height),
-        )
+        columns, rows = round(scale * seen_width), round(scale * seen_height)
+        self._resized = max(columns, width), max(rows, height)
         self._crop = (self._resized[0] - width) // 2, (self._resized[1] - height) // 2
-        self.camera = (
-            raw_camera.cropped(*self._window)
-            .resized(*self._resized)
-            .cropped(*self._crop, width, height)
-        )
+        resized = raw_camera.cropped(*self._window).resized(*self._resized)
+        self.camera = resized.cropped(*self._crop, width, height)
         self.steps: dict[str, object] = {  # from raw to working images, in order, in pixels
             "raw_camera": asdict(raw_camera),
             "distortion": asdict(distortion),

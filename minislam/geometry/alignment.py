@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 
 # Singular values of the covariance below this fraction of the largest are round-off.
 _RANK_TOLERANCE = 1e-12
@@ -45,10 +45,9 @@ def umeyama(
     unique only if D has rank 2 at least, because points on one line do not fix a rotation about it.
     """
     assert source.shape == target.shape and source.shape[1:] == (3,), (source.shape, target.shape)
-    if len(source) < 3 or not (np.isfinite(source).all() and np.isfinite(target).all()):
-        advice = "check that the timestamps of both trajectories belong together"
-        found = f"{len(source)} pairs; {advice}"
-        raise InputError(f"expected at least 3 pairs of finite points to align, found {found}")
+    is_enough = len(source) >= 3 and np.isfinite(source).all() and np.isfinite(target).all()
+    found = f"{len(source)} pairs; check that the timestamps of both trajectories belong together"
+    require(bool(is_enough), "at least 3 pairs of finite points to align", found)
     source_mean, target_mean = source.mean(0), target.mean(0)  # (34), (35)
     source_centred, target_centred = source - source_mean, target - target_mean
     source_variance = (source_centred**2).sum(1).mean()  # (36)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import require
 
 LONGEST_FOCAL = 1e6  # px; beyond it the field of view is nothing, and squares overflow
 REFERENCE_DIAGONAL = 400.0  # px, of the 320x240 image that thresholds in pixels belong to
@@ -28,16 +28,14 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        if not all(0 < focal <= LONGEST_FOCAL for focal in (self.fx, self.fy)):
-            found = f"fx={self.fx} fy={self.fy}; give them in pixels with --fx and --fy"
-            wanted = f"positive focal lengths up to {LONGEST_FOCAL:g}"
-            raise InputError(f"expected {wanted}, found {found}")
+        is_positive = all(0 < focal <= LONGEST_FOCAL for focal in (self.fx, self.fy))
+        found = f"fx={self.fx} fy={self.fy}; give them in pixels with --fx and --fy"
+        require(is_positive, f"positive focal lengths up to {LONGEST_FOCAL:g}", found)
         size = f"{self.width}x{self.height}"
-        if not (self.width >= 1 and self.height >= 1):
-            raise InputError(f"expected an image of at least 1x1 pixels, found {size}")
-        if not (-0.5 <= self.cx <= self.width - 0.5 and -0.5 <= self.cy <= self.height - 0.5):
-            found = f"cx={self.cx} cy={self.cy}; check that calibration and images belong together"
-            raise InputError(f"expected a principal point inside the {size} image, found {found}")
+        require(min(self.width, self.height) >= 1, "an image of at least 1x1 pixels", size)
+        is_inside = -0.5 <= self.cx <= self.width - 0.5 and -0.5 <= self.cy <= self.height - 0.5
+        found = f"cx={self.cx} cy={self.cy}; check that calibration and images belong together"
+        require(is_inside, f"a principal point inside the {size} image", found)
 
     def project(self, points_camera: Tensor) -> Tensor:
         """Return pixels (..., 2) of points (..., 3) in front of the camera.

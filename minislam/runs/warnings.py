@@ -35,10 +35,7 @@ def alarms(slam: Slam) -> Iterator[str]:
     tracked, diagnostics = slam.tracker.tracked, slam.tracker.watch.diagnostics
     followed = [frame.status.is_followed for frame in tracked[-2:]]
     if slam.tracker.initialised and followed == [True, False]:
-        yield (
-            f"frame {tracked[-1].frame_index}: the camera is lost; it is looked for among the "
-            "keyframes"
-        )
+        yield f"frame {tracked[-1].frame_index}: the camera is lost; it is sought among keyframes"
     if diagnostics and is_unexplained(diagnostics[-1]):
         yield (
             f"frame {diagnostics[-1].frame_index}: the estimated motion explains only "
