@@ -169,10 +169,9 @@ def required_mask(sequence: Sequence, frame_index: int) -> np.ndarray:  # (H, W)
     """Return the mask of dynamic objects that a frame must have, where masks are used."""
     mask = sequence.given_mask(frame_index)
     if mask is None:
-        raise InputError(
-            f"expected a mask of movers for every frame of {sequence.name}, found none for "
-            f"{frame_index}; give --masks files:FOLDER, or set uncertainty.given_masks to off"
-        )
+        wanted = f"a mask of movers for every frame of {sequence.name}"
+        advice = "give --masks files:FOLDER, or set uncertainty.given_masks to off"
+        raise InputError(f"expected {wanted}, found none for {frame_index}; {advice}")
     return mask
 
 

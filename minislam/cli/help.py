@@ -104,10 +104,8 @@ def add_command(
 def unknown_option(found: str, parser: argparse.ArgumentParser) -> UsageError:
     """Return what to say about an option that a command lacks: whose it is, or the nearest."""
     if not found.startswith("-"):
-        return UsageError(
-            f"expected only the names that {parser.prog} takes, found also {found!r}; put a name "
-            "with spaces in quotes"
-        )
+        wanted = f"only the names that {parser.prog} takes"
+        return UsageError(f"expected {wanted}, found also {found!r}; quote a name with spaces")
     name = found.partition("=")[0]
     is_of_run = name in (parser.get_default("of_run") or ())
     otherwise = "it is an option of minislam run" if is_of_run else f"see {parser.prog} --help"

@@ -26,10 +26,8 @@ def download(
         path.parent.mkdir(parents=True, exist_ok=True)
         _append(url, part, show)
     except (OSError, HTTPException) as error:
-        raise InputError(
-            f"expected to fetch {url} to {path}, but: {error}; the same command goes on where this "
-            "one ended, or put the file there by hand"
-        ) from error
+        advice = "the same command goes on where this one ended, or put the file there by hand"
+        raise InputError(f"expected to fetch {url} to {path}, but: {error}; {advice}") from error
     try:
         check(part)
     except InputError as error:

@@ -127,9 +127,7 @@ def read_json(path: Path | str) -> Any:
     try:
         return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:  # also a number of 5000 digits
-        raise InputError(
-            f"expected JSON in {path}, found a mistake: {error}; correct it, or give another file"
-        ) from error
+        raise InputError(f"expected JSON in {path}, found an error: {error}; correct it") from error
 
 
 def data_rows(text: str, name: str) -> list[tuple[str, str]]:

@@ -76,10 +76,9 @@ def require_source(source: str, masks: str | None = None) -> None:
         return
     path = user_path(source)
     if not (os.path.isfile(path) or os.path.isdir(path)):  # these know names of any length
-        raise InputError(
-            f"expected a video file, an image folder, a TUM RGB-D folder or synth:NAME, but "
-            f"{source[:300]} does not exist or is a device; check the path"
-        )
+        kinds = "a video file, an image folder, a TUM RGB-D folder or synth:NAME"
+        found = f"{source[:300]} does not exist or is a device; check the path"
+        raise InputError(f"expected {kinds}, but {found}")
 
 
 def mask_folder(masks: str) -> Path:

@@ -133,9 +133,7 @@ class VideoImages:
         # It takes what precedes a colon for a protocol, and crashes at a name that is no text.
         name = os.path.abspath(self.path)
         if re.search("[\ud800-\udfff]", name):
-            raise InputError(
-                f"expected a video whose name is text, found {name!a}; give it another name"
-            )
+            raise InputError(f"expected a video whose name is text, found {name!a}; rename it")
         self._capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
         self._grabbed = 0  # calls of grab() since the start
         codec = self._capture.get(cv2.CAP_PROP_FOURCC)

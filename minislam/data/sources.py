@@ -149,9 +149,7 @@ def mask_files(images: ImageSource, masks: str, chosen: list[int]) -> dict[int, 
     numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
     found = named if named and isinstance(images, FileImages) else numbered
     if missing := [images.labels[index] for index in chosen if index not in found]:
-        raise InputError(
-            f"expected a mask of every frame in {folder}, found none for {len(missing)} of "
-            f"{len(chosen)}, such as {missing[0]}; name them like the images or by number from 0, "
-            "and make a black one where nothing moves"
-        )
+        without = f"none for {len(missing)} of {len(chosen)}, such as {missing[0]}"
+        advice = "name them like the images or by number from 0; a black one where nothing moves"
+        raise InputError(f"expected a mask of every frame in {folder}, found {without}; {advice}")
     return found

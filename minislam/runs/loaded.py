@@ -243,10 +243,9 @@ class Run:
             T_camera_world, one = se3_inverse(pose), torch.eye(4, dtype=pose.dtype)
             is_pose = torch.allclose(pose @ T_camera_world, one, atol=1e-3) and bool(det(pose) > 0)
         if not is_pose or pose.shape != (4, 4):
-            raise InputError(
-                "expected T_world_camera (4, 4), a rotation and a position over 0 0 0 1, found "
-                f"{' '.join(repr(T_world_camera).split())[:100]}; give one like those of run.poses"
-            )
+            wanted = "T_world_camera (4, 4), a rotation and a position over 0 0 0 1"
+            found = f"{' '.join(repr(T_world_camera).split())[:100]}; give one like run.poses"
+            raise InputError(f"expected {wanted}, found {found}")
         background = torch.from_numpy(self.background)
         rows = {name: torch.from_numpy(values) for name, values in vars(self.gaussians).items()}
         anchors = torch.zeros(len(self.gaussians), dtype=torch.int64)

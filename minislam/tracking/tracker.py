@@ -6,7 +6,7 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from minislam.errors import MinislamError
+from minislam.errors import require
 from minislam.geometry import Camera
 from minislam.priors.interfaces import (
     DepthPrior,
@@ -246,11 +246,8 @@ class Tracker(Stateful):
         """Estimate the warm-up keyframes together, beta unknown (first of the two stages)."""
         if len(self.keyframes) == 1 and self.last_non_keyframe is not None:
             self._insert(*self.last_non_keyframe)
-        if len(self.keyframes) < 2:
-            raise MinislamError(
-                "expected at least two frames that show the same scene, found none among "
-                f"{len(self.tracked)} frames; check that the images are not blank and overlap"
-            )
+        found = f"none among {len(self.tracked)} frames; check that they are not blank and overlap"
+        require(len(self.keyframes) >= 2, "at least two frames that show the same scene", found)
         first_geometry(self.graph, workers)
         self._settling.fall_back_on_prior()
         self.mode = Mode.TRACKING
