@@ -69,6 +69,7 @@ _PAPER: dict[str, Any] = {
     "mapping.colors_rate": 7.05e-4,
     "mapping.refine_rate_end": 1.0,
     "mapping.insertion.cell": 4,
+    "mapping.insertion.plain": 0.0,
     "mapping.insertion.footprint": 0.22,  # officially of the distance between neighbours
     "mapping.insertion.opacity": 0.5,
     "mapping.density.max_gaussians": 1_000_000,

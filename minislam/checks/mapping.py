@@ -118,7 +118,8 @@ def check_insertion(student: Function) -> Verdict:
         middle = torch.zeros_like(allowed)
         middle[cell // 2 :: cell, cell // 2 :: cell] = True
         pixels = (allowed & middle).nonzero().flip(-1)
-        new = gaussians_at_pixels(pixels, image, depth, camera, T, 0, InsertionConfig(cell))
+        view = torch.full_like(allowed, cell, dtype=torch.int64), image, depth, camera, T
+        new = gaussians_at_pixels(pixels, *view, 0, InsertionConfig())
         far = transform_points(T, new.means)[:, 2:] if flaw == "one size" else 1
         return torch.cat([new.means, new.scales[:, :1] / far, new.colors], -1)
 

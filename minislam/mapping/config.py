@@ -11,7 +11,10 @@ from minislam.splatting import LearningRates
 class InsertionConfig:
     """How densely a keyframe adds Gaussians, and how they start."""
 
-    cell: int = parameter(3, "one Gaussian per square cell of this side [px of the full image]", 1)
+    cell: int = parameter(2, "one Gaussian per square cell of this side [px of the full image]", 1)
+    plain: float = parameter(
+        0.12, "largest range of each colour in a cell of 2 or 4 times the side; 0, official: none"
+    )
     footprint: float = parameter(
         0.45, "first scale over the side of a cell seen at its depth [1]; official 0.22", 0.01
     )

@@ -11,6 +11,8 @@ from minislam.mapping.config import InsertionConfig
 from minislam.splatting import GaussianMap, Rendering
 
 EXPLAINED_OPACITY = 0.8  # a pixel of the map that is at least so opaque gets no new Gaussian
+WIDER = 2  # times that a cell may double where the image is plain
+SURFACE = 1.1  # farthest over nearest depth within a wider cell [-]
 _SMALLEST_SCALE = 1e-8  # world units; a scale must be positive, because its logarithm is stored
 
 
@@ -34,26 +36,55 @@ def insertable_pixels(
     return wanted
 
 
+def cell_sides(
+    image: Tensor,  # (H, W, 3) RGB in [0, 1]
+    depth: Tensor,  # (H, W) world units, 0 where unknown
+    cell: int,  # px, side of the smallest cells
+    plain: float,  # largest range of each colour, in [0, 1], in a wider cell
+) -> Tensor:  # (H, W) int64 px
+    """Return the side of the cell of each pixel: wide where one Gaussian can stand for many.
+
+    A cell of twice or four times the side shows one surface and hardly any detail: its depths are
+    about the same, and so are its colours once noise is gone, by the mean of 3 x 3 pixels.
+    """
+    height, width = depth.shape
+    smooth = functional.avg_pool2d(image.permute(2, 0, 1), 3, 1, 1, count_include_pad=False)
+    seen = torch.cat([smooth, depth[None].to(smooth)])
+    sides = torch.full_like(depth, cell, dtype=torch.int64)
+    for side in (cell << level for level in range(1, WIDER + 1)):
+        highest, lowest = (
+            sign * functional.max_pool2d(sign * seen, side, ceil_mode=True) for sign in (1, -1)
+        )
+        is_plain = (highest - lowest)[:3].amax(0) < plain
+        is_wide = is_plain & (highest[3] < SURFACE * lowest[3])
+        is_wide = is_wide.repeat_interleave(side, 0).repeat_interleave(side, 1)
+        sides[is_wide[:height, :width]] = side
+    return sides
+
+
 def draw_pixels(
     known: Tensor,  # (H, W) bool
-    cell: int,  # px, side of a cell
+    sides: Tensor,  # (H, W) int64 px, of the cells
     generator: torch.Generator,
 ) -> Tensor:  # (M, 2) int64, column and row
-    """Draw one random known pixel in each cell x cell square of the image that has any.
+    """Draw one random known pixel in each cell of the image that has any.
 
     The official random subset of the image leaves clumps, holes and less where depth is sparse.
     """
     height, width = known.shape
     priority = torch.rand(height, width, generator=generator).to(known.device)
-    priority = torch.where(known, priority, -1)
-    square = cell, cell
-    highest, where = functional.max_pool2d_with_indices(priority[None], square, ceil_mode=True)
-    drawn = where[highest >= 0]
-    return torch.stack([drawn % width, drawn // width], -1)
+    drawn = []
+    for side in sides.unique().tolist():
+        here = torch.where(known & (sides == side), priority, -1)[None]
+        highest, where = functional.max_pool2d_with_indices(here, (side, side), ceil_mode=True)
+        drawn.append(where[highest >= 0])
+    pixels = torch.cat(drawn)
+    return torch.stack([pixels % width, pixels // width], -1)
 
 
 def gaussians_at_pixels(
     pixels: Tensor,  # (M, 2) int64, column and row
+    sides: Tensor,  # (H, W) px, of the cells
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
     depth: Tensor,  # (H, W) world units
     camera: Camera,
@@ -67,7 +98,7 @@ def gaussians_at_pixels(
     points_camera = camera.backproject(pixels.to(z), z)
     means = transform_points(se3_inverse(T_camera_world), points_camera.double()).to(z)
     focal = math.sqrt(camera.fx * camera.fy)
-    scales = (config.footprint * config.cell * z / focal).clamp_min(_SMALLEST_SCALE)
+    scales = (config.footprint * sides[row, column] * z / focal).clamp_min(_SMALLEST_SCALE)
     count = len(z)
     logit = math.log(config.opacity / (1 - config.opacity))
     return GaussianMap(

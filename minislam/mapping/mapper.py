@@ -15,6 +15,7 @@ from minislam.mapping import safeguards
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.gaps import filled_depth, is_refuted
 from minislam.mapping.insertion import (
+    cell_sides,
     draw_pixels,
     gaussians_at_pixels,
     insertable_pixels,
@@ -143,11 +144,12 @@ class Mapper(JointOptimisation):
         weight = self.static_weight(self.beta_of(keyframe), self.camera)
         far_limit = FAR_FACTOR * self.median_depth
         allowed = insertable_pixels(keyframe.depth, far_limit, weight, rendering)
-        pixels = draw_pixels(keyframe.depth > 0, self.cell, self._generator)
+        insertion, image, depth = self.config.insertion, keyframe.levelled, keyframe.depth
+        sides = cell_sides(image, depth, self.cell, insertion.plain)
+        pixels = draw_pixels(depth > 0, sides, self._generator)
         pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
-        view = keyframe.levelled, keyframe.depth, self.camera, keyframe.T_camera_world
-        insertion = replace(self.config.insertion, cell=self.cell)
-        new = gaussians_at_pixels(pixels, *view, position, insertion)
+        view = image, depth, self.camera, keyframe.T_camera_world
+        new = gaussians_at_pixels(pixels, sides, *view, position, insertion)
         if fills:
             views = self.keyframes[position], self.keyframes
             new = new.prune(~is_refuted(new.means, self.camera, *views))

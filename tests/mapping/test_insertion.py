@@ -6,6 +6,8 @@ import torch
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 from minislam.mapping import InsertionConfig
 from minislam.mapping.insertion import (
+    SURFACE,
+    cell_sides,
     draw_pixels,
     gaussians_at_pixels,
     insertable_pixels,
@@ -16,6 +18,10 @@ from tests.helpers import generator
 from tests.mapping.plane_scene import CAMERA, wall_keyframe
 
 CONFIG = InsertionConfig()
+
+
+def cells_of(side: int, height: int = CAMERA.height, width: int = CAMERA.width) -> torch.Tensor:
+    return torch.full((height, width), side)
 
 
 def rendering_with(depth: torch.Tensor, opacity: torch.Tensor) -> Rendering:
@@ -40,17 +46,45 @@ def test_new_gaussians_project_to_their_pixels_with_the_size_of_a_cell():
     keyframe = wall_keyframe(3)
     twist = torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64)
     pixels = torch.tensor([[0, 0], [31, 23], [7, 5]])
+    sides = cells_of(2)
+    sides[5, 7] = 8
     gaussians = gaussians_at_pixels(
-        pixels, keyframe.image, keyframe.depth, camera, se3_exp(twist), 3, CONFIG
+        pixels, sides, keyframe.image, keyframe.depth, camera, se3_exp(twist), 3, CONFIG
     )
     points = transform_points(se3_exp(twist), gaussians.means.double())
     torch.testing.assert_close(camera.project(points).float(), pixels.float(), rtol=0, atol=1e-3)
     torch.testing.assert_close(points[:, 2].float(), torch.full((3,), 2.0))
-    size_px = 40.0 * gaussians.scales[0, 0] / 2.0
-    assert float(size_px) == pytest.approx(CONFIG.footprint * CONFIG.cell)
+    sizes_px = 40.0 * gaussians.scales[:, 0] / 2.0
+    torch.testing.assert_close(sizes_px, CONFIG.footprint * torch.tensor([2.0, 2.0, 8.0]))
     assert torch.equal(gaussians.colors[2], keyframe.image[5, 7])
     assert gaussians.anchor_keyframe.tolist() == [3, 3, 3]
     assert float(gaussians.opacities[0]) == pytest.approx(CONFIG.opacity)
+
+
+def test_a_cell_is_wide_where_one_colour_and_one_surface_fill_it():
+    image, depth = torch.full((32, 48, 3), 0.5), torch.full((32, 48), 2.0)
+    image[3, 35] = 1.0  # a fleck in a plain wall, .06 too bright once it is smooth
+    image[20:, 40:, 2] = 0.0  # an edge of one colour
+    depth[18:, 3:5] = 1.01 * SURFACE * 2.0  # another surface of the same colour
+    depth[0, 16] = 0.0  # unknown
+    eight, four, two = 8, 4, 2
+    sides = cell_sides(image, depth, 2, plain=0.12)
+    assert sides[16, 24] == eight and sides[3, 35] == eight
+    assert sides[20, 40] == two and sides[20, 42] == two and sides[24, 44] == four
+    assert sides[12, 1] == eight and sides[17, 1] == two and sides[24, 6] == two
+    assert (cell_sides(image, depth, 2, plain=0.05)[0:4, 32:36] == two).all()  # the fleck
+    assert (cell_sides(image, depth, 2, plain=0.0) == two).all()
+    assert sides[0, 16] == two and sides[0, 20] == four and sides[5, 17] == four
+
+
+def test_each_cell_of_several_sides_gives_one_pixel():
+    sides = cells_of(2, 24, 32)
+    sides[:8, 8:16], sides[16:20, 4:8] = 8, 4
+    pixels = draw_pixels(torch.ones(24, 32, dtype=torch.bool), sides, generator(3))
+    side = sides[pixels[:, 1], pixels[:, 0]]
+    assert [int((side == s).sum()) for s in (2, 4, 8)] == [24 * 32 // 4 - 16 - 4, 1, 1]
+    cells = torch.cat([pixels // side[:, None], side[:, None]], -1)
+    assert len(cells.unique(dim=0)) == len(cells)
 
 
 # Identities
@@ -58,7 +92,8 @@ def test_new_gaussians_project_to_their_pixels_with_the_size_of_a_cell():
 
 @pytest.mark.parametrize(("height", "width", "cell"), [(24, 32, 4), (23, 31, 4), (5, 3, 8)])
 def test_each_cell_gives_at_most_one_pixel_inside_the_image(height, width, cell):
-    pixels = draw_pixels(torch.ones(height, width, dtype=torch.bool), cell, generator(0))
+    known = torch.ones(height, width, dtype=torch.bool)
+    pixels = draw_pixels(known, cells_of(cell, height, width), generator(0))
     cells = (pixels // cell).tolist()
     assert len({tuple(c) for c in cells}) == len(cells)
     assert (pixels >= 0).all() and (pixels < torch.tensor([width, height])).all()
@@ -69,7 +104,7 @@ def test_each_cell_gives_at_most_one_pixel_inside_the_image(height, width, cell)
 def test_only_known_pixels_are_drawn_and_the_seed_decides():
     allowed = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     allowed[:, 10:20] = True
-    first, second = draw_pixels(allowed, 2, generator(1)), draw_pixels(allowed, 2, generator(1))
+    first, second = (draw_pixels(allowed, cells_of(2), generator(1)) for _ in range(2))
     assert torch.equal(first, second)
     assert ((first[:, 0] >= 10) & (first[:, 0] < 20)).all() and len(first) > 40
 
@@ -77,7 +112,7 @@ def test_only_known_pixels_are_drawn_and_the_seed_decides():
 def test_sparse_depth_is_used_up_to_one_pixel_per_cell():
     known = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     known[1::4, 2::4] = True
-    pixels = draw_pixels(known, 4, generator(2))
+    pixels = draw_pixels(known, cells_of(4), generator(2))
     assert len(pixels) == 6 * 8 and (pixels % 4 == torch.tensor([2, 1])).all()
 
 
@@ -100,8 +135,7 @@ def test_a_gaussian_on_a_mover_of_its_own_keyframe_is_found():
 
 def test_nothing_allowed_gives_an_empty_map():
     keyframe = wall_keyframe(0)
-    pixels = draw_pixels(torch.zeros(24, 32, dtype=torch.bool), 4, generator(0))
-    gaussians = gaussians_at_pixels(
-        pixels, keyframe.image, keyframe.depth, CAMERA, keyframe.T_camera_world, 0, CONFIG
-    )
+    pixels = draw_pixels(torch.zeros(24, 32, dtype=torch.bool), cells_of(4), generator(0))
+    view = cells_of(4), keyframe.image, keyframe.depth, CAMERA, keyframe.T_camera_world
+    gaussians = gaussians_at_pixels(pixels, *view, 0, CONFIG)
     assert len(gaussians) == 0
