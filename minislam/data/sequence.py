@@ -65,6 +65,7 @@ class RecordedSequence:
         advice = "after --start, --stride and --max-frames; change these, or give more images"
         require(len(self._chosen) >= 2, "at least two frames", f"{found} {advice}")
         stamps = recording.timestamps
+        self._step = float(np.median(np.diff(stamps)))
         first, last = stamps[chosen[0]], stamps[chosen[-1]]
         self.lost = [row for row in recording.lost if first < row[0] < last]
         self.lost += [(float(stamps[index]), odd[index]) for index in chosen if index in odd]
@@ -149,7 +150,7 @@ class RecordedSequence:
                 self._kept[frame_index] = place
         release()
         stamp = float(self._recording.timestamps[index])
-        return Frame(frame_index, stamp, torch.from_numpy(image))
+        return Frame(frame_index, stamp, torch.from_numpy(image), step=self._step)
 
     def through_lens(self, fx: float, k1: float, k2: float) -> "RecordedSequence":
         """Return the sequence, straightened: fx [px] is of the working size, fy in proportion."""

@@ -36,6 +36,7 @@ def run_facts(
     """Return the content of run.json: the command, how long the run took, and how it ended."""
     graph, fit = slam.tracker.graph, slam.focal_length
     stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
+    steps = [frame.step for frame in graph.keyframes.frames[:1]]  # of the source
     return {
         "version": minislam.__version__,
         "command": sys.argv,
@@ -65,7 +66,7 @@ def run_facts(
         | (asdict(fit) | {"is_doubtful": fit.is_doubtful} if fit else {}),
         "began_anew": {"lens": asdict(slam.undone_lens)} if slam.undone_lens else None,
         "readout_seconds": list(graph.shutter.readout),
-        "frame_seconds": float(np.median(np.diff(stamps))) if len(stamps) > 1 else None,
+        "frame_seconds": min([float(np.median(np.diff(stamps))), *steps]) if stamps[1:] else None,
         "breaks": [asdict(found) for found in slam.tracker.watch.breaks],
         "segments": slam.tracker.watch.segments,
         "keyframe_diagnostics": [asdict(d) for d in slam.tracker.watch.diagnostics],

@@ -22,8 +22,6 @@ LEAST_SHOWN = 0.75
 # to .23; of a night crowd in rain, whose map has holes, .36.
 MOST_LEFT_OUT = 0.3
 NEARLY_ALL = 0.7  # of them: 187 runs have .59 and less, five that are wrong .80 and more
-# Relative, of depths by earlier and by later keyframes (tests/benchmarks/diary/broken_runs.md).
-MOST_DIFFERENCE = 0.2
 # Of the static pixels [-]: maps that are whole have .11 to .67, fog and lumps .65 to .96.
 MOST_GUESSED = 0.7
 BROKEN = "the trajectory is broken"  # how a warning of breaks begins
@@ -167,7 +165,7 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
             + ": trajectory and map may be bent; give --fx or a calibration file"
         )
         return
-    if lens is not None and lens.is_bent:
+    if lens is not None and lens.is_bent and not slam.tracker.watch.breaks:
         yield (
             f"the flow fits a lens that bends straight lines, the corners by {lens.bend:+.0%}, "
             f"with {lens.saved:.0%} less cost: focal length, trajectory and map may be bent; film "
@@ -213,7 +211,7 @@ def _parallax_warnings(slam: Slam) -> Iterator[str]:
             "Depth is hardly determined, and near and far may be exchanged; film while you walk "
             "sideways, and look at the pictures of the depth"
         )
-    elif (watch.depth_difference or 0.0) > MOST_DIFFERENCE and not keyframes.has_prior:
+    elif watch.has_two_depths:
         yield (
             f"depths by earlier and by later keyframes differ by {watch.depth_difference:.0%} "
             "(median): what moves the image is not only a camera that walks through a scene that "

@@ -43,6 +43,7 @@ def test_a_video_keeps_the_time_of_skipped_frames(tmp_path: Path):
     sequence = open_sequence(str(video(tmp_path / "v.mp4", rate=10)), options)
     frames = list(sequence)
     np.testing.assert_allclose([frame.timestamp for frame in frames], [0.2, 0.5, 0.8])
+    np.testing.assert_allclose([frame.step for frame in frames], 0.1)
     again = sequence.frame(0)
     np.testing.assert_array_equal(again.image.numpy(), frames[0].image.numpy())
     assert abs(float(frames[2].image[50, 80, 0]) * 255 - 160) <= 4

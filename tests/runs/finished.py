@@ -42,7 +42,8 @@ def finished(**parts: object) -> SimpleNamespace:
         watch=SimpleNamespace(
             diagnostics=[SimpleNamespace(parallax=p) for p in parts.pop("parallax", [5.0])],
             beyond_turns=0.41,
-            depth_difference=parts.pop("depth_difference", 0.1),
+            depth_difference=0.26,
+            has_two_depths=parts.pop("has_two_depths", False),
             hardly_walked=parts.pop("hardly_walked", False),
             breaks=parts.pop("breaks", []),
             segments=parts.pop("segments", [(0, 5), (7, 7)]),

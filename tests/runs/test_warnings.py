@@ -121,12 +121,11 @@ def test_flow_that_is_hardly_more_than_a_turn_is_warned_of_where_no_prior_tells_
     assert "hardly any parallax" in warning
 
 
-def test_depths_that_change_with_the_views_are_warned_of_where_no_prior_tells_depth():
-    changing = {"depth_difference": 0.26}
-    assert not list(warnings(finished(**changing)))
-    warning, _ = warnings(finished(**changing, has_prior=False))
+def test_depths_that_change_with_the_views_are_warned_of():
+    changing = {"has_two_depths": True, "has_prior": False}
+    warning, _ = warnings(finished(**changing))
     assert "differ by 26% (median)" in warning
-    warning, _ = warnings(finished(**changing, has_prior=False, hardly_walked=True))  # said once
+    warning, _ = warnings(finished(**changing, hardly_walked=True))  # said once
     assert "hardly did more than turn" in warning
 
 

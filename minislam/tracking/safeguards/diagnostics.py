@@ -42,6 +42,7 @@ LEAST_FRAMES = 6  # with a pose, of a piece that gets a map of its own
 # A camera that walks; the tables stand in tests/benchmarks/diary/turning_cameras.md.
 LEAST_BEYOND_TURNS = 0.45  # px of a 320x240 image
 MOST_RESTING = 0.75  # fraction of the keyframes: cameras that stand .88 to 1, pans 0 to .16 [-]
+MOST_DIFFERENCE = 0.2  # relative, of depths by earlier and by later keyframes (broken_runs.md)
 LEAST_CONFIRMED = 0.15  # fraction of the cells: a hand-held camera .05, pans .24 and more [-]
 
 
@@ -93,7 +94,8 @@ class Watch(Stateful):
         self.beyond_turns, self.resting = flow_beyond_turns(graph), fraction_at_rest(graph)
         self.depth_difference = depth_difference(graph)
         judged = self.diagnostics
-        if self.only_turned:  # depths are arbitrary, and a pan leaves old cells behind
+        if self.only_turned or (self.hardly_walked and self.has_two_depths):
+            # Depths are arbitrary, and a pan leaves old cells behind.
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
             problem = bundle_problem(graph, range(len(graph.edges)))
@@ -118,6 +120,13 @@ class Watch(Stateful):
     def hardly_walked(self) -> bool:
         """Tell whether hardly any flow is more than a turn explains."""
         return self.beyond_turns is not None and self.beyond_turns < LEAST_BEYOND_TURNS
+
+    @property
+    def has_two_depths(self) -> bool:
+        """Tell whether earlier and later views measure different depths; a prior gives them."""
+        return (
+            not self._graph.keyframes.has_prior and (self.depth_difference or 0) > MOST_DIFFERENCE
+        )
 
     @property
     def segments(self) -> list[tuple[int, int]]:

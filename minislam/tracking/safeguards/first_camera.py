@@ -126,7 +126,8 @@ def lowest_minimum(
     columns = graph.shutter.edge_columns(positions) if tells_camera else None
     if columns is not None and columns.any():
         rolled = best(adjusted(replace(free, shutter=columns), found))
-        if cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found)):
+        saves = cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found))
+        if saves and graph.shutter.is_possible(rolled[0].readout):
             graph.shutter.take(rolled[0].readout)
             problem = bundle_problem(graph, positions)  # corrected
             free = replace(problem, free_focal=seeks_focal)

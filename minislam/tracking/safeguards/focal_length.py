@@ -158,5 +158,7 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = least_cost(problem.weights)
-    if held.cost_after - free.cost_after > READOUT_WORTH_SAVING * max(held.cost_after, floor):
+    saved = held.cost_after - free.cost_after
+    is_worth_it = saved > READOUT_WORTH_SAVING * max(held.cost_after, floor)
+    if is_worth_it and shutter.is_possible(state.readout):
         shutter.take(state.readout)

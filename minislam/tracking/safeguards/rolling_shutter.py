@@ -43,7 +43,7 @@ class ImageMotion(Stateful):
 
     first: int = 0  # frame that was seen first
     velocities: list[Tensor]  # per frame u (2, N) px/s, by the frame before it
-    shortest_step: float = math.inf  # s between two frames: no readout is longer
+    shortest_step: float = math.inf  # s between two images of the source: no readout is longer
     _newest: Frame | None = None
 
     def __init__(self, grid: Grid) -> None:
@@ -60,7 +60,7 @@ class ImageMotion(Stateful):
             back = residual_flow(grayscale(frame.image), grayscale(before.image))
             cells = back[:: self._grid.stride, :: self._grid.stride].reshape(-1, 2).T.copy()
             velocity = torch.from_numpy(cells).to(velocity) / -seconds
-            self.shortest_step = min(self.shortest_step, seconds)
+            self.shortest_step = min(self.shortest_step, seconds, frame.step)
         self.velocities.append(velocity)
 
     def velocity(self, frame_index: int) -> Tensor:  # (2, N) px/s
@@ -139,6 +139,10 @@ class RollingShutter(Stateful):
             columns[:, int(self._grid.camera.width < self._grid.camera.height)] = 0
             rows += SHELF.rows(columns)
         return stack(rows)
+
+    def is_possible(self, readout: Readout) -> bool:
+        """Tell whether a readout is shorter than a frame's time; else it fits something else."""
+        return max(map(abs, readout)) < self.motion.shortest_step
 
     def take(self, found: Readout) -> None:
         """Set the readouts estimated from the flow; all later adjustments refine them."""

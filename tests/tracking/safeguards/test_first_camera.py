@@ -172,6 +172,15 @@ def test_a_readout_is_found_with_the_first_geometry(readout: Readout):
 
 
 @pytest.mark.slow
+def test_a_readout_longer_than_a_frames_time_is_none():
+    graph = rolled_graph((0.0, 0.06))
+    graph.shutter.motion.shortest_step = 0.05
+    first_geometry(graph)
+    seek_readouts(graph)
+    assert not any(graph.shutter.readout) and not graph.shutter.is_found
+
+
+@pytest.mark.slow
 def test_an_image_counts_as_read_along_its_shorter_side():
     graph = rolled_graph((0.06, 0.0))  # along the longer one
     first_geometry(graph)

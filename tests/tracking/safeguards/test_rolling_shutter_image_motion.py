@@ -1,5 +1,7 @@
 """How fast the image moves, measured, and how far a rolling shutter displaces it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -17,6 +19,8 @@ def test_the_velocity_is_that_of_the_image_before_and_after():
         torch.testing.assert_close(u[0], torch.full_like(u[0], wanted), rtol=0, atol=0.3)
         assert u[1].abs().max() < 0.3
     assert motion.shortest_step == pytest.approx(1 / RATE)
+    motion.see(replace(picture(3, 12), step=0.25 / RATE))  # every fourth image of the source
+    assert motion.shortest_step == 0.25 / RATE
 
 
 def test_a_frame_without_a_neighbour_does_not_move():

@@ -10,9 +10,11 @@ from minislam.geometry import se3_exp, se3_inverse, se3_log
 from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.safeguards import diagnostics
 from minislam.tracking.safeguards.diagnostics import (
     LEAST_BEYOND_TURNS,
     LEAST_CONFIRMED,
+    MAX_DEPTH_ERROR,
     MOST_RESTING,
     Watch,
     diagnose,
@@ -92,6 +94,22 @@ def test_parallax_that_no_sweep_confirms_is_none():
     watch = Watch(true_graph([0, 1]))  # without edges no pose claims parallax
     watch.conclude()
     assert watch.beyond_turns is None and watch.only_turned and not watch.hardly_walked
+
+
+@pytest.mark.parametrize(("difference", "breaks"), [(0.3, 0), (0.1, 1), (None, 1)])
+def test_depths_that_the_flow_hardly_measures_break_no_trajectory(
+    monkeypatch: pytest.MonkeyPatch, difference: float | None, breaks: int
+):
+    graph, watch = watched(GRID.pixels + GRID.pixels.new_tensor([0.5, 0.0]))
+    graph.least_parallax = 0.0
+    graph.keyframes.disparities[1] *= 2
+    monkeypatch.setattr(diagnostics, "depth_difference", lambda graph: difference)
+    watch.conclude()
+    assert watch.hardly_walked and not watch.only_turned
+    assert watch.diagnostics[1].depth_error > MAX_DEPTH_ERROR and len(watch.breaks) == breaks
+    graph.keyframes.prior_disparities[:] = 1.0  # a prior measures them
+    watch.conclude()
+    assert len(watch.breaks) == 1 and not watch.has_two_depths
 
 
 def test_weak_parallax_is_depth_only_if_poses_and_sweeps_make_depth_of_it():
