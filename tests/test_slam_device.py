@@ -74,7 +74,8 @@ BORDERS = {
     "tracking/safeguards/exposure.py", "tracking/safeguards/motion_memory.py",
     "tracking/safeguards/pose_support.py",
     "tracking/safeguards/relocalisation.py", "tracking/safeguards/rolling_shutter.py",
-    "mapping/insertion.py", "mapping/views.py", "mapping/safeguards.py", "stereo/second_adjustment.py",
+    "mapping/insertion.py", "mapping/views.py", "mapping/safeguards.py",
+    "stereo/second_adjustment.py",
     "stereo/dense_structure.py", "slam.py", "splatting/gaussians.py",
     "splatting/tiles.py",  # how long the lists are
 }  # fmt: skip

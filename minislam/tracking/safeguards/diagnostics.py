@@ -124,9 +124,8 @@ class Watch(Stateful):
     @property
     def has_two_depths(self) -> bool:
         """Tell whether earlier and later views measure different depths; a prior gives them."""
-        return (
-            not self._graph.keyframes.has_prior and (self.depth_difference or 0) > MOST_DIFFERENCE
-        )
+        differ = (self.depth_difference or 0.0) > MOST_DIFFERENCE
+        return differ and not self._graph.keyframes.has_prior
 
     @property
     def segments(self) -> list[tuple[int, int]]:
