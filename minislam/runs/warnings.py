@@ -209,7 +209,7 @@ def _parallax_warnings(slam: Slam) -> Iterator[str]:
             "the camera hardly did more than turn: walking moved the image by only "
             f"{watch.beyond_turns:.2f} px between neighbouring keyframes (median, for 320x240). "
             "Depth is hardly determined, and near and far may be exchanged; film while you walk "
-            "sideways, and look at the pictures of the depth"
+            "sideways, crop what is fixed to the camera, and look at the pictures of the depth"
         )
     elif watch.has_two_depths:
         yield (
