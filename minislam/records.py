@@ -47,7 +47,7 @@ class Frame(Pictured):
     timestamp: float  # second, as the source gives it
     pixels: Tensor  # (H, W, 3) uint8 RGB, undistorted, at the working size
     exposure: Tensor | None = None  # (3,) see `Pictured`
-    step: float = math.inf  # s between two images of the source; none is exposed for longer
+    step: float = math.inf  # s between two images of the source: no shutter takes longer
 
     def to(self, device: torch.device | str) -> "Frame":
         """Return the frame with its image on a device."""
