@@ -39,8 +39,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/insertion.py", "mapping/test_insertion.py"): [
         ("& (weight > 0)", ""), ("opacity < EXPLAINED_OPACITY", "opacity > EXPLAINED_OPACITY"),
-        ("torch.where(known, priority, -1)", "priority"), ("(z > 0) & (weight", "(weight"),
-        ("config.cell * z / focal", "config.cell / focal"),
+        ("& (sides == side)", ""), ("known & (s", "(s"), ("amax(0) < plain", "amax(0) < 9"),
+        ("] * z / focal", "] / focal"), ("SURFACE * lowest[3]", "9"), ("(z > 0) & (we", "(we"),
     ],
     ("mapping/losses.py", "mapping/test_losses.py"): [
         ("slopes * (v_loss / -len(x))", "slopes * (v_loss / len(x))"),
