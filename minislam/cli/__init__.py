@@ -1,1 +1,1 @@
-"""The commands, one file each; its `add_parser` adds them, and `main` lists the files."""
+"""The commands: `main` lists the files, and the `add_parser` of each adds its commands."""

@@ -63,8 +63,9 @@ class Lpips:
     def __call__(self, image: ArrayLike, reference: ArrayLike) -> float:
         """Return the distance of two images (H, W, 3) RGB in [0, 1], 0 for equal ones."""
         both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
-        shape = both[0].shape
+        height, width, _ = shape = both[0].shape
         assert both[1].shape == shape and shape[2] == 3, (shape, both[1].shape)
+        self.require_size(width, height)
         total = 0.0
         with torch.no_grad():
             for level, (a, b) in enumerate(zip(*map(self._features, both), strict=True)):
@@ -73,7 +74,7 @@ class Lpips:
         return total
 
     def require_size(self, width: int, height: int) -> None:
-        """Refuse images that are too small to compare [px], before a run makes them."""
+        """Refuse images that are too small to compare [px]."""
         side = self._layout.smallest_side
         wanted = f"images of at least {side}x{side} px for LPIPS with {self.name}"
         found = f"{width}x{height}; give a larger working size"

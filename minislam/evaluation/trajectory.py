@@ -6,7 +6,7 @@ from enum import Enum
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.geometry.alignment import Similarity, umeyama
 from minislam.records import Trajectory
 
@@ -59,7 +59,8 @@ def relative_pose_error(
     E = Q^-1 P. Returned are |translation of E| and the angle of E [rad], one per motion. The
     motions do not overlap. Where the scale is unknown, align it first.
     """
-    assert 1 <= step < len(truth), (step, len(truth))
+    wanted = f"a step of 1 to {len(truth) - 1} of {len(truth)} paired poses"
+    require(1 <= step < len(truth), wanted, f"{step}; choose a step between")
     first = np.arange(0, len(truth) - step, step)
     true, found = truth.T_world_camera, estimate.T_world_camera
     true_motion = np.linalg.inv(true[first]) @ true[first + step]

@@ -218,5 +218,5 @@ def test_times_in_milliseconds_are_told_from_a_truth_of_few_poses():
 
 @pytest.mark.parametrize("step", [0, 10])
 def test_impossible_steps_are_refused(step: int):
-    with pytest.raises(AssertionError):
+    with pytest.raises(InputError, match="a step of 1 to 9 of 10 paired poses"):
         relative_pose_error(spiral(10), spiral(10), step)

@@ -135,6 +135,12 @@ def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
     assert "present focal length" not in warning
 
 
+def test_a_broken_run_gives_no_advice_about_the_lens():
+    bent = LensFit(300.0, (-0.1, 0.0), -0.07, 0.13)
+    (warning,) = warnings(finished(lens=bent, breaks=[Break(2, 2)]))
+    assert "straight lines" not in warning
+
+
 def test_an_unknown_focal_length_of_a_broken_run_gets_no_advice_from_its_halves():
     _, warning = warnings(finished(seeks_focal=True, focal_length=ZOOMED, lost=[3]))
     assert "the motion does not tell it: trajectory" in warning
