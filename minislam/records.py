@@ -135,6 +135,7 @@ class Sequence(Protocol):
     description: str  # one line: what was found
     camera: Camera  # of the undistorted images at the working size
     refines_focal: bool  # whether the focal length is to be estimated, the camera's is a guess
+    focal_origin: str  # what tells the camera's focal length; empty for a mere guess
     seeks_lens: bool  # whether a lens that bends straight lines is to be found, too
     warnings: list[str]  # what the user must know, for instance that the focal length is guessed
     lost: list[tuple[float, str]]  # timestamp [s] and reason of frames that could not be decoded

@@ -40,9 +40,9 @@ minislam run --resume -o FOLDER
 
 exit codes: 0 finished; 1 what was given cannot be used, in one sentence; 2 an unknown command or
   option, or an option without a readable value; 3 finished but not to be trusted as a whole:
-  frames were lost, the trajectory is broken (motion and depth contradict the images; run.json
-  lists the breaks and the segments between them, and the map shows the longest), the map has
-  large holes or most bundle adjustments failed; 130 interrupted with everything so far written
+  frames were lost or left out, the trajectory is broken (motion and depth contradict the images;
+  run.json lists the breaks and the segments between them, and the map shows the longest), the map
+  has large holes or most bundle adjustments failed; 130 interrupted with everything so far written
 
 settings: each is an option, like --tracking.window 8; minislam settings lists them.
   Ablations of the paper:

@@ -96,6 +96,8 @@ class RecordedSequence:
             self.warnings.append(f"{text}, such as {similar[0]}")
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
+        is_guess = calibration.is_rough and recording.noted_focal_length is None
+        self.focal_origin = "" if is_guess else calibration.origin
         knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
         self.seeks_lens = knows_nothing and options.focal == "auto"
         if calibration.is_rough and not self.refines_focal:

@@ -159,8 +159,10 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
     is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
     is_other = fit is not None and fit.is_doubtful and not is_broken
     if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
+        origin = slam.sequence.focal_origin
         yield (
-            "the focal length is unknown and the motion does not tell it"
+            f"the focal length is {f'known from {origin} alone' if origin else 'unknown'} "
+            "and the motion does not tell it"
             + (_of_a_half(slam, fit) if fit is not None and is_other else "")
             + ": trajectory and map may be bent; give --fx or a calibration file"
         )

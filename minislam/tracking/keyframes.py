@@ -48,8 +48,12 @@ class KeyframeStore(Stateful):
     @property
     def cell_weights(self) -> Tensor:  # (K, N) in [0, 1]
         """Return the weight of each cell: by its appearance (beta) and by its motion so far."""
-        weights = self.static_weights * self.motion_weights
-        return weights if self.overlay is None else weights * self.overlay
+        return self.static_weights * self.standing_weights
+
+    @property
+    def standing_weights(self) -> Tensor:  # (K, N) in [0, 1]
+        """Return the weight of each cell by its motion so far; an overlay of the image has none."""
+        return self.motion_weights if self.overlay is None else self.motion_weights * self.overlay
 
     def append(
         self,

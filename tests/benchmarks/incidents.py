@@ -22,7 +22,7 @@ class Clip:
     def __init__(self, name: str, frames: list[SyntheticFrame], k: Intrinsics) -> None:
         self.name, self.description, self.warnings = name, f"{name}, {len(frames)} frames", []
         self.camera = Camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height)
-        self.refines_focal = self.seeks_lens = False
+        self.refines_focal, self.focal_origin, self.seeks_lens = False, "synthetic", False
         self.ground_truth = ClipTruth(frames)
         self._frames = frames
 

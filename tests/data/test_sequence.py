@@ -114,6 +114,7 @@ def test_the_focal_length_is_refined_where_it_is_not_known(tmp_path: Path):
     for given, refines in (({}, True), ({"cx": 20.0}, True), ({"fx": 60.0}, False)):
         sequence = open_sequence(str(folder), InputOptions(**given))
         assert sequence.refines_focal == refines and sequence.warnings == []
+        assert sequence.focal_origin == ("" if refines else "intrinsics given")
 
 
 def test_a_lens_is_sought_where_nothing_is_known_and_straightened_by_its_options(tmp_path: Path):
@@ -144,6 +145,7 @@ def test_a_focal_length_noted_in_a_photo_is_the_start(tmp_path: Path):
     sequence = open_sequence(str(tmp_path))
     assert sequence.camera.fx == pytest.approx(26 / 43.267 * 80, rel=1e-4)
     assert sequence.refines_focal
+    assert sequence.focal_origin == "EXIF of 0.jpg"
     assert sequence.description.endswith("EXIF of 0.jpg, focal length to be refined")
 
 

@@ -75,6 +75,7 @@ def finished(**parts: object) -> SimpleNamespace:
         sequence=SimpleNamespace(
             warnings=[],
             camera=CAMERA,
+            focal_origin=parts.pop("focal_origin", ""),
             ground_truth=truth,
             source_index=lambda k: 10 + 3 * k,
             preparation={"raw_camera": {"fx": 544.0}},

@@ -74,6 +74,10 @@ WARNINGS = [
         {"seeks_focal": True},
         "the motion does not tell it: trajectory and map may be bent; give --fx",
     ),
+    (
+        {"seeks_focal": True, "focal_origin": "QuickTime tag of a.mov"},
+        "is known from QuickTime tag of a.mov alone and the motion does not tell it: traj",
+    ),
     # Half of the run tells 1.4 times 272 px of images that are half as large as the raw ones.
     (
         {"seeks_focal": True, "focal_length": ZOOMED},

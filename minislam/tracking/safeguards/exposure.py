@@ -4,8 +4,10 @@ A camera adapts to the light. Matched static cells give the factors a_k of each 
 
     log a_j - log a_i = median of log I_j(p~_ij) - log I_i(p_i)      over the cells of an edge.
 
-All edges together are a linear least-squares problem, in which each counts by its cells' weight.
-A common factor is free: the median is 1. Not in the paper; MonoGS optimises such factors.
+All that stands still counts alike. Brightness asks for no texture, and what is textured may be a
+shiny thing, which grows darker as the camera walks around it. All edges together are a linear
+least-squares problem, in which each counts by the weight of its matches. A common factor is free:
+the median is 1. Not in the paper; MonoGS optimises such factors.
 """
 
 from dataclasses import replace
@@ -26,7 +28,7 @@ from minislam.tracking.safeguards.robust import weighted_median
 BLUR = 2.0  # px: a match is not exact, and a median of noise is biased in the dark
 DARKEST, BRIGHTEST = 0.04, 0.96  # beyond, a pixel may be black or saturated
 KEPT = 20  # blurred images in the cache: most edges join neighbours
-LEAST_CHANGE = 0.05  # log of a factor: if none is larger, one exposure is assumed
+LEAST_CHANGE = 0.03  # log of a factor: if none is larger, one exposure is assumed
 LEAST_WEIGHT = 0.015  # of the heaviest edge: with less, a few chance matches would decide [-]
 STEADY = 1e-6  # weight of "as bright as the keyframe before", for keyframes without an edge
 Shot = TypeVar("Shot", Frame, Keyframe)
@@ -34,7 +36,8 @@ Shot = TypeVar("Shot", Frame, Keyframe)
 
 def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
     """Return each keyframe's exposure (3,) by frame index, with median 1; {} if all are alike."""
-    edges, cells, frames = graph.edges, graph.keyframes.cell_weights, graph.keyframes.frames
+    edges, keyframes, frames = graph.edges, graph.keyframes, graph.keyframes.frames
+    ends = torch.stack([keyframes.standing_weights, keyframes.cell_weights], -1)
     # A row is a pair of keyframes, its weight, and how much brighter the second is (log, 3).
     neighbours = [(pair, STEADY, [0.0] * 3) for pair in pairwise(range(len(frames)))]
     linked = []
@@ -52,10 +55,10 @@ def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
         there = torch.from_numpy(moved.reshape(-1, 3))
         both = torch.cat([here, there], 1)
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
-        static = cells[source] * graph.grid.sample(cells[target][:, None], targets.T)[:, 0]
-        weight = visible * (edges.confidences[edge][0] * static).cpu()
+        stands, static = (ends[source] * graph.grid.sample(ends[target], targets.T)).unbind(-1)
         ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
-        step = [weighted_median(channel, weight) for channel in ratio.T]
+        step = [weighted_median(channel, visible * stands.cpu()) for channel in ratio.T]
+        weight = visible * (edges.confidences[edge][0] * static).cpu()
         linked.append(((source, target), float(weight.mean()), step))
     least = LEAST_WEIGHT * max((weight for _, weight, _ in linked), default=0.0)
     rows = [*neighbours, *(row for row in linked if row[1] > least)]

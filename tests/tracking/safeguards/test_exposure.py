@@ -49,10 +49,24 @@ def test_what_moves_has_no_say():
         dark = frame.image.clone()
         dark[:, : dark.shape[1] // 2] *= 0.5 if index == 1 else 1
         graph.keyframes.frames[index] = replace(frame, pixels=dark)
-        static = torch.ones(graph.grid.shape)
-        static[:, : graph.grid.shape[1] // 2 + 2] = 0
-        graph.keyframes.static_weights[index] = static.reshape(-1)
+        stands = torch.ones(graph.grid.shape)
+        stands[:, : graph.grid.shape[1] // 2 + 2] = 0
+        graph.keyframes.motion_weights[index] = stands.reshape(-1)
     torch.testing.assert_close(factors(keyframe_exposures(graph)), FACTORS, rtol=0.02, atol=0)
+
+
+def test_a_shiny_thing_has_no_more_say_for_its_texture():
+    graph = exposed_graph(torch.ones(4, 3))
+    quarter = graph.grid.shape[1] // 4
+    for index, frame in enumerate(graph.keyframes.frames):
+        shiny = frame.image.clone()
+        shiny[:, : shiny.shape[1] // 4] *= 0.8**index
+        graph.keyframes.frames[index] = replace(frame, pixels=shiny)
+    textured = torch.full(graph.grid.shape, 0.05)
+    textured[:, : quarter + 1] = 1
+    edges = graph.edges
+    edges.confidences = [seen * textured.reshape(-1) for seen in edges.confidences]
+    assert keyframe_exposures(graph) == {}
 
 
 def test_a_frame_between_keyframes_is_exposed_as_between_them():
