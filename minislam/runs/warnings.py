@@ -158,7 +158,8 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
     # The flow of a broken run fits whatever focal length.
     is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
     is_other = fit is not None and fit.is_doubtful and not is_broken
-    if graph.seeks_focal and graph.adjustments and not graph.focal_is_free:
+    is_unknown = graph.seeks_focal and graph.adjustments and not graph.focal_is_free
+    if is_unknown and slam.tracker.knows_depth:  # a view at one depth needs none
         origin = slam.sequence.focal_origin
         yield (
             f"the focal length is {f'known from {origin} alone' if origin else 'unknown'} "
@@ -237,7 +238,7 @@ def _prior_warnings(slam: Slam, depth: str) -> Iterator[str]:
             f"such as frame {keyframes.frames[known.index(False)].frame_index}: there depth is "
             "that of the motion alone; give it for all frames"
         )
-    if not keyframes.has_prior:
+    if not keyframes.has_prior and slam.tracker.knows_depth:
         yield "without a depth prior the unit of length is arbitrary"
 
 

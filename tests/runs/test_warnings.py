@@ -133,6 +133,12 @@ def test_depths_that_change_with_the_views_are_warned_of():
     assert "hardly did more than turn" in warning
 
 
+def test_a_view_at_one_depth_needs_neither_focal_length_nor_unit():
+    flat = finished(seeks_focal=True, has_prior=False, parallax=[0.1], knows_depth=False)
+    (warning,) = warnings(flat)
+    assert "at one depth" in warning
+
+
 @pytest.mark.parametrize("broken", [{"lost": [3]}, {"failed": 3}])
 def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
     (warning,) = warnings(finished(focal_length=DOUBTFUL, **broken))
