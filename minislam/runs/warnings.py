@@ -1,5 +1,6 @@
 """What the user must know of a run: at once when something goes wrong, and all of it at its end."""
 
+import math
 from collections.abc import Iterator
 from itertools import dropwhile, pairwise
 
@@ -24,6 +25,7 @@ MOST_LEFT_OUT = 0.3
 NEARLY_ALL = 0.7  # of them: 187 runs have .59 and less, five that are wrong .80 and more
 # Of the static pixels [-]: maps that are whole have .11 to .67, fog and lumps .65 to .96.
 MOST_GUESSED = 0.7
+LARGEST_CHANGE = 4.0  # of a focal length by the run, either way; lenses lie nearer to the guess [-]
 BROKEN = "the trajectory is broken"  # how a warning of breaks begins
 _FAR_APART = "If the images lie far apart, give more frames per second (a smaller --stride)"
 
@@ -168,6 +170,13 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
             + ": trajectory and map may be bent; give --fx or a calibration file"
         )
         return
+    change = graph.grid.camera.fx / slam.sequence.camera.fx
+    if graph.focal_is_free and max(change, 1 / change) > LARGEST_CHANGE:
+        view = 2 * math.degrees(math.atan(0.5 * graph.grid.camera.width / graph.grid.camera.fx))
+        yield (
+            f"the focal length was found to be {change:.1f} times the first one, a view of "
+            f"{view:.0f} degrees: unless the lens has it, path and depth are wrong; give --fx"
+        )
     if lens is not None and lens.is_bent and not slam.tracker.watch.breaks:
         yield (
             f"the flow fits a lens that bends straight lines, the corners by {lens.bend:+.0%}, "

@@ -23,7 +23,7 @@ def finished(**parts: object) -> SimpleNamespace:
         least_parallax=1.0,
         seeks_focal=parts.pop("seeks_focal", False),
         focal_is_free=parts.pop("focal_is_free", False),
-        grid=SimpleNamespace(camera=replace(CAMERA, fx=250.0)),
+        grid=SimpleNamespace(camera=replace(CAMERA, fx=parts.pop("fx", 250.0))),
         shutter=SimpleNamespace(readout=(0.0, 0.0)),
     )
     lost, mapped = parts.pop("lost", range(0)), parts.pop("mapped", range(20))

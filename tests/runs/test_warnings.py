@@ -78,6 +78,10 @@ WARNINGS = [
         {"seeks_focal": True, "focal_origin": "QuickTime tag of a.mov"},
         "is known from QuickTime tag of a.mov alone and the motion does not tell it: traj",
     ),
+    (
+        {"seeks_focal": True, "focal_is_free": True, "fx": 1500.0},
+        "times the first one, a view of 12 degrees: unless the lens has it, path and depth",
+    ),
     # Half of the run tells 1.4 times 272 px of images that are half as large as the raw ones.
     (
         {"seeks_focal": True, "focal_length": ZOOMED},
