@@ -2,13 +2,15 @@
 
 Without a depth network such a pixel has no depth, so nothing is inserted there. By half of the
 refinement, the MLP has learned what moves. What it calls static and the map leaves transparent then
-gets the depth of its surroundings: 1/depth is linear over a plane, and so is the solution of
-Laplace's equation whose border is linear. Between a table and the wall behind it, that is the depth
-of neither: from elsewhere it would float in front of what is known there, so other views vote.
+gets the depth of its surroundings, continued as a thin plate, which bends least: 1/depth is linear
+over a plane, so a road goes on to the border of the image. Between a table and the wall behind it,
+that is the depth of neither: from elsewhere it would float in front of what is known there, so
+other views vote.
 """
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,6 +25,10 @@ from minislam.records import Keyframe
 
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
 VOTERS = 48  # most images of the map that vote, evenly spread; at least 24 of more than 48
+STIFFNESS = 10.0  # of what holds the plate at a known cell, over its own [-]
+FREE = 1e-9  # of what holds it at the mean elsewhere, where known cells leave it free to tilt [-]
+OUTLIERS = (0.02, 0.98)  # quantiles of the known 1/depth
+WITHIN = (0.5, 1.5)  # of these quantiles: the plate is cut off beyond [-]
 MUCH_NEARER = 0.5  # of the distance from which a keyframe guesses a depth [-]
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 
@@ -36,7 +42,8 @@ def filled_depth(depth: Tensor) -> Tensor:
     share, mean = (cv2.resize(a, size, None, 0, 0, cv2.INTER_AREA) for a in (known, inverse))
     if not share.any():
         return depth
-    cells = membrane(mean / np.maximum(share, 1e-6), share > 0)
+    values, found = mean / np.maximum(share, 1e-6), share > 0
+    cells = plate(values, found).clip(*np.quantile(values[found], OUTLIERS) * WITHIN)
     smooth = torch.from_numpy(cv2.resize(cells, (width, height))).to(depth)
     return torch.where(depth > 0, depth, 1 / smooth)
 
@@ -66,17 +73,21 @@ def is_refuted(
     return is_guessed & ((votes > 0) | is_near)
 
 
-def membrane(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return values (h, w) in which each cell that is not known is the mean of its neighbours."""
-    number = np.arange(values.size).reshape(values.shape)
-    pairs = [(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]
-    first, second = (
-        np.concatenate([ends.ravel() for ends in side]) for side in zip(*pairs, strict=True)
-    )
-    upper = sparse.coo_array((np.ones(len(first)), (first, second)), shape=2 * (values.size,))
-    laplacian = sparse.csgraph.laplacian(upper + upper.T).tocsr()
-    filled, free = values.astype(np.float64).ravel(), ~known.ravel()
-    if free.any():
-        rows = laplacian[free]
-        filled[free] = linalg.spsolve(rows[:, free].tocsc(), -(rows[:, ~free] @ filled[~free]))
-    return filled.reshape(values.shape)
+def plate(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the plate (h, w) through the known values that bends least.
+
+    That is the least sum of f_xx^2 + f_yy^2 + 2 f_xy^2, by differences of cells (Terzopoulos 1983).
+    """
+    height, width = values.shape
+    across, down = (partial(differences, n) for n in (width, height))
+    pairs = (down(0), across(2)), (down(2), across(0)), (math.sqrt(2) * down(1), across(1))
+    bending = sparse.vstack([sparse.kron(*pair) for pair in pairs])
+    held = np.where(known, STIFFNESS, FREE).ravel()
+    at = np.where(known, values, values[known].mean()).ravel()
+    system = bending.T @ bending + sparse.diags_array(held)
+    return linalg.spsolve(system.tocsc(), held * at).reshape(height, width)
+
+
+def differences(count: int, order: int) -> sparse.sparray:
+    """Return the matrix of the differences of this order between `count` values in a row."""
+    return sparse.csr_array(np.diff(np.eye(count), order, axis=0))

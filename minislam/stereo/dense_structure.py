@@ -32,6 +32,9 @@ DEPTH_RANGE = 1.5  # inverse depth of the nearest plane over the largest of the 
 LARGEST_QUANTILE = 0.98  # of the inverse depths: the few beyond it are taken for outliers [-]
 PLANES = (48, 96)  # fewest and most
 FARTHEST = 0.5  # planes: what matches farther away, even at infinity, is put here
+ALIKE = 0.1  # planes whose costs exceed the least one by less tell a pixel's depth no better
+MOST_ALIKE = 0.5  # fraction of such planes: what matches well at more is a line along the motion
+LEAST_PARALLAX = 24.0  # px of the nearest plane; with less, a window matches at most planes
 LEAST_KNOWN = 0.5  # fraction of the pixels of all keyframes: with less, a pan's holes are filled
 LEAST_COMMON = 100  # px that have both depths; with fewer their scales are not compared
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
@@ -166,6 +169,7 @@ def swept_view(
     reference: PosedImage,
     others: list[PosedImage],
     planes: np.ndarray,  # (D,) 1/world unit, evenly spaced from 0
+    leaves_lines: bool = False,  # out, which look the same at every depth
 ) -> votes.SweptView:
     """Sweep one image; without others nothing is found. Any process can compute it."""
     step, pose = float(planes[1]), reference.T_camera_world
@@ -178,6 +182,9 @@ def swept_view(
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
     at_best = np.take_along_axis(cost, best[None], 0)[0]
     found[(best == 0) & (at_best >= votes.CONFIRMING_COST)] = np.nan  # the cost has no minimum
+    if leaves_lines:
+        are_alike = (cost < at_best + ALIKE).mean(0) > MOST_ALIKE
+        found[are_alike & (at_best < votes.CONFIRMING_COST)] = np.nan
     return votes.SweptView(found, at_best, step, pose)
 
 
@@ -187,7 +194,7 @@ class SweepPlanner:
     def __init__(
         self, read: Callable[[int], Frame], camera: Camera, poses: dict[int, Tensor], width: int
     ) -> None:
-        self.camera = _small(camera, width)
+        self.camera, self._is_for_map = _small(camera, width), width == WIDTH
         self._read = read
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._centres = {k: np.linalg.inv(pose)[:3, 3] for k, pose in self._poses.items()}
@@ -195,15 +202,19 @@ class SweepPlanner:
 
     def plan(
         self, frame: int, known: np.ndarray
-    ) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray]:
-        """Return the arguments of `swept_view`; `known` are inverse depths of the scene."""
+    ) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray, bool]:
+        """Return the arguments of `swept_view`; `known` are inverse depths of the scene.
+
+        Only sweeps for the map leave out lines: what coarse ones confirm tells turns as well.
+        """
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
         baseline = max(others.values(), default=0.0)
-        # About one plane per pixel of parallax.
-        planes = np.linspace(0, nearest, int(np.clip(baseline * nearest * self.camera.fx, *PLANES)))
+        parallax = baseline * nearest * self.camera.fx
+        planes = np.linspace(0, nearest, int(np.clip(parallax, *PLANES)))  # about one per pixel
         views = [self._image(other) for other in others] if baseline > 0 else []
-        return self.camera, self._image(frame), views, planes
+        leaves_lines = self._is_for_map and parallax > LEAST_PARALLAX
+        return self.camera, self._image(frame), views, planes, leaves_lines
 
     def _read_image(self, frame_index: int) -> PosedImage:
         gray = cv2.cvtColor(self._read(frame_index).image.numpy(), cv2.COLOR_RGB2GRAY)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from minislam.mapping.gaps import CELL, VOTERS, filled_depth, is_refuted, membrane
+from minislam.mapping.gaps import CELL, STIFFNESS, VOTERS, filled_depth, is_refuted, plate
 from minislam.records import Keyframe
 from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 from tests.pretended_gpu import GPU, pretended_gpu
@@ -37,19 +37,36 @@ def test_beyond_the_last_known_depth_it_goes_on_alike():
     torch.testing.assert_close(filled_depth(depth), torch.full_like(depth, 4.0))
 
 
+def test_beyond_the_last_known_depth_a_plane_goes_on():
+    known = ROW < 24
+    filled = filled_depth(torch.where(known, PLANE, 0))
+    near = ROW < 32  # farther on, 1/depth is cut off at 1.5 times the largest that is known
+    torch.testing.assert_close(filled[near], PLANE[near], rtol=0.02, atol=0)
+    assert filled.min() > PLANE[known].min() / 1.5 - 1e-4
+
+
+def test_a_single_known_cell_is_continued_alike():
+    values, known = np.zeros((4, 5)), np.zeros((4, 5), bool)
+    values[1, 2], known[1, 2] = 0.7, True
+    np.testing.assert_allclose(plate(values, known), 0.7, rtol=1e-6)
+
+
 @pytest.mark.parametrize("shape", [(1, 7), (5, 1), (6, 9)])
-def test_each_unknown_cell_is_the_mean_of_its_neighbours(shape: tuple[int, int]):
+def test_no_other_plate_bends_less(shape: tuple[int, int]):
     generator = np.random.default_rng(3)
-    values, known = generator.random(shape), generator.random(shape) < 0.4
-    known.flat[0] = True
-    filled = membrane(values, known)
-    assert np.array_equal(filled[known], values[known])
-    assert filled.min() >= values[known].min() and filled.max() <= values[known].max()
-    height, width = shape
-    for row, column in zip(*np.nonzero(~known), strict=True):
-        beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
-        inside = [filled[r, c] for r, c in beside if 0 <= r < height and 0 <= c < width]
-        assert filled[row, column] == pytest.approx(np.mean(inside))
+    values, known = generator.random(shape), generator.random(shape) < 0.6
+    found = plate(values, known)
+
+    def energy(f: np.ndarray) -> float:
+        xx, yy, xy = np.diff(f, 2, 1), np.diff(f, 2, 0), np.diff(np.diff(f, axis=0), axis=1)
+        bending = (xx**2).sum() + (yy**2).sum() + 2 * (xy**2).sum()
+        return bending + STIFFNESS * ((f - values)[known] ** 2).sum()
+
+    for cell in range(found.size):
+        step = np.zeros(found.size)
+        step[cell] = 1e-3
+        up, down = (energy(found + sign * step.reshape(shape)) for sign in (1, -1))
+        assert (up - down) / 2e-3 == pytest.approx(0, abs=1e-6)
 
 
 def views(*depths: float) -> tuple[Keyframe, ...]:

@@ -69,6 +69,38 @@ def test_what_lies_at_infinity_is_known_to_be_far():
     assert not (alike == infinity).any() and np.isnan(alike).mean() > 0.5
 
 
+def test_a_line_along_the_motion_is_left_out():
+    noise = np.random.default_rng(0).uniform(0, 1, (30, 60)).astype(np.float32)
+    gray = cv2.blur(noise, (3, 3))
+    gray[10:20] = 0.5 + 0.3 * np.sin(np.arange(10.0))[:, None]  # the same at every depth
+    images = []
+    for index in range(5):
+        posed = np.eye(4)
+        posed[0, 3] = -0.4 * index
+        images.append(PosedImage(np.roll(gray, -4 * index, 1), posed))
+    far, planes = Camera(40.0, 40.0, 30.0, 15.0, 60, 30), np.linspace(0, 1, 48)
+    every, told = (
+        swept_view(far, images[2], images[:2] + images[3:], planes, leaves_lines=leaves)
+        for leaves in (False, True)
+    )
+    textured, line = np.r_[0:7, 23:30], np.s_[13:17]
+    inner = np.s_[15:45]
+    assert np.isfinite(every.inverse_depth[line, inner]).all()
+    assert np.isnan(told.inverse_depth[line, inner]).all()
+    np.testing.assert_array_equal(told.inverse_depth[textured], every.inverse_depth[textured])
+    assert np.median(told.inverse_depth[textured][:, inner]) == pytest.approx(0.25, abs=0.02)
+
+
+def test_coarse_sweeps_and_those_of_little_parallax_keep_lines():
+    poses = {}
+    for index in range(9):
+        poses[index] = torch.eye(4, dtype=torch.float64)
+        poses[index][0, 3] = 0.01 * index
+    for width, nearest, leaves in ((160, 8.0, True), (80, 8.0, False), (160, 1.0, False)):
+        planner = SweepPlanner(sequence().frame, camera(), poses, width)
+        assert planner.plan(0, np.full(9, nearest))[-1] is leaves
+
+
 # Which frames
 
 
