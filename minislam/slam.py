@@ -180,20 +180,20 @@ class Slam(Stateful):
 
     def _rebuild_map(self) -> None:
         """Build map and MLP anew on swept depth, of keyframes and of frames in the gaps."""
-        graph, progress = self.tracker.graph, self.steps.on_progress("dense depth")
+        graph, watch = self.tracker.graph, self.tracker.watch
         tracked = [frame.frame_index for frame in graph.keyframes.frames]
-        poses = self.tracker.watch.longest_piece(self.poses)
+        poses = watch.longest_piece(self.poses)
         frames = swept_frames([index for index in tracked if index in poses], list(poses), least=1)
         keyframes = self.keyframes(others=sorted({*frames} - {*tracked}))
         keyframes = [keyframe for keyframe in keyframes if keyframe.frame_index in poses]
         if self.tracker.knows_depth:
             inputs = graph, self.sequence, poses, frames, frames
-            swept = sweep_frames(*inputs, progress, self.workers)
-            fills = self.tracker.watch.hardly_walked
-            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, fills)
+            swept = sweep_frames(*inputs, self.steps.on_progress("dense depth"), self.workers)
+            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, watch.hardly_walked)
         else:
             keyframes = on_backdrop(keyframes)
-        exposures = keyframe_exposures(graph)
+        by_beta = torch.stack([self._static_weight(k).flatten() for k in range(len(tracked))])
+        exposures = keyframe_exposures(graph, by_beta)
         self.mapper = self._new_mapper(self.config.mapping.insertion.cell)
         progress = self.steps.on_progress("first map")
         self.mapper.initialise([with_exposure(k, exposures) for k in keyframes], progress)

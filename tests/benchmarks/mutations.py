@@ -49,7 +49,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/mapper.py", "mapping/test_mapper.py"): [("if not keyframe.inserts", "if False")],
     ("mapping/gaps.py", "mapping/test_gaps.py"): [
-        ("mean / np.maximum(share, 1e-6)", "mean"), ("-(rows[:, ~free]", "(rows[:, ~free]"),
+        ("mean / np.maximum(share, 1e-6)", "mean"), ("math.sqrt(2) * down(1)", "down(1)"),
         ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
         ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
         ("is_guessed & ((votes > 0)", "((votes > 0)"), ("(votes > 0) | is_near", "(votes > 0)"),
@@ -225,7 +225,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("before + STEP_COST", "before"), ("0.5 * (left - right)", "0.5 * (right - left)"),
     ],
     ("stereo/dense_structure.py", "stereo/test_dense_structure.py"): [
-        (".clip(FARTHEST * step)", ".clip(0)"),
+        (".clip(FARTHEST * step)", ".clip(0)"), ("are_alike & (", "("),
         ("(best == 0) & (at_best >= votes.CONFIRMING_COST)", "best < 0"),
     ],
     ("stereo/second_adjustment.py", "stereo/test_second_adjustment.py"): [

@@ -34,10 +34,14 @@ STEADY = 1e-6  # weight of "as bright as the keyframe before", for keyframes wit
 Shot = TypeVar("Shot", Frame, Keyframe)
 
 
-def keyframe_exposures(graph: KeyframeGraph) -> dict[int, Tensor]:
+def keyframe_exposures(
+    graph: KeyframeGraph,
+    static_weights: Tensor,  # (K, N) in [0, 1], from beta alone: plain cells confirm no depth
+) -> dict[int, Tensor]:
     """Return each keyframe's exposure (3,) by frame index, with median 1; {} if all are alike."""
     edges, keyframes, frames = graph.edges, graph.keyframes, graph.keyframes.frames
-    ends = torch.stack([keyframes.standing_weights, keyframes.cell_weights], -1)
+    standing = static_weights * keyframes.standing_weights
+    ends = torch.stack([standing, keyframes.cell_weights], -1)
     # A row is a pair of keyframes, its weight, and how much brighter the second is (log, 3).
     neighbours = [(pair, STEADY, [0.0] * 3) for pair in pairwise(range(len(frames)))]
     linked = []

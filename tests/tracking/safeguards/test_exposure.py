@@ -8,7 +8,8 @@ import torch
 from minislam.records import Frame
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.safeguards.exposure import keyframe_exposures, with_exposure
+from minislam.tracking.safeguards import exposure
+from minislam.tracking.safeguards.exposure import with_exposure
 from tests.tracking.wall import true_graph
 
 FRAMES = [0, 3, 6, 9]
@@ -23,6 +24,13 @@ def exposed_graph(factors: torch.Tensor, linked: int = len(FRAMES)) -> KeyframeG
     for index, (frame, factor) in enumerate(zip(frames, factors, strict=True)):
         frames[index] = replace(frame, pixels=torch.ones_like(frame.image) * 0.5 * factor)
     return graph
+
+
+def keyframe_exposures(
+    graph: KeyframeGraph, static_weights: torch.Tensor | None = None
+) -> dict[int, torch.Tensor]:
+    every = torch.ones_like(graph.keyframes.disparities)
+    return exposure.keyframe_exposures(graph, every if static_weights is None else static_weights)
 
 
 def factors(exposures: dict[int, torch.Tensor]) -> torch.Tensor:
@@ -43,16 +51,20 @@ def test_one_exposure_is_left_alone():
     assert keyframe_exposures(exposed_graph(steady)) == {}
 
 
-def test_what_moves_has_no_say():
-    graph = exposed_graph(FACTORS)
+@pytest.mark.parametrize("told_by", ["memory", "beta"])
+def test_what_moves_has_no_say(told_by: str):
+    graph, by_beta = exposed_graph(FACTORS), []
     for index, frame in enumerate(graph.keyframes.frames):
         dark = frame.image.clone()
         dark[:, : dark.shape[1] // 2] *= 0.5 if index == 1 else 1
         graph.keyframes.frames[index] = replace(frame, pixels=dark)
         stands = torch.ones(graph.grid.shape)
         stands[:, : graph.grid.shape[1] // 2 + 2] = 0
-        graph.keyframes.motion_weights[index] = stands.reshape(-1)
-    torch.testing.assert_close(factors(keyframe_exposures(graph)), FACTORS, rtol=0.02, atol=0)
+        by_beta.append(stands.reshape(-1))
+        if told_by == "memory":
+            graph.keyframes.motion_weights[index] = by_beta.pop()
+    found = keyframe_exposures(graph, torch.stack(by_beta) if by_beta else None)
+    torch.testing.assert_close(factors(found), FACTORS, rtol=0.02, atol=0)
 
 
 def test_a_shiny_thing_has_no_more_say_for_its_texture():
