@@ -23,7 +23,7 @@ from minislam.geometry import Camera
 from minislam.mapping.insertion import nearest_pixels
 from minislam.records import Keyframe
 
-CELL = 6  # px, side of the cells that are solved for: the depth of a gap is smooth
+CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
 VOTERS = 48  # most images of the map that vote, evenly spread; at least 24 of more than 48
 STIFFNESS = 10.0  # of what holds the plate at a known cell, over its own [-]
 FREE = 1e-9  # of what holds it at the mean elsewhere, where known cells leave it free to tilt [-]
