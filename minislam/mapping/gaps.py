@@ -84,8 +84,9 @@ def plate(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     bending = sparse.vstack([sparse.kron(*pair) for pair in pairs])
     held = np.where(known, STIFFNESS, FREE).ravel()
     at = np.where(known, values, values[known].mean()).ravel()
-    system = bending.T @ bending + sparse.diags_array(held)
-    return linalg.spsolve(system.tocsc(), held * at).reshape(height, width)
+    system = (bending.T @ bending + sparse.diags_array(held)).tocsc()
+    # The order for symmetric matrices takes half the time.
+    return linalg.spsolve(system, held * at, "MMD_AT_PLUS_A").reshape(height, width)
 
 
 def differences(count: int, order: int) -> sparse.sparray:
