@@ -171,7 +171,7 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
         )
         return
     change = graph.grid.camera.fx / slam.sequence.camera.fx
-    if graph.focal_is_free and max(change, 1 / change) > LARGEST_CHANGE:
+    if graph.focal_is_free and not is_broken and max(change, 1 / change) > LARGEST_CHANGE:
         view = 2 * math.degrees(math.atan(0.5 * graph.grid.camera.width / graph.grid.camera.fx))
         yield (
             f"the focal length was found to be {change:.1f} times the first one, a view of "

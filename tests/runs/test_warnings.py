@@ -151,8 +151,9 @@ def test_a_broken_run_gives_no_advice_about_the_focal_length(broken: dict):
 
 def test_a_broken_run_gives_no_advice_about_the_lens():
     bent = LensFit(300.0, (-0.1, 0.0), -0.07, 0.13)
-    (warning,) = warnings(finished(lens=bent, breaks=[Break(2, 2)]))
-    assert "straight lines" not in warning
+    far = {"seeks_focal": True, "focal_is_free": True, "fx": 1500.0}
+    (warning,) = warnings(finished(lens=bent, breaks=[Break(2, 2)], **far))
+    assert "straight lines" not in warning and "degrees" not in warning
 
 
 def test_an_unknown_focal_length_of_a_broken_run_gets_no_advice_from_its_halves():
