@@ -3,6 +3,7 @@
 A loop is searched where the present geometry predicts it, as in the paper. Its flow must match in
 both directions. If it fits already, it waits for the next adjustment of all keyframes. Else that
 follows at once; a loop that does not fit afterwards is removed, and the adjustment is undone.
+Where the geometry predicts none, `safeguards/revisits.py` looks for one by appearance.
 """
 
 import torch
@@ -10,9 +11,11 @@ from torch import Tensor
 
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import FAR, both_directions, proximity_pairs
-from minislam.tracking.keyframe_graph import KeyframeGraph
+from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 from minislam.tracking.optimisation import FIRST_WIDENING, adjust, bundle_problem
 from minislam.tracking.reprojection import lengths
+from minislam.tracking.safeguards.relocalisation import Relocaliser
+from minislam.tracking.safeguards.revisits import undo_drift
 
 LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code
 FITTING_LOOP_RESIDUAL = 1.5  # px at 320x240: a loop that is better fits already (diary/tracking.md)
@@ -37,29 +40,48 @@ def loop_pairs(
     return proximity_pairs(candidates, far_edges, newer, max_distance, limit, suppression)
 
 
-def close_loops(graph: KeyframeGraph) -> bool:
-    """Link loops that end at the newest keyframe; return whether all keyframes were adjusted."""
-    config, newest = graph.config, len(graph.keyframes) - 1
-    if newest < config.loop_min_gap:
-        return False
-    limits = config.loop_distance * graph.pixel_scale, config.loop_min_gap, config.loop_edges
-    distances = graph.distances(rows=range(newest, newest + 1), limit=limits[0])
-    pairs = loop_pairs(distances, graph.edges.ends, newest, *limits, LOOP_SUPPRESSION)
-    edges = graph.filter_confirmed(both_directions(pairs))
-    if not edges:
-        return False
+def close_loops(graph: KeyframeGraph, relocaliser: Relocaliser | None = None) -> bool:
+    """Link loops that end at the newest keyframe; return whether all keyframes were adjusted.
+
+    The relocaliser finds those that drift hides from the geometry.
+    """
+    iterations = graph.config.global_iterations
     before, first_new = graph.state, len(graph.edges)
-    graph.match(edges)
-    if _residual(graph, first_new) <= FITTING_LOOP_RESIDUAL * graph.pixel_scale:
-        return False
-    adjust(graph, 0, config.global_iterations, widening=FIRST_WIDENING)
-    graph.match(edges)
-    adjust(graph, 0, config.global_iterations)
-    if _residual(graph, first_new) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
-        return True
+    edges, is_moved = _loop_edges(graph), False
+    if not edges and relocaliser is not None and not _is_linked(graph):
+        is_moved = undo_drift(graph, relocaliser)
+        edges = _loop_edges(graph) if is_moved else []
+    if edges:
+        graph.match(edges)
+        if _residual(graph, first_new) <= FITTING_LOOP_RESIDUAL * graph.pixel_scale:
+            if not is_moved:
+                return False
+        adjust(graph, 0, iterations, widening=FIRST_WIDENING)
+        graph.match(edges)
+        adjust(graph, 0, iterations)
+        if _residual(graph, first_new) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
+            return True
     graph.keyframes.set_geometry(before.T_camera_world, before.disparities)
     graph.edges.remove_newest(len(graph.edges) - first_new)
     return False
+
+
+def _loop_edges(graph: KeyframeGraph) -> list[Edge]:
+    """Return edges of the newest keyframe where the geometry predicts loops and flow confirms."""
+    config, newest = graph.config, len(graph.keyframes) - 1
+    if newest < config.loop_min_gap:
+        return []
+    limits = config.loop_distance * graph.pixel_scale, config.loop_min_gap, config.loop_edges
+    distances = graph.distances(rows=range(newest, newest + 1), limit=limits[0])
+    pairs = loop_pairs(distances, graph.edges.ends, newest, *limits, LOOP_SUPPRESSION)
+    return graph.filter_confirmed(both_directions(pairs))
+
+
+def _is_linked(graph: KeyframeGraph) -> bool:
+    """Tell whether a loop ends near the newest keyframe, so that the geometry predicts more."""
+    newest, gap = len(graph.keyframes) - 1, graph.config.loop_min_gap
+    edges = graph.edges.ends
+    return any(abs(i - j) >= gap and max(i, j) >= newest - LOOP_SUPPRESSION for i, j in edges)
 
 
 def _residual(graph: KeyframeGraph, first_edge: int) -> float:

@@ -207,7 +207,7 @@ class Tracker(Stateful):
     def _adjust_all_if_due(self) -> None:
         """Close loops; run online global BA if `global_interval` keyframes and half are new."""
         interval, count, last = self.config.global_interval, len(self.keyframes), self._last_global
-        closed = self.config.loop_closure and close_loops(self.graph)
+        closed = self.config.loop_closure and close_loops(self.graph, self._relocaliser)
         is_due = interval > 0 and count - last >= max(interval, last)
         if is_due and not closed:
             if not self.graph.focal_is_free:  # in the end, what has drifted may tell none

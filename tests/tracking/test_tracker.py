@@ -133,7 +133,7 @@ def global_adjustments(monkeypatch, keyframes: int, interval: int, loops: Sequen
         lambda graph: adjusted.append(len(graph.keyframes)),
     )
     monkeypatch.setattr(
-        "minislam.tracking.tracker.close_loops", lambda graph: len(graph.keyframes) in loops
+        "minislam.tracking.tracker.close_loops", lambda graph, _: len(graph.keyframes) in loops
     )
     for _ in range(keyframes):
         tracker.keyframes.frames.append(frames()[0])

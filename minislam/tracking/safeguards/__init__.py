@@ -5,6 +5,7 @@ parts            restricts a bundle problem to some edges, keyframes or cells
 motion_memory    remembers which cells have moved, so that a growing dynamic object stays excluded
 settling         which disparities parallax has measured: only these warp to a new keyframe
 relocalisation   finds a lost camera among the keyframes
+revisits         finds a loop that drift hides from the geometry, by its appearance
 pose_support     tries other starts for poses between keyframes that little of the flow supports
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
 first_camera     which minimum the start takes, with an unknown focal length and readout

@@ -40,17 +40,21 @@ class Place:
 
 
 class Relocaliser:
-    """Finds frames among the keyframes; keeps the keypoints of the keyframes it has tried."""
+    """Finds frames among the keyframes; keeps what sums these up, and keypoints once tried."""
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._graph = graph
         self._keypoints: dict[int, Keypoints] = {}
+        self._summaries: list[Tensor] = []  # (C,) each
 
-    def find(self, image: Tensor, features: Tensor) -> Place | None:
-        """Return the place with most inliers: image (H, W, 3), features (h', w', C); or None."""
-        seen = _keypoints(image)
-        summaries = torch.stack([_summary(f) for f in self._graph.keyframes.features])
-        similarity = summaries @ _summary(features)
+    def find(self, image: Tensor, features: Tensor, older: int | None = None) -> Place | None:
+        """Return the place with most inliers: image (H, W, 3), features (h', w', C); or None.
+
+        It is sought among the first `older` keyframes, None: among all.
+        """
+        seen, known = _keypoints(image), self._graph.keyframes.features[:older]
+        self._summaries += map(_summary, known[len(self._summaries) :])
+        similarity = torch.stack(self._summaries[: len(known)]) @ _summary(features)
         most_similar = similarity.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
         places = [self._place(seen, index) for index in most_similar]
         found = [place for place in places if place is not None]
