@@ -22,6 +22,7 @@ MAX_REFUTED = 0.5  # refuting views per agreeing view [-]
 SUPPORT_WINDOW = 7  # px, side of the window that supports a pixel
 MIN_SUPPORT = 0.4  # of the window that must be known, too [-]
 CONFIRMING_COST = 0.6  # a pixel with a larger matching cost confirms nothing [-]
+MOST_SPREAD = 0.075  # image widths from a good match: so far aggregation may carry a depth
 JUDGES = 24  # views, spread evenly over the clip, that tell what stays
 
 
@@ -50,7 +51,7 @@ def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> Confirm
     known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)
     known &= _window_share(known) >= MIN_SUPPORT
     static = known & (view.cost < CONFIRMING_COST)
-    known &= _components(known, static)  # without a good match, aggregation has spread a guess
+    known &= _distance(static) <= MOST_SPREAD * camera.width  # beyond, a guess has spread
     return ConfirmedDepth(np.where(known, view.inverse_depth, 0), _window_share(static))
 
 
@@ -82,10 +83,11 @@ def keep_what_stays(
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
-def _components(known: np.ndarray, seeds: np.ndarray) -> np.ndarray:  # 3 x (h, w) bool
-    """Return the connected components of the known pixels that hold a seed."""
-    _, labels = cv2.connectedComponents(known.astype(np.uint8), connectivity=4)
-    return np.isin(labels, np.unique(labels[seeds & known]))
+def _distance(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32 px
+    """Return how far each pixel is from the nearest one that the mask holds; inf without any."""
+    if not mask.any():
+        return np.full(mask.shape, np.inf, np.float32)
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32

@@ -5,7 +5,14 @@ import pytest
 
 from minislam.geometry import Camera
 from minislam.stereo import votes
-from minislam.stereo.votes import ConfirmedDepth, SweptView, confirm, keep_what_stays, vote
+from minislam.stereo.votes import (
+    MOST_SPREAD,
+    ConfirmedDepth,
+    SweptView,
+    confirm,
+    keep_what_stays,
+    vote,
+)
 
 CAMERA = Camera(fx=60.0, fy=66.0, cx=19.5, cy=14.5, width=40, height=30)
 WALL = 0.5  # inverse depth
@@ -47,15 +54,16 @@ def test_a_depth_that_nobody_else_finds_is_unknown():
     assert (result.inverse_depth[4:8, 8:-8] > 0).all()
 
 
-def test_parts_in_which_nothing_matches_are_guesses():
+def test_a_depth_goes_on_so_far_from_a_good_match_and_no_farther():
     swept = view()
-    swept.cost[:, 24:] = 0.9  # a plain wall at the right, joined to what matches at its left
-    joined = confirmed(swept, others())
-    swept.inverse_depth[:, 24:27] = np.nan
-    apart = confirmed(swept, others())
-    assert (joined.inverse_depth[4:-4, 27:32] > 0).all()
-    assert (apart.inverse_depth[:, 27:] == 0).all()
-    assert (apart.inverse_depth[4:-4, 8:20] > 0).all()
+    swept.cost[:, 20:] = 0.9  # a plain wall at the right, joined to what matches at its left
+    result = confirmed(swept, others())
+    last = 19 + int(MOST_SPREAD * CAMERA.width)
+    assert (result.inverse_depth[4:-4, 8 : last + 1] > 0).all()
+    assert (result.inverse_depth[:, last + 1 :] == 0).all()
+    swept.cost[14, 30] = 0.1  # one match in it: around it, a disc
+    rows, columns = np.nonzero(confirmed(swept, others()).inverse_depth[:, 25:])
+    assert np.hypot(rows - 14, columns - 5).max() == MOST_SPREAD * CAMERA.width == 3
 
 
 def test_a_view_that_looks_through_a_point_refutes_it():
@@ -99,11 +107,12 @@ def test_too_few_votes_are_not_enough():
 
 
 def test_what_matches_badly_is_known_but_confirms_nothing():
-    half = view()
-    half.cost[:, 20:] = 0.7
-    result = confirmed(half, others())
+    stripes = view()
+    stripes.cost[:, 20:] = 0.7
+    stripes.cost[:, 20::4] = 0.1
+    result = confirmed(stripes, others())
     assert (result.inverse_depth[4:-4, 8:-8] > 0).all()
-    assert result.confirmation[:, 24:].max() == 0 < result.confirmation[:, 10:16].min()
+    assert result.confirmation[:, 24:28].max() < 0.5 < 0.99 < result.confirmation[6:24, 12:16].min()
 
 
 def test_if_nothing_matches_well_nothing_is_known():
