@@ -31,6 +31,8 @@ OUTLIERS = (0.02, 0.98)  # quantiles of the known 1/depth
 WITHIN = (0.5, 1.5)  # of these quantiles: the plate is cut off beyond [-]
 MUCH_NEARER = 0.5  # of the distance from which a keyframe guesses a depth [-]
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
+SAME_COLOR = 0.25  # largest difference of a colour, of which 1 is white [-]
+LEAST_DIFFERING = 3  # views that see another colour
 
 
 def filled_depth(depth: Tensor) -> Tensor:
@@ -50,27 +52,36 @@ def filled_depth(depth: Tensor) -> Tensor:
 
 def is_refuted(
     means: Tensor,  # (N, 3) world units, of what a keyframe inserts
+    colors: Tensor,  # (N, 3), as bright as the map
     camera: Camera,
     own: Keyframe,
     keyframes: Sequence[Keyframe],  # of the map
 ) -> Tensor:  # (N,) bool
-    """Tell which guesses, points that their own keyframe has no depth for, are refuted.
+    """Tell which points that fill gaps are refuted.
 
-    Either more views know a surface behind a guess, which it would hide, than one at its depth. Or
-    a view sees it from less than half the distance: it would cover much there, and that view can
-    guess the place itself.
+    A guess, a point that its own keyframe has no depth for: more views know a surface behind it,
+    which it would hide, than one at its depth. Or a view sees it from less than half the distance:
+    it would cover much there, and that view can guess the place itself. Any point: most views in
+    which nothing known hides it have another colour there, as where the rim of one surface has got
+    the depth of another.
     """
     own_z, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
     is_guessed = own.depth[row, column] == 0
-    votes, is_near = torch.zeros_like(row), torch.zeros_like(is_guessed)
+    depth_votes, color_votes = torch.zeros_like(row), torch.zeros_like(row)
+    is_near, differing = torch.zeros_like(is_guessed), torch.zeros_like(row)
     for keyframe in keyframes[:: math.ceil(len(keyframes) / VOTERS)]:
         z, row, column, inside = nearest_pixels(means, camera, keyframe.T_camera_world)
         known = keyframe.depth[row, column]
         beyond = (known - z) / z
-        votes += (inside & (beyond > SAME_DEPTH)).long()
-        votes -= (inside & (beyond.abs() <= SAME_DEPTH)).long()
+        depth_votes += (inside & (beyond > SAME_DEPTH)).long()
+        depth_votes -= (inside & (beyond.abs() <= SAME_DEPTH)).long()
         is_near |= inside & (z < MUCH_NEARER * own_z)
-    return is_guessed & ((votes > 0) | is_near)
+        is_seen = inside & ((known == 0) | (beyond >= -SAME_DEPTH))
+        differs = (keyframe.levelled[row, column] - colors).abs().amax(1) > SAME_COLOR
+        differing += (is_seen & differs).long()
+        color_votes += (is_seen & differs).long() - (is_seen & ~differs).long()
+    looks_otherwise = (color_votes > 0) & (differing >= LEAST_DIFFERING)
+    return is_guessed & ((depth_votes > 0) | is_near) | looks_otherwise
 
 
 def plate(values: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -151,8 +151,8 @@ class Mapper(JointOptimisation):
         view = image, depth, self.camera, keyframe.T_camera_world
         new = gaussians_at_pixels(pixels, sides, *view, position, insertion)
         if fills:
-            views = self.keyframes[position], self.keyframes
-            new = new.prune(~is_refuted(new.means, self.camera, *views))
+            views = self.camera, self.keyframes[position], self.keyframes
+            new = new.prune(~is_refuted(new.means, new.colors, *views))
         self._optimizer.append(new)
         self._reset_gradients()
 

@@ -1,5 +1,6 @@
 """Gaps in a depth image are filled from around them; only what is static gets Gaussians there."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from tests.pretended_gpu import GPU, pretended_gpu
 COLUMN, ROW = torch.arange(64.0).expand(48, 64), torch.arange(48.0)[:, None].expand(48, 64)
 PLANE = 1 / (0.1 + 0.002 * COLUMN + 0.005 * ROW)  # the depth of a tilted plane
 INSIDE = (COLUMN > 11) & (COLUMN < 44) & (ROW > 15) & (ROW < 32)
+GRAY = 0.5  # of all images
 
 
 def test_a_gap_that_a_plane_surrounds_is_of_the_plane():
@@ -72,7 +74,14 @@ def test_no_other_plate_bends_less(shape: tuple[int, int]):
 def views(*depths: float) -> tuple[Keyframe, ...]:
     """Return views from the origin along z, each of which knows one depth, or none (0)."""
     view = replace(wall_keyframe(0), T_camera_world=torch.eye(4, dtype=torch.float64))
+    view = replace(view, pixels=torch.full_like(view.image, GRAY))
     return tuple(replace(view, depth=torch.full_like(view.depth, z)) for z in depths)
+
+
+def refuted(
+    points: torch.Tensor, own: Keyframe, keyframes: Sequence[Keyframe], shade: float = GRAY
+) -> torch.Tensor:
+    return is_refuted(points, torch.full_like(points, shade), CAMERA, own, keyframes)
 
 
 @pytest.mark.parametrize(
@@ -84,13 +93,13 @@ def views(*depths: float) -> tuple[Keyframe, ...]:
 )  # fmt: skip
 def test_a_point_hides_what_more_views_know_behind_it_than_at_it(known, hides: bool):
     points = torch.tensor([[0.0, 0.0, 1.0], [9.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    assert is_refuted(points, CAMERA, *views(0.0), views(*known)).tolist() == [hides, False, False]
+    assert refuted(points, *views(0.0), views(*known)).tolist() == [hides, False, False]
 
 
 def test_a_view_that_does_not_see_a_point_does_not_vote():
     [seeing], [other] = views(2.0), views(1.0)
     other.T_camera_world[0, 3] = 9.0
-    assert is_refuted(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(0.0), [seeing, other])
+    assert refuted(torch.tensor([[0.0, 0.0, 1.0]]), *views(0.0), [seeing, other])
 
 
 @pytest.mark.parametrize(("ahead", "aside", "left"), [(0.7, 0, 1), (0.5, 0, 0), (0.7, 9, 0)])
@@ -98,19 +107,42 @@ def test_a_guess_is_left_to_a_view_from_less_than_half_the_distance(ahead, aside
     [own], [near] = views(0.0), views(0.0)
     near.T_camera_world[:3, 3] = torch.tensor([aside, 0, -ahead])
     point = torch.tensor([[0.0, 0.0, 1.0]])
-    assert is_refuted(point, CAMERA, own, [own, near]).tolist() == [bool(left)]
+    assert refuted(point, own, [own, near]).tolist() == [bool(left)]
     [own] = views(1.0)  # no guess
-    assert not is_refuted(point, CAMERA, own, [own, near])
+    assert not refuted(point, own, [own, near])
 
 
 def test_of_many_views_every_nth_votes():
     point = torch.tensor([[0.0, 0.0, 1.0]])
-    assert is_refuted(point, CAMERA, *views(0.0), views(2.0, 1.0, 1.0) * VOTERS)
-    assert not is_refuted(point, CAMERA, *views(0.0), views(1.0, 2.0, 2.0) * VOTERS)
+    assert refuted(point, *views(0.0), views(2.0, 1.0, 1.0) * VOTERS)
+    assert not refuted(point, *views(0.0), views(1.0, 2.0, 2.0) * VOTERS)
 
 
 def test_what_its_own_keyframe_measures_stays():
-    assert not is_refuted(torch.tensor([[0.0, 0.0, 1.0]]), CAMERA, *views(1.0), views(2.0))
+    assert not refuted(torch.tensor([[0.0, 0.0, 1.0]]), *views(1.0), views(2.0))
+
+
+@pytest.mark.parametrize(
+    ("own", "known", "shade", "is_wrong"),
+    [
+        (1.0, (1.0,) * 3, 0.8, True), (1.0, (1.0,) * 3, 0.7, False),  # .3 and .2 off
+        (0.0, (1.0,) * 3, 0.8, True), (1.0, (0.0,) * 3, 0.2, True),
+        (1.0, (1.0,) * 2, 0.8, False),  # two views are too few
+        (1.0, (0.5,) * 3, 0.8, False), (1.0, (0.95,) * 3, 0.8, True),  # hidden or not
+    ],
+)  # fmt: skip
+def test_a_point_that_most_views_see_in_another_color_is_refuted(own, known, shade, is_wrong):
+    point = torch.tensor([[0.0, 0.0, 1.0]])
+    assert bool(refuted(point, *views(own), views(*known), shade)) is is_wrong
+
+
+def test_as_many_views_that_see_its_color_save_a_point():
+    point, seen = torch.tensor([[0.0, 0.0, 1.0]]), views(*(1.0,) * 6)
+    bright = [replace(view, pixels=torch.full_like(view.image, 0.8)) for view in seen]
+    assert refuted(point, *views(1.0), [*seen[:3], *bright[:4]])
+    assert not refuted(point, *views(1.0), [*seen[:3], *bright[:3]])
+    dark = [replace(view, exposure=torch.full((3,), 1.6)) for view in bright]  # .5, levelled
+    assert not refuted(point, *views(1.0), dark)
 
 
 def test_on_a_gpu_it_is_filled_as_on_the_cpu():
