@@ -81,7 +81,8 @@ def _path_warnings(slam: Slam) -> Iterator[str]:
         where = ", ".join(span(found.first_frame, found.last_frame) for found in watch.breaks)
         mapped, piece = watch.longest_piece(slam.poses), ""
         if len(mapped) < len(slam.poses):
-            piece = f", so the map shows frames {span(min(mapped), max(mapped))} alone"
+            shown = _stretches(sorted(mapped), slam.config.tracking.warmup_keyframes)
+            piece = f", so the map shows frames {' and '.join(span(*s) for s in shown)} alone"
         pieces = _as_options(slam, _followed_pieces(slam))
         anew = f"; run each piece anew, with the other options as here: {pieces}" if pieces else ""
         yield (

@@ -10,6 +10,7 @@ pose_support     tries other starts for poses between keyframes that little of t
 first_frame      chooses the start: not a black frame, a slate, or the shorter side of a cut
 first_camera     which minimum the start takes, with an unknown focal length and readout
 diagnostics      how well each keyframe is tied to the others
+pieces           which stretches of a broken trajectory belong together
 depth_agreement  whether earlier and later views measure the same depths
 turns            recognises a camera that stands or only rotates, and adjusts rotations alone
 focal_length     estimates an unknown focal length and the readout, checks a given focal length

@@ -19,6 +19,7 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.depth_agreement import depth_difference
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
+from minislam.tracking.safeguards.pieces import pieces
 from minislam.tracking.safeguards.robust import weighted_median
 from minislam.tracking.safeguards.scale_certainty import scale_deviations
 from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_rest
@@ -143,9 +144,14 @@ class Watch(Stateful):
         A map shows it alone, because the pieces differ in scale and direction, and each would hide
         the others. Without a break, or where all pieces are short, all poses are returned.
         """
-        spans = self.segments if self.breaks else []
-        pieces = [{i: poses[i] for i in poses if first <= i <= last} for first, last in spans]
-        longest = max(pieces, key=len, default=poses)
+        graph, frames = self._graph, [keyframe.frame_index for keyframe in self.diagnostics]
+        losses = {k for k, matches in enumerate(graph.flow_to_next, 1) if matches is None}
+        tied = pieces(frames, self.segments, losses, graph.edges.ends) if self.breaks else []
+        found = [
+            {i: poses[i] for i in poses if any(first <= i <= last for first, last in spans)}
+            for spans in tied
+        ]
+        longest = max(found, key=len, default=poses)
         return longest if len(longest) >= LEAST_FRAMES else poses
 
 
