@@ -52,8 +52,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("mean / np.maximum(share, 1e-6)", "mean"), ("math.sqrt(2) * down(1)", "down(1)"),
         ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
         ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
-        ("is_guessed & ((votes > 0)", "((votes > 0)"), ("(votes > 0) | is_near", "(votes > 0)"),
-        ("inside & (z < MUCH_NEARER", "(z < MUCH_NEARER"),
+        ("is_guessed & ((depth_votes", "((depth_votes"), ("> 0) | is_near", "> 0)"),
+        ("inside & (z < MUCH_NEARER", "(z < MUCH_NEARER"), ("votes > 0) & (d", "votes > 0) | (d"),
     ],
     ("mapping/mapper.py", "mapping/test_gaps.py"): [
         ("self._insert(position, fills=True)", "self._insert(position)"),
@@ -171,7 +171,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_diagnostics.py"): [
         ("weak >= LONG or _is", "_is"), ("find_breaks(judged)", "find_breaks(self.diagnostics)"),
-        ("if all(k.parallax <", "if any(k.parallax <"), ("max(pieces, key", "min(pieces, key"),
+        ("if all(k.parallax <", "if any(k.parallax <"), ("max(found, key", "min(found, key"),
         (">= LEAST_BEYOND_TURNS and not graph", ">= 0 and not graph"),
         ("and not graph.keyframes.has_prior", ""), ("is_tied and has_scale", "is_tied"),
         ("(k, depth_error=None, ", "(k, explained=None, depth_error=None, "),
