@@ -19,7 +19,7 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.depth_agreement import depth_difference
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
-from minislam.tracking.safeguards.pieces import pieces
+from minislam.tracking.safeguards.pieces import edges_past_a_loss, losses, pieces
 from minislam.tracking.safeguards.robust import weighted_median
 from minislam.tracking.safeguards.scale_certainty import scale_deviations
 from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_rest
@@ -144,9 +144,10 @@ class Watch(Stateful):
         A map shows it alone, because the pieces differ in scale and direction, and each would hide
         the others. Without a break, or where all pieces are short, all poses are returned.
         """
-        graph, frames = self._graph, [keyframe.frame_index for keyframe in self.diagnostics]
-        losses = {k for k, matches in enumerate(graph.flow_to_next, 1) if matches is None}
-        tied = pieces(frames, self.segments, losses, graph.edges.ends) if self.breaks else []
+        frames, tied = [keyframe.frame_index for keyframe in self.diagnostics], []
+        if self.breaks:
+            ties = losses(self._graph), edges_past_a_loss(self._graph)
+            tied = pieces(frames, self.segments, *ties)
         found = [
             {i: poses[i] for i in poses if any(first <= i <= last for first, last in spans)}
             for spans in tied

@@ -1,20 +1,42 @@
 """Which stretches of a broken trajectory belong together.
 
 A stretch ends at a break, or where the camera was lost. Behind a loss it was found again at a place
-that it had seen, perhaps long before, and edges lead there. So a stretch can belong to one before
-the last break, and not to the one before the loss.
+that it had seen, perhaps long before, and edges lead there that fit. So a stretch can belong to one
+before the last break, and not to the one before the loss.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+
+from minislam.tracking.bundle_adjustment import residuals
+from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
+from minislam.tracking.optimisation import bundle_problem
 
 Span = tuple[int, int]  # first and last frame
+MIN_SUPPORT = 0.5  # robust weight of an edge that fits, over its weight; of one that does not 0 [-]
+
+
+def losses(graph: KeyframeGraph) -> list[int]:
+    """Return the keyframes before which the camera was lost."""
+    return [k for k, matches in enumerate(graph.flow_to_next, 1) if matches is None]
+
+
+def edges_past_a_loss(graph: KeyframeGraph) -> list[Edge]:
+    """Return the edges between keyframes before and behind a loss that fit the geometry."""
+    ends, lost = graph.edges.ends, losses(graph)
+    past = [p for p, edge in enumerate(ends) if any(min(edge) < k <= max(edge) for k in lost)]
+    if not past:
+        return []
+    problem = bundle_problem(graph, past)
+    _, weights = residuals(problem, graph.state)
+    support = weights.mean((1, 2)) / problem.weights.mean((1, 2)).clamp_min(1e-9)
+    return [ends[p] for p, is_tied in zip(past, support >= MIN_SUPPORT, strict=True) if is_tied]
 
 
 def pieces(
     frames: Sequence[int],  # of the keyframes
     segments: Sequence[Span],  # between the breaks
-    losses: Collection[int],  # keyframes before which the camera was lost
-    edges: Iterable[tuple[int, int]],  # between keyframes
+    lost: Sequence[int],  # keyframes before which the camera was lost
+    edges: Iterable[Edge],  # that fit
 ) -> list[list[Span]]:
     """Return the groups of stretches that edges tie; those right across a break do not count."""
     stretches: list[Span] = []
@@ -23,7 +45,7 @@ def pieces(
     for number, (first, last) in enumerate(segments):
         inside = [k for k, frame in enumerate(frames) if first <= frame <= last]
         for k in inside:
-            if k == inside[0] or k in losses:
+            if k == inside[0] or k in lost:
                 if k != inside[0]:
                     stretches[-1] = stretches[-1][0], frames[k] - 1
                 stretches.append((frames[k], last))
