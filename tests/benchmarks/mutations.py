@@ -57,7 +57,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/mapper.py", "mapping/test_gaps.py"): [
         ("self._insert(position, fills=True)", "self._insert(position)"),
-        ("new.prune(~is_refuted(new.means, self.camera, *views))", "new"),
+        ("new.prune(~is_refuted(new.means, new.colors, *views))", "new"),
     ],
     ("mapping/safeguards.py", "mapping/test_mapper.py"): [
         (".detach()[static] > OPAQUE", ".detach()[weight > -1] > OPAQUE"),
