@@ -73,7 +73,8 @@ def spread(
     in the coordinates of the old camera, moves each camera by the fraction a of C.
     """
     count = len(disparities) - 1 - old
-    fractions = torch.arange(1, count + 1)[:, None].to(T_camera_world) / count
+    steps = torch.arange(1, count + 1, device=T_camera_world.device)
+    fractions = steps[:, None].to(T_camera_world) / count
     growth = scale**fractions
     T_old_camera = T_camera_world[old] @ se3_inverse(T_camera_world[old:])
     T_old_camera[1:, :3, 3] = (growth * T_old_camera[:, :3, 3].diff(dim=0)).cumsum(0)
