@@ -53,9 +53,9 @@ def close_loops(graph: KeyframeGraph, relocaliser: Relocaliser | None = None) ->
         edges = _loop_edges(graph) if is_moved else []
     if edges:
         graph.match(edges)
-        if _residual(graph, first_new) <= FITTING_LOOP_RESIDUAL * graph.pixel_scale:
-            if not is_moved:
-                return False
+        fitting = FITTING_LOOP_RESIDUAL * graph.pixel_scale
+        if not is_moved and _residual(graph, first_new) <= fitting:
+            return False
         adjust(graph, 0, iterations, widening=FIRST_WIDENING)
         graph.match(edges)
         adjust(graph, 0, iterations)

@@ -43,6 +43,10 @@ WARNINGS = [
         {"breaks": [Break(9, 9)], "mapped": range(10, 20)},
         "do not belong together, so the map shows frames 10 to 19 alone; run each piece",
     ),
+    (
+        {"breaks": [Break(9, 9)], "mapped": [*range(3), *range(16, 20)]},
+        "so the map shows frames 0 to 2 and 16 to 19 alone; run each piece",
+    ),
     ({"breaks": [Break(9, 9)]}, "do not belong together; run each piece"),
     (
         {"truth": [9.0, 9.5]},

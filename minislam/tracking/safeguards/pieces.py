@@ -17,7 +17,7 @@ MIN_SUPPORT = 0.5  # robust weight of an edge that fits, over its weight; of one
 
 def losses(graph: KeyframeGraph) -> list[int]:
     """Return the keyframes before which the camera was lost."""
-    return [k for k, matches in enumerate(graph.flow_to_next, 1) if matches is None]
+    return [k for k in range(len(graph.keyframes)) if graph.follows_a_loss(k)]
 
 
 def edges_past_a_loss(graph: KeyframeGraph) -> list[Edge]:

@@ -14,7 +14,7 @@ from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.relocalisation import Place, Relocaliser
 from minislam.tracking.safeguards.robust import weighted_median
 
-EVERY = 2  # keyframes: one place is seen by several, and the search takes some 60 ms
+EVERY = 2  # keyframes from one search to the next: several see the same place
 MOST_DRIFT = 0.1  # of the way walked, and of the angle turned: more is another place [-]
 
 
