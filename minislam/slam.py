@@ -10,8 +10,7 @@ by the MLP's beta. `_move_map` deforms the map when an adjustment has moved keyf
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from itertools import chain
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -111,8 +110,7 @@ class Slam(Stateful):
             self.steps.once("photometric refinement", self._refine_other_poses)
 
     def _new_mapper(self, cell: int) -> Mapper:
-        config, dimension = self.config, self._features.dimension
-        camera = self.tracker.grid.camera
+        config, dimension, camera = self.config, self._features.dimension, self.tracker.grid.camera
         parts = camera, config.mapping, config.uncertainty, dimension, config.seed
         mapper = Mapper(*parts, self.device, self.workers)
         mapper.cell = cell
@@ -254,20 +252,21 @@ class Slam(Stateful):
 
     def keyframes(self, first: int = 0, others: Iterable[int] = ()) -> list[Keyframe]:
         """Return keyframes of the tracker from `first` on, and others, which insert nothing."""
-        store, shutter = self.tracker.keyframes, self.tracker.graph.shutter
+        store = self.tracker.keyframes
         columns = store.frames, store.features, store.metric_depths, store.T_camera_world
-        rows = zip(*(column[first:] for column in columns), strict=True)
-        read = (
-            (f, self._features(f), None, self.poses[f.frame_index]) for f in map(self.frame, others)
-        )
-        result = []
-        for position, (frame, features, depth, pose) in enumerate(chain(rows, read), first):
-            pixels, mask = shutter.undone(frame).pixels, self._given_mask(frame.frame_index)
-            unknown = torch.zeros((), device=self.device).expand(pixels.shape[:2])
-            seen = pixels, features, unknown if depth is None else depth, pose, mask
-            result.append(Keyframe(frame.frame_index, *seen, inserts=position < len(store)))
-            SHELF.put([pixels, features])
-        return sorted(result, key=lambda keyframe: keyframe.frame_index)
+        images = [self._view(*row) for row in zip(*(c[first:] for c in columns), strict=True)]
+        for frame in map(self.frame, others):
+            seen = self._features(frame), None, self.poses[frame.frame_index]
+            images.append(replace(self._view(frame, *seen), inserts=False))
+        return sorted(images, key=lambda image: image.frame_index)
+
+    def _view(self, frame: Frame, features: Tensor, depth: Tensor | None, pose: Tensor) -> Keyframe:
+        pixels = self.tracker.graph.shutter.undone(frame).pixels
+        if depth is None:  # it is unknown, 0, everywhere
+            depth = torch.zeros((), device=self.device).expand(pixels.shape[:2])
+        SHELF.put([pixels, features])
+        mask = self._given_mask(frame.frame_index)
+        return Keyframe(frame.frame_index, pixels, features, depth, pose, mask)
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames that were not lost; before the end, those of keyframes."""

@@ -54,68 +54,43 @@ class RecordedSequence:
         masks, lens = (p and absolute_path(p) for p in (options.masks, options.calibration))
         options = replace(options, masks=masks, calibration=lens)
         self._recording, self._options, self._source = recording, options, source
-        read = partial(read_depth, units_per_metre=options.depth_scale)
-        self.read_depth: Callable[[Path], np.ndarray] = read
         source = source if source.startswith(SYNTHETIC) else absolute_path(source)
         self.opened_as = {"sequence": source, "input": asdict(options)}
-        chosen = range(options.start, len(recording.images), options.stride)
-        chosen, odd = chosen[: options.max_frames], recording.images.odd
-        self._chosen = [index for index in chosen if index not in odd]
-        found = f"{len(self._chosen)} among {len(recording.images)} images of {recording.name}"
+        self.name, images, stamps = recording.name, recording.images, recording.timestamps
+        asked = range(options.start, len(images), options.stride)[: options.max_frames]
+        self._chosen = [index for index in asked if index not in images.odd]
+        found = f"{len(self._chosen)} among {len(images)} images of {recording.name}"
         advice = "after --start, --stride and --max-frames; change these, or give more images"
         require(len(self._chosen) >= 2, "at least two frames", f"{found} {advice}")
-        stamps = recording.timestamps
-        self._step = float(np.median(np.diff(stamps)))
-        first, last = stamps[chosen[0]], stamps[chosen[-1]]
+        left_out = [index for index in asked if index in images.odd]
+        first, last = stamps[asked[0]], stamps[asked[-1]]
         self.lost = [row for row in recording.lost if first < row[0] < last]
-        self.lost += [(float(stamps[index]), odd[index]) for index in chosen if index in odd]
+        self.lost += [(float(stamps[index]), images.odd[index]) for index in left_out]
+        self._step = float(np.median(np.diff(stamps)))
+        self._masks = recording.mask_paths
+        if options.masks is not None:
+            self._masks = mask_files(images, options.masks, self._chosen)
+        self.files = [*images.paths, *self._masks.values()]
+        self.read_depth: Callable[[Path], np.ndarray]
+        self.read_depth = partial(read_depth, units_per_metre=options.depth_scale)
         self.checksums: dict[int, int] = {}
         self._shelf = Shelf()
         self._kept: dict[int, np.ndarray] = {}  # working images on the shelf, by frame index
-        self._masks = recording.mask_paths
-        if options.masks is not None:
-            self._masks = mask_files(recording.images, options.masks, self._chosen)
-        self.files = [*recording.images.paths, *self._masks.values()]
-        height, width = (first := recording.images.read(self._chosen[0])).shape[:2]
-        picture = picture_window(recording.images.lit_extents, width, height)
+
+        height, width = (image := images.read(self._chosen[0])).shape[:2]
+        picture = picture_window(images.lit_extents, width, height)
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
         self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels, picture)
-        self.name = recording.name
-        self.camera = self.prepare.camera
-        self.preparation = self.prepare.steps
-        given_fx = 0.0 if calibration.is_rough else camera.fx
-        doubts = _doubts(first, recording.images.labels[self._chosen[0]], given_fx)
-        self.warnings = [*recording.warnings, *doubts]
-        if left_out := [odd[index] for index in chosen if index in odd]:
-            text = f"{len(left_out)} of {len(chosen)} images are left out because of their size"
-            self.warnings.append(f"{text}, such as {left_out[0]}; crop or resize them")
-        resized = recording.images.resized
-        if similar := [resized[index] for index in chosen if index in resized]:
-            text = f"{len(similar)} of {len(chosen)} images are resized to the size of most"
-            self.warnings.append(f"{text}, such as {similar[0]}")
+        self.camera, self.preparation = self.prepare.camera, self.prepare.steps
         refines = {"fixed": False, "refine": True, "auto": calibration.is_rough}
         self.refines_focal = refines[options.focal]
         is_guess = calibration.is_rough and recording.noted_focal_length is None
         self.focal_origin = "" if is_guess else calibration.origin
         knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
         self.seeks_lens = knows_nothing and options.focal == "auto"
-        if calibration.is_rough and not self.refines_focal:
-            self.warnings.append(
-                f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}, for "
-                f"{width}x{height} images, trajectory and map may be bent; give --fx, a "
-                "calibration file, or --focal refine"
-            )
-        size = f"{width}x{height} -> {self.camera.width}x{self.camera.height} px"
-        counts = f"{len(self)} of {len(recording.images)} images"
-        if picture[2:] != (width, height):
-            size = f"black bars cut to {picture[2]}x{picture[3]}, {size}"
-        parts = [counts, *recording.notes, size, calibration.origin]
-        if options.masks is not None:
-            parts.append(f"masks from {options.masks}")
-        if self.refines_focal:
-            parts.append("focal length to be refined")
-        self.description = f"{recording.kind}: {', '.join(parts)}"
+        self.warnings = [*recording.warnings, *self._doubts(calibration, image, left_out)]
+        self.description = f"{recording.kind}: {', '.join(self._facts(calibration, picture))}"
         truth = GroundTruth(
             recording.trajectory,
             moving_mask=partial(self._picture, recording.mask_paths, read_mask),
@@ -126,6 +101,48 @@ class RecordedSequence:
         files = recording.mask_paths or recording.static_paths or recording.novel_views
         has_truth = recording.trajectory is not None or files  # a sensor's depth is an input
         self.ground_truth = truth if has_truth else None
+
+    def _doubts(
+        self, calibration: Calibration, raw: np.ndarray, left_out: list[int]
+    ) -> Iterator[str]:
+        """Yield what is likely a mistake in the first raw image, the focal length or the sizes."""
+        images, (height, width) = self._recording.images, raw.shape[:2]
+        label, resized = images.labels[self._chosen[0]], images.resized
+        if label.lower().endswith(".png") and 0 < raw.max() < 16:
+            what = f"{label} is almost black, its largest value {raw.max()} of 255"
+            yield f"{what}: if it holds 10 or 12 bits in 16, multiply all images by 64 or 16"
+        fx = self.prepare.raw_camera.fx
+        angle = 60 if calibration.is_rough else 2 * np.degrees(np.arctan(width / 2 / fx))
+        if not 15 <= angle <= 130:  # degree
+            means = f"fx {fx:g} px means a field of view of {angle:.0f} degrees"
+            unit = "in millimetres" if angle > 130 else "for larger images"
+            yield f"{means}: check if it is {unit}"
+        every = len(self) + len(left_out)
+        if left_out:
+            text = f"{len(left_out)} of {every} images are left out because of their size"
+            yield f"{text}, such as {images.odd[left_out[0]]}; crop or resize them"
+        if similar := [resized[index] for index in self._chosen if index in resized]:
+            text = f"{len(similar)} of {every} images are resized to the size of most"
+            yield f"{text}, such as {similar[0]}"
+        if calibration.is_rough and not self.refines_focal:
+            unknown = f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}"
+            advice = "give --fx, a calibration file, or --focal refine"
+            size = f"for {width}x{height} images"
+            yield f"{unknown}, {size}, trajectory and map may be bent; {advice}"
+
+    def _facts(self, calibration: Calibration, picture: Window) -> Iterator[str]:
+        """Yield what the description says of images and camera."""
+        yield f"{len(self)} of {len(self._recording.images)} images"
+        yield from self._recording.notes
+        raw, (_, _, *seen) = self.prepare.raw_camera, picture
+        is_cut = seen != [raw.width, raw.height]
+        cut = f"black bars cut to {seen[0]}x{seen[1]}, " if is_cut else ""
+        yield f"{cut}{raw.width}x{raw.height} -> {self.camera.width}x{self.camera.height} px"
+        yield calibration.origin
+        if self._options.masks is not None:
+            yield f"masks from {self._options.masks}"
+        if self.refines_focal:
+            yield "focal length to be refined"
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -196,17 +213,6 @@ class RecordedSequence:
     def _novel_views(self) -> list[tuple[np.ndarray, np.ndarray]]:
         views, prepare = self._recording.novel_views, self.prepare
         return [(pose, prepare.color(read_color(path), str(path))) for pose, path in views]
-
-
-def _doubts(raw: np.ndarray, label: str, fx: float) -> Iterator[str]:
-    """Yield what is likely a mistake in a raw image, or in a given focal length [px], 0 if none."""
-    if label.lower().endswith(".png") and 0 < raw.max() < 16:
-        what = f"{label} is almost black, its largest value {raw.max()} of 255"
-        yield f"{what}: if it holds 10 or 12 bits in 16, multiply all images by 64 or 16"
-    angle = 2 * np.degrees(np.arctan(raw.shape[1] / 2 / fx)) if fx else 60
-    if not 15 <= angle <= 130:  # degree
-        unit = "in millimetres" if angle > 130 else "for larger images"
-        yield f"fx {fx:g} px means a field of view of {angle:.0f} degrees: check if it is {unit}"
 
 
 def _calibration(

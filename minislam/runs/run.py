@@ -51,6 +51,17 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
     )
 
 
+def _require_masks(sequence: Sequence, config: SlamConfig) -> None:
+    """Read every mask once, so that a wrong one is refused before the run."""
+    is_used = config.uncertainty.enabled or sequence.opened_as["input"]["masks"] is None
+    require(is_used, "either --masks or --no-uncertainty", "both; leave one out")
+    for index in range(len(sequence)):
+        if config.uncertainty.takes_masks:
+            required_mask(sequence, index)
+        else:
+            sequence.given_mask(index)
+
+
 def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list[dict[str, float]]:
     """Return the stages of a run: what each shows, and about its seconds on one idle core.
 
@@ -104,13 +115,7 @@ def run_in_folder(
     choice = choice.from_anywhere()
     if choice.features.startswith(FILES) or choice.depth.startswith(FILES):
         sequence.seeks_lens = False  # the files belong to the images as they are
-    is_used = config.uncertainty.enabled or sequence.opened_as["input"]["masks"] is None
-    require(is_used, "either --masks or --no-uncertainty", "both; leave one out")
-    for index in range(len(sequence)):
-        if config.uncertainty.takes_masks:
-            required_mask(sequence, index)
-        else:
-            sequence.given_mask(index)
+    _require_masks(sequence, config)
     priors = choose_priors(choice, sequence, config)
     count = 1 if choice.device != "cpu" else idle_cores() if workers is None else workers
     threads = torch.get_num_threads()
@@ -145,8 +150,8 @@ def run_in_folder(
     except BentLens as found:
         observer.warn(str(found))
         straight = sequence.through_lens(found.lens.focal, *found.lens.radial)
-        anew = lpips, True, False, workers, found
-        return run_in_folder(straight, config, choice, output, observer, *anew)
+        anew = straight, config, choice, output, observer
+        return run_in_folder(*anew, lpips, overwrite=True, workers=workers, bent=found)
     finally:
         torch.set_num_threads(threads)
 

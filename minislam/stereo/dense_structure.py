@@ -52,36 +52,45 @@ def with_swept_depth(
     the same image, because a network errs image by image; where other views look through it, the
     pixel stays empty. With `fills`, if less than half is known, holes take the nearest known depth.
     """
-    small, judges, result = _small(camera, WIDTH), votes.judges(len(keyframes)), []
-    judging: dict[int, votes.SweptView] = {}
-
-    def view(keyframe: Keyframe, depth: Tensor, cost: np.ndarray) -> votes.SweptView:
-        pose, sampled = keyframe.T_camera_world.cpu().numpy(), _nearest(depth, small)
-        inverse_depth = np.where(sampled > 0, 1 / np.maximum(sampled, 1e-6), np.nan)
-        return votes.SweptView(inverse_depth, cost, 0.0, pose)
-
+    small, judging, result = _small(camera, WIDTH), dict[int, votes.SweptView](), []
+    judges = votes.judges(len(keyframes))
     for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
         SHELF.put([depth])
         if index in judges:
-            judging[index] = view(keyframe, depth, 1 - _nearest(confirmation, small))
+            cost = 1 - _nearest(confirmation, small)
+            judging[index] = _as_swept(small, depth, cost, keyframe.T_camera_world)
         confirmation = resample(confirmation, *keyframe.features.shape[:2])
         result.append(replace(keyframe, depth=depth, confirmation=confirmation))
     for index, (keyframe, found) in enumerate(zip(keyframes, result, strict=True)):
         depth = found.depth
         if bool(keyframe.depth.any()):
-            both = (depth > 0) & (keyframe.depth > 0)
-            enough = int(both.sum()) > LEAST_COMMON
-            guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
-            guessed = view(keyframe, guess, np.zeros((small.height, small.width), np.float32))
             others = [judge for at, judge in judging.items() if at != index]
-            agreeing, refuting = votes.count_votes(small, guessed, others)
-            moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
-            moves = resample(moves, *depth.shape) > 0.5
-            depth = torch.where((depth > 0) | moves, depth, guess)
+            depth = _completed(small, keyframe, depth, others)
         SHELF.put([depth])
         result[index] = replace(found, depth=depth)
     shares = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
     return list(map(_filled, result)) if fills and np.mean(shares) < LEAST_KNOWN else result
+
+
+def _completed(
+    small: Camera, keyframe: Keyframe, depth: Tensor, others: list[votes.SweptView]
+) -> Tensor:
+    """Return swept depth (H, W), completed by the keyframe's own where no other view refutes it."""
+    both = (depth > 0) & (keyframe.depth > 0)
+    enough = int(both.sum()) > LEAST_COMMON
+    guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
+    free = np.zeros((small.height, small.width), np.float32)
+    guessed = _as_swept(small, guess, free, keyframe.T_camera_world)
+    agreeing, refuting = votes.count_votes(small, guessed, others)
+    moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
+    moves = resample(moves, *depth.shape) > 0.5
+    return torch.where((depth > 0) | moves, depth, guess)
+
+
+def _as_swept(small: Camera, depth: Tensor, cost: np.ndarray, pose: Tensor) -> votes.SweptView:
+    sampled = _nearest(depth, small)
+    inverse_depth = np.where(sampled > 0, 1 / np.maximum(sampled, 1e-6), np.nan)
+    return votes.SweptView(inverse_depth, cost, 0.0, pose.cpu().numpy())
 
 
 def _filled(keyframe: Keyframe) -> Keyframe:

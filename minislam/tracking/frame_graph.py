@@ -163,7 +163,7 @@ def flow_distances(
         near = rough < COARSE_MARGIN * limit
     distances = disparities.new_full((count, count), FAR)
     for row in rows:
-        near[row, rows.start : row] = False  # known already
+        near[row, rows.start : row : rows.step] = False  # known already
         others = near[row].nonzero()[:, 0]
         this = torch.full_like(others, row)
         mean = 0.5 * (directed(this, others) + directed(others, this))

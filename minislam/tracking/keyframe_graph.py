@@ -250,10 +250,10 @@ class KeyframeGraph(Stateful):
         near = self.neighbour_edges(keyframe)
         return self._covisible_edges(start, newest, near, PROXIMITY_DISTANCE, PROXIMITY_EDGES)
 
-    def global_edges(self) -> list[Edge]:
-        """Return further edges among all keyframes, over many baselines."""
-        all_keyframes = range(len(self.keyframes))
-        return self._covisible_edges(0, all_keyframes, [], GLOBAL_DISTANCE, GLOBAL_EDGES)
+    def global_edges(self, every: int = 1) -> list[Edge]:
+        """Return further edges of all keyframes, or one in so many, over many baselines."""
+        keyframes = range(0, len(self.keyframes), every)
+        return self._covisible_edges(0, keyframes, [], GLOBAL_DISTANCE, GLOBAL_EDGES)
 
     def _covisible_edges(
         self,
@@ -265,7 +265,7 @@ class KeyframeGraph(Stateful):
     ) -> list[Edge]:
         """Return confirmed edges between covisible keyframes, by increasing flow distance."""
         limit *= self.pixel_scale
-        shifted = range(newer.start - start, newer.stop - start)
+        shifted = range(newer.start - start, newer.stop - start, newer.step)
         distances = self.distances(start, shifted, limit)
         existing = self.edges.ends + planned
         taken = [(i - start, j - start) for i, j in existing if min(i, j) >= start]

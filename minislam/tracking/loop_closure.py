@@ -9,16 +9,18 @@ Where the geometry predicts none, `safeguards/revisits.py` looks for one by appe
 import torch
 from torch import Tensor
 
-from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import FAR, both_directions, proximity_pairs
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
-from minislam.tracking.optimisation import FIRST_WIDENING, adjust, bundle_problem
-from minislam.tracking.reprojection import lengths
+from minislam.tracking.optimisation import (
+    FIRST_WIDENING,
+    FITTING_RESIDUAL,
+    adjust,
+    mean_residual,
+)
 from minislam.tracking.safeguards.relocalisation import Relocaliser
 from minislam.tracking.safeguards.revisits import undo_drift
 
 LOOP_SUPPRESSION = 10  # keyframes: no second loop so near to another, official code
-FITTING_LOOP_RESIDUAL = 1.5  # px at 320x240: a loop that is better fits already (diary/tracking.md)
 MAX_LOOP_RESIDUAL = 3.0  # px at 320x240: a loop that stays worse than this is undone
 
 
@@ -53,13 +55,13 @@ def close_loops(graph: KeyframeGraph, relocaliser: Relocaliser | None = None) ->
         edges = _loop_edges(graph) if is_moved else []
     if edges:
         graph.match(edges)
-        fitting = FITTING_LOOP_RESIDUAL * graph.pixel_scale
-        if not is_moved and _residual(graph, first_new) <= fitting:
+        fitting = FITTING_RESIDUAL * graph.pixel_scale
+        if not is_moved and mean_residual(graph, first_new) <= fitting:
             return False
         adjust(graph, 0, iterations, widening=FIRST_WIDENING)
         graph.match(edges)
         adjust(graph, 0, iterations)
-        if _residual(graph, first_new) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
+        if mean_residual(graph, first_new) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
             return True
     graph.keyframes.set_geometry(before.T_camera_world, before.disparities)
     graph.edges.remove_newest(len(graph.edges) - first_new)
@@ -82,11 +84,3 @@ def _is_linked(graph: KeyframeGraph) -> bool:
     newest, gap = len(graph.keyframes) - 1, graph.config.loop_min_gap
     edges = graph.edges.ends
     return any(abs(i - j) >= gap and max(i, j) >= newest - LOOP_SUPPRESSION for i, j in edges)
-
-
-def _residual(graph: KeyframeGraph, first_edge: int) -> float:
-    """Return the weighted mean length of the residuals [px], over edges `first_edge` and later."""
-    problem = bundle_problem(graph, range(first_edge, len(graph.edges)))
-    residual, _ = residuals(problem, graph.state)
-    weight = problem.weights.mean(1)
-    return float((weight * lengths(residual)).sum() / weight.sum().clamp_min(1e-6))

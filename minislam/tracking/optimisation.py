@@ -21,6 +21,9 @@ from minislam.tracking.safeguards.robust import weighted_median
 FIRST_WIDENING = 8.0
 EVERY = 4  # one cell in so many is sampled for the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
+FITTING_RESIDUAL = 1.5  # px at 320x240: new edges that are better fit already (diary/tracking.md)
+SAMPLED = 4  # keyframes: one in so many tells whether new edges fit (diary/time_and_memory.md)
+ENOUGH_EDGES = 8  # that tell it
 
 
 def local_ba(graph: KeyframeGraph) -> None:
@@ -43,7 +46,16 @@ def local_ba(graph: KeyframeGraph) -> None:
 
 
 def online_global_ba(graph: KeyframeGraph) -> None:
-    """Adjust all keyframes while the sequence goes on; flow is measured only on new edges."""
+    """Adjust all keyframes while the sequence goes on; flow is measured only on new edges.
+
+    If those of a sample of the keyframes fit already, nothing has drifted, and it can wait.
+    """
+    sample, first_new = graph.global_edges(every=SAMPLED), len(graph.edges)
+    if len(sample) >= ENOUGH_EDGES:
+        graph.match(sample)
+        if mean_residual(graph, first_new) <= FITTING_RESIDUAL * graph.pixel_scale:
+            return
+        graph.edges.remove_newest(len(sample))
     graph.match(graph.global_edges())
     adjust(graph, 0, graph.config.global_iterations, free_camera=True)
 
@@ -66,6 +78,14 @@ def warm_up_ba(graph: KeyframeGraph, edges: list[Edge], rounds: int) -> None:
     for _ in range(rounds):
         graph.match(edges)
         adjust(graph, 0, graph.config.warmup_iterations, free_camera=True)
+
+
+def mean_residual(graph: KeyframeGraph, first_edge: int) -> float:
+    """Return the weighted mean length of the residuals [px], over edges `first_edge` and later."""
+    problem = bundle_problem(graph, range(first_edge, len(graph.edges)))
+    residual, _ = residuals(problem, graph.state)
+    weight = problem.weights.mean(1)
+    return float((weight * lengths(residual)).sum() / weight.sum().clamp_min(1e-6))
 
 
 def adjust(

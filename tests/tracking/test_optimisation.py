@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
-from minislam.tracking import frame_graph
+from minislam.tracking import frame_graph, optimisation
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.config import TrackingConfig
@@ -18,6 +18,7 @@ from minislam.tracking.optimisation import (
     bundle_problem,
     final_global_ba,
     local_ba,
+    online_global_ba,
     typical_residual,
 )
 from minislam.tracking.safeguards import parts
@@ -223,3 +224,40 @@ def test_adjustments_that_all_fail_are_counted_and_keep_the_state(monkeypatch: p
     final_global_ba(graph)
     assert graph.failed_adjustments == 1 + graph.config.final_rounds
     assert_same_bits(graph.state, before)
+
+
+# Online
+
+
+def drifted(keyframe: int) -> KeyframeGraph:
+    """Return the graph of twelve keyframes, those from one on off by the same motion."""
+    graph = matched(12)
+    for later in range(keyframe, 12):
+        move(graph, later)
+    return graph
+
+
+def test_all_keyframes_are_adjusted_only_if_a_sample_of_new_edges_does_not_fit(monkeypatch):
+    graph = matched(12)
+    every, sampled = len(graph.global_edges()), len(graph.global_edges(optimisation.SAMPLED))
+    assert every > 3 * sampled > 0
+    monkeypatch.setattr(optimisation, "ENOUGH_EDGES", sampled)
+    known, poses = len(graph.edges), graph.keyframes.T_camera_world.clone()
+    online_global_ba(graph)
+    assert len(graph.edges) == known + sampled
+    assert torch.equal(graph.keyframes.T_camera_world, poses)
+
+    graph = drifted(8)
+    assert pose_error(graph, 11) > 0.02
+    expected = known + len(graph.global_edges())
+    online_global_ba(graph)
+    assert len(graph.edges) == expected and pose_error(graph, 11) < 5e-3
+
+
+def test_a_sample_of_few_edges_does_not_tell_whether_all_fit(monkeypatch):
+    graph = matched(12)
+    expected = len(graph.edges) + len(graph.global_edges())
+    enough = len(graph.global_edges(optimisation.SAMPLED)) + 1
+    monkeypatch.setattr(optimisation, "ENOUGH_EDGES", enough)
+    online_global_ba(graph)
+    assert len(graph.edges) == expected
