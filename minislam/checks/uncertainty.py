@@ -16,7 +16,7 @@ from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.losses import variance_regulariser
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.training import RenderingError, uncertainty_loss
-from minislam.uncertainty.weights import MAPPING_CAP, MAPPING_CUT, adjusted_beta, mapping_weight
+from minislam.uncertainty.weights import MAPPING_CAP, MAPPING_CUT, mapping_weight, pixel_weight
 
 
 def check_mapping_weight(student: Function) -> Verdict:
@@ -24,7 +24,7 @@ def check_mapping_weight(student: Function) -> Verdict:
     camera = Camera(5.0, 5.0, 1.0, 0.5, 3, 2)
 
     def uncapped(beta: Tensor) -> Tensor:
-        return 0.5 / adjusted_beta(beta, camera) ** 2
+        return pixel_weight(beta, camera)
 
     def cut(weight: Tensor, most: float = MAPPING_CAP) -> Tensor:
         return torch.where(weight < MAPPING_CUT, 0.0, weight.clamp_max(most))
@@ -39,7 +39,7 @@ def check_mapping_weight(student: Function) -> Verdict:
         (lambda b: uncapped(b).clamp_max(5), "Weights below 0.1 must be 0: little adds up."),
         (lambda b: cut(uncapped(b), 1e9), "No weight is above 5, that of a beta of a quarter."),
         (lambda b: uncapped(b).clamp(0.1, 5), "Weights below 0.1 become 0, not 0.1."),
-        (lambda b: cut(0.5 / (adjusted_beta(b, camera) + 0.1631579) ** 2), "Take off 0.1 first."),
+        (lambda b: cut(uncapped(b.clamp_min(0.1) + 0.1)), "Take off 0.1 first."),
         (lambda beta: cut(0.5 / beta**2), "This is 0.5 / beta^2: beta is adjusted first."),
         (lambda beta: cut(2 * uncapped(beta)), "It is a half by beta_adj^2: 0.5 is missing."),
         (lambda beta: cut((0.5 * uncapped(beta)).sqrt()), "The adjusted beta must be squared."),

@@ -62,8 +62,8 @@ def least_weight(beta_raw: Tensor) -> float:
     upper = beta_raw[bins > split].mean()  # the last bin of the lower mode is `split`
     if not upper > LEAST_UPPER_MODE:  # nan without one
         return weights.MAPPING_CUT
-    cut = weights.stretched(weights.clipped_beta(UPPER_MODE * upper))
-    return max(weights.MAPPING_CUT, weights.WEIGHT_SCALE / float(cut) ** 2)
+    at_cut = weights.weight_of(weights.clipped_beta(UPPER_MODE * upper))
+    return max(weights.MAPPING_CUT, float(at_cut))
 
 
 def is_wrong(error: RenderingError, beta_raw: Tensor, least: float, lambda_depth: float) -> bool:
@@ -74,8 +74,7 @@ def is_wrong(error: RenderingError, beta_raw: Tensor, least: float, lambda_depth
     """
     optimal = 2 * (error.ssim + lambda_depth * error.depth).sqrt()
     excluded, wrong = (
-        weights.WEIGHT_SCALE / weights.stretched(weights.clipped_beta(beta)) ** 2 < least
-        for beta in (beta_raw, optimal)
+        weights.weight_of(weights.clipped_beta(beta)) < least for beta in (beta_raw, optimal)
     )
     excluded &= error.opacity >= SURFACE_OPACITY  # a hole is no error
     return not excluded.any() or float(wrong[excluded].float().mean()) >= LEAST_WRONG

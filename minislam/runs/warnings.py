@@ -164,11 +164,14 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
     is_unknown = graph.seeks_focal and graph.adjustments and not graph.focal_is_free
     if is_unknown and slam.tracker.knows_depth:  # a view at one depth needs none
         origin = slam.sequence.focal_origin
+        told = zoomed = ""
+        if fit is not None and is_other:
+            told = _of_a_half(slam, fit)
+            zoomed = "; if the lens zoomed, run each part for itself" if fit.half else ""
         yield (
             f"the focal length is {f'known from {origin} alone' if origin else 'unknown'} "
-            "and the motion does not tell it"
-            + (_of_a_half(slam, fit) if fit is not None and is_other else "")
-            + ": trajectory and map may be bent; give --fx or a calibration file"
+            f"and the motion does not tell it{told}: trajectory and map may be bent; give --fx or "
+            f"a calibration file{zoomed}"
         )
         return
     change = graph.grid.camera.fx / slam.sequence.camera.fx

@@ -18,8 +18,8 @@ from minislam.images import resample
 
 BETA_FLOOR = 0.1  # smallest beta, official: keeps 1 / beta^2 and log beta finite
 BETA_OFFSET = 1e-3  # added to the clipped beta, official
-TRAIN_FRACTION = 0.3  # x: position in NeRF On-the-go's schedule, fixed in the official code
-SCHLICK_MIDDLE = 0.8  # s: value of that schedule at its middle, x = 1/2, official
+# NeRF On-the-go's schedule 1 + x / (1 + (1 - x) (1/s - 2)), s = 0.8; official: fixed at x = 0.3.
+DATA_RATE = 1 + 0.3 / (1 + (1 - 0.3) * (1 / 0.8 - 2))  # 1.6316
 WEIGHT_SCALE = 0.5  # numerator of the weight, official
 TRACKING_CAP = 1.0  # beta may lower the weight that the flow confidence gives, not raise it
 BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: what the capped SSIM alone gives
@@ -28,14 +28,6 @@ MAPPING_CUT = 0.1
 BETA_CUT = 1.41  # the beta_raw of that weight
 STATIC_FRACTION = 0.1  # ours: so much of a frame counts fully in tracking, whatever its beta [-]
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
-
-
-def schlick_bias(position: float, middle: float) -> float:
-    """Return x / (1 + (1 - x) (1/s - 2)), Schlick's bias of x in [0, 1], which is s at x = 1/2."""
-    return position / (1 + (1 - position) * (1 / middle - 2))
-
-
-DATA_RATE = 1 + schlick_bias(TRAIN_FRACTION, SCHLICK_MIDDLE)  # 1.6316
 
 
 def clipped_beta(beta_raw: Tensor) -> Tensor:
@@ -48,14 +40,14 @@ def beta_of_mask(moving: Tensor) -> Tensor:
     return torch.where(moving, BETA_OF_MASK, BETA_FLOOR)
 
 
-def stretched(beta: Tensor) -> Tensor:
-    """Return beta_adj of a clipped beta, of any shape."""
-    return (beta - BETA_FLOOR) * DATA_RATE + BETA_FLOOR
+def weight_of(beta: Tensor) -> Tensor:
+    """Return w = 0.5 / beta_adj^2 of a clipped beta, of any shape."""
+    return WEIGHT_SCALE / ((beta - BETA_FLOOR) * DATA_RATE + BETA_FLOOR) ** 2
 
 
-def adjusted_beta(beta_raw: Tensor, camera: Camera) -> Tensor:
-    """Return the stretched beta (H, W) of a grid (h', w'), without gradient."""
-    return stretched(resample(clipped_beta(beta_raw.detach()), camera.height, camera.width))
+def pixel_weight(beta_raw: Tensor, camera: Camera) -> Tensor:
+    """Return the weight w (H, W) of the beta of a grid (h', w'), without gradient."""
+    return weight_of(resample(clipped_beta(beta_raw.detach()), camera.height, camera.width))
 
 
 def mapping_weight(
@@ -64,7 +56,7 @@ def mapping_weight(
     least: float = MAPPING_CUT,  # a smaller weight is 0
 ) -> Tensor:  # (H, W) 0, or from `least` to 5
     """Return the weight of each pixel in L_render, Eq. (6): 0.5 / beta_adj^2, cut and capped."""
-    weight = (WEIGHT_SCALE / adjusted_beta(beta_raw, camera) ** 2).clamp_max(MAPPING_CAP)
+    weight = pixel_weight(beta_raw, camera).clamp_max(MAPPING_CAP)
     return torch.where(weight < least, 0, weight)
 
 
@@ -74,8 +66,7 @@ def tracking_weight(
     stride: int,  # px between grid cells of the tracker
 ) -> Tensor:  # (ceil(H / stride), ceil(W / stride)) in (0, 1]
     """Return the weight of each tracker cell in Eq. (5), sampled at pixels (stride i, stride j)."""
-    weight = WEIGHT_SCALE / adjusted_beta(beta_raw, camera)[::stride, ::stride] ** 2
-    return weight.clamp_max(TRACKING_CAP)
+    return pixel_weight(beta_raw, camera)[::stride, ::stride].clamp_max(TRACKING_CAP)
 
 
 def relative_weight(weight: Tensor) -> Tensor:  # both (h, w) in (0, 1]

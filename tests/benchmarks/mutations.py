@@ -21,7 +21,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("signs[2] = -1.0", "signs[2] = 1.0"), ("target_mean - scale *", "target_mean -"),
     ],
     ("uncertainty/weights.py", "uncertainty/test_weights.py"): [
-        ("1 + (1 - position)", "1 - (1 - position)"), (".clamp_max(TRACKING_CAP)", ""),
+        ("1 / 0.8 - 2", "1 / 0.8 + 2"), (".clamp_max(TRACKING_CAP)", ""),
         ("torch.where(weight < least", "torch.where(weight > least"),
         ("weight.quantile(1 - STATIC_FRACTION)", "weight.quantile(STATIC_FRACTION)"),
         ("(weight / weight.quantile(1 - STATIC_FRACTION))", "weight"),
@@ -105,7 +105,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("max(residual, MIN_RESIDUAL)", "residual"), ("min(width, self.scale)", "width"),
     ],
     ("tracking/optimisation.py", "tracking/test_optimisation.py"): [
-        ("settled=is_last", "settled=True"),
+        ("settled=is_last", "settled=True"), ("(sample) >= ENOUGH", "(sample) < ENOUGH"),
         ("0, len(problem.rays), EVERY", "0, len(problem.rays) // 2, EVERY"),
         ("lengths(residual), weights[:, 0]", "lengths(residual), 1 + 0 * weights[:, 0]"),
         ("static[:, None]", "of_cell[source][:, None]"),

@@ -14,10 +14,9 @@ from minislam.mapping.safeguards import (
 from minislam.uncertainty import RenderingError
 from minislam.uncertainty.weights import (
     MAPPING_CUT,
-    WEIGHT_SCALE,
     clipped_beta,
     mapping_weight,
-    stretched,
+    weight_of,
 )
 from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_keyframe
 
@@ -57,10 +56,10 @@ def test_what_moves_in_this_clip_is_excluded_though_its_beta_is_below_the_usual_
 
 def test_the_last_bin_of_the_lower_mode_is_no_part_of_the_upper_one():
     lower, upper = torch.linspace(0.19, 0.195, 9000), torch.linspace(1.2, 1.5, 1000)
-    cut = stretched(clipped_beta(0.75 * upper.mean()))
+    at_cut = weight_of(clipped_beta(0.75 * upper.mean()))
     found = least_weight(torch.cat([lower, upper]))
     assert found > MAPPING_CUT
-    assert found == pytest.approx(WEIGHT_SCALE / float(cut) ** 2, rel=1e-3)
+    assert found == pytest.approx(float(at_cut), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +94,7 @@ HOLE, ELSEWHERE = (1.1, 0.0, 0.0, 0.5), (0.8, 4.0, 0.0, 1.0)
 )
 def test_an_upper_mode_is_kept_where_the_map_explains_most_of_it(cells, expected: bool):
     beta, ssim, depth, opacity = torch.tensor(cells).T
-    least = WEIGHT_SCALE / float(stretched(clipped_beta(torch.tensor(0.86)))) ** 2
+    least = float(weight_of(clipped_beta(torch.tensor(0.86))))
     assert is_wrong(RenderingError(ssim, depth, opacity), beta, least, 0.2) == expected
 
 

@@ -91,6 +91,10 @@ WARNINGS = [
         {"seeks_focal": True, "focal_length": ZOOMED},
         "tell it, but from frame 8 to 15 the flow fits --fx 762 best, with 52% less cost: traj",
     ),
+    (
+        {"seeks_focal": True, "focal_length": ZOOMED},
+        "give --fx or a calibration file; if the lens zoomed, run each part for itself",
+    ),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
     ({"parallax": [0.1], "knows_depth": False}, "and all that the map shows is at one depth"),
     ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),

@@ -5,12 +5,11 @@ from minislam.geometry import Camera
 from minislam.uncertainty.weights import (
     BETA_CUT,
     DATA_RATE,
-    adjusted_beta,
     beta_of_mask,
     clipped_beta,
     mapping_weight,
+    pixel_weight,
     relative_weight,
-    schlick_bias,
     tracking_weight,
 )
 
@@ -24,10 +23,8 @@ def grid(value: float) -> torch.Tensor:
 # Known answers
 
 
-def test_schlick_bias_and_the_constants_made_from_it():
-    assert schlick_bias(0.3, 0.8) == pytest.approx(0.6315789, abs=1e-7)
-    assert DATA_RATE == pytest.approx(1.6315789, abs=1e-7)
-    assert 100 + 900 * schlick_bias(0.3, 0.8) == pytest.approx(668.4211, abs=1e-4)
+def test_the_rate_is_that_of_the_official_schedule():
+    assert pytest.approx(1.6315789, abs=1e-7) == DATA_RATE
 
 
 @pytest.mark.parametrize(
@@ -51,8 +48,10 @@ def test_weight_table(beta_raw, mapping, tracking):
     assert weight == pytest.approx(tracking, abs=5e-4)
 
 
-def test_smallest_adjusted_beta_is_0_1016():
-    assert float(adjusted_beta(grid(0.02), CAMERA).min()) == pytest.approx(0.101632, abs=1e-6)
+def test_the_largest_weight_is_that_of_an_adjusted_beta_of_0_1016():
+    assert float(pixel_weight(grid(0.02), CAMERA).max()) == pytest.approx(
+        0.5 / 0.101632**2, rel=1e-5
+    )
 
 
 def test_thresholds_of_the_weights_one_and_zero():
@@ -91,15 +90,11 @@ def test_relative_weights_do_not_depend_on_the_level_and_leave_a_well_explained_
     assert torch.equal(relative_weight(weight), weight)
 
 
-def test_bias_with_slope_one_half_is_the_identity():
-    assert schlick_bias(0.37, 0.5) == pytest.approx(0.37)
-
-
 def test_tracking_weight_is_sampled_at_the_pixels_of_the_camera_grid():
     beta = torch.linspace(0.3, 2.0, 12).reshape(3, 4)
     weight = tracking_weight(beta, CAMERA, 5)
     pixels = CAMERA.pixel_grid(5).long()
-    full = (0.5 / adjusted_beta(beta, CAMERA) ** 2).clamp_max(1)
+    full = pixel_weight(beta, CAMERA).clamp_max(1)
     assert torch.equal(weight, full[pixels[..., 1], pixels[..., 0]])
 
 
