@@ -78,7 +78,7 @@ class RecordedSequence:
         self._kept: dict[int, np.ndarray] = {}  # working images on the shelf, by frame index
 
         height, width = (image := images.read(self._chosen[0])).shape[:2]
-        picture = picture_window(images.lit_extents, width, height)
+        picture = picture_window(images.lit_fractions, width, height)
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
         self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels, picture)

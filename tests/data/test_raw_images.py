@@ -105,11 +105,14 @@ def test_images_far_apart_tell_what_is_not_black(tmp_path: Path):
         (video.images, [0, 1, 2, 4, 8, 16, 32]),
         (folder.images, [0, 1, 2, 4, 8, 32]),
     ):
-        expected = [[index, 8, index, 39] for index in sampled]
-        np.testing.assert_allclose(images.lit_extents, expected, atol=2)
+        assert len(images.lit_fractions) == len(sampled)
+        for index, (columns, rows) in zip(sampled, images.lit_fractions, strict=True):
+            np.testing.assert_allclose(np.flatnonzero(columns), index, atol=2)
+            np.testing.assert_allclose(np.flatnonzero(rows)[[0, -1]], [8, 39], atol=2)
     cv2.imwrite(str(tmp_path / "b/00.png"), frames[0][::2])  # of another size than the others
     folder = read_image_folder(tmp_path / "b")
-    assert folder.images.lit_extents[:2] == [[1, 8, 1, 39], [2, 8, 2, 39]]
+    lit = [np.flatnonzero(columns) for columns, _ in folder.images.lit_fractions]
+    assert [index.tolist() for index in lit[:2]] == [[1], [2]]
 
 
 # Damage
