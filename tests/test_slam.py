@@ -38,7 +38,7 @@ COMMAND = ["run", *INPUT, "--preset", "test"]
 METRICS = [
     "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
     "psnr_novel_oriented_db",
-    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db",
+    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db", "far_worse",
     "psnr_unseen_db", "focal_length_px", "seconds_total",
     "frames_per_second", "peak_memory_mb",
     "left_out", "shown_static", "guessed_depth",

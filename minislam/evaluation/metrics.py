@@ -21,6 +21,7 @@ Render = Callable[[np.ndarray], np.ndarray]  # T_world_camera (4, 4) -> RGB (H, 
 ImageDistance = Callable[[np.ndarray, np.ndarray], float]  # rendered, true (H, W, 3) RGB
 MIN_MASK = 20  # px of dynamic objects below which a view does not measure ghosts
 CENTIMETRES = 100.0  # per world unit of the truth, which is metric
+FAR_WORSE = 6.0  # dB below the median of all views: twice as large an error
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def measure_run(
     names = [
         "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
         "psnr_novel_oriented_db", "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm",
-        "psnr_static_db",
+        "psnr_static_db", "far_worse",
     ]  # fmt: skip
     names += ["lpips_novel", "lpips_input"] if lpips is not None else []
     metrics: dict[str, float | None] = dict.fromkeys(names)
@@ -73,6 +74,8 @@ def measure_run(
     for name in names:
         if found := [value for of, value in errors if of == name]:
             metrics[name] = float(np.mean(found))
+    if static := [value for of, value in errors if of == "psnr_static_db"]:
+        metrics["far_worse"] = float(np.mean(np.array(static) < np.median(static) - FAR_WORSE))
     if betas:  # over all images of the map
         beta, masks = (np.stack(parts) for parts in zip(*betas, strict=True))
         if masks.any() and not masks.all():  # else there is nothing to separate

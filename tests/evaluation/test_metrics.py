@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 24, 32
 NAMES = [
     "ate_all_cm", "ate_keyframes_cm", "ate_straight_line_cm", "psnr_novel_db", "ssim_novel",
     "psnr_novel_oriented_db",
-    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db",
+    "psnr_input_db", "psnr_masked_db", "beta_auroc", "depth_l1_cm", "psnr_static_db", "far_worse",
 ]  # fmt: skip
 TURN = random_transforms(1, "normal", 1)[0].numpy()
 TO_ESTIMATE = Similarity(0.4, TURN[:3, :3], TURN[:3, 3])  # the world of the map is another one
@@ -113,7 +113,17 @@ def test_how_well_the_map_fits_what_stands_still_needs_no_truth():
     views = [MappedView(k, grey(0.5), static_psnr=found) for k, found in enumerate((20, None, 24))]
     for truth in (None, Truth()):
         metrics = measured(truth, views)
-        assert known(metrics) == {"psnr_static_db"} and metrics["psnr_static_db"] == 22
+        assert known(metrics) == {"psnr_static_db", "far_worse"}
+        assert (metrics["psnr_static_db"], metrics["far_worse"]) == (22, 0)
+
+
+def test_images_that_the_map_shows_far_worse_than_most_are_counted():
+    found = [30.0, 29.0, 31.0, 23.1, 22.9, 17.0]  # median 26.05
+    views = [MappedView(k, grey(0.5), static_psnr=value) for k, value in enumerate(found)]
+    assert measured(None, views)["far_worse"] == pytest.approx(1 / 6)
+    found = [30.0, 29.0, 31.0, 30.0, 23.6, 23.4]  # median 29.5
+    views = [MappedView(k, grey(0.5), static_psnr=value) for k, value in enumerate(found)]
+    assert measured(None, views)["far_worse"] == pytest.approx(1 / 6)
 
 
 # Known answers
