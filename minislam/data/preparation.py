@@ -138,6 +138,8 @@ def picture_window(
     In most images a bar ends at the same place, a thing on a black ground does not. Beta would
     learn that a bar is no part of the scene, and take all that is black for a part of the bar.
     """
+    if not lit:  # none could be decoded
+        return 0, 0, width, height
     window, areas = [], np.array([columns.mean() for columns, _ in lit])
     is_bright = areas >= max(FADED * areas.max(), 1e-9)
     for axis, side in ((0, width), (1, height)):

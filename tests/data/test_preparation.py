@@ -151,6 +151,7 @@ def test_what_is_dark_is_no_bar():
     assert window_of(barred(0, 14, 0, 16, value=24)) == (0, 0, 200, 100)  # all is black
     lit = barred(0, 14, 0, 16)
     lit[3, 60] = 25  # a star
+    assert picture_window([], 200, 100) == (0, 0, 200, 100)  # no image could be decoded
     assert window_of(lit) == (0, 5, 200, 77)
 
 
