@@ -100,49 +100,75 @@ def lowest_minimum(
 ) -> Found:
     """Return the geometry of the warm-up that is most plausible, adjusted with its camera.
 
-    The focal length stays as guessed if it is not observable and another saves little cost. A
-    readout that saves little stays 0: it would follow noise or movers. Of few keyframes both stay.
+    The graph takes a readout that is told, and is told whether the focal length is free from now
+    on. Of few keyframes both stay as guessed.
     """
-    tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
-    seeks_focal = graph.seeks_focal and tells_camera
-    workers, positions = workers or Workers(), list(range(len(graph.edges)))
+    search = _Search(graph, workers or Workers())
+    found = at_guess = minima(search.problem, start(0.0), search.workers)
+    if search.seeks_focal:
+        others = (minima(search.problem, start(log), search.workers) for log in OTHER_FOCALS)
+        found = search.adjusted(search.free, [*found, *itertools.chain(*others)])
+    chosen = search.with_readout(found) or search.best(found)
+    return search.with_focal(chosen, at_guess) if search.seeks_focal else chosen
 
-    def adjusted(problem: BundleProblem, found: list[Found]) -> list[Found]:
+
+class _Search:
+    """The search for the unknowns of the camera among the minima of a warm-up."""
+
+    def __init__(self, graph: KeyframeGraph, workers: Workers) -> None:
+        self.graph, self.workers = graph, workers
+        self.tells_camera = len(graph.keyframes) >= LEAST_KEYFRAMES
+        self.seeks_focal = graph.seeks_focal and self.tells_camera
+        self.positions = list(range(len(graph.edges)))
+        self.problem = bundle_problem(graph, self.positions)
+
+    @property
+    def free(self) -> BundleProblem:
+        """The problem with an unknown focal length, if it is to be found."""
+        return replace(self.problem, free_focal=self.seeks_focal)
+
+    def adjusted(self, problem: BundleProblem, found: list[Found]) -> list[Found]:
+        """Adjust some results again; return the first of those that meet in one minimum."""
         calls = [(problem, state, WIDENINGS[1:], ITERATIONS) for state, _ in found]
-        return _each_once(workers.map(adjust_narrowing, calls))
+        return _each_once(self.workers.map(adjust_narrowing, calls))
 
-    def best(found: list[Found]) -> Found:
-        if not graph.seeks_focal:
+    def best(self, found: list[Found]) -> Found:
+        """Return the most plausible result; under a given focal length, that of lowest cost."""
+        if not self.graph.seeks_focal:
             return min(found, key=cost_of)
-        return most_plausible(graph.grid, graph.keyframes.prior_disparities, found)
+        return most_plausible(self.graph.grid, self.graph.keyframes.prior_disparities, found)
 
-    problem = bundle_problem(graph, positions)
-    free = replace(problem, free_focal=seeks_focal)
-    found = at_guess = minima(problem, start(0.0), workers)
-    if seeks_focal:
-        others = (minima(problem, start(log_focal), workers) for log_focal in OTHER_FOCALS)
-        found = adjusted(free, [*found, *itertools.chain(*others)])
-    chosen = best(found)
-    columns = graph.shutter.edge_columns(positions) if tells_camera else None
-    if columns is not None and columns.any():
-        rolled = best(adjusted(replace(free, shutter=columns), found))
+    def with_readout(self, found: list[Found]) -> Found | None:
+        """Let the graph take the readout that fits best; return the geometry with it.
+
+        A readout that saves little stays 0, because it would follow noise or movers; then None.
+        """
+        shutter = self.graph.shutter
+        columns = shutter.edge_columns(self.positions) if self.tells_camera else None
+        if columns is None or not columns.any():
+            return None
+        rolled = self.best(self.adjusted(replace(self.free, shutter=columns), found))
         saves = cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found))
-        if saves and graph.shutter.is_possible(rolled[0].readout):
-            graph.shutter.take(rolled[0].readout)
-            problem = bundle_problem(graph, positions)  # corrected
-            free = replace(problem, free_focal=seeks_focal)
-            chosen = adjust_narrowing(free, rolled[0], WIDENINGS[2:], ITERATIONS)
-    if not seeks_focal:
+        if not (saves and shutter.is_possible(rolled[0].readout)):
+            return None
+        shutter.take(rolled[0].readout)
+        self.problem = bundle_problem(self.graph, self.positions)  # of the corrected flow
+        return adjust_narrowing(self.free, rolled[0], WIDENINGS[2:], ITERATIONS)
+
+    def with_focal(self, chosen: Found, at_guess: list[Found]) -> Found:
+        """Return the geometry with its own focal length, which is free from now on.
+
+        If that is not observable and saves little, return the best one with the guessed one.
+        """
+        own = replace(chosen[0], log_focal=0.0), chosen[1]  # the same geometry under the guess
+        held = self.adjusted(self.problem, [own])
+        fit, fitted = fit_focal_length(self.problem, held[0][0], self.workers, chosen[0])
+        if fit.factor is not None:
+            chosen = adjust_narrowing(self.free, fitted, WIDENINGS[2:], ITERATIONS)
+        else:
+            held = _each_once([*held, *self.adjusted(self.problem, at_guess)])
+            saving = 1 - cost_of(chosen) / min(map(cost_of, held))
+            if abs(chosen[0].log_focal) > FARTHEST or saving <= FOCAL_WORTH_SAVING:
+                return self.best(held)
+        self.graph.focal_is_free = True
         return chosen
-    own = replace(chosen[0], log_focal=0.0), chosen[1]  # the same geometry under the guess
-    held = adjusted(problem, [own])
-    fit, fitted = fit_focal_length(problem, held[0][0], workers, chosen[0])
-    if fit.factor is not None:
-        chosen = adjust_narrowing(free, fitted, WIDENINGS[2:], ITERATIONS)
-    else:
-        held = _each_once([*held, *adjusted(problem, at_guess)])
-        saving = 1 - cost_of(chosen) / min(map(cost_of, held))
-        if abs(chosen[0].log_focal) > FARTHEST or saving <= FOCAL_WORTH_SAVING:
-            return best(held)
-    graph.focal_is_free = True
-    return chosen
