@@ -27,7 +27,7 @@ NEARLY_ALL = 0.7  # of them: 187 runs have .59 and less, five that are wrong .80
 MOST_GUESSED = 0.7
 LARGEST_CHANGE = 4.0  # of a focal length by the run, either way; lenses lie nearer to the guess [-]
 BROKEN = "the trajectory is broken"  # how a warning of breaks begins
-_FAR_APART = "If the images lie far apart, give more frames per second (a smaller --stride)"
+_FAR_APART = "If the images lie far apart, give more from between them (a smaller --stride)"
 
 
 def alarms(slam: Slam) -> Iterator[str]:
@@ -163,7 +163,8 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
     is_other = fit is not None and fit.is_doubtful and not is_broken
     is_unknown = graph.seeks_focal and graph.adjustments and not graph.focal_is_free
     if is_unknown and slam.tracker.knows_depth:  # a view at one depth needs none
-        origin = slam.sequence.focal_origin
+        fitted = "the lens that the flow fits"
+        origin = fitted if slam.undone_lens else slam.sequence.focal_origin
         told = zoomed = ""
         if fit is not None and is_other:
             told = _of_a_half(slam, fit)

@@ -112,6 +112,12 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
     assert words in warning
 
 
+def test_a_lens_that_was_found_is_not_said_to_be_given():
+    lens = LensFit(300.0, (-0.1, 0.02), -0.07, 0.13)
+    run = finished(undone_lens=lens, seeks_focal=True, focal_origin="intrinsics given")
+    assert "is known from the lens that the flow fits alone and" in list(warnings(run))[1]
+
+
 def test_keyframes_without_depth_are_warned_of_where_a_prior_was_given():
     run = finished()
     run.tracker.keyframes = KeyframeStore(torch.zeros(2))
