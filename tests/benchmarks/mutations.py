@@ -140,7 +140,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
      "tracking/safeguards/test_motion_memory_overlay.py"): [
         ("counts & (flow < STANDS)", "flow < STANDS"),
         ("> MOVES", "> 0"), (">= ALWAYS", "> 0"), ("len(still) < MIN_PAIRS", "not still"),
-        ("2 * REACH + 1, 1, REACH", "REACH + 1, 1, REACH // 2"),
+        ("2 * REACH + 1, 1, REACH", "REACH + 1, 1, REACH // 2"), ("* of_matched /", "/"),
         ("matches.confidences * overlay", "matches.confidences * (1 - overlay)"),
     ],
     ("tracking/initialisation.py", "tracking/test_tracker_overlay.py"): [

@@ -150,7 +150,11 @@ def without_overlay(matches: FlowMatches, overlay: Tensor | None) -> FlowMatches
     """Return matches in which no cell of an overlay counts, by its `overlay_weights`.
 
     Its zero flow would delay keyframes, and its low motion weight would spread by wrong matches.
+    Its cells, which always match, would hide that the camera is lost.
     """
     if overlay is None:
         return matches
-    return replace(matches, confidences=matches.confidences * overlay)
+    kept = matches.confidences * overlay
+    of_matched = kept.sum((1, 2)) / matches.confidences.sum((1, 2)).clamp_min(1e-6)
+    ratios = matches.matched_ratios * of_matched / overlay.mean().clamp_min(1e-6)
+    return replace(matches, confidences=kept, matched_ratios=ratios.clamp_max(1))

@@ -36,7 +36,15 @@ def test_an_overlay_counts_in_no_match():
     seen = without_overlay(matches, overlay)
     assert torch.equal(seen.confidences > 0, (overlay > 0).expand_as(seen.confidences))
     assert torch.equal(seen.targets, matches.targets)
+    assert seen.matched_ratios.tolist() == pytest.approx([1.0])
     assert without_overlay(matches, None) is matches
+
+
+def test_an_overlay_alone_is_no_match():
+    lost, overlay = flow(LOGO), 1 - LOGO.reshape(-1).float()
+    lost.confidences[..., overlay > 0] = 0
+    lost.matched_ratios[:] = 0.2
+    assert float(without_overlay(lost, overlay).matched_ratios) == 0
 
 
 def test_most_of_the_time_is_enough():
