@@ -21,12 +21,12 @@ class FirstFrame(Stateful):
 
     best: int = 0  # first frame of the best start that was given up
     worth: Worth = (False, 0)  # of the best start
-    is_repeated: bool = False  # all starts were tried, the best is the last
+    is_chosen: bool = False  # all starts were tried: frames that are lost later change nothing
 
     def next_frame(self, tracker: Tracker, count: int) -> int | None:
         """Return which of `count` frames the tracker shall see next, None after the last."""
         tracked, is_over = tracker.tracked, len(tracker.tracked) == count
-        is_open = (is_over or not tracker.initialised) and not self.is_repeated
+        is_open = (is_over or not tracker.initialised) and not self.is_chosen
         if len(tracker.keyframes) and is_open:
             start = tracker.keyframes.frames[0].frame_index
             followed = [t.frame_index for t in tracked[start:] if t.status.is_followed]
@@ -38,9 +38,12 @@ class FirstFrame(Stateful):
                     self.best, self.worth = start, worth
                 begin_anew(tracker, followed[-1] + 1)
             elif is_over and worth < self.worth:
-                self.is_repeated = True
+                self.is_chosen = True
                 begin_anew(tracker, self.best)
-        return len(tracked) if len(tracked) < count else None
+        if len(tracked) < count:
+            return len(tracked)
+        self.is_chosen = True
+        return None
 
 
 def has_warmed_up(tracker: Tracker) -> bool:

@@ -1,6 +1,7 @@
 """A start that nothing can be matched with is lost; the frames after it are not."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -145,8 +146,8 @@ def shot(scene: float, count: int, pace: float = PACE) -> list[Tensor]:
     return [torch.tensor([scene, k * pace, 0.0]).repeat(size) for k in range(count)]
 
 
-def followed_in(images: Sequence[Tensor]) -> tuple[list[int], Tracker]:
-    """Track images to their end; return which have poses."""
+def followed_in(images: Sequence[Tensor]) -> tuple[list[int], Tracker, FirstFrame]:
+    """Track images to their end; return which have poses, tracker and choice."""
 
     def static(keyframe: int) -> Tensor:
         return torch.ones(GRID.shape)
@@ -163,12 +164,12 @@ def followed_in(images: Sequence[Tensor]) -> tuple[list[int], Tracker]:
     assert [frame.frame_index for frame in tracker.tracked] == list(range(len(frames)))
     assert flow.frames == set(range(len(tracker.keyframes)))
     assert len(tracker.graph.flow_to_next) == len(tracker.keyframes) - 1
-    return [t.frame_index for t in tracker.tracked if t.status.is_followed], tracker
+    return [t.frame_index for t in tracker.tracked if t.status.is_followed], tracker, first_frame
 
 
 @pytest.mark.parametrize("first, second", [(14, 14), (8, 20), (20, 8), (30, 30), (14, 13), (1, 2)])
 def test_of_two_scenes_the_longer_is_kept(first: int, second: int):
-    followed, tracker = followed_in(shot(1, first) + shot(2, second))
+    followed, tracker, _ = followed_in(shot(1, first) + shot(2, second))
     kept = range(first) if first > second else range(first, first + second)
     assert followed == list(kept)
     assert tracker.keyframes.frames[0].frame_index == kept[0]
@@ -178,10 +179,18 @@ def test_of_two_scenes_the_longer_is_kept(first: int, second: int):
 
 def test_a_start_that_was_given_up_is_repeated_if_none_was_better():
     images = shot(1, 9) + shot(BLACK, 12) + shot(2, 4)
-    followed, tracker = followed_in(images)
+    followed, tracker, _ = followed_in(images)
     assert followed == list(range(9))
     statuses = {frame.status for frame in tracker.tracked[9:]}
     assert statuses == {TrackingStatus.LOST}
+
+
+def test_frames_that_are_lost_after_the_choice_change_it_no_longer():
+    images = shot(1, 20, pace=0.0)
+    _, tracker, first = followed_in(images)
+    for index in (17, 18, 19):
+        tracker.tracked[index] = replace(tracker.tracked[index], status=TrackingStatus.LOST)
+    assert first.next_frame(tracker, len(images)) is None and len(tracker.keyframes)
 
 
 def test_without_a_depth_prior_a_title_that_stands_is_worth_less_than_a_scene_that_moves():
@@ -201,7 +210,7 @@ def test_an_old_view_that_returns_is_followed_again():
 
 def test_an_interrupted_choice_goes_on(tmp_path: Path):
     given, restored = FirstFrame(), FirstFrame()
-    given.best, given.worth, given.is_repeated = 7, (True, 9), True
+    given.best, given.worth, given.is_chosen = 7, (True, 9), True
     write_checkpoint(tmp_path / "a.npz", given.saved_state())
     restored.restore_state(read_checkpoint(tmp_path / "a.npz"), lambda index: None)
     assert vars(restored) == vars(given)
