@@ -49,15 +49,17 @@ class SourceFrame:
     source: str  # name of its image file, or of its video with the number in it
     keyframe: bool
     exposure: list[float] | None = None  # of an image of the map: brightness over the map's
+    mapped: bool = True  # of a broken run: in the piece that the map shows
 
 
 def scene_of(slam: Slam) -> dict[str, Any]:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
-    mapped = slam.tracker.watch.longest_piece(slam.poses)
+    name = sequence.source_name
+    mapped = slam.tracker.watch.longest_piece(slam.poses) or range(len(slam.tracker.tracked))
     exposures = {index: e.tolist() for index, e in slam.mapper.exposures.items()}
     frames = [
-        SourceFrame(i, t.timestamp, sequence.source_name(i), i in keyframes, exposures.get(i))
+        SourceFrame(i, t.timestamp, name(i), i in keyframes, exposures.get(i), i in mapped)
         for i, t in enumerate(slam.tracker.tracked)
     ]
     return {
@@ -67,7 +69,6 @@ def scene_of(slam: Slam) -> dict[str, Any]:
         "background": slam.mapper.background.tolist(),
         "least_weight": slam.mapper.least_weight,
         "preparation": sequence.preparation,
-        "mapped_frames": [min(mapped), max(mapped) + 1] if mapped else [None],
         "frames": [asdict(frame) for frame in frames],
     }
 
@@ -97,7 +98,6 @@ class Run:
             self.background = np.array(scene["background"], np.float32).reshape(3)
             self.least_weight = float(scene.get("least_weight", MAPPING_CUT))  # of a static pixel
             self.frames = [SourceFrame(**frame) for frame in scene["frames"]]
-            self._mapped = self.frames[slice(*scene.get("mapped_frames", [None]))]
         except (KeyError, TypeError, ValueError) as error:
             found = f"{error!r} in {path}; repeat the run, or restore the file"
             raise InputError(f"expected camera.json of a run, found {found}") from error
@@ -120,13 +120,13 @@ class Run:
         """
         rows = zip(self.trajectory.timestamps, self.trajectory.T_world_camera, strict=True)
         found = {round(stamp, 6): pose for stamp, pose in rows}
-        stamps = {frame.index: round(frame.timestamp, 6) for frame in self._mapped}
+        stamps = {frame.index: round(frame.timestamp, 6) for frame in self.frames if frame.mapped}
         return {index: found[stamp] for index, stamp in stamps.items() if stamp in found}
 
     @property
     def keyframes(self) -> list[int]:
         """Return the frame indices of the keyframes, like `poses`."""
-        return [frame.index for frame in self._mapped if frame.keyframe]
+        return [frame.index for frame in self.frames if frame.mapped and frame.keyframe]
 
     @property
     def warnings_of_breaks(self) -> list[str]:

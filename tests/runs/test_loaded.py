@@ -74,6 +74,16 @@ def test_a_broken_run_maps_the_longest_piece_and_marks_the_break(tmp_path: Path,
         run.plot(2)
 
 
+def test_of_a_piece_in_two_stretches_the_frames_between_them_are_not_shown(
+    tmp_path: Path, monkeypatch
+):
+    monkeypatch.setattr(diagnostics, "find_breaks", lambda _: [diagnostics.Break(3, 3)])
+    monkeypatch.setattr(diagnostics, "pieces", lambda *_: [[(0, 3), (7, 9)], [(4, 6)]])
+    options = {"stride": 3, "max_frames": 10, "size": (96, 72), "preset": "test", "quiet": True}
+    run = minislam.run("synth:person", tmp_path / "run", **options)
+    assert list(run.poses) == [0, 1, 2, 3, 7, 8, 9] and not {*run.keyframes} & {4, 5, 6}
+
+
 def test_depth_is_that_of_the_surface_and_a_camera_can_be_given(run: minislam.Run):
     pose = run.poses[run.keyframes[0]]
     depth = run.render_depth(pose)
