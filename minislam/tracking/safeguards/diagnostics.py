@@ -279,7 +279,7 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
             start = index - LONG + 1 if weak >= LONG else index
             first = diagnostics[start].frame_index
             if found and start - last <= HEALED_AFTER:
-                first = found.pop().first_frame
+                first = min(first, found.pop().first_frame)
             found.append(Break(first, keyframe.frame_index))
             last = index
     return found

@@ -217,6 +217,7 @@ def test_a_keyframe_without_links_is_reported_as_such():
         ([HEALTHY, LOOSE, HEALTHY], [Break(10, 10)]),
         ([HEALTHY, WEAK, WEAK, HEALTHY], []),
         ([HEALTHY, WEAK, WEAK, WEAK, WEAK, HEALTHY], [Break(10, 40)]),
+        ([HEALTHY, WEAK, UNEXPLAINED, WEAK, HEALTHY], [Break(10, 30)]),
         ([HEALTHY, (0.97, 0.02, 0.2, 0.48)], []),
         ([FAINT] * 3, [Break(0, 20)]),
         ([FAINT, FIRM, FAINT, FAINT], []),  # wide photos
