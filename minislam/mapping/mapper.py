@@ -182,7 +182,7 @@ class Mapper(JointOptimisation):
         errors = [vars(v.error).values() for v in self._workers.stream(view_gradients, calls)]
         error = RenderingError(*map(torch.stack, zip(*errors, strict=True)))
         beta = torch.stack([self.beta_of(keyframe) for keyframe in sample])
-        if safeguards.is_wrong(error, beta, least, self.uncertainty.lambda_depth):
+        if safeguards.is_wrong(error, beta, least, self.uncertainty):
             self.least_weight = least
             self._replace_dynamic_gaussians()
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.splatting import GaussianMap, render
-from minislam.uncertainty import RenderingError, weights
+from minislam.uncertainty import RenderingError, UncertaintyConfig, weights
 from minislam.uncertainty.losses import SURFACE_OPACITY
 
 # The rendering error of a confirmed cell fades: where it stands still, the map is wrong. [-]
@@ -66,13 +66,16 @@ def least_weight(beta_raw: Tensor) -> float:
     return max(weights.MAPPING_CUT, float(at_cut))
 
 
-def is_wrong(error: RenderingError, beta_raw: Tensor, least: float, lambda_depth: float) -> bool:
+def is_wrong(
+    error: RenderingError, beta_raw: Tensor, least: float, config: UncertaintyConfig
+) -> bool:
     """Tell whether the map is wrong in most cells (..., h', w') that a least weight would exclude.
 
     The MLP sees features, not places: a dark wall, rendered well, gets the beta of a dark dog in
-    front of it. Alone, a cell of error L has its least loss at beta = 2 sqrt(L) (`cell_loss`).
+    front of it. Alone, a cell of error L has its least loss at beta = sqrt(2 L / lambda_3)
+    (`cell_loss`).
     """
-    optimal = 2 * (error.ssim + lambda_depth * error.depth).sqrt()
+    optimal = (2 * error.total(config.lambda_depth) / config.lambda_log).sqrt()
     excluded, wrong = (
         weights.weight_of(weights.clipped_beta(beta)) < least for beta in (beta_raw, optimal)
     )

@@ -23,6 +23,10 @@ class RenderingError:
     depth: Tensor  # the same shape, L_depth in depth units, capped
     opacity: Tensor  # the same shape, in [0, 1]
 
+    def total(self, lambda_depth: float) -> Tensor:
+        """Return the numerator of L_uncer, L'_SSIM + lambda_1 L_depth, of each cell. Eq. (4)."""
+        return self.ssim + lambda_depth * self.depth
+
 
 @torch.no_grad()
 def rendering_error(
@@ -54,7 +58,7 @@ def uncertainty_loss(
     config: UncertaintyConfig,
 ) -> Tensor:  # ()
     """Return L_uncer: the mean cell loss plus lambda_2 L_reg_V. Eq. (4)."""
-    numerator = error.ssim + config.lambda_depth * error.depth
+    numerator = error.total(config.lambda_depth)
     cells = losses.cell_loss(beta_raw, numerator, error.opacity, config)
     regulariser = losses.variance_regulariser(sample_beta_raw, sample_features, config)
     return cells.mean() + config.lambda_variance * regulariser

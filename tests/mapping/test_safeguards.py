@@ -11,7 +11,7 @@ from minislam.mapping.safeguards import (
     least_weight,
     support,
 )
-from minislam.uncertainty import RenderingError
+from minislam.uncertainty import RenderingError, UncertaintyConfig
 from minislam.uncertainty.weights import (
     MAPPING_CUT,
     clipped_beta,
@@ -95,7 +95,17 @@ HOLE, ELSEWHERE = (1.1, 0.0, 0.0, 0.5), (0.8, 4.0, 0.0, 1.0)
 def test_an_upper_mode_is_kept_where_the_map_explains_most_of_it(cells, expected: bool):
     beta, ssim, depth, opacity = torch.tensor(cells).T
     least = float(weight_of(clipped_beta(torch.tensor(0.86))))
-    assert is_wrong(RenderingError(ssim, depth, opacity), beta, least, 0.2) == expected
+    assert (
+        is_wrong(RenderingError(ssim, depth, opacity), beta, least, UncertaintyConfig()) == expected
+    )
+
+
+def test_with_another_lambda_3_another_beta_is_best():
+    error = RenderingError(*torch.tensor([[0.1], [0.0], [1.0]]))
+    beta = torch.tensor([1.0])
+    least = float(weight_of(clipped_beta(torch.tensor(0.6))))  # 2 sqrt(0.1) = 0.63
+    assert is_wrong(error, beta, least, UncertaintyConfig())
+    assert not is_wrong(error, beta, least, UncertaintyConfig(lambda_log=1.0))  # sqrt(0.2) = 0.45
 
 
 # Whole refinements
