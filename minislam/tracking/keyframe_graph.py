@@ -176,9 +176,8 @@ class KeyframeGraph(Stateful):
                 source, starts = (disparities[0], weights[0], poses[0]), [state.T_camera_world[1]]
                 pose = start_pose(grid, matches, *source, starts, self.robust)
                 state = BundleState(torch.cat([poses, pose[None]]), disparities)
-            state, report = bundle_adjust(problem, state, self.config.pose_iterations)
+            state, _ = bundle_adjust(problem, state, self.config.pose_iterations)
         self.flow.remove_frame(newest)
-        self.count_adjustment(report)
         _, final_weights = residuals(problem, state)
         support = final_weights.mean() / weights.mean().clamp_min(LEAST_WEIGHT)
         return state.T_camera_world[-1], float(support)
