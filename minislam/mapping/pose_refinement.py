@@ -44,19 +44,20 @@ def refine_pose(
         improved = float(loss.detach()) < lowest
         if improved:
             pose, lowest, damping = candidate, float(loss.detach()), _LESS_DAMPING * damping
+            seen = rendering  # from the pose that a step starts from
         if steps_done == config.iterations or not math.isfinite(lowest):
             break
         if improved:
             (gradient,) = torch.autograd.grad(loss, twist)
             hessian = curvature(rendering, image, weight, camera)
             if not hessian.diagonal().min() > 0:
-                return pose  # The picture does not depend on the pose: it is empty or uniform.
+                break  # The picture does not depend on the pose: it is empty or uniform.
         else:
             damping *= _MORE_DAMPING
         damped = hessian + damping * torch.diag(hessian.diagonal())
         step = -torch.linalg.solve(damped, gradient.double())
-        if _motion(step, rendering, camera) < config.tolerance:
-            return pose
+        if _motion(step, seen, camera) < config.tolerance:
+            break
         candidate = se3_exp(step) @ pose
     return pose
 

@@ -5,6 +5,7 @@ and the files of a run folder. Everything else may move.
 """
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,7 @@ def run(
     output = user_path(output or default_output(sequence))
     progress = SilentProgress() if quiet else ProgressLine()
     progress.plan = plan_of(config, choice, sequence)
-    with ending_signals(progress.interrupt):
+    with closing(progress), ending_signals(progress.interrupt):
         run_in_folder(
             sequence, config, choice, output, progress, overwrite=overwrite, workers=workers
         )
