@@ -66,9 +66,11 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
     """Return the stages of a run: what each shows, and about its seconds on one idle core.
 
     The figures come from runs of the demo, synth:crowd:61 and synth:table2:61, where about every
-    fifth frame was a keyframe. What the results take at the end is never shown, hence "".
+    fifth frame was a keyframe; without a prior, and to seek the focal length, from six real clips.
+    What the results take at the end is never shown, hence "".
     """
     mapping, has_prior, frames = config.mapping, choice.depth != "none", len(sequence)
+    seeks_focal = sequence.refines_focal
     scale = sequence.camera.width * sequence.camera.height / REFERENCE_PIXELS
     per_frame, iteration = frames * scale, 0.24 * mapping.image_scale * scale
     online_iterations = mapping.keyframe_iterations * config.tracking.warmup_keyframes
@@ -77,9 +79,10 @@ def plan_of(config: SlamConfig, choice: PriorChoice, sequence: Sequence) -> list
     online = late_keyframes * mapping.keyframe_iterations * iteration if has_prior else 0.0
     coarse = {"posing frames": 0.04 * per_frame, "coarse depth": 0.03 * per_frame}
     stages = [
-        {"tracking and mapping": 0.25 * per_frame + online}
+        {"tracking and mapping": (0.25 if has_prior else 0.5) * per_frame + online}
+        | {"initialisation": (35 if seeks_focal else 5) * scale}
         | ({"first map": first_online} if has_prior else {}),
-        {"final adjustment": 0.05 * per_frame},
+        {"final adjustment": (0.35 if seeks_focal else 0.05) * per_frame},
         coarse | {"second adjustment": 0.06 * per_frame} if config.uncertainty.enabled else {},
         {"posing all frames": 0.12 * per_frame},
         {"dense depth": 0.25 * per_frame, "first map": iteration * mapping.init_iterations},
