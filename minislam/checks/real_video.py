@@ -17,6 +17,10 @@ def check_gains(student: Function) -> Verdict:
         ratios = torch.where(both, a[1] / a[0], torch.nan)
         return ratios.nanquantile(0.5, dim=0, interpolation="lower" if lower else "linear")
 
+    def together(*a: Tensor) -> Tensor:
+        usable = ((torch.minimum(*a) > 0.05) & (torch.maximum(*a) < 0.95)).all(1)
+        return reference(*(part[usable] for part in a))
+
     def case(seed: int, gain: float, what: str) -> Case:
         first, noise = normals(seed, 2, 23, 3).sigmoid()
         first = 0.15 + 0.5 * first
@@ -36,6 +40,7 @@ def check_gains(student: Function) -> Verdict:
         (lambda *a: reference(*a, low=-1), "Values below 0.05 are nearly all noise."),
         (lambda *a: reference(*a, lower=True), "torch.median takes the lower of two."),
         (lambda *a: reference(*a, high=2.0), "Values above 0.95 are cut off."),
+        (together, "Each channel has its own usable points: one may be too bright in red alone."),
         (lambda a, b: reference(b, a), "This is the gain from the second frame to the first."),
         (lambda a, b: (b / a).mean(0), "A mean follows what moves: take the median."),
         (lambda a, b: reference(a, b).mean().expand(3), "Each channel has a gain of its own."),

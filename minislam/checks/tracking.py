@@ -130,7 +130,7 @@ def check_keyframes(student: Function) -> Verdict:
         kept, none = [0], np.zeros((*images[0].shape, 2), np.float32)
         cells, flow, start = none[::8, ::8], none, images[0]
         for n, image in enumerate(images[1:], 1):
-            flow = composed_flow(start, image, flow)
+            flow = composed_flow(start, image, none if flaw == "cold" else flow)
             back = reverse_flow(start, image, flow)
             _, sure = grid_flow.grid_matches(flow, cells, back, cells[..., 0] + 1, 8)
             if flaw == "outside":
@@ -181,6 +181,7 @@ def check_keyframes(student: Function) -> Verdict:
         ("outside", "The confidence is 0 where p + f(p) leaves the image."),
         ("equal", "The mean is weighted by the confidence of each cell."),
         ("unmatched", "A frame of which too little is matched is kept as well."),
+        ("cold", "The flow starts from the flow to the frame before, not from zero."),
         ("no restart", "The flow starts anew, from the frame that was kept last."),
         (lambda a, b, _: choice(a, b, 99), "At the latest `interval` frames after the last one."),
         (lambda *a: choice(*a)[1:], "Frame 0 is the first that is kept."),

@@ -30,7 +30,13 @@ def lower_median(first, second):
     return torch.where(bad, torch.nan, second / first).nanmedian(0).values
 
 
+def usable_in_all_channels(first, second):
+    usable = ((torch.minimum(first, second) > 0.05) & (torch.maximum(first, second) < 0.95)).all(1)
+    return gains_of_nan(first[usable], second[usable])
+
+
 WRONG_GAINS = [
+    (usable_in_all_channels, "own usable points"),
     (lower_median, "lower of two"),
     (lambda a, b: (b / a).quantile(0.5, dim=0), "Saturated"),
     (lambda a, b: gains_of_nan(b, a), "from the second frame to the first"),

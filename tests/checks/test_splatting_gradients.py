@@ -2,10 +2,12 @@
 
 from functools import partial
 
+import pytest
 import torch
 from torch import Tensor
 
-from minislam.checks import check_picture_gradient
+from minislam.checks import WRONG, check_picture_gradient
+from minislam.checks.cases import normals
 from tests.helpers import assert_variants
 
 
@@ -31,17 +33,42 @@ def picture_gradient(gaussians: Tensor, target: Tensor, flaw: str = "") -> tuple
     return image, torch.stack(gradient[::-1])
 
 
-def gradient_by_autograd(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    def loss(values: Tensor) -> tuple[Tensor, Tensor]:
-        rows, columns = torch.meshgrid(*map(torch.arange, target.shape[:2]), indexing="ij")
-        image = torch.zeros_like(target)
-        for mean_u, mean_v, a, b, c, log_o, *color in values.flip(0):  # from the back
-            du, dv = columns - mean_u, rows - mean_v
-            alpha = torch.exp(log_o - 0.5 * (a * du**2 + 2 * b * du * dv + c * dv**2))
-            image = alpha[..., None] * torch.stack(color) + (1 - alpha[..., None]) * image
-        return ((image - target) ** 2).sum(), image
+def squared_error(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    rows, columns = torch.meshgrid(*map(torch.arange, target.shape[:2]), indexing="ij")
+    image = torch.zeros_like(target)
+    for mean_u, mean_v, a, b, c, log_o, *color in gaussians.flip(0):  # from the back
+        du, dv = columns - mean_u, rows - mean_v
+        alpha = torch.exp(log_o - 0.5 * (a * du**2 + 2 * b * du * dv + c * dv**2))
+        image = alpha[..., None] * torch.stack(color) + (1 - alpha[..., None]) * image
+    return ((image - target) ** 2).sum(), image
 
-    return torch.func.grad(loss, has_aux=True)(gaussians)[::-1]
+
+def gradient_by_complex_steps(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    steps = 1e-30j * torch.eye(gaussians.numel()).view(-1, *gaussians.shape)
+    slopes = [squared_error(gaussians + step, target)[0].imag / 1e-30 for step in steps]
+    return squared_error(gaussians, target)[1], torch.stack(slopes).view_as(gaussians)
+
+
+def backward(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor | None]:
+    leaf = gaussians.clone().requires_grad_()
+    loss, image = squared_error(leaf, target)
+    loss.backward()
+    return image, leaf.grad
+
+
+def backward_again_on(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor | None]:
+    with torch.enable_grad():
+        return backward(gaussians, target)
+
+
+def grad(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    leaf = gaussians.clone().requires_grad_()
+    loss, image = squared_error(leaf, target)
+    return image, torch.autograd.grad(loss, leaf)[0]
+
+
+def grad_of_a_function(gaussians: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.func.grad(squared_error, has_aux=True)(gaussians, target)[::-1]
 
 
 def test_the_gradient_of_a_picture_is_told_from_a_wrong_one():
@@ -67,6 +94,16 @@ def test_the_gradient_of_a_picture_is_told_from_a_wrong_one():
         "shades itself": partial(picture_gradient, flaw="own shade"),
         "reversed": lambda g, target: picture_gradient(g.flip(0), target),
     }
-    right = {"by hand": picture_gradient, "autograd": gradient_by_autograd}
+    right = {"by hand": picture_gradient, "complex steps": gradient_by_complex_steps}
     assert_variants(check_picture_gradient, right, wrong)
     assert "not o" in check_picture_gradient(by_opacity).hint
+
+
+@pytest.mark.ex03_3
+@pytest.mark.parametrize("answer", [backward, backward_again_on, grad, grad_of_a_function])
+def test_the_gradient_of_a_picture_is_not_left_to_autograd(answer):
+    gaussians, target = normals(1, 2, 9).abs(), normals(2, 4, 5, 3)
+    right, found = picture_gradient(gaussians, target), answer(gaussians, target)
+    assert all(torch.allclose(a, b) for a, b in zip(right, found, strict=True))
+    verdict = check_picture_gradient(answer)
+    assert verdict.status == WRONG and "autograd is switched off" in verdict.sentence

@@ -15,13 +15,13 @@ from tests.helpers import assert_variants
 def kept(
     images, max_flow, interval,
     weighted=True, restart=True, matched=0.2, forced=True, stride=8, by_remap=False,
-    warped=True, half=0.5, masked=True, zero=True,
+    warped=True, half=0.5, masked=True, zero=True, warm=True,
 ):  # fmt: skip
     height, width = images[0].shape
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     chosen, start, flow = [0], images[0], np.zeros((height, width, 2), np.float32)
     for n, image in enumerate(images[1:], 1):
-        flow = dense_flow.composed_flow(start, image, flow)
+        flow = dense_flow.composed_flow(start, image, flow if warm else np.zeros_like(flow))
         back = dense_flow.reverse_flow(start, image, flow)
         to_u, to_v = (u + flow[..., 0]).astype(np.float32), (v + flow[..., 1]).astype(np.float32)
         if not warped:
@@ -64,6 +64,7 @@ def test_keyframes():
         "also outside of the image": lambda *a: kept(*a, masked=False),
     }
     assert_variants(check_keyframes, right, wrong)
+    assert "not from zero" in check_keyframes(lambda *a: kept(*a, warm=False)).hint
 
 
 def remembered(
