@@ -27,7 +27,10 @@ NEARLY_ALL = 0.7  # of them: 187 runs have .59 and less, five that are wrong .80
 MOST_GUESSED = 0.7
 LARGEST_CHANGE = 4.0  # of a focal length by the run, either way; lenses lie nearer to the guess [-]
 BROKEN = "the trajectory is broken"  # how a warning of breaks begins
-_FAR_APART = "If the images lie far apart, give more from between them (a smaller --stride)"
+_FAR_APART = (
+    "If the images lie far apart or out of order, give more from between them (a smaller "
+    "--stride), with names in their order"
+)
 
 
 def alarms(slam: Slam) -> Iterator[str]:
