@@ -6,23 +6,12 @@ import cv2
 import numpy as np
 
 from minislam.data.options import MINIMUM_SIDE
+from minislam.data.picture import Window
 from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion, Camera
 
-Window = tuple[int, int, int, int]  # left, top, width, height px
-
 # The tracker's grid, classical or DROID's, has cells of 8 px, so both sides are multiples of it.
 SIZE_MULTIPLE = 8  # px
-BLACK = 24  # of 255: the brightest that a codec leaves in a black bar
-BLURRED = 2  # px of the picture, beside a bar, that a codec mixes with it
-# A scene that leaves less of a side is dark, not barred [-], unless both bars are alike [px].
-LEAST_PICTURE, ALIKE = 0.5, 4
-FADED = 0.5  # of the largest lit area: an image that shows less does not tell where bars end [-]
-CAPTION = 0.5  # of the most that is lit of any row or column: a caption is smaller [-]
-# From image to image a caption changes by less, of itself and of the line [-].
-SAME_CAPTION, NOISE = 0.15, 0.005
-SHARP = 0.8  # of that: beside a bar the picture has more, a round one has less [-]
-LEAST_IMAGES = 4  # that tell a caption
 
 
 class ImagePreparation:
@@ -38,7 +27,7 @@ class ImagePreparation:
         distortion: BrownDistortion,
         size: tuple[int, int] | None,  # (width, height) px of the working image, None: choose
         pixels: int,  # about width * height of the working image when it is chosen
-        picture: Window | None = None,  # of the raw image, see `picture_window`; None: all
+        picture: Window | None = None,  # of the raw image, see picture.py; None: all
     ) -> None:
         self.raw_camera, self._raw_size = raw_camera, (raw_camera.width, raw_camera.height)
         wanted = f"images of at least {MINIMUM_SIDE}x{MINIMUM_SIDE} px"
@@ -120,54 +109,6 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
         return max(cells * SIZE_MULTIPLE, MINIMUM_SIDE)
 
     return side(width), side(height)
-
-
-def lit_fractions(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (W,), (H,) in [0, 1]
-    """Return which fraction of each column and of each row of an image is not black."""
-    lit = image.max(2) > BLACK
-    return lit.mean(0), lit.mean(1)
-
-
-def picture_window(
-    lit: list[tuple[np.ndarray, np.ndarray]],  # `lit_fractions` of several images
-    width: int,  # px
-    height: int,  # px
-) -> Window:
-    """Return the window that no black bar covers, as films have; a bar may carry a caption.
-
-    In most images a bar ends at the same place, a thing on a black ground does not. Beta would
-    learn that a bar is no part of the scene, and take all that is black for a part of the bar.
-    """
-    if not lit:  # none could be decoded
-        return 0, 0, width, height
-    window, areas = [], np.array([columns.mean() for columns, _ in lit])
-    is_bright = areas >= max(FADED * areas.max(), 1e-9)
-    for axis, side in ((0, width), (1, height)):
-        lines = _without_captions(np.stack([fractions[axis] for fractions in lit]), is_bright)
-        extents = [np.flatnonzero(line)[[0, -1]] for line in lines[is_bright] if line.any()]
-        first, last = np.flatnonzero(lines.any(0))[[0, -1]] if extents else (0, side - 1)
-        is_steady = bool(extents) and np.abs(np.median(extents, 0) - (first, last)).max() <= ALIKE
-        first, last = int(first + BLURRED * (first > 0)), int(last - BLURRED * (last < side - 1))
-        are_alike = abs(first - (side - 1 - last)) <= ALIKE  # an upright film in a wide one
-        least = MINIMUM_SIDE if are_alike else max(LEAST_PICTURE * side, MINIMUM_SIDE)
-        is_picture = is_steady and last + 1 - first >= least
-        window.append((first, last + 1 - first) if is_picture else (0, side))
-    (left, width), (top, height) = window
-    return left, top, width, height
-
-
-def _without_captions(lines: np.ndarray, is_bright: np.ndarray) -> np.ndarray:  # (n, side)
-    """Return the lit fractions of lines in n images, 0 in a bar with a caption, if it ends sharply.
-
-    A caption lights less than half of what the picture does, and the same in all images.
-    """
-    if is_bright.sum() < LEAST_IMAGES:
-        return lines
-    most, change = lines.max(0), np.ptp(lines[is_bright], 0)
-    has_caption = (most < CAPTION * most.max()) & (change <= SAME_CAPTION * most + NOISE)
-    inner = most[~has_caption][BLURRED:-BLURRED]
-    is_sharp = len(inner) > 0 and inner[[0, -1]].min() > SHARP * inner.max()
-    return np.where(has_caption & is_sharp, 0, lines)
 
 
 def seen_window(

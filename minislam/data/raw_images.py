@@ -11,7 +11,7 @@ import numpy as np
 
 from minislam.data.images import read_color
 from minislam.data.metadata import noted_size
-from minislam.data.preparation import lit_fractions
+from minislam.data.picture import Glance, glance_at
 from minislam.errors import InputError, MinislamError
 
 SIMILAR = 0.03  # of a side: images that differ by less are resized [-]
@@ -59,14 +59,14 @@ class FileImages:
         return resized > 0 if is_mask else resized
 
     @property
-    def lit_fractions(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the `lit_fractions` of each sampled image."""
+    def glances(self) -> list[Glance]:
+        """Return a glance at each sampled image."""
         usual = [index for index in range(len(self.paths)) if index not in self.odd]
-        found = [lit_fractions(first := self.read(usual[0]))]
+        found = [glance_at(first := self.read(usual[0]))]
         for place in filter(_is_sampled, range(1, len(usual))):
             with suppress(MinislamError):  # raised again when that frame is read
                 image = self.read(usual[place])
-                found += [lit_fractions(image)] if image.shape == first.shape else []
+                found += [glance_at(image)] if image.shape == first.shape else []
         return found
 
 
@@ -84,7 +84,7 @@ class VideoImages:
         self._rewind()
         self._calls: list[int] = []  # of grab(), after which a frame can be had
         self.frame_rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self.lit_fractions: list[tuple[np.ndarray, np.ndarray]] = []  # of the sampled images
+        self.glances: list[Glance] = []  # at the sampled images
         stamps: list[float] = []
         last = 0  # A failed call is the end of the file, or damage with more frames behind it.
         while len(stamps) != limit and self._grabbed < last + _MOST_FAILURES:
@@ -95,7 +95,7 @@ class VideoImages:
                 if _is_sampled(len(stamps)):
                     decoded, image = self._capture.retrieve()
                     if decoded:
-                        self.lit_fractions.append(lit_fractions(image))
+                        self.glances.append(glance_at(image))
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         # The container counts all frames: its count says nothing if reading stopped at the limit.
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))

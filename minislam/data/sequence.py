@@ -13,7 +13,8 @@ import torch
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
 from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
-from minislam.data.preparation import ImagePreparation, Window, picture_window
+from minislam.data.picture import Window, first_of_two, picture_window
+from minislam.data.preparation import ImagePreparation
 from minislam.data.raw_images import FileImages
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
@@ -78,7 +79,9 @@ class RecordedSequence:
         self._kept: dict[int, np.ndarray] = {}  # working images on the shelf, by frame index
 
         height, width = (image := images.read(self._chosen[0])).shape[:2]
-        picture = picture_window(images.lit_fractions, width, height)
+        picture = barless = picture_window(images.glances, width, height)
+        if not (recording.calibration or options.calibration):
+            picture = first_of_two(barless, images.glances, width, height)
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
         self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels, picture)
@@ -90,6 +93,11 @@ class RecordedSequence:
         knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
         self.seeks_lens = knows_nothing and options.focal == "auto"
         self.warnings = [*recording.warnings, *self._doubts(calibration, image, left_out)]
+        if picture != barless:
+            self.warnings.append(
+                "the images show two pictures that are alike, as of two eyes: the left or upper "
+                "one is taken; if they show one, give a calibration file"
+            )
         self.description = f"{recording.kind}: {', '.join(self._facts(calibration, picture))}"
         truth = GroundTruth(
             recording.trajectory,
@@ -136,7 +144,7 @@ class RecordedSequence:
         yield from self._recording.notes
         raw, (_, _, *seen) = self.prepare.raw_camera, picture
         is_cut = seen != [raw.width, raw.height]
-        cut = f"black bars cut to {seen[0]}x{seen[1]}, " if is_cut else ""
+        cut = f"cut to {seen[0]}x{seen[1]}, " if is_cut else ""
         yield f"{cut}{raw.width}x{raw.height} -> {self.camera.width}x{self.camera.height} px"
         yield calibration.origin
         if self._options.masks is not None:

@@ -270,12 +270,12 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("0 if len(stamps) == limit else promised", "promised"),
         ("index & (index - 1) == 0", "index == 0"),
     ],
+    ("data/picture.py", "data/test_picture.py"): [
+        ("> BLACK", "> 0"), ("first + BLURRED * (first > 0)", "first"), ("is_steady and", ""),
+        ("LEAST_PICTURE * side", "0 * side"), ("FADED *", "0 *"), ("best - ", "best + 0 *")],
     ("data/preparation.py", "data/test_preparation.py"): [
-        ("> BLACK", "> 0"), ("first + BLURRED * (first > 0)", "first"),
-        ("LEAST_PICTURE * side", "0 * side"), ("FADED * areas.max()", "0"), ("is_steady and", ""),
         ("(*self._maps, self._window)", "(*self._maps, (0, 0, *self._raw_size))"),
-        ("map_y > bottom - 1", "map_y > height - 1"),
-    ],
+        ("map_y > bottom - 1", "map_y > height - 1")],
     ("data/checkpoint.py", "data/test_checkpoint.py"): [("allow_pickle=False", "allow_pickle=1")],
     ("data/run_folder.py", "data/test_run_folder.py"): [("fcntl.LOCK_EX |", "fcntl.LOCK_SH |")],
     ("runs/run.py", "runs/test_run_ending.py"): [

@@ -105,13 +105,14 @@ def test_images_far_apart_tell_what_is_not_black(tmp_path: Path):
         (video.images, [0, 1, 2, 4, 8, 16, 32]),
         (folder.images, [0, 1, 2, 4, 8, 32]),
     ):
-        assert len(images.lit_fractions) == len(sampled)
-        for index, (columns, rows) in zip(sampled, images.lit_fractions, strict=True):
+        assert len(images.glances) == len(sampled)
+        for index, glance in zip(sampled, images.glances, strict=True):
+            columns, rows = glance.lit
             np.testing.assert_allclose(np.flatnonzero(columns), index, atol=2)
             np.testing.assert_allclose(np.flatnonzero(rows)[[0, -1]], [8, 39], atol=2)
     cv2.imwrite(str(tmp_path / "b/00.png"), frames[0][::2])  # of another size than the others
     folder = read_image_folder(tmp_path / "b")
-    lit = [np.flatnonzero(columns) for columns, _ in folder.images.lit_fractions]
+    lit = [np.flatnonzero(glance.lit[0]) for glance in folder.images.glances]
     assert [index.tolist() for index in lit[:2]] == [[1], [2]]
 
 
