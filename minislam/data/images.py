@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -20,6 +21,9 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _WEBP_QUALITY = 75  # of 100
 _JPEG_QUALITY = 85  # of 100: without visible blocks, a tenth of the bytes of a PNG
 _JPEG_START_OF_SCAN, _JPEG_END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
+_STDERR = Lock()  # file descriptor 2 belongs to the whole process
+_OF_CODECS = re.compile(rb"JPEG|JFIF|SOS|Adobe|progression|scanlines|libpng")  # in their lines
+_OF_FFMPEG = re.compile(rb"FFMPEG")
 
 
 def is_image(path: Path) -> bool:
@@ -32,10 +36,17 @@ def natural_key(name: str) -> list[str | int]:  # text and numbers in turns
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
+def is_number(name: str) -> bool:
+    """Tell whether a name is a number, as a time or a count."""
+    return re.fullmatch(r"\d+(\.\d+)?", name, re.ASCII) is not None
+
+
 def list_images(folder: Path) -> list[Path]:
-    """Return the pictures of a folder in natural order; none of a folder that is not there."""
+    """Return the pictures of a folder in their order; none of a folder that is not there."""
     entries = folder.iterdir() if folder.is_dir() else ()
     images = [path for path in entries if is_image(path) and path.is_file()]
+    if all(is_number(path.stem) for path in images):  # 0.15 stands before 0.2
+        return sorted(images, key=lambda path: (float(path.stem), path.name))
     return sorted(images, key=lambda path: (natural_key(path.name), path.name))
 
 
@@ -97,7 +108,7 @@ def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     writer, code = cv2.VideoWriter(), cv2.VideoWriter.fourcc(*"VP80")
     for frame in frames:
         if not writer.isOpened():
-            with _standard_error():  # where FFmpeg says that WebM has another code for VP8
+            with _off_screen(_OF_FFMPEG):  # where FFmpeg says that WebM has another code for VP8
                 writer.open(str(file), code, rate, (frame.shape[1], frame.shape[0]))
         writer.write(frame)
     writer.release()
@@ -120,7 +131,10 @@ def _bgr(image: np.ndarray) -> np.ndarray:
 
 def _decode(path: Path, mode: int) -> np.ndarray:
     content, decoded = read_bytes(path), None
-    with _standard_error() as lines, suppress(cv2.error):  # of a header that claims 10^10 px
+    with (
+        _off_screen(_OF_CODECS) as lines,
+        suppress(cv2.error),
+    ):  # of a header that claims 10^10 px
         if _is_complete(content):
             decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
     # Only here libjpeg reports damage. What libpng only warns of, such as a broken colour profile,
@@ -131,7 +145,9 @@ def _decode(path: Path, mode: int) -> np.ndarray:
     elif said:
         decoded = None  # libjpeg has filled the rest with grey
     if decoded is None:
-        found = f"{path} ({len(content)} bytes) is damaged; replace or remove it"
+        is_other = content and not content.startswith((PNG, JPEG))
+        fault = "of another format than its name says; convert" if is_other else "damaged; replace"
+        found = f"{path} ({len(content)} bytes) is {fault} or remove it"
         raise InputError(f"expected a whole PNG or JPEG image, but {found}")
     return decoded
 
@@ -144,24 +160,30 @@ def _is_complete(content: bytes) -> bool:
         # A thumbnail in the header has its own end marker, a film that phones append any bytes.
         at = 2  # behind the start marker; then one segment of the header after the other
         while content[at : at + 1] == b"\xff" and content[at : at + 2] != _JPEG_START_OF_SCAN:
-            at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+            is_fill = content[at + 1 : at + 2] == b"\xff"  # any number may precede a marker
+            at += 1 if is_fill else 2 + int.from_bytes(content[at + 2 : at + 4], "big")
         return content.find(_JPEG_END_OF_IMAGE, at) > 0
     return False
 
 
 @contextmanager
-def _standard_error() -> Iterator[list[bytes]]:
-    """Keep what C libraries write to standard error off the screen; afterwards yield its lines."""
-    reader, writer = os.pipe()
-    if hasattr(os, "set_blocking"):  # Windows has it from Python 3.12 on
-        os.set_blocking(writer, False)  # what does not fit is dropped, rather than waited for
-    before, said = os.dup(2), list[bytes]()
-    os.dup2(writer, 2)
-    try:
-        yield said
-    finally:
-        os.dup2(before, 2)
-        os.close(before)
-        os.close(writer)
-        with open(reader, "rb") as file:
-            said += file.read().splitlines(keepends=True)
+def _off_screen(pattern: re.Pattern[bytes]) -> Iterator[list[bytes]]:
+    """Keep lines of C libraries off standard error; afterwards yield them. Others go there."""
+    with _STDERR:
+        reader, writer = os.pipe()
+        if hasattr(os, "set_blocking"):  # Windows has it from Python 3.12 on
+            os.set_blocking(reader, False)  # another process may have inherited the other end
+            os.set_blocking(writer, False)  # what does not fit is dropped, rather than waited for
+        before, kept = os.dup(2), list[bytes]()
+        os.dup2(writer, 2)
+        try:
+            yield kept
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+            os.close(writer)
+            with suppress(BlockingIOError):
+                lines = os.read(reader, 1 << 16).splitlines(keepends=True)
+                kept += filter(pattern.search, lines)
+                os.write(2, b"".join(line for line in lines if not pattern.search(line)))
+            os.close(reader)

@@ -71,6 +71,9 @@ def _segments(photo: memoryview) -> Iterator[tuple[int, memoryview]]:
     """Yield marker and content of the segments in the header of a JPEG file."""
     at = 2
     while photo[at] == 0xFF:
+        if photo[at + 1] == 0xFF:  # a fill byte
+            at += 1
+            continue
         (length,) = struct.unpack_from(">H", photo, at + 2)
         yield photo[at + 1], photo[at + 4 : at + 2 + length]
         at += 2 + length

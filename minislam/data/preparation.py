@@ -88,7 +88,8 @@ class ImagePreparation:
         """Undistort an image and cut unseen borders, at the size of the source."""
         width, height = self._raw_size
         wanted = f"images of one size, {width}x{height} as the first"
-        found = f"{raw.shape[1]}x{raw.shape[0]} in {label}; remove or resize the odd ones"
+        advice = "remove or resize the odd ones" if raw.ndim == 3 else "resize depth and masks"
+        found = f"{raw.shape[1]}x{raw.shape[0]} in {label}; {advice}"
         require(raw.shape[:2] == (height, width), wanted, found)
         if self._maps is not None:
             raw = cv2.remap(raw, *self._maps, interpolation)

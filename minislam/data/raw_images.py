@@ -17,6 +17,7 @@ from minislam.errors import InputError, MinislamError
 SIMILAR = 0.03  # of a side: images that differ by less are resized [-]
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
 _TEXT = cv2.VideoWriter.fourcc(*"ansi")  # FFmpeg films a text file on a terminal
+_CLOCK_RATE = 10  # frames: with more between two stamps, the rate noted is that of a clock
 _CONSTANT_RATE = 0.1  # frames; containers round timestamps to milliseconds
 
 
@@ -50,13 +51,12 @@ class FileImages:
         return self.as_usual(index, read_color(self.paths[index]))
 
     def as_usual(self, index: int, image: np.ndarray) -> np.ndarray:
-        """Return an image, or the mask (H, W) bool that belongs to it, at the size of most."""
+        """Return an image, or the mask or depth (H, W) that belongs to it, at the size of most."""
         if index not in self.resized:
             return image
-        is_mask = image.ndim == 2
-        method = cv2.INTER_NEAREST_EXACT if is_mask else cv2.INTER_AREA
-        resized = cv2.resize(image.astype(np.uint8), self._size, None, 0, 0, method)
-        return resized > 0 if is_mask else resized
+        method = cv2.INTER_AREA if image.ndim == 3 else cv2.INTER_NEAREST_EXACT
+        numbers = image.astype(np.uint8) if image.dtype == bool else image
+        return cv2.resize(numbers, self._size, None, 0, 0, method).astype(image.dtype)
 
     @property
     def glances(self) -> list[Glance]:
@@ -99,6 +99,9 @@ class VideoImages:
                 stamps.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         # The container counts all frames: its count says nothing if reading stopped at the limit.
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0  # s
+        if usual > 0 and self.frame_rate * usual > _CLOCK_RATE:
+            self.frame_rate, promised = 1 / usual, 0
         self.promised = 0 if len(stamps) == limit else promised  # 0 or less: unknown
         self.timestamps = np.array(stamps)  # (N,) second, as the container has them
         self.labels = [f"frame {index} of {path}" for index in range(len(stamps))]

@@ -2,13 +2,14 @@
 
 import math
 import re
+import unicodedata
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from minislam.data.calibration import Calibration, calibration_beside
-from minislam.data.images import is_image, list_images
+from minislam.data.images import is_image, is_number, list_images
 from minislam.data.metadata import noted_focal_length
 from minislam.data.options import mask_folder
 from minislam.data.raw_images import FileImages, ImageSource, VideoImages
@@ -22,6 +23,7 @@ _LISTS = b"ffconcat", b"#EXTM3U"  # how texts begin for which FFmpeg opens other
 
 _ASSUMED_FRAME_RATE = 30.0  # frames per second, if neither names nor container state it
 _COUNTED = f"timestamps counted at {_ASSUMED_FRAME_RATE:g} frames per second"
+_CLOCKS = {13: ("ms", 1e-3), 16: ("us", 1e-6), 19: ("ns", 1e-9)}  # by digits, of times since 1970
 _MOST_COUNTED = 1e6  # larger whole numbers in names are times
 
 
@@ -89,10 +91,12 @@ def read_video(path: Path, limit: int | None) -> Recording:
         if not (math.isfinite(rate) and rate > 0):
             rate = _ASSUMED_FRAME_RATE
         stamps, lost = np.arange(len(images)) / rate, lost[:0]
-        warnings.append(f"{path.name} has no timestamps: {rate:g} frames per second assumed")
+        what = f"{path.name} has no times that increase"
+        warnings.append(f"{what}: {rate:g} frames per second assumed")
     if len(images) < images.promised:
         warnings.append(
             f"{path.name} promises {images.promised} frames, but only {len(images)} can be decoded"
+            ": it is damaged, or was trimmed on a phone"
         )
     return Recording(
         name=folder_name(path.with_suffix("")),
@@ -102,16 +106,19 @@ def read_video(path: Path, limit: int | None) -> Recording:
         lost=[(stamp, f"{path.name} is damaged there") for stamp in lost.tolist()],
         calibration=calibration_beside(path.parent, path.stem + ".calibration.txt"),
         noted_focal_length=noted_focal_length(path),
-        notes=[f"{rate:g} frames per second"],
+        notes=[f"{rate:.4g} frames per second"],
         warnings=warnings,
     )
 
 
 def stamps_of_names(paths: list[Path]) -> tuple[np.ndarray, str]:
     """Return timestamps (N,): the names if all are numbers, else a count; and a note on that."""
-    if not all(re.fullmatch(r"\d+(\.\d+)?", path.stem, re.ASCII) for path in paths):
+    if not all(is_number(path.stem) for path in paths):
         return np.arange(len(paths)) / _ASSUMED_FRAME_RATE, _COUNTED
-    return np.array([float(path.stem) for path in paths]), "timestamps from the file names"
+    digits = {len(path.stem) for path in paths if path.stem.isdecimal()}
+    unit, second = _CLOCKS.get(digits.pop(), ("s", 1.0)) if len(digits) == 1 else ("s", 1.0)
+    stamps = np.array([float(path.stem) for path in paths]) * second
+    return stamps, f"timestamps [{unit}] from the file names"
 
 
 def _are_counts(paths: list[Path], numbers: np.ndarray) -> bool:
@@ -144,8 +151,8 @@ def _found(folder: Path) -> str:
 def mask_files(images: ImageSource, masks: str, chosen: list[int]) -> dict[int, Path]:
     """Return the mask of each chosen image in files:FOLDER: of its name, or of its number."""
     folder = mask_folder(masks)
-    files = {path.stem: path for path in list_images(folder)}
-    named = {k: files[path.stem] for k, path in enumerate(images.paths) if path.stem in files}
+    files = {_stem(path): path for path in list_images(folder)}
+    named = {k: files[_stem(path)] for k, path in enumerate(images.paths) if _stem(path) in files}
     numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
     found = named if named and isinstance(images, FileImages) else numbered
     if missing := [images.labels[index] for index in chosen if index not in found]:
@@ -153,3 +160,8 @@ def mask_files(images: ImageSource, masks: str, chosen: list[int]) -> dict[int, 
         advice = "name them like the images or by number from 0; a black one where nothing moves"
         raise InputError(f"expected a mask of every frame in {folder}, found {without}; {advice}")
     return found
+
+
+def _stem(path: Path) -> str:
+    """Return a name in composed letters; archives of macOS have accents apart."""
+    return unicodedata.normalize("NFC", path.stem)

@@ -1,6 +1,8 @@
 """Pictures as cameras write them: accepted kinds, and damaged files."""
 
 import struct
+import subprocess
+import sys
 import warnings
 import zlib
 from pathlib import Path
@@ -17,6 +19,7 @@ from minislam.data.images import (
     read_depth,
     read_mask,
 )
+from minislam.data.metadata import noted_size
 from minislam.errors import InputError
 from tests.recordings import picture, save
 
@@ -206,6 +209,48 @@ def test_a_png_whose_notes_are_wrong_is_a_whole_picture(note: bytes, tmp_path: P
     (tmp_path / "noted.png").write_bytes(content[:33] + note + content[33:])
     np.testing.assert_array_equal(read_color(tmp_path / "noted.png"), picture(0))
     assert capfd.readouterr().err == ""
+
+
+def test_fill_bytes_may_precede_a_marker(tmp_path: Path):
+    photo = cv2.imencode(".jpg", picture(0, 32, 24))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(photo[:2] + b"\xff" * 3 + photo[2:])
+    assert read_color(tmp_path / "a.jpg").shape == (24, 32, 3)
+    assert noted_size(tmp_path / "a.jpg") == (32, 24)
+
+
+def test_a_picture_of_another_format_is_to_be_converted(tmp_path: Path):
+    (tmp_path / "a.jpg").write_bytes(cv2.imencode(".webp", picture(0))[1].tobytes())
+    with pytest.raises(
+        InputError, match=r"a\.jpg .* is of another format than its name says; conv"
+    ):
+        read_color(tmp_path / "a.jpg")
+
+
+THREADS = """
+import os, sys, threading, time
+from pathlib import Path
+from minislam.data.images import read_color
+
+def read():
+    for _ in range(20):
+        read_color(Path(sys.argv[1]))
+
+def log():
+    while readers[0].is_alive():
+        os.write(2, b"a line" + os.linesep.encode())
+        time.sleep(0.001)
+
+readers = [threading.Thread(target=read) for _ in range(2)]
+for thread in (*readers, threading.Thread(target=log)):
+    thread.start()
+"""
+
+
+def test_two_threads_read_while_a_third_writes_a_log(tmp_path: Path):
+    path = save(tmp_path / "a.jpg", picture(0, 320, 240))
+    command = [sys.executable, "-c", THREADS, str(path)]
+    done = subprocess.run(command, capture_output=True, timeout=60, text=True)
+    assert {*done.stderr.splitlines()} <= {"a line"}, done.stderr
 
 
 def test_a_png_with_a_flipped_byte_in_its_pixels_is_refused(tmp_path: Path):

@@ -214,7 +214,15 @@ def test_without_timestamps_the_frame_rate_is_taken_and_said(phone: Path, monkey
     monkeypatch.setattr(Capture, "stamps", (0.0,) * 6)
     recording = read_video(phone, None)
     np.testing.assert_allclose(recording.timestamps, np.arange(6) / 30)
-    assert recording.warnings == ["phone.mp4 has no timestamps: 30 frames per second assumed"]
+    assert recording.warnings == [
+        "phone.mp4 has no times that increase: 30 frames per second assumed"
+    ]
+
+
+def test_the_rate_of_a_clock_is_no_frame_rate(phone: Path, monkeypatch):
+    monkeypatch.setattr(Capture, "stamps", tuple(k / 2 for k in range(6)))
+    recording = read_video(phone, None)
+    assert recording.warnings == [] and recording.notes == ["2 frames per second"]
 
 
 # Errors

@@ -61,3 +61,21 @@ def test_images_of_nearly_the_usual_size_are_resized(tmp_path: Path):
     given = InputOptions(size=(100, 66), masks=f"files:{tmp_path / 'masks'}")
     masks = [open_sequence(str(tmp_path), given).given_mask(index) for index in range(3)]
     assert all(abs(mask[:, :50].mean() - 1) + mask[:, 50:].mean() < 0.03 for mask in masks)
+
+
+def test_the_depth_of_a_resized_image_stays_metres(tmp_path: Path):
+    rows = {"rgb": "", "depth": ""}
+    for number in range(3):
+        width = 48 if number != 1 else 49
+        images = {"rgb": picture(number, width, 32)}
+        images["depth"] = np.full((32, width), 2500 * (number + 1), np.uint16)
+        for kind, image in images.items():
+            save(tmp_path / f"{kind}/{number}.png", image)
+            rows[kind] += f"{0.1 * number} {kind}/{number}.png\n"
+    for kind, text in rows.items():
+        (tmp_path / f"{kind}.txt").write_text(text)
+    sequence = open_sequence(str(tmp_path))
+    for number in range(3):
+        depth = sequence.sensor_depth(number)
+        assert depth is not None and depth.dtype == np.float32
+        assert (depth == 0.5 * (number + 1)).all()

@@ -29,6 +29,25 @@ def test_numeric_names_are_the_timestamps(tmp_path: Path):
     np.testing.assert_array_equal(read_image_folder(tmp_path).timestamps, [7.5, 12, 101])
 
 
+def test_times_with_unequal_decimals_are_in_their_order(tmp_path: Path):
+    for name in ("0.1", "0.15", "0.2", "0.25"):
+        save(tmp_path / f"{name}.png", picture(0))
+    np.testing.assert_array_equal(read_image_folder(tmp_path).timestamps, [0.1, 0.15, 0.2, 0.25])
+
+
+@pytest.mark.parametrize(
+    "unit, per_second", [("ms", 10**3), ("us", 10**6), ("ns", 10**9), ("s", 1)]
+)
+def test_times_since_1970_are_in_the_unit_of_their_digits(
+    tmp_path: Path, unit: str, per_second: int
+):
+    for second in (1403636579, 1403636581):
+        save(tmp_path / f"{second * per_second}.png", picture(0))
+    recording = read_image_folder(tmp_path)
+    np.testing.assert_array_equal(recording.timestamps, [1403636579, 1403636581])
+    assert recording.notes == [f"timestamps [{unit}] from the file names"]
+
+
 @pytest.mark.parametrize(
     "names",
     ["0 1 2 9", "00020 00022 00028", "10 15 20", "0 33 67", "5 900000 1800000", "1.0 2.0", "7"],

@@ -85,6 +85,12 @@ def test_masks_are_found_by_the_names_of_the_images_or_by_their_numbers(tmp_path
     assert columns(open_sequence(source, InputOptions(masks=stamps))) == [3, 4, 5]
 
 
+def test_names_of_masks_may_be_written_with_accents_apart(tmp_path: Path):
+    source = photos(tmp_path / "named", "\u00e91", "\u00e92")
+    apart = masks(tmp_path / "masks", "e\u03011", "e\u03012")
+    assert columns(open_sequence(source, InputOptions(masks=apart))) == [1, 2]
+
+
 def test_masks_of_files_come_before_those_of_the_recording_and_are_no_truth(tmp_path: Path):
     folder = tum_folder(tmp_path)
     given = masks(tmp_path / "given", *(p.stem for p in sorted((folder / "rgb").iterdir())))
