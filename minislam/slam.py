@@ -42,7 +42,7 @@ from minislam.tracking.trajectory import as_trajectory, pose_all_frames
 from minislam.uncertainty.weights import beta_of_mask, relative_weight, tracking_weight
 from minislam.workers import Workers
 
-ONLINE_CELL = 4  # px, side of the square of a Gaussian in the map that the final one replaces
+ONLINE_CELL = 4  # px, side of the square that gets one Gaussian; the final map has its own
 FRAMES_AT_ONCE = 8  # whose poses are refined side by side; with more, Ctrl-C waits longer
 
 

@@ -16,7 +16,7 @@ Tangent vectors
 Quaternions
     w, x, y, z in memory, and the name says so: `quats_wxyz`. Only TUM files hold x, y, z, w.
 Images
-    (H, W, 3) float32 RGB in [0, 1].
+    (H, W, 3) RGB: `image` is float32 in [0, 1]; what is kept is `pixels`, uint8 in [0, 255].
 Units
     Angles in radians. Lengths in world units, which are metres only if the depth prior is metric.
 """

@@ -63,8 +63,8 @@ class MappingConfig:
     )
     init_iterations: int = parameter(
         150,
-        "on the images that a map is begun with, at least 4 each if beta is learned, online at most"
-        " keyframe_iterations each; official 1050",
+        "iterations on the images that a map begins with: at least 4 of each if beta is learned, "
+        "online at most keyframe_iterations of each; official 1050",
     )
     keyframe_iterations: int = parameter(12, "iterations per keyframe, online; official 450")
     keyframe_stride: int = parameter(1, "optimise at every n-th keyframe only; fast mode 5", 1)

@@ -57,13 +57,14 @@ def is_refuted(
     own: Keyframe,
     keyframes: Sequence[Keyframe],  # of the map
 ) -> Tensor:  # (N,) bool
-    """Tell which points that fill gaps are refuted.
+    """Tell which points that fill gaps are refuted, by the depths or by the colours of other views.
 
-    A guess, a point that its own keyframe has no depth for: more views know a surface behind it,
-    which it would hide, than one at its depth. Or a view sees it from less than half the distance:
-    it would cover much there, and that view can guess the place itself. Any point: most views in
-    which nothing known hides it have another colour there, as where the rim of one surface has got
-    the depth of another.
+    Depths refute only a guess, a point that its own keyframe has no depth for. Either more views
+    know a surface behind it, which it would hide, than one at its depth. Or a view sees it from
+    less than half the distance: it would cover much there, and that view can guess the place
+    itself. Colours refute any point if most views in which nothing known hides it, and at least
+    LEAST_DIFFERING, have another colour there. So it is where the rim of one surface has got the
+    depth of another.
     """
     own_z, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
     is_guessed = own.depth[row, column] == 0

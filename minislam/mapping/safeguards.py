@@ -23,7 +23,7 @@ CONFIRMED_BETA = 0.4
 # Renderings of each keyframe before which beta weights nothing: as long as the map is not fitted,
 # its errors are not those of dynamic objects, and what is excluded then would never be fitted.
 FIRST_VIEWS = 4
-LEAST_UPPER_MODE = 0.85  # mean raw beta: with less, the mode is what the map does not show yet
+LEAST_UPPER_MODE = 0.85  # mean raw beta: a mode with less is what the map does not show yet
 UPPER_MODE = 0.75  # of that mean, from which on a raw beta belongs to the mode
 BINS = 50  # of the histogram, per unit of raw beta
 LEAST_VIEWS = 2  # renderings of each keyframe before which beta of a static room may still be high

@@ -49,8 +49,8 @@ def median_depth(keyframes: list[Keyframe]) -> float:  # world units
 class Comparison:
     """How the MLP compares a keyframe with its rendering.
 
-    All of a run use one size, because the windows of the SSIM are in pixels: at another image
-    size the same rendering has another error, and beta learns another value.
+    All comparisons of a run use one size, because the windows of the SSIM are in pixels: at another
+    image size the same rendering has another error, and beta learns another value.
     """
 
     reference: View  # the keyframe at the size at which they are compared

@@ -1,5 +1,16 @@
 """One run, from a sequence to a folder of results (files: see the end of `minislam run --help`).
 
-api.py is the Python interface; run.py does a run from its start to its folder; facts.py says what
-run.json and metrics.json hold; pictures.py draws; resume.py saves checkpoints and restores them.
+Read the files in this order:
+
+    api         the Python interface: run, load
+    run         a run from its start to its folder
+    resume      when checkpoints are saved, and which run may go on from one
+    progress    the line that a run shows, and how a signal ends the run between two steps
+    facts       what run.json and metrics.json hold
+    warnings    what the user must know
+    summary     the measures in words; measures.csv has their bounds
+    pictures    images, plots, report and viewer
+    loaded      `Run`, a run read back: to render, plot and export it
+    flythrough  films of a run
+    export      COLMAP, nerfstudio, point clouds, depth and masks
 """

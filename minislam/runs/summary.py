@@ -1,8 +1,8 @@
 """The summary of a run in words: what is known, in which unit, and whether it is good.
 
 measures.csv beside this file names the numbers of metrics.json and says when they are healthy. Its
-bounds are from tests/benchmarks/RESULTS.md: good is what nearly all clips reach with beta, and
-what is not even fair is what they reach without it, or where a run is broken.
+bounds are from tests/benchmarks/RESULTS.md: nearly all clips are good with beta; without it, or
+where a run is broken, they are poor.
 """
 
 import csv

@@ -1,1 +1,1 @@
-"""The state of a run: its memory (memory.py), its parts (stateful.py), its steps (steps.py)."""
+"""The state of a run: parts that can be saved (stateful.py), steps.py, memory.py, threads.py."""

@@ -26,7 +26,7 @@ ALIGNMENT = 64  # bytes, as tensors in memory: another one can change the last b
 
 
 class Shelf:
-    """Holds tensors in temporary files (of TMPDIR), which vanish with it and the last of them."""
+    """Holds tensors in files of TMPDIR. Each vanishes with the shelf and the last tensor in it."""
 
     def __init__(self) -> None:
         self._blocks: list[mmap.mmap] = []
@@ -49,7 +49,7 @@ class Shelf:
         release()
 
     def array(self, values: np.ndarray) -> np.ndarray:
-        """Return an array as `put` leaves a tensor of its values; the given one stays in memory."""
+        """Return a copy of an array in the file, if `put` moves it there; else the array itself."""
         self.put([tensor := torch.from_numpy(values)])
         return tensor.numpy()
 

@@ -178,7 +178,7 @@ def swept_view(
     reference: PosedImage,
     others: list[PosedImage],
     planes: np.ndarray,  # (D,) 1/world unit, evenly spaced from 0
-    leaves_lines: bool = False,  # out, which look the same at every depth
+    drops_lines: bool = False,  # what lies along the motion and matches at most depths
 ) -> votes.SweptView:
     """Sweep one image; without others nothing is found. Any process can compute it."""
     step, pose = float(planes[1]), reference.T_camera_world
@@ -191,7 +191,7 @@ def swept_view(
     found[best == len(planes) - 1] = np.nan  # the cost still falls: the minimum lies nearer
     at_best = np.take_along_axis(cost, best[None], 0)[0]
     found[(best == 0) & (at_best >= votes.CONFIRMING_COST)] = np.nan  # the cost has no minimum
-    if leaves_lines:
+    if drops_lines:
         are_alike = (cost < at_best + ALIKE).mean(0) > MOST_ALIKE
         found[are_alike & (at_best < votes.CONFIRMING_COST)] = np.nan
     return votes.SweptView(found, at_best, step, pose)
@@ -214,7 +214,7 @@ class SweepPlanner:
     ) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray, bool]:
         """Return the arguments of `swept_view`; `known` are inverse depths of the scene.
 
-        Only sweeps for the map leave out lines: what coarse ones confirm tells turns as well.
+        Only sweeps for the map drop lines: what coarse ones confirm tells turns as well.
         """
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
@@ -222,8 +222,8 @@ class SweepPlanner:
         parallax = baseline * nearest * self.camera.fx
         planes = np.linspace(0, nearest, int(np.clip(parallax, *PLANES)))  # about one per pixel
         views = [self._image(other) for other in others] if baseline > 0 else []
-        leaves_lines = self._is_for_map and parallax > LEAST_PARALLAX
-        return self.camera, self._image(frame), views, planes, leaves_lines
+        drops_lines = self._is_for_map and parallax > LEAST_PARALLAX
+        return self.camera, self._image(frame), views, planes, drops_lines
 
     def _read_image(self, frame_index: int) -> PosedImage:
         gray = cv2.cvtColor(self._read(frame_index).image.numpy(), cv2.COLOR_RGB2GRAY)

@@ -37,7 +37,7 @@ from minislam.tracking.safeguards.turns import adjust_turns
 from minislam.workers import Workers
 
 MIN_MATCHED_RATIO = 0.1  # a frame in which less of the last keyframe is matched is lost [-]
-LONGEST_TAIL = 2  # frames after the last keyframe that need none behind them
+LONGEST_TAIL = 2  # frames after the last keyframe; of more, the last becomes a keyframe, too
 
 
 class Mode(Enum):
@@ -66,7 +66,7 @@ class Tracker(Stateful):
     _settling: Settling
     mode: Mode = Mode.WAITING
     last_non_keyframe: tuple[Frame, FlowMatches] | None = None  # if the newest frame is none
-    _last_global: int = 0  # keyframes at the last online global BA
+    _last_global: int = 0  # keyframes when all were last adjusted, or found to fit
 
     def __init__(
         self,

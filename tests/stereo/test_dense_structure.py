@@ -80,8 +80,8 @@ def test_a_line_along_the_motion_is_left_out():
         images.append(PosedImage(np.roll(gray, -4 * index, 1), posed))
     far, planes = Camera(40.0, 40.0, 30.0, 15.0, 60, 30), np.linspace(0, 1, 48)
     every, told = (
-        swept_view(far, images[2], images[:2] + images[3:], planes, leaves_lines=leaves)
-        for leaves in (False, True)
+        swept_view(far, images[2], images[:2] + images[3:], planes, drops_lines=drops)
+        for drops in (False, True)
     )
     textured, line = np.r_[0:7, 23:30], np.s_[13:17]
     inner = np.s_[15:45]

@@ -1,7 +1,7 @@
 """Whether earlier and later views measure the same depths, not in the paper.
 
 What the flow shows need not be the parallax of a scene that stands still: a stabilised film bends
-its images, water runs, a lens zooms. Depths fit such flow as well, but others at other times.
+its images, water runs, a lens zooms. Depths fit such flow as well, but other depths at each time.
 """
 
 import math

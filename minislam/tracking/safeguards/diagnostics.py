@@ -36,7 +36,7 @@ MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 t
 MIN_AGREEMENT = 0.45  # healthy .49 to 1, broken 0 to .41
 MAX_SCALE_DEVIATION = 0.1  # of a length, relative; healthy to .06, broken .19 and .40
 CERTAIN_SCALE_DEVIATION = 0.03  # photos from far apart that were posed well to .013
-MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that tell an agreement
+MIN_EVIDENCE, LEAST_CELLS = 0.005, 1.5  # of the view, and cells, that an agreement needs
 HEALED_AFTER = 3  # healthy keyframes that end a break
 LEAST_FRAMES = 6  # with a pose, of a piece that gets a map of its own
 

@@ -1,8 +1,10 @@
 """Which frame the warm-up begins with, and when it is over.
 
-After a black first frame, a slate or a jump cut, the warm-up begins anew with the first lost frame,
-once as many were lost as followed; after it, at the end of the film, if more were lost. If a later
-start is worth less, the best is repeated.
+Nothing can be followed from a black first frame, a slate, or the short side of a jump cut. So the
+warm-up begins anew behind the last followed frame as soon as it has lost as many frames as it has
+followed. Once it is over, tracking goes on to the end of the film. Then it begins anew there, too,
+if it has lost more frames than it has followed, or if it has lost some and cannot tell depth. If
+the later start is worth less, the best start is repeated.
 """
 
 from dataclasses import replace

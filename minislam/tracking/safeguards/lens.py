@@ -80,7 +80,7 @@ class BentLens(MinislamError):
 
 
 def check_lens(graph: KeyframeGraph, is_unknown: bool) -> LensFit | None:
-    """Return the lens that fits; None: too few keyframes. `BentLens`: an unknown one bends much."""
+    """Return the lens that fits, or None; raise `BentLens` if an unknown one must be undone."""
     lens = fit_lens(graph)
     if is_unknown and lens is not None and lens.is_worth_undoing:
         if lens.focal > LEAST_FOCAL * graph.grid.camera.width:

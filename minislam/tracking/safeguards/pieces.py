@@ -38,7 +38,7 @@ def pieces(
     lost: Sequence[int],  # keyframes before which the camera was lost
     edges: Iterable[Edge],  # that fit
 ) -> list[list[Span]]:
-    """Return the groups of stretches that edges tie; those right across a break do not count."""
+    """Return the groups of stretches that edges tie. An edge that only spans a break ties none."""
     stretches: list[Span] = []
     segment_of: list[int] = []  # by stretch
     stretch_of: dict[int, int] = {}  # by keyframe

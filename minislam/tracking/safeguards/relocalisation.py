@@ -40,7 +40,7 @@ class Place:
 
 
 class Relocaliser:
-    """Finds frames among the keyframes; keeps what sums these up, and keypoints once tried."""
+    """Finds the place of a frame; keeps keyframes' mean features, and keypoints of those tried."""
 
     def __init__(self, graph: KeyframeGraph) -> None:
         self._graph = graph

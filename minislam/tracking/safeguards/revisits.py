@@ -19,7 +19,7 @@ MOST_DRIFT = 0.1  # of the way walked, and of the angle turned: more is another 
 
 
 def undo_drift(graph: KeyframeGraph, relocaliser: Relocaliser) -> bool:
-    """Move the keyframes since the newest one's place was seen first; return whether it was.
+    """Move the keyframes since the newest one's place was first seen; return False if it never was.
 
     The caller checks what the flow says of the new poses.
     """
