@@ -138,7 +138,7 @@ class Sequence(Protocol):
     focal_origin: str  # what tells the camera's focal length; empty for a mere guess
     seeks_lens: bool  # whether a lens that bends straight lines is to be found, too
     warnings: list[str]  # what the user must know, for instance that the focal length is guessed
-    lost: list[tuple[float, str]]  # timestamp [s] and reason of frames that could not be decoded
+    unread: list[tuple[float, str]]  # timestamp [s] and reason of images that are left out
     checksums: dict[int, int]  # of the images read so far, by frame index
     ground_truth: GroundTruth | None
     read_depth: Callable[[Path], np.ndarray]  # a depth image, as (H, W) [m], 0 where unknown

@@ -122,7 +122,7 @@ class VideoImages:
         _, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
-    def lost(self) -> np.ndarray:  # (M,) second
+    def unread(self) -> np.ndarray:  # (M,) second
         """Return about when frames are missing: gaps of a constant rate, or calls that failed."""
         gaps = np.diff(self.timestamps) * self.frame_rate  # frames
         missing = np.diff(self._calls) - 1

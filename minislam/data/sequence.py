@@ -65,8 +65,8 @@ class RecordedSequence:
         require(len(self._chosen) >= 2, "at least two frames", f"{found} {advice}")
         left_out = [index for index in asked if index in images.odd]
         first, last = stamps[asked[0]], stamps[asked[-1]]
-        self.lost = [row for row in recording.lost if first < row[0] < last]
-        self.lost += [(float(stamps[index]), images.odd[index]) for index in left_out]
+        self.unread = [row for row in recording.unread if first < row[0] < last]
+        self.unread += [(float(stamps[index]), images.odd[index]) for index in left_out]
         self._step = float(np.median(np.diff(stamps)))
         self._masks = recording.mask_paths
         if options.masks is not None:

@@ -42,7 +42,7 @@ class Recording:
     mask_paths: dict[int, Path] = field(default_factory=dict)  # True on dynamic objects
     static_paths: dict[int, Path] = field(default_factory=dict)  # without dynamic objects
     novel_views: list[tuple[np.ndarray, Path]] = field(default_factory=list)  # (T_world_camera, .)
-    lost: list[tuple[float, str]] = field(default_factory=list)  # timestamp [s], reason
+    unread: list[tuple[float, str]] = field(default_factory=list)  # timestamp [s], reason
     notes: list[str] = field(default_factory=list)  # more for the description
     warnings: list[str] = field(default_factory=list)
 
@@ -86,11 +86,12 @@ def read_video(path: Path, limit: int | None) -> Recording:
     images = VideoImages(path, limit)
     if len(images) == 0:
         raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")
-    rate, stamps, lost, warnings = images.frame_rate, images.timestamps, images.lost(), list[str]()
+    rate, stamps, unread = images.frame_rate, images.timestamps, images.unread()
+    warnings: list[str] = []
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         if not (math.isfinite(rate) and rate > 0):
             rate = _ASSUMED_FRAME_RATE
-        stamps, lost = np.arange(len(images)) / rate, lost[:0]
+        stamps, unread = np.arange(len(images)) / rate, unread[:0]
         what = f"{path.name} has no times that increase"
         warnings.append(f"{what}: {rate:g} frames per second assumed")
     if len(images) < images.promised:
@@ -103,7 +104,7 @@ def read_video(path: Path, limit: int | None) -> Recording:
         kind="video" if images.is_whole else f"first {limit} images of a video",
         images=images,
         timestamps=stamps,
-        lost=[(stamp, f"{path.name} is damaged there") for stamp in lost.tolist()],
+        unread=[(stamp, f"{path.name} is damaged there") for stamp in unread.tolist()],
         calibration=calibration_beside(path.parent, path.stem + ".calibration.txt"),
         noted_focal_length=noted_focal_length(path),
         notes=[f"{rate:.4g} frames per second"],

@@ -41,10 +41,10 @@ def filled_depth(depth: Tensor) -> Tensor:
     known = (depth > 0).float().cpu().numpy()
     inverse = torch.where(depth > 0, 1 / depth, 0).cpu().numpy()
     size = -(-width // CELL), -(-height // CELL)
-    share, mean = (cv2.resize(a, size, None, 0, 0, cv2.INTER_AREA) for a in (known, inverse))
-    if not share.any():
+    covered, mean = (cv2.resize(a, size, None, 0, 0, cv2.INTER_AREA) for a in (known, inverse))
+    if not covered.any():
         return depth
-    values, found = mean / np.maximum(share, 1e-6), share > 0
+    values, found = mean / np.maximum(covered, 1e-6), covered > 0
     cells = plate(values, found).clip(*np.quantile(values[found], OUTLIERS) * WITHIN)
     smooth = torch.from_numpy(cv2.resize(cells, (width, height))).to(depth)
     return torch.where(depth > 0, depth, 1 / smooth)

@@ -198,7 +198,7 @@ class Mapper(JointOptimisation):
         views = zip(self.keyframes, weights, strict=True)
         calls = ((gaussians, camera, k.T_camera_world, weight) for k, weight in views)
         sums = gaussians.means.new_zeros(2, len(gaussians))
-        for of_view, fraction in self._workers.stream(safeguards.support, calls):
+        for of_view, fraction in self._workers.stream(safeguards.static_blending, calls):
             sums += of_view
             self.shown.append(fraction)
         static, total = sums

@@ -83,7 +83,7 @@ def is_wrong(
     return not excluded.any() or float(wrong[excluded].float().mean()) >= LEAST_WRONG
 
 
-def support(
+def static_blending(
     gaussians: GaussianMap,
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4)

@@ -56,7 +56,7 @@ def run_facts(
         "frames": len(slam.tracker.tracked),
         "keyframes": len(slam.tracker.keyframes),
         "lost_frames": len(slam.lost_frames()),
-        "unread_images": len(slam.sequence.lost),
+        "unread_images": len(slam.sequence.unread),
         "adjustments": graph.adjustments,
         "failed_adjustments": graph.failed_adjustments,
         "gaussians": len(slam.mapper.gaussians),
@@ -160,7 +160,7 @@ def _ties(slam: Slam) -> dict[str, float | None]:
 
 
 def _segment_errors(slam: Slam) -> dict[str, float | None]:
-    """Return the ATE of each piece of a broken trajectory, aligned by itself [cm]."""
+    """Return the ATE of each segment of a broken trajectory, aligned by itself [cm]."""
     truth, watch = slam.sequence.ground_truth, slam.tracker.watch
     if truth is None or truth.trajectory is None or not watch.breaks:
         return {}

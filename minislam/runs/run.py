@@ -218,7 +218,7 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
         return "finished, map with large holes", LOST_EXIT
     if slam.lost_frames():
         return "finished, partly lost", LOST_EXIT
-    if slam.sequence.lost:
+    if slam.sequence.unread:
         return "finished, images left out", LOST_EXIT
     return "finished", 0
 
@@ -228,8 +228,8 @@ def _write_trajectories(folder: RunFolder, slam: Slam) -> None:
     if slam.tracker.initialised:
         write_trajectory(folder.path / names.TRAJECTORY, slam.trajectory())
         write_trajectory(folder.path / names.KEYFRAME_TRAJECTORY, slam.keyframe_trajectory())
-        undecoded = [(-1, stamp, reason) for stamp, reason in slam.sequence.lost]
-        folder.write_lost_frames(sorted([*slam.lost_frames(), *undecoded], key=itemgetter(1)))
+        unread = [(-1, stamp, reason) for stamp, reason in slam.sequence.unread]
+        folder.write_lost_frames(sorted([*slam.lost_frames(), *unread], key=itemgetter(1)))
 
 
 def _write_estimates(folder: RunFolder, slam: Slam) -> None:

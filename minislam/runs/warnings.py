@@ -86,7 +86,7 @@ def _path_warnings(slam: Slam) -> Iterator[str]:
         if len(mapped) < len(slam.poses):
             shown = _stretches(sorted(mapped), slam.config.tracking.warmup_keyframes)
             piece = f", so the map shows frames {' and '.join(span(*s) for s in shown)} alone"
-        pieces = _as_options(slam, _followed_pieces(slam))
+        pieces = _as_options(slam, _followed_stretches(slam))
         anew = f"; run each piece anew, with the other options as here: {pieces}" if pieces else ""
         yield (
             f"{BROKEN} at frames {where}: motion or depth contradicts the images, there is too "
@@ -135,12 +135,12 @@ def _lost_stretches(slam: Slam) -> list[tuple[int, int]]:
     return given_up + _stretches([f.frame_index for f in frames if not f.status.is_followed], gap=1)
 
 
-def _followed_pieces(slam: Slam) -> list[tuple[int, int]]:
-    """Return first and last frame of the pieces between breaks and longer losses."""
+def _followed_stretches(slam: Slam) -> list[tuple[int, int]]:
+    """Return first and last frame of the stretches between breaks and longer losses."""
     lost = {f.frame_index for f in slam.tracker.tracked if not f.status.is_followed}
     followed = ({*range(first, last + 1)} - lost for first, last in slam.tracker.watch.segments)
     gap = slam.config.tracking.warmup_keyframes
-    return [piece for frames in followed for piece in _stretches(sorted(frames), gap)]
+    return [span for frames in followed for span in _stretches(sorted(frames), gap)]
 
 
 def _stretches(frames: list[int], gap: int) -> list[tuple[int, int]]:

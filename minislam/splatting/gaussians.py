@@ -89,7 +89,7 @@ class MapOptimizer(Stateful):
 
     A row that is added starts with zero moments and a step count of zero, so Adam's bias
     correction holds for it too. With one count for all rows, as torch.optim.Adam has, the first
-    step of a late row would be (1 - beta1) / sqrt(1 - beta2) = 3.2 times too long.
+    step of a late row would be (1 - decay1) / sqrt(1 - decay2) = 3.2 times too long.
     """
 
     gaussians: GaussianMap
@@ -97,7 +97,7 @@ class MapOptimizer(Stateful):
     _second: dict[str, Tensor]  # second moments, by parameter
     _steps: Tensor  # (N,)
 
-    BETAS = (0.9, 0.999)  # decay of the first and second moment, Adam's defaults
+    DECAYS = (0.9, 0.999)  # of the first and second moment, Adam's defaults
     EPSILON = 1e-15  # added to the denominator: 3DGS, gradients of a mean over pixels are tiny
 
     def __init__(self, gaussians: GaussianMap, rates: LearningRates) -> None:
@@ -118,16 +118,16 @@ class MapOptimizer(Stateful):
     @torch.no_grad()
     def step(self) -> None:
         """Move every parameter that has a gradient, then drop the gradients."""
-        beta1, beta2 = self.BETAS
+        decay1, decay2 = self.DECAYS
         self._steps += 1
-        correction1 = 1 - beta1**self._steps  # (N,)
-        correction2 = (1 - beta2**self._steps).sqrt()
+        correction1 = 1 - decay1**self._steps  # (N,)
+        correction2 = (1 - decay2**self._steps).sqrt()
         for name, values in self.gaussians.parameters.items():
             if values.grad is None:
                 continue
             first, second = self._first[name], self._second[name]
-            first.lerp_(values.grad, 1 - beta1)
-            second.mul_(beta2).addcmul_(values.grad, values.grad, value=1 - beta2)
+            first.lerp_(values.grad, 1 - decay1)
+            second.mul_(decay2).addcmul_(values.grad, values.grad, value=1 - decay2)
             rows = (-1,) + (1,) * (values.dim() - 1)
             denominator = (second.sqrt() / correction2.view(rows)).add_(self.EPSILON)
             rate = getattr(self.rates, name) / correction1.view(rows)

@@ -68,8 +68,8 @@ def with_swept_depth(
             depth = _completed(small, keyframe, depth, others)
         SHELF.put([depth])
         result[index] = replace(found, depth=depth)
-    shares = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
-    return list(map(_filled, result)) if fills and np.mean(shares) < LEAST_KNOWN else result
+    known = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
+    return list(map(_filled, result)) if fills and np.mean(known) < LEAST_KNOWN else result
 
 
 def _completed(

@@ -19,8 +19,8 @@ TOLERANCE = 0.05  # relative error of the inverse depth that still agrees [-]
 WELL_MATCHED = 0.5  # a view with a larger matching cost cannot refute [-]
 MIN_AGREEING = 3  # views
 MAX_REFUTED = 0.5  # refuting views per agreeing view [-]
-SUPPORT_WINDOW = 7  # px, side of the window that supports a pixel
-MIN_SUPPORT = 0.4  # of the window that must be known, too [-]
+WINDOW = 7  # px, side of the window around a pixel
+LEAST_KNOWN_AROUND = 0.4  # fraction of this window that must be known, too [-]
 CONFIRMING_COST = 0.6  # a pixel with a larger matching cost confirms nothing [-]
 MOST_SPREAD = 0.075  # image widths from a good match: so far aggregation may carry a depth
 JUDGES = 24  # views, spread evenly over the clip, that tell what stays
@@ -49,10 +49,10 @@ def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> Confirm
     agreeing, refuting = count_votes(camera, view, others)
     needed = min(MIN_AGREEING, len(others))
     known = (agreeing >= max(1, needed)) & (refuting < MAX_REFUTED * agreeing)
-    known &= _window_share(known) >= MIN_SUPPORT
+    known &= _fraction_around(known) >= LEAST_KNOWN_AROUND
     static = known & (view.cost < CONFIRMING_COST)
     known &= _distance(static) <= MOST_SPREAD * camera.width  # beyond, a guess has spread
-    return ConfirmedDepth(np.where(known, view.inverse_depth, 0), _window_share(static))
+    return ConfirmedDepth(np.where(known, view.inverse_depth, 0), _fraction_around(static))
 
 
 def keep_what_stays(
@@ -78,8 +78,8 @@ def keep_what_stays(
         agreeing, refuting = count_votes(camera, confirmed_view(index), others)
         refuted = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
         known = (depth.inverse_depth > 0) & ~refuted
-        known &= _window_share(known) >= MIN_SUPPORT
-        confirmation = depth.confirmation * np.maximum(1 - 2 * _window_share(refuted), 0)
+        known &= _fraction_around(known) >= LEAST_KNOWN_AROUND
+        confirmation = depth.confirmation * np.maximum(1 - 2 * _fraction_around(refuted), 0)
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
@@ -90,9 +90,9 @@ def _distance(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32 
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
-def _window_share(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
+def _fraction_around(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
     """Return the fraction of the window around each pixel in which the mask is true."""
-    return cv2.blur(mask.astype(np.float32), (SUPPORT_WINDOW, SUPPORT_WINDOW))
+    return cv2.blur(mask.astype(np.float32), (WINDOW, WINDOW))
 
 
 def judges(count: int) -> list[int]:

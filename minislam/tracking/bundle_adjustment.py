@@ -45,7 +45,9 @@ class BundleReport:
 
 
 @dataclass(frozen=True)
-class _Linearised:
+class _WeightedPart:
+    """Some edges, linearised about a state and weighted."""
+
     edges: Tensor  # (E,) positions in the whole problem
     problem: BundleProblem  # of these edges
     costs: Tensor  # (E,) float64 px^2
@@ -95,16 +97,17 @@ def bundle_adjust(
 
 def residuals(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
     """Return the residuals p~ - p (E, 2, N) [px] and the weights (E, 2, N), robust one included."""
-    residual, weight = joined((a.edges, a.residual, a.weight) for a in _linearised(problem, state))
+    parts = _weighted_parts(problem, state)
+    residual, weight = joined((at.edges, at.residual, at.weight) for at in parts)
     return residual, weight
 
 
-def _linearised(problem: BundleProblem, state: BundleState) -> Iterator[_Linearised]:
-    """Linearise the edges, part by part."""
-    return side_by_side(partial(_linearise, state), in_parts(problem))
+def _weighted_parts(problem: BundleProblem, state: BundleState) -> Iterator[_WeightedPart]:
+    """Linearise and weight the edges, part by part."""
+    return side_by_side(partial(_weighted_part, state), in_parts(problem))
 
 
-def _linearise(state: BundleState, edges: Tensor, part: BundleProblem) -> _Linearised:
+def _weighted_part(state: BundleState, edges: Tensor, part: BundleProblem) -> _WeightedPart:
     source, dtype = part.edges_source, part.targets.dtype
     transforms = relative_transforms(state.T_camera_world, source, part.edges_target)
     view = part.rays, part.camera, state.log_focal, part.free_focal
@@ -118,19 +121,19 @@ def _linearise(state: BundleState, edges: Tensor, part: BundleProblem) -> _Linea
     # v. Were it left out, the cheapest camera would be one that looks away from all points.
     counted = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
     costs = edge_losses(part.weights, counted, part.robust)
-    return _Linearised(edges, part, costs, residual, weight, reprojection, transforms)
+    return _WeightedPart(edges, part, costs, residual, weight, reprojection, transforms)
 
 
 def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) float64 px^2
     """Return the reprojection cost of each edge, the robust loss included."""
-    return joined((at.edges, at.costs) for at in _linearised(problem, state))[0]
+    return joined((at.edges, at.costs) for at in _weighted_parts(problem, state))[0]
 
 
 def _cost(
     problem: BundleProblem, state: BundleState, of_edges: list[Tensor] | None = None
 ) -> float:
     """Return the cost [px^2] of Eq. (5), from the costs of the edges if these are computed."""
-    of_edges = of_edges or [at.costs for at in _linearised(problem, state)]
+    of_edges = of_edges or [at.costs for at in _weighted_parts(problem, state)]
     difference = state.disparities - problem.prior_disparities
     prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
     return float(torch.cat(of_edges).sum() + prior_cost)
@@ -143,7 +146,7 @@ def normal_equations(problem: BundleProblem, state: BundleState) -> NormalEquati
 
     def of_part(edges: Tensor, part: BundleProblem) -> tuple[Any, ...]:
         """Return costs, blocks and couplings; add to the rows of C and s that no other part has."""
-        at, source = _linearise(state, edges, part), part.edges_source
+        at, source = _weighted_part(state, edges, part), part.edges_source
         residual, weight, J = at.residual, at.weight, at.reprojection.J_target
         weighted_J = (J * weight[:, None]).flatten(2)
         A = (weighted_J @ J.flatten(2).mT).double()  # (E, 6 + G, 6 + G)

@@ -49,7 +49,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/mapper.py", "mapping/test_mapper.py"): [("if not keyframe.inserts", "if False")],
     ("mapping/gaps.py", "mapping/test_gaps.py"): [
-        ("mean / np.maximum(share, 1e-6)", "mean"), ("math.sqrt(2) * down(1)", "down(1)"),
+        ("mean / np.maximum(covered, 1e-6)", "mean"), ("math.sqrt(2) * down(1)", "down(1)"),
         ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
         ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
         ("is_guessed & ((depth_votes", "((depth_votes"), ("> 0) | is_near", "> 0)"),
@@ -176,7 +176,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("and not graph.keyframes.has_prior", ""), ("is_tied and has_scale", "is_tied"),
         ("(k, depth_error=None, ", "(k, explained=None, depth_error=None, "),
         ("depth_error=None, continuity=None", "depth_error=None"), ("or held < MIN_CONTINUITY", ""),
-        ("max(holding) / max(matched, 1e-6)", "max(holding)"),
+        ("max(holding) / max(confidence, 1e-6)", "max(holding)"),
         ("max(LEAST_CELLS, MIN_EVIDENCE * len(matched))", "MIN_EVIDENCE * len(matched)"),
         ("or agreement < MIN_AGREEMENT", ""), ("matched * fits[i, keyframe]", "matched"),
         ("known[i] * graph.edges.conf", "graph.edges.conf"), ("start - last <=", "index - last <="),

@@ -135,23 +135,23 @@ def test_frames_lost_in_the_middle_are_listed_and_those_behind_are_read(tmp_path
     middle = len(content) // 2
     (tmp_path / "hole.mkv").write_bytes(content[:middle] + content[middle + 4096 :])
     recording = read_video(tmp_path / "hole.mkv", None)
-    count, lost = len(recording.images), [stamp for stamp, _ in recording.lost]
+    count, lost = len(recording.images), [stamp for stamp, _ in recording.unread]
     assert 30 < count < 60 and count + len(lost) == 60
     assert recording.timestamps[-1] == pytest.approx(59 / 30, abs=1e-3)  # behind the hole
     stamps = np.sort(np.concatenate([recording.timestamps, lost]))
     np.testing.assert_allclose(stamps, np.arange(60) / 30, atol=2e-3)
     assert f"hole.mkv promises 60 frames, but only {count} can be decoded" in recording.warnings[0]
     sequence = RecordedSequence(recording, InputOptions(), "hole.mkv")
-    assert sequence.lost == recording.lost and len(sequence) == count
+    assert sequence.unread == recording.unread and len(sequence) == count
     part = RecordedSequence(recording, InputOptions(max_frames=10), "hole.mkv")
-    assert part.lost == []  # nothing is lost of the frames that are asked for
+    assert part.unread == []  # nothing is lost of the frames that are asked for
 
 
 def test_a_cut_video_is_warned_of(tmp_path: Path):
     content = long_video(tmp_path / "whole.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(content[: int(0.6 * len(content))])
     recording = read_video(tmp_path / "cut.avi", None)
-    assert 20 < len(recording.images) < 60 and recording.lost == []
+    assert 20 < len(recording.images) < 60 and recording.unread == []
     assert "promises 60 frames" in recording.warnings[0]
     assert read_video(tmp_path / "cut.avi", 10).warnings == []
 
@@ -159,7 +159,7 @@ def test_a_cut_video_is_warned_of(tmp_path: Path):
 def test_a_whole_video_is_not_warned_of(tmp_path: Path):
     for name in ("a.mp4", "a.mkv", "a.avi"):
         recording = read_video(long_video(tmp_path / name), None)
-        assert (recording.warnings, recording.lost, len(recording.images)) == ([], [], 60)
+        assert (recording.warnings, recording.unread, len(recording.images)) == ([], [], 60)
 
 
 class Capture:
@@ -198,7 +198,7 @@ def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(ph
     recording = read_video(phone, None)
     np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2, 0.233, 0.4])
     assert [recording.images.read(k)[0, 0, 0] for k in (0, 2, 4, 1)] == [1, 4, 6, 2]
-    assert recording.lost == [(pytest.approx(0.15), "phone.mp4 is damaged there")]
+    assert recording.unread == [(pytest.approx(0.15), "phone.mp4 is damaged there")]
     assert "promises 6 frames, but only 5 can be decoded" in recording.warnings[0]
 
 
@@ -206,7 +206,7 @@ def test_timestamps_are_those_of_the_container_and_a_bad_frame_is_passed_over(ph
 def test_a_pause_of_the_recorder_is_no_damage(phone: Path, limit: int | None, monkeypatch):
     monkeypatch.setattr(Capture, "stamps", tuple(k / 30 for k in (0, 1, 2, 3, 7, 8)))
     recording = read_video(phone, limit)
-    assert (recording.lost, recording.warnings) == ([], [])
+    assert (recording.unread, recording.warnings) == ([], [])
     assert len(recording.images) == (limit or 6)
 
 

@@ -17,10 +17,10 @@ def test_images_of_another_size_are_left_out(tmp_path: Path):
     save(tmp_path / "3.png", picture(1))
     sequence = open_sequence(str(tmp_path))
     assert [frame.timestamp for frame in sequence] == pytest.approx([1 / 30, 3 / 30])
-    assert sequence.lost == [(pytest.approx(2 / 30), "2.png is 32x48 px, others are 48x32")]
+    assert sequence.unread == [(pytest.approx(2 / 30), "2.png is 32x48 px, others are 48x32")]
     assert "1 of 3 images are left out because of their size" in sequence.warnings[-1]
     sequence = open_sequence(str(tmp_path), InputOptions(stride=2))  # without the odd one
-    assert len(sequence) == 2 and not sequence.lost
+    assert len(sequence) == 2 and not sequence.unread
 
 
 def test_the_size_of_most_images_counts_not_that_of_the_first(tmp_path: Path):
@@ -28,7 +28,7 @@ def test_the_size_of_most_images_counts_not_that_of_the_first(tmp_path: Path):
     for name in "23":
         save(tmp_path / f"{name}.png", picture(1))
     sequence = open_sequence(str(tmp_path))
-    assert len(sequence) == 2 and len(sequence.lost) == 1
+    assert len(sequence) == 2 and len(sequence.unread) == 1
 
 
 def test_a_size_of_zero_is_no_size(tmp_path: Path):

@@ -9,7 +9,7 @@ from minislam.mapping.safeguards import (
     doubted_error,
     is_wrong,
     least_weight,
-    support,
+    static_blending,
 )
 from minislam.uncertainty import RenderingError, UncertaintyConfig
 from minislam.uncertainty.weights import (
@@ -178,10 +178,11 @@ def test_the_blending_weights_of_two_parts_of_a_view_are_those_of_all():
     mapper.initialise([wall_keyframe(0), wall_keyframe(2)])
     left = torch.zeros(CAMERA.height, CAMERA.width)
     left[:, : CAMERA.width // 3] = 0.5  # any weight but 0 is static
-    parts = [support(mapper.gaussians, CAMERA, pose, w)[0] for w in (left, (left == 0) * 1.0)]
+    weights = left, (left == 0) * 1.0
+    parts = [static_blending(mapper.gaussians, CAMERA, pose, w)[0] for w in weights]
     torch.testing.assert_close(parts[0][0] + parts[1][0], parts[0][1], atol=1e-4, rtol=1e-4)
     assert torch.equal(parts[0][1], mapper.render(pose).weight_sums)
-    everywhere = support(mapper.gaussians, CAMERA, pose, torch.ones_like(left))[0]
+    everywhere = static_blending(mapper.gaussians, CAMERA, pose, torch.ones_like(left))[0]
     assert torch.equal(everywhere[0], everywhere[1]) and torch.equal(everywhere[1], parts[0][1])
     pixels = CAMERA.project(mapper.gaussians.means.detach() @ pose[:3, :3].T.float() + pose[:3, 3])
     is_far_right = pixels[:, 0] > CAMERA.width / 2

@@ -13,7 +13,7 @@ from minislam.uncertainty import UncertaintyConfig
 
 def ended(
     lost: int = 0,
-    undecoded: int = 0,
+    unread: int = 0,
     failed: int = 0,
     broken: bool = False,
     shown: tuple[float, ...] = (1.0, 0.9),
@@ -22,7 +22,7 @@ def ended(
 ) -> object:
     graph = SimpleNamespace(adjustments=5, failed_adjustments=failed)
     tracker = SimpleNamespace(graph=graph, watch=SimpleNamespace(breaks=broken))
-    sequence = SimpleNamespace(lost=[(0.1, "damaged")] * undecoded)
+    sequence = SimpleNamespace(unread=[(0.1, "damaged")] * unread)
     mapper = SimpleNamespace(shown=shown, keyframes=[None], camera=None, beta_of=lambda _: None)
     mapper.static_weight = lambda beta, camera: (torch.arange(100) >= 100 * left_out).float()
     config = replace(SlamConfig(), uncertainty=UncertaintyConfig(**uncertainty))
@@ -45,8 +45,8 @@ def ended(
         ({"left_out": 0.8, "given_masks": True}, ("finished", 0)),
         ({"left_out": 0.8, "enabled": False}, ("finished", 0)),
         ({"lost": 1}, ("finished, partly lost", 3)),
-        ({"undecoded": 1}, ("finished, images left out", 3)),
-        ({"undecoded": 1, "lost": 1}, ("finished, partly lost", 3)),
+        ({"unread": 1}, ("finished, images left out", 3)),
+        ({"unread": 1, "lost": 1}, ("finished, partly lost", 3)),
     ],
 )
 def test_a_run_that_is_not_whole_ends_with_three(parts: dict, ending: tuple[str, int]):

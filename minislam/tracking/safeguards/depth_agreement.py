@@ -18,7 +18,7 @@ from minislam.tracking.optimisation import bundle_problem
 
 MOST_KEYFRAMES = 100  # evenly spread, whose depths are compared
 LEAST_INFORMATION = 0.05  # of what is usual in the keyframe: a cell with less is not compared [-]
-LEAST_CELLS = 0.15  # fraction of the cells that both sides must see [-]
+LEAST_COMMON_FRACTION = 0.15  # fraction of the cells that both sides must see [-]
 
 
 def depth_difference(graph: KeyframeGraph) -> float | None:
@@ -38,7 +38,7 @@ def depth_difference(graph: KeyframeGraph) -> float | None:
     differences = []
     for k, row in enumerate(information):
         seen = row > LEAST_INFORMATION * row[row > 0].median() if (row > 0).any() else row > 0
-        if seen.float().mean() > LEAST_CELLS:
+        if seen.float().mean() > LEAST_COMMON_FRACTION:
             differences.append(float((before[k] / after[k])[seen].log().abs().median()))
     return median(differences) if differences else None
 

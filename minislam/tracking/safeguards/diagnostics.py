@@ -19,7 +19,7 @@ from minislam.tracking.optimisation import bundle_problem
 from minislam.tracking.reprojection import lengths, scaled_points
 from minislam.tracking.safeguards.depth_agreement import depth_difference
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
-from minislam.tracking.safeguards.pieces import edges_past_a_loss, losses, pieces
+from minislam.tracking.safeguards.pieces import edges_past_a_loss, found_again, pieces
 from minislam.tracking.safeguards.robust import weighted_median
 from minislam.tracking.safeguards.scale_certainty import scale_deviations
 from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_rest
@@ -130,7 +130,7 @@ class Watch(Stateful):
 
     @property
     def segments(self) -> list[tuple[int, int]]:
-        """Return the first and last frame of each piece of trajectory between breaks."""
+        """Return the first and last frame of each segment: the keyframes between two breaks."""
         segments: dict[int, tuple[int, int]] = {}
         for frame in (keyframe.frame_index for keyframe in self.diagnostics):
             if not any(b.first_frame <= frame <= b.last_frame for b in self.breaks):
@@ -139,14 +139,14 @@ class Watch(Stateful):
         return list(segments.values())
 
     def longest_piece(self, poses: dict[int, Tensor]) -> dict[int, Tensor]:
-        """Return, of the poses by frame index, those of the longest piece between breaks.
+        """Return, of the poses by frame index, those of the longest of the `pieces`.
 
         A map shows it alone, because the pieces differ in scale and direction, and each would hide
         the others. Without a break, or where all pieces are short, all poses are returned.
         """
         frames, tied = [keyframe.frame_index for keyframe in self.diagnostics], []
         if self.breaks:
-            ties = losses(self._graph), edges_past_a_loss(self._graph)
+            ties = found_again(self._graph), edges_past_a_loss(self._graph)
             tied = pieces(frames, self.segments, *ties)
         found = [
             {i: poses[i] for i in poses if any(first <= i <= last for first, last in spans)}
@@ -161,11 +161,10 @@ def diagnose(graph: KeyframeGraph, keyframe: int) -> KeyframeDiagnostics:
     frame_index = graph.keyframes.frames[keyframe].frame_index
     edges = graph.edges.ends
     positions = [p for p, edge in enumerate(edges) if keyframe in edge]
-    explained, depth_error = tie_to_predecessors(graph, keyframe)
     sources, targets = ([edges[p][end] for p in positions] for end in (0, 1))
     ratio = max((graph.edges.matched_ratios[p] for p in positions), default=0.0)
     parallax = float(graph.parallaxes(sources, targets).max()) if positions else 0.0
-    ties = explained, depth_error, *continuity(graph, keyframe)
+    ties = *tie_to_predecessors(graph, keyframe), *continuity(graph, keyframe)
     return KeyframeDiagnostics(frame_index, ratio, parallax, *ties)
 
 
@@ -189,9 +188,9 @@ def tie_to_predecessors(graph: KeyframeGraph, keyframe: int) -> tuple[float | No
     weights *= (targets == keyframe)[:, None]
     explained = float((weights * fitting(graph, residual)).sum() / weights.sum().clamp_min(1e-6))
 
-    positions_seen = (problem.targets - residual).mT
-    seen, expected = seen_and_expected(graph, sources, targets, positions_seen)
-    counted = robust_weights[:, 0] * graph.grid.camera.contains(positions_seen)
+    seen_at = (problem.targets - residual).mT
+    seen, expected = seen_and_expected(graph, sources, targets, seen_at)
+    counted = robust_weights[:, 0] * graph.grid.camera.contains(seen_at)
     return explained, weighted_median((seen / expected).log().abs(), counted * expected)
 
 
@@ -206,7 +205,8 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
     the fraction that fits of the known and matched cells, without motion weights, in the worst
     edge. None: an edge is missing or the camera was lost, or for agreement too few cells are known.
     """
-    before, now = [None, None, *graph.flow_to_next][keyframe : keyframe + 2]
+    flow_into = dict(enumerate(graph.flow_to_next, start=1))  # by keyframe
+    before, now = flow_into.get(keyframe - 1), flow_into.get(keyframe)
     sources = range(max(0, keyframe - LOOK_BACK), keyframe)
     wanted = {(i, end) for i in sources for end in (i + 1, keyframe)}
     at = {ends: p for p, ends in enumerate(graph.edges.ends) if ends in wanted}
@@ -224,8 +224,8 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
         holding.append(float((fitted * graph.keyframes.motion_weights[i]).mean()))
         if matched.sum() > max(LEAST_CELLS, MIN_EVIDENCE * len(matched)):
             agreeing.append(float(fitted.sum() / matched.sum()))
-    matched = float(graph.edges.confidences[at[keyframe - 1, keyframe]][0].mean())
-    return max(holding) / max(matched, 1e-6), min(agreeing, default=None)
+    confidence = float(graph.edges.confidences[at[keyframe - 1, keyframe]][0].mean())
+    return max(holding) / max(confidence, 1e-6), min(agreeing, default=None)
 
 
 def fitting(graph: KeyframeGraph, residual: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) bool

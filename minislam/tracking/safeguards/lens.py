@@ -32,7 +32,7 @@ from minislam.tracking.safeguards.robust import least_cost
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
 WIDENINGS_AGAIN = [8.0, 4.0, 1.0]  # of the robust weight: a path that was bent lets go of its flow
 ROUNDS = 16  # of straightening and adjusting, at most, from either first width
-SETTLED = 0.001  # a round that bends a corner by no more is the last [-]
+LAST_BEND = 0.001  # a round that bends a corner by no more is the last [-]
 INVERSION_STEPS = 50  # of the fixed point that inverts the lens
 LEAST_STRETCH = 0.3  # of a ray: a stronger lens cannot be inverted at the corners [-]
 # tests/benchmarks/diary/focal_length.md, "A lens that nobody told of". [-]
@@ -104,7 +104,7 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
             found, _ = adjust_narrowing(lens, state, widenings, ITERATIONS)
             state, widenings = replace(found, readout=(0.0, 0.0)), [1.0]
             before, radial = radial, _without_fold(problem.camera, radial, found.readout)
-            if abs(bend_of(problem.camera, radial) - bend_of(problem.camera, before)) < SETTLED:
+            if abs(bend_of(problem.camera, radial) - bend_of(problem.camera, before)) < LAST_BEND:
                 break
     lens = replace(straightened(problem, radial), shutter=None)
     state, held = adjust_narrowing(lens, state, [1.0], ITERATIONS)

@@ -15,14 +15,14 @@ Span = tuple[int, int]  # first and last frame
 MIN_SUPPORT = 0.5  # robust weight of an edge that fits, over its weight; of one that does not 0 [-]
 
 
-def losses(graph: KeyframeGraph) -> list[int]:
-    """Return the keyframes before which the camera was lost."""
+def found_again(graph: KeyframeGraph) -> list[int]:
+    """Return the keyframes at which a lost camera was found again."""
     return [k for k in range(len(graph.keyframes)) if graph.follows_a_loss(k)]
 
 
 def edges_past_a_loss(graph: KeyframeGraph) -> list[Edge]:
     """Return the edges between keyframes before and behind a loss that fit the geometry."""
-    ends, lost = graph.edges.ends, losses(graph)
+    ends, lost = graph.edges.ends, found_again(graph)
     past = [p for p, edge in enumerate(ends) if any(min(edge) < k <= max(edge) for k in lost)]
     if not past:
         return []

@@ -20,7 +20,7 @@ DOUBTFUL_SUPPORT = 0.5  # with less, other starts are tried
 LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
 # The largest residual of a flow that a pose explains: so many px at 320x240, plus this part of the
 # flow, because the first updates of a network fall short, but in the right direction.
-EXPLAINED = 3.0, 0.25
+EXPLAINED_PX, EXPLAINED_FRACTION = 3.0, 0.25
 CHANCE = 0.25  # of the weight of a random flow is explained as well; .95 and more of a good one [-]
 REPEATED = 0.001  # mean difference of an image from the one that it repeats, encoded again [-]
 
@@ -77,7 +77,7 @@ def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
     disparities = graph.keyframes.disparities[-1:]
     predicted, _ = reproject(motion, disparities, graph.grid.rays, graph.grid.camera)
     flow = lengths(matches.targets - graph.grid.pixels.T)
-    allowed = EXPLAINED[0] * graph.pixel_scale + EXPLAINED[1] * flow
+    allowed = EXPLAINED_PX * graph.pixel_scale + EXPLAINED_FRACTION * flow
     weights = matches.confidences.mean(1)
     explained = weights * (lengths(matches.targets - predicted) < allowed)
     ratio = (explained.sum(1) / weights.sum(1) - CHANCE) / (1 - CHANCE)

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from minislam.geometry import Camera
 from minislam.priors.dense_flow import dense_from_grid, grayscale, residual_flow, warp
 from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
@@ -72,8 +73,8 @@ class ImageMotion(Stateful):
     def displacement(self, frame_index: int, readout: Readout) -> np.ndarray | None:  # (H, W, 2)
         """Return how far the rolling shutter moves each pixel of a frame [px]; None: negligible."""
         grid, camera = self._grid, self._grid.camera
-        late = grid.pixels.T / grid.pixels.new_tensor([[camera.width], [camera.height]]) - 0.5
-        moved = self.velocity(frame_index) * (grid.pixels.new_tensor(readout) @ late)
+        late = grid.pixels.new_tensor(readout) @ lateness(grid.pixels.T, camera)  # s
+        moved = self.velocity(frame_index) * late
         if not moved.abs().max() > NEGLIGIBLE:
             return None
         cells = (grid.pixels + moved.T).reshape(*grid.shape, 2).cpu().numpy()
@@ -99,20 +100,19 @@ class RollingShutter(Stateful):
     def columns(
         self,
         edges: list[tuple[int, int]],  # keyframe indices
-        positions: Tensor,  # (E, 2, N) px, of the source's cells in the target
+        targets: Tensor,  # (E, 2, N) px, p~ of the source's cells
         next_frame: int | None = None,  # frame that counts as the keyframe after the newest
     ) -> Tensor:  # (E, 2, 2, N) px/s
         """Return c, the derivative of the flow of some edges by either readout."""
-        camera, pixels = self._grid.camera, self._grid.pixels
         frames = [frame.frame_index for frame in self._keyframes.frames]
         frames += [] if next_frame is None else [next_frame]
         ends = {end for edge in edges for end in edge}
         u = {end: self.motion.velocity(frames[end]) for end in ends}
         u_source = torch.stack([u[source] for source, _ in edges])
         u_target = torch.stack([u[target].mT for _, target in edges])
-        u_target = self._grid.sample(u_target, positions.mT).mT
-        size = pixels.new_tensor([[camera.width], [camera.height]])
-        late_source, late_target = pixels.T / size - 0.5, positions / size - 0.5
+        u_target = self._grid.sample(u_target, targets.mT).mT
+        pixels, camera = self._grid.pixels.T, self._grid.camera
+        late_source, late_target = lateness(pixels, camera), lateness(targets, camera)
         at_source = late_source[:, None] * u_source[:, None]
         return at_source - late_target[:, :, None] * u_target[:, None]
 
@@ -158,10 +158,10 @@ class RollingShutter(Stateful):
         self.readout = after[0], after[1]
         moved: list[Tensor] = []
         parts = zip(at_once(self._edges.ends), at_once(self._edges.targets), strict=True)
-        for ends, targets in parts:
-            columns = self.columns(ends, positions := torch.stack(targets))
+        for ends, rows in parts:
+            columns = self.columns(ends, targets := torch.stack(rows))
             change = displacements(columns, self.readout) - displacements(columns, before)
-            moved += SHELF.rows(positions + change)
+            moved += SHELF.rows(targets + change)
         self._edges.targets = moved
 
     def undone(self, frame: Frame) -> Frame:
@@ -171,6 +171,11 @@ class RollingShutter(Stateful):
             return frame
         pixels = warp(frame.pixels.cpu().numpy(), moved, cv2.INTER_CUBIC)
         return replace(frame, pixels=torch.from_numpy(pixels).to(frame.pixels))
+
+
+def lateness(pixels: Tensor, camera: Camera) -> Tensor:  # both (..., 2, N)
+    """Return s(x) of pixels x in u and in v: how long after the middle each is read, over rho."""
+    return pixels / pixels.new_tensor([[camera.width], [camera.height]]) - 0.5
 
 
 def displacements(columns: Tensor, readout: Readout) -> Tensor:  # (E, 2, N) px

@@ -2,7 +2,7 @@
 
 A single camera knows lengths only as multiples of those before, by points that several keyframes
 see from far enough apart. Where a fast turn, a plain wall or a dynamic object leaves few of them,
-two pieces of a trajectory can differ in scale although each fits its flow. The normal equations of
+two parts of a trajectory can differ in scale although each fits its flow. The normal equations of
 Eq. (5) tell how far: the inverse of their Schur complement, times the mean squared residual, is
 the covariance of the poses.
 """

@@ -4,7 +4,7 @@ import pytest
 
 from minislam.geometry import se3_exp
 from minislam.tracking.frame_graph import both_directions
-from minislam.tracking.safeguards.pieces import edges_past_a_loss, losses, pieces
+from minislam.tracking.safeguards.pieces import edges_past_a_loss, found_again, pieces
 from tests.tracking.test_loop_closure import CONFIG
 from tests.tracking.wall import TrueFlow, true_graph
 
@@ -38,7 +38,7 @@ def test_only_edges_past_a_loss_that_fit_tie():
     edges = both_directions([(1, 0), (2, 1), (3, 1), (3, 2)])
     graph.match(edges)
     graph.flow_to_next = [object(), None, object()]
-    assert losses(graph) == [2]
+    assert found_again(graph) == [2]
     assert edges_past_a_loss(graph) == both_directions([(2, 1), (3, 1)])
     graph.keyframes.T_camera_world[3] @= se3_exp(graph.keyframes.T_camera_world.new_ones(6))
     assert edges_past_a_loss(graph) == both_directions([(2, 1)])
