@@ -112,9 +112,7 @@ class Slam(Stateful):
     def _new_mapper(self, cell: int) -> Mapper:
         config, dimension, camera = self.config, self._features.dimension, self.tracker.grid.camera
         parts = camera, config.mapping, config.uncertainty, dimension, config.seed
-        mapper = Mapper(*parts, self.device, self.workers)
-        mapper.cell = cell
-        return mapper
+        return Mapper(*parts, self.device, self.workers, cell)
 
     def frame(self, frame_index: int) -> Frame:
         """Read a frame; it moves to the device of the run."""

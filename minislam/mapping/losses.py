@@ -19,12 +19,10 @@ FLOATER_MARGIN = 0.5  # median depths between a floater and the reference behind
 
 @dataclass(frozen=True)
 class RenderLoss:
-    """L_render and its parts."""
+    """L_render, and the mean of L_color, which is noted beside it."""
 
     total: Tensor  # () Eq. (6)
     color: Tensor  # () weighted mean of L_color
-    depth: Tensor  # () weighted mean of L_depth [m, see `metre`]
-    isotropic: Tensor  # () L_iso [m]
 
 
 def metre(median_depth: float) -> float:
@@ -146,4 +144,4 @@ def render_loss(
     depth = weighted_depth_loss(*depths, weight, *limits).mean() / unit
     isotropic = isotropic_loss(gaussians.scales) / unit
     total = config.color_weight * color + (1 - config.color_weight) * depth
-    return RenderLoss(total + config.lambda_isotropic * isotropic, color, depth, isotropic)
+    return RenderLoss(total + config.lambda_isotropic * isotropic, color)

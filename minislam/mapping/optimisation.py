@@ -56,12 +56,13 @@ class JointOptimisation(Stateful):
         seed: int,
         device: str = "cpu",  # of all tensors; keyframes must be there, too
         workers: Workers | None = None,  # render the views of a step
+        cell: int | None = None,  # px; None: that of the configuration
     ) -> None:
         self.camera = camera
         self.config = config
         self.uncertainty = uncertainty
         self.seed = seed
-        self.cell = config.insertion.cell
+        self.cell = cell or config.insertion.cell
         self.keyframes = []
         self.window, self.shown = [], []
         self.background = torch.zeros(3, device=device)
@@ -102,7 +103,7 @@ class JointOptimisation(Stateful):
     def render(self, T_camera_world: Tensor, camera: Camera | None = None) -> Rendering:
         """Render the map from a pose (4, 4), without gradients."""
         camera = camera or self.camera
-        return render(self.gaussians, camera, T_camera_world.float(), self.background)
+        return render(self.gaussians, camera, T_camera_world, self.background)
 
     def renderings(self, keyframes: list[Keyframe]) -> Iterator[Rendering]:
         """Yield what the map shows of each keyframe; the workers render side by side."""
@@ -184,7 +185,7 @@ class JointOptimisation(Stateful):
             grid = small, (rows, columns), keyframe.confirmation, unit
             comparison = Comparison(*grid, self.uncertainty)
         pose, weight = keyframe.T_camera_world, self.static_weight(self.beta_of(keyframe), camera)
-        view = camera, pose.float(), self.background, view_of(keyframe, camera), weight
+        view = camera, pose, self.background, view_of(keyframe, camera), weight
         return self.gaussians, *view, self.median_depth, self.config, comparison
 
     def _train_mlp(self, positions: list[int], views: list[ViewGradients]) -> float:

@@ -97,7 +97,7 @@ def static_blending(
     """
     static, colors = weight > 0, gaussians.colors.detach()
     colors.requires_grad_(not static.all())
-    rendering = render(replace(gaussians, colors=colors), camera, T_camera_world.float())
+    rendering = render(replace(gaussians, colors=colors), camera, T_camera_world)
     of_static = rendering.weight_sums
     if colors.requires_grad:
         of_static = torch.autograd.grad(rendering.color[..., 0][static].sum(), colors)[0][:, 0]

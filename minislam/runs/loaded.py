@@ -251,4 +251,4 @@ class Run:
         anchors = torch.zeros(len(self.gaussians), dtype=torch.int64)
         gaussians = GaussianMap(**rows, anchor_keyframe=anchors)
         with torch.no_grad():
-            return render(gaussians, camera or self.camera, T_camera_world.float(), background)
+            return render(gaussians, camera or self.camera, T_camera_world, background)

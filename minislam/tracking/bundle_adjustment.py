@@ -168,7 +168,8 @@ def normal_equations(problem: BundleProblem, state: BundleState) -> NormalEquati
         costs.append(of_edges)
         rows.append(blocks)
         couplings.add(of_sources)
-    return NormalEquations(_cost(problem, state, costs), joined(rows), C, s, couplings)
+    A, b, adjoints = joined(rows)
+    return NormalEquations(_cost(problem, state, costs), A, b, adjoints, C, s, couplings)
 
 
 def _damped_step(

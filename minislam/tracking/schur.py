@@ -20,7 +20,9 @@ class NormalEquations:
     """The normal equations of Eq. (5): pose blocks by edge, disparity blocks, their coupling."""
 
     cost: float  # px^2, Eq. (5)
-    of_edges: list[Tensor]  # J^T W J (E, 6 + G, 6 + G), J^T W r (E, 6 + G), Ad (E, 6, 6), float64
+    edge_blocks: Tensor  # J^T W J (E, 6 + G, 6 + G) float64
+    edge_gradients: Tensor  # J^T W r (E, 6 + G) float64
+    adjoints: Tensor  # Ad(T_target_source) (E, 6, 6) float64
     disparity_diagonal: Tensor  # C (K, N)
     disparity_gradient: Tensor  # s (K, N)
     source_blocks: SourceBlocks  # per source k: k, rows (R,), E_k (R, N)
@@ -36,7 +38,8 @@ def marginalised(
     The unknowns U are 6 per free pose, then those of the camera. The inverse of this Schur
     complement, times the variance of a residual, is the covariance of the poses.
     """
-    S, b = assemble_poses(problem, *equations.of_edges)
+    of_edges = equations.edge_blocks, equations.edge_gradients, equations.adjoints
+    S, b = assemble_poses(problem, *of_edges)
     for source, rows, E in equations.source_blocks:
         scaled = E * inverse_C[source]
         S.index_put_((rows[:, None], rows[None, :]), -(scaled @ E.mT).double(), accumulate=True)

@@ -29,7 +29,8 @@ class KnownProblem:
 
 def pose_equations(problem: BundleProblem, state: BundleState) -> tuple[Tensor, Tensor]:
     """Return H and g of the poses."""
-    return assemble_poses(problem, *normal_equations(problem, state).of_edges)
+    found = normal_equations(problem, state)
+    return assemble_poses(problem, found.edge_blocks, found.edge_gradients, found.adjoints)
 
 
 def normal(seed: int, *shape: int) -> Tensor:

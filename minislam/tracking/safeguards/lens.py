@@ -26,7 +26,6 @@ from minislam.tracking.bundle_problem import BundleProblem
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing
 from minislam.tracking.safeguards import focal_length
-from minislam.tracking.safeguards.focal_length import ITERATIONS, WIDENINGS
 from minislam.tracking.safeguards.robust import least_cost
 
 MOST_KEYFRAMES = 40  # from the first on: they tell a lens, in a few seconds
@@ -96,18 +95,18 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
     if among is None:
         return None
     problem, state = replace(among[0], free_focal=True), among[1]
-    _, pinhole = adjust_narrowing(problem, state, WIDENINGS, ITERATIONS)
+    _, pinhole = adjust_narrowing(problem, state, focal_length.WIDENINGS, focal_length.ITERATIONS)
     radial = (0.0, 0.0)
-    for widenings in (WIDENINGS, WIDENINGS_AGAIN):
+    for widenings in (focal_length.WIDENINGS, WIDENINGS_AGAIN):
         for _ in range(ROUNDS):
             lens = straightened(problem, radial)
-            found, _ = adjust_narrowing(lens, state, widenings, ITERATIONS)
+            found, _ = adjust_narrowing(lens, state, widenings, focal_length.ITERATIONS)
             state, widenings = replace(found, readout=(0.0, 0.0)), [1.0]
             before, radial = radial, _without_fold(problem.camera, radial, found.readout)
             if abs(bend_of(problem.camera, radial) - bend_of(problem.camera, before)) < LAST_BEND:
                 break
     lens = replace(straightened(problem, radial), shutter=None)
-    state, held = adjust_narrowing(lens, state, [1.0], ITERATIONS)
+    state, held = adjust_narrowing(lens, state, [1.0], focal_length.ITERATIONS)
     floor = least_cost(problem.weights)
     saved = (pinhole.cost_after - held.cost_after) / max(pinhole.cost_after, floor)
     zoom, bend = math.exp(state.log_focal), bend_of(problem.camera, radial)

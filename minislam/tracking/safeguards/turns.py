@@ -6,12 +6,11 @@ from statistics import fmean, median
 
 import torch
 
-from minislam.tracking import pose_from_flow
 from minislam.tracking.bundle_adjustment import bundle_adjust, residuals
 from minislam.tracking.bundle_problem import BundleState
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import adjust_narrowing, bundle_problem
-from minislam.tracking.pose_from_flow import POSE_ITERATIONS, ROBUST_WIDENING
+from minislam.tracking.pose_from_flow import POSE_ITERATIONS, ROBUST_WIDENING, motion_only_problem
 from minislam.tracking.reprojection import lengths, parallax
 from minislam.tracking.safeguards.robust import weighted_median
 
@@ -35,7 +34,7 @@ def flow_beyond_turns(graph: KeyframeGraph) -> float | None:  # px of a 320x240 
     numbers = torch.arange(len(pairs) + 1, device=grid.rays.device)
     ends = torch.zeros_like(numbers[1:]), numbers[1:]  # without translation sources share a pose
     measured = torch.stack([edges.targets[p] for p in pairs]), torch.stack(weights)
-    problem = pose_from_flow.motion_only_problem(grid, *ends, *measured, numbers > 0, None)
+    problem = motion_only_problem(grid, *ends, *measured, numbers > 0, None)
     problem = replace(problem, free_focal=graph.seeks_focal and not graph.focal_is_free)
     poses = torch.eye(4, dtype=torch.float64, device=grid.rays.device).repeat(len(numbers), 1, 1)
     turned = BundleState(poses, grid.rays.new_zeros(len(numbers), len(grid.rays)))
