@@ -17,7 +17,7 @@ from minislam.tracking.optimisation import final_global_ba
 from minislam.tracking.reprojection import reproject
 from minislam.tracking.safeguards.diagnostics import seen_and_expected
 from minislam.tracking.tracker import Tracker
-from minislam.tracking.trajectory import pose_all_frames
+from minislam.tracking.trajectory import pose_frames
 from minislam.workers import Workers
 
 # Static weight of a cell that nothing confirms: where no cell is confirmed, all count alike. [-]
@@ -39,16 +39,12 @@ def adjust_again(
 
     Frames between keyframes are posed and swept as well, to vote. None is called lost here.
     """
-    tracked = tracker.tracked
     keyframes = [frame.frame_index for frame in tracker.keyframes.frames]
-    followed = [frame.frame_index for frame in tracked if frame.status.is_followed]
+    followed = [frame.frame_index for frame in tracker.tracked if frame.status.is_followed]
     # To pose all frames took two to five times as long, as accurate (diary/dense_structure.md).
     wanted = {*swept_frames(keyframes, followed)}
-    tracker.tracked = [frame for frame in tracked if frame.frame_index in wanted]
-    try:
-        poses = pose_all_frames(tracker, sequence, on_progress("posing frames"))
-    finally:
-        tracker.tracked = tracked
+    chosen = [frame for frame in tracker.tracked if frame.frame_index in wanted]
+    poses, _ = pose_frames(tracker.graph, chosen, sequence, on_progress("posing frames"))
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
     inputs = tracker.graph, sequence, poses, sorted(poses), keyframes
     swept = sweep_frames(*inputs, on_sweep, workers, COARSE_WIDTH)

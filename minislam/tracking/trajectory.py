@@ -10,41 +10,54 @@ from minislam.errors import MinislamError
 from minislam.geometry import se3_interpolate, se3_inverse
 from minislam.records import Progress, Sequence, TrackedFrame, TrackingStatus, Trajectory
 from minislam.tracking.keyframe_graph import KeyframeGraph
-from minislam.tracking.safeguards.pose_support import PoseFit, repeats_last, retry_doubtful
+from minislam.tracking.safeguards.pose_support import PoseFit, repeats, retry_doubtful
 from minislam.tracking.tracker import Tracker
 
 
 def pose_all_frames(
     tracker: Tracker, sequence: Sequence, progress: Progress | None = None
 ) -> dict[int, Tensor]:
-    """Return T_camera_world (4, 4) of every frame that was not lost, by frame index.
+    """Return T_camera_world (4, 4) of the frames by frame index; those without support are lost."""
+    poses, lost = pose_frames(tracker.graph, tracker.tracked, sequence, progress)
+    for position, tracked in enumerate(tracker.tracked):
+        if tracked.frame_index in lost:
+            tracker.tracked[position] = replace(tracked, status=TrackingStatus.LOST)
+    return poses
+
+
+def pose_frames(
+    graph: KeyframeGraph,
+    tracked: list[TrackedFrame],  # the followed ones of these are posed
+    sequence: Sequence,
+    progress: Progress | None = None,
+) -> tuple[dict[int, Tensor], list[int]]:
+    """Return T_camera_world (4, 4) of keyframes and frames by index, and frames without support.
 
     A keyframe keeps its pose; an image that repeats the one before takes its pose. Another frame
     starts from the interpolated pose and is adjusted on the flow from the keyframes around it; with
-    little support it starts again from its neighbours, and is lost if it stays without support.
+    little support it starts again from its neighbours, and has no pose if it stays without support.
     """
-    graph, frames = tracker.graph, tracker.keyframes.frames
-    poses = tracker.keyframes.T_camera_world
+    frames, poses = graph.keyframes.frames, graph.keyframes.T_camera_world
     fits = {f.frame_index: PoseFit(T, 1.0) for f, T in zip(frames, poses, strict=True)}
-    followed = [t for t in tracker.tracked if t.status.is_followed]
+    followed = [t for t in tracked if t.status.is_followed]
     others = {t.frame_index: t for t in followed if t.frame_index not in fits}
     shown = {frame.frame_index: frame for frame in frames}
 
     def fit_from(index: int, start: Tensor) -> PoseFit:
         frame = sequence.frame(index).to(poses.device)
-        if repeats_last(frame, shown) and index - 1 in fits:
+        shown[index] = frame
+        shown.pop(index - 2, None)
+        before = shown.get(index - 1)
+        if before is not None and index - 1 in fits and repeats(frame, before):
             return fits[index - 1]
         return PoseFit(*graph.fit_pose(frame, _around(graph, others[index]), start))
 
-    for done, (index, tracked) in enumerate(others.items()):
-        fits[index] = fit_from(index, _interpolate(graph, tracked))
+    for done, (index, other) in enumerate(others.items()):
+        fits[index] = fit_from(index, _interpolate(graph, other))
         if progress:
             progress(done + 1, len(others))
-    lost = retry_doubtful(fits, list(others), fit_from)
-    for position, tracked in enumerate(tracker.tracked):
-        if tracked.frame_index in lost:
-            tracker.tracked[position] = replace(tracked, status=TrackingStatus.LOST)
-    return {index: fits[index].T_camera_world for index in sorted(fits)}
+    unsupported = retry_doubtful(fits, list(others), fit_from)
+    return {index: fits[index].T_camera_world for index in sorted(fits)}, unsupported
 
 
 def _around(graph: KeyframeGraph, tracked: TrackedFrame) -> list[int]:

@@ -128,25 +128,17 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
     tracker = SimpleNamespace(graph=graph, keyframes=graph.keyframes, tracked=tracked, watch=watch)
     tracker.conclude = lambda: done.append(("judged", graph.keyframes.static_weights.min()))
 
-    def pose_all_frames(tracker, sequence, progress):
-        assert [frame.frame_index for frame in tracker.tracked] == NUMBERS
-        tracker.tracked[0] = lost
-        return {0: torch.eye(4)}
-
-    def interrupted(tracker, sequence, progress):
-        raise KeyboardInterrupt
+    def pose_frames(graph, tracked, sequence, progress):
+        assert [frame.frame_index for frame in tracked] == NUMBERS
+        return {0: torch.eye(4)}, NUMBERS[1:]
 
     def sweep(graph, sequence, poses, frames, wanted, progress, workers, width):
         done.append((sorted(poses), width, frames, wanted))
         return swept(graph)
 
-    monkeypatch.setattr(second_adjustment, "pose_all_frames", pose_all_frames)
+    monkeypatch.setattr(second_adjustment, "pose_frames", pose_frames)
     monkeypatch.setattr(second_adjustment, "sweep_frames", sweep)
     adjust_again(tracker, SimpleNamespace())
-    assert tracker.tracked == [followed[0], lost, *followed[2:]]
-    monkeypatch.setattr(second_adjustment, "pose_all_frames", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
     swept_first = [0], COARSE_WIDTH, [0], NUMBERS
     assert done == [swept_first, ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end

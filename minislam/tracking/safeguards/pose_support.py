@@ -54,15 +54,9 @@ def retry_doubtful(
     return lost
 
 
-def repeats_last(frame: Frame, shown: dict[int, Frame]) -> bool:
-    """Tell whether an image repeats the one before it, as of a recorder that froze.
-
-    Sensor noise differs by more. The frame joins those that were `shown`, by frame index.
-    """
-    shown[frame.frame_index] = frame
-    shown.pop(frame.frame_index - 2, None)
-    before = shown.get(frame.frame_index - 1)
-    return before is not None and float((frame.image - before.image).abs().mean()) < REPEATED
+def repeats(frame: Frame, before: Frame) -> bool:
+    """Tell whether an image repeats the one before: a recorder froze. Noise differs by more."""
+    return float((frame.image - before.image).abs().mean()) < REPEATED
 
 
 def judged_by_pose(graph: KeyframeGraph, matches: FlowMatches) -> FlowMatches:
