@@ -132,11 +132,14 @@ class Slam(Stateful):
 
     def _initialise(self) -> None:
         """Start in two stages (paper supplement): first without beta, then with beta."""
+        show = self.steps.on_progress("initialisation")
+        show(0, 1)
         with self.steps.timed("initialisation"):
             self.tracker.initialise(self.workers)
         self._map_new_keyframes()
         with self.steps.timed("initialisation"):
             self.tracker.refine_initialisation()
+        show(1, 1)
 
     def _map_new_keyframes(self) -> None:
         """Add new keyframes to the map. Without a depth prior it is built at the end."""

@@ -56,8 +56,11 @@ def read_color(path: Path) -> np.ndarray:  # (H, W, 3) uint8 RGB
 
 
 def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
-    """Read a black and white picture: white is True."""
+    """Read a black and white picture: what is white and not transparent is True."""
     gray = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if path.suffix.lower() == ".png":
+        alpha = _decode(path, cv2.IMREAD_UNCHANGED).reshape(*gray.shape, -1)[..., 3:]
+        gray = np.minimum(gray, alpha[..., 0]) if alpha.size else gray
     white = 255 if gray.max() <= 255 else 65535
     found = f"{gray.max()} as the largest value in {path}"
     advice = f"write {white} where something moves, not its number"

@@ -14,10 +14,10 @@ BLURRED = 2  # px of the picture, beside a bar, that a codec mixes with it
 # A scene that leaves less of a side is dark, not barred [-], unless both bars are alike [px].
 LEAST_PICTURE, ALIKE = 0.5, 4
 FADED = 0.5  # of the largest lit area: an image that shows less does not tell where bars end [-]
-CAPTION = 0.5  # of the most that is lit of any row or column: a caption is smaller [-]
-# From image to image a caption changes by less, of itself and of the line [-].
+CAPTION = 0.5  # of the lit fraction of the brightest line: a line of a bar with a caption has less
+# Between images a caption changes by less than this part of its lit fraction, and noise [-].
 SAME_CAPTION, NOISE = 0.15, 0.005
-SHARP = 0.8  # of that: beside a bar the picture has more, a round one has less [-]
+SHARP = 0.8  # of the same: the first line of a picture has more, that of a round one less
 LEAST_IMAGES = 4  # that tell a caption
 HALF = 96  # px, side of a half of an image when it is compared with the other
 COARSE = 4.0  # px of a half: what is coarser, such as the sky above a street, tells nothing

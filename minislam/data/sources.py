@@ -156,6 +156,10 @@ def mask_files(images: ImageSource, masks: str, chosen: list[int]) -> dict[int, 
     named = {k: files[_stem(path)] for k, path in enumerate(images.paths) if _stem(path) in files}
     numbered = {int(name): path for name, path in files.items() if name.isdecimal()}
     found = named if named and isinstance(images, FileImages) else numbered
+    # Counted from 1, as ffmpeg does, the last mask has the number of images.
+    is_shifted = found is numbered and 0 not in numbered and {1, len(images)} <= {*numbered}
+    wanted, advice = f"masks counted from 0 in {folder}", "or name them like the images"
+    require(not is_shifted, wanted, f"1 to {len(images)}; count them anew, {advice}")
     if missing := [images.labels[index] for index in chosen if index not in found]:
         without = f"none for {len(missing)} of {len(chosen)}, such as {missing[0]}"
         advice = "name them like the images or by number from 0; a black one where nothing moves"

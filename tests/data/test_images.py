@@ -76,6 +76,13 @@ def test_a_mask_of_16_bits_is_read_at_its_full_range(tmp_path: Path):
         read_mask(save(tmp_path / "labels.png", np.array([[0, 300]], np.uint16)))
 
 
+def test_what_is_transparent_in_a_mask_is_no_mask(tmp_path: Path):
+    cut_out = np.full((2, 2, 4), 255, np.uint8)
+    cut_out[0, 0, 3] = 0
+    cv2.imwrite(str(tmp_path / "m.png"), cut_out)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), [[False, True], [True, True]])
+
+
 def test_natural_order_of_300_files(tmp_path: Path):
     names = [f"frame {number}.png" for number in range(300)]
     for name in np.random.default_rng(0).permutation(names):

@@ -108,6 +108,15 @@ def test_masks_of_a_video_are_found_by_number(tmp_path: Path):
     assert columns(sequence) == [2, 4]
 
 
+def test_masks_counted_from_one_are_refused(tmp_path: Path):
+    walk = str(video(tmp_path / "walk.mp4", 4, (48, 32)))
+    given = masks(tmp_path / "given", "1", "2", "3", "4")
+    with pytest.raises(InputError, match=r"counted from 0 in .*, found 1 to 4; count them anew"):
+        open_sequence(walk, InputOptions(masks=given, start=1))
+    later = masks(tmp_path / "later", "2", "3", "4")  # of some images
+    assert columns(open_sequence(walk, InputOptions(masks=later, start=2))) == [1, 2]
+
+
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
