@@ -91,10 +91,9 @@ class Watch(Stateful):
     def conclude(self) -> None:
         """Judge all keyframes after the final adjustment, and find the breaks."""
         self.judge()
-        graph = self._graph
+        graph, judged = self._graph, self.diagnostics
         self.beyond_turns, self.resting = flow_beyond_turns(graph), fraction_at_rest(graph)
         self.depth_difference = depth_difference(graph)
-        judged = self.diagnostics
         if self.only_turned or (self.hardly_walked and self.has_two_depths):
             # Depths are arbitrary, and a pan leaves old cells behind.
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
@@ -218,8 +217,9 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
     known[keyframe - 1] = arrived(graph.grid, before, known[keyframe - 2])
     holding, agreeing = [], []
     for i in sources:
-        matched = known[i] * graph.edges.confidences[at[i, keyframe]][0]
-        matched = matched * graph.keyframes.static_weights[i]
+        static = graph.keyframes.static_weights[i]
+        static = static / static.max().clamp_min(1e-6)  # small everywhere if nothing is confirmed
+        matched = known[i] * static * graph.edges.confidences[at[i, keyframe]][0]
         fitted = matched * fits[i, keyframe]
         holding.append(float((fitted * graph.keyframes.motion_weights[i]).mean()))
         if matched.sum() > max(LEAST_CELLS, MIN_EVIDENCE * len(matched)):

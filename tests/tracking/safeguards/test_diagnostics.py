@@ -109,6 +109,8 @@ def test_what_holds_a_keyframe_is_known_from_those_before():
     graph.keyframes.motion_weights[:] = 0.5
     graph.keyframes.static_weights[:, ::2] = 0
     assert continuity(graph, 3)[0] == pytest.approx(held / 4, rel=0.1)
+    graph.keyframes.static_weights *= 0.02  # nothing is confirmed
+    assert continuity(graph, 3)[0] == pytest.approx(held / 4, rel=0.1)
     graph.flow_to_next[1] = None  # the camera was lost
     assert continuity(graph, 2) == continuity(graph, 3) == (None, None)
 
