@@ -76,7 +76,10 @@ def _kinds(
     # Everything the result depends on, so that files of another command are not taken for these.
     tree = asdict(config)
     constants = {name: tree[name] for name in ("seed", "simulated_depth", "networks")}
-    conditions = f"{sequence.description}; {sequence.camera}; {constants}"
+    conditions = (
+        f"{choice.precision} on {choice.device}; {sequence.description}; {sequence.camera}; "
+        f"{sequence.opened_as}; {constants}"
+    )
     if with_features:
         features = choose_features(choice, sequence.camera, config.networks)
         factor = config.uncertainty.grid_factor

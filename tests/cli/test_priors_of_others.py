@@ -80,6 +80,24 @@ def test_wrong_priors_are_one_sentence_and_nothing_is_written(here: Path, capsys
         assert words in said[0] and not (here / "out").exists()
 
 
+def test_depth_of_another_recording_scale_or_precision_is_not_kept(here: Path, capsys):
+    for name, depth in ("one", 2000), ("other", 4000):
+        for kind, image in (
+            ("rgb", np.random.default_rng(0).integers(30, 255, (48, 64, 3), np.uint8)),
+            ("depth", np.full((48, 64), depth, np.uint16)),
+        ):
+            (here / name / kind).mkdir(parents=True)
+            for stamp in "0.0", "0.1":
+                (here / name / kind / f"{stamp}.png").write_bytes(encode_png(image))
+    command = ["priors", "one", "--depth", "sensor", "--out", "made"]
+    assert main(command) == main(command) == 0
+    assert np.load("made/depth/00001.npy").max() == np.float32(2000 / 5000)
+    other = ["priors", "other", *command[2:]]
+    for changed in other, [*command, "--depth-scale", "1000"], [*command, "--precision", "bf16"]:
+        assert main(changed) == 1
+        assert "made/depth with other files; choose another --out" in capsys.readouterr().err
+
+
 def test_masks_from_files_replace_the_learned_uncertainty(here: Path, cache, capsys):
     (here / "masks").mkdir()
     assert main(["run", *CLIP, "--masks", "files:masks", "-o", "out"]) == 1
