@@ -12,13 +12,18 @@ RUN, LOG = "run.json", "log.txt"  # of a run folder; run.json is written when th
 
 
 class Log:
-    """Keeps what is printed, with the time of each line, until the run in `folder` has begun."""
+    """Keeps what is printed, with the time of each line, until the run in its folder has begun."""
 
     def __init__(self) -> None:
-        self.folder: Path | None = None
+        self._folder: Path | None = None
+        self._earlier: int | None = None  # when run.json of an earlier run was written [ns]
         self.is_begun = False  # something is in the file
         self._lines: list[str] = []  # not written yet
         self._begun = ""  # a line whose end is not printed yet
+
+    def write_into(self, folder: Path) -> None:
+        """Write into a folder, but only once run.json there is that of this run."""
+        self._folder, self._earlier = folder, _written(folder)
 
     def add(self, text: str) -> None:
         """Take what is printed. Of a progress line on a terminal, the last state is kept."""
@@ -26,11 +31,18 @@ class Log:
         now = time.strftime("%Y-%m-%d %H:%M:%S")
         states = (line.rpartition("\r")[2].replace("\033[K", "") for line in lines)
         self._lines += [f"{now}  {state}\n" for state in states]
-        if self.folder is not None and self._lines and (self.folder / RUN).exists():
+        if self._folder and self._lines and _written(self._folder) not in (None, self._earlier):
             with contextlib.suppress(OSError):  # a full disk ends no run
-                with open(self.folder / LOG, "a", encoding="utf-8", errors="replace") as file:
+                with open(self._folder / LOG, "a", encoding="utf-8", errors="replace") as file:
                     file.writelines(self._lines)
                 self._lines, self.is_begun = [], True
+
+
+def _written(folder: Path) -> int | None:
+    """Return when run.json of a folder was written [ns], None if there is none."""
+    with contextlib.suppress(OSError):
+        return (folder / RUN).stat().st_mtime_ns
+    return None
 
 
 class _Recorded(io.TextIOBase):

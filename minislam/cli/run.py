@@ -85,7 +85,7 @@ def _run(args: argparse.Namespace) -> int:
         for warning in sequence.warnings:
             say(f"WARNING: {warning}", "stderr")
         progress.plan = plan_of(config, choice, sequence)
-        log.folder = Path(output)
+        log.write_into(Path(output))
         mode = args.overwrite, args.resume, args.workers
         with closing(progress), ending_signals(progress.interrupt):
             metrics, facts = run_in_folder(sequence, config, choice, output, progress, lpips, *mode)
