@@ -57,8 +57,8 @@ def measure_run(
         metrics["ate_all_cm"] = ate_cm(trajectory, path)
         metrics["ate_keyframes_cm"] = ate_cm(keyframe_trajectory, path)
         if metrics["ate_all_cm"] is not None:
-            metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
             estimate, path = paired(trajectory, path, MAX_DIFFERENCE)
+            metrics["ate_straight_line_cm"] = CENTIMETRES * straight_line_error(path)
             scale = umeyama(estimate.centres, path.centres).scale
             errors += _novel_errors(truth.novel_views(), estimate, path, render, lpips)
     betas: list[tuple[np.ndarray, np.ndarray]] = []  # with the true masks

@@ -151,6 +151,14 @@ def test_errors_are_in_centimetres_of_the_truth():
     assert 0.2 < off["ate_all_cm"] < 1 / np.sqrt(12)
 
 
+def test_the_straight_line_is_that_of_the_poses_that_the_run_saw():
+    truth = walk()
+    part = Trajectory(truth.timestamps[3:8], truth.T_world_camera[3:8])
+    path = estimated(part)
+    metrics = measure_run(Truth(trajectory=truth), path, path, [], lambda pose: grey(0))
+    assert metrics["ate_straight_line_cm"] == CENTIMETRES * straight_line_error(part)
+
+
 def test_novel_views_are_rendered_from_the_world_of_the_map():
     poses = random_transforms(3, "normal", 5).numpy()
     asked: list[np.ndarray] = []
