@@ -16,6 +16,7 @@ import shutil
 import tempfile
 import time
 import zlib
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -101,8 +102,9 @@ def cached_sequence(
     filmed = "" if phone is None else f"-phone-{zlib.crc32(repr(phone).encode()):08x}"
     folder = root / "synth" / f"{name}-{seed}-{frames}-{size[0]}x{size[1]}{filmed}"
     for scratch in root.glob("synth/.*-*-*-*x*-????????"):  # left by a killed process
-        if time.time() - scratch.stat().st_mtime > STALE and not scratch.is_symlink():
-            shutil.rmtree(scratch, ignore_errors=True)
+        with suppress(OSError):  # another process has just finished and renamed it
+            if time.time() - scratch.stat().st_mtime > STALE and not scratch.is_symlink():
+                shutil.rmtree(scratch, ignore_errors=True)
     return write_sequence(name, seed, frames, size, folder, progress, phone)
 
 
@@ -189,9 +191,8 @@ def _write_images(folder: Path, frame: SyntheticFrame) -> None:
 
 def _write_image(path: Path, image: Array) -> None:
     """Write a PNG; colour comes in the order blue, green, red."""
-    done = cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
-    if not done:
-        raise SynthError(f"could not write {path}: is the disk full or the folder read-only?")
+    png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])[1]
+    path.write_bytes(png.tobytes())  # on Windows cv2.imwrite fails at names with an umlaut
 
 
 def _write_lists(folder: Path, name: str, trajectory: list[tuple[str, Array]]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -80,6 +81,12 @@ def test_two_runs_write_the_same_bytes(folder, tmp_path):
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     for file in files:
         assert (folder / file).read_bytes() == (again / file).read_bytes(), file
+
+
+def test_no_file_is_written_by_its_name_in_opencv(tmp_path, monkeypatch):
+    monkeypatch.delattr(cv2, "imwrite")
+    folder = write_sequence("static", 0, 1, SIZE, tmp_path / "Jürgen")
+    assert len(list(folder.rglob("*.png"))) > 4
 
 
 def test_a_complete_folder_is_kept(folder):
@@ -177,3 +184,11 @@ def test_what_a_killed_process_left_in_the_cache_is_removed_after_a_day(tmp_path
     os.utime(old, (0, 0))
     cached_sequence("ball", 0, 1, (32, 24))
     assert new.exists() and not old.exists()
+
+
+def test_a_scratch_folder_that_another_process_renames_meanwhile_is_no_obstacle(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("MINISLAM_CACHE", str(tmp_path))
+    monkeypatch.setattr(Path, "glob", lambda *_: [tmp_path / "synth/.ball-0-1-32x24-renamed_"])
+    assert (cached_sequence("ball", 0, 1, (32, 24)) / "rgb.txt").exists()
