@@ -127,6 +127,8 @@ def _relative_errors(
     wanted = f"as a whole number of frames, 1 to {most}"
     if unit == "s":
         seconds = float(np.median(np.diff(result.truth.timestamps)))  # between poses
+        found = "one for most of them; give a smaller --t_max_diff, or --delta_unit f"
+        require(seconds > 0, "estimated poses that pair with different true ones", found)
         wanted = f"of more than 0 and at most {most * seconds:g} s, the length of the paths"
         step = max(1, round(delta / seconds)) if 0 < delta < 1e9 else 0
     is_possible = 1 <= step <= most and step == int(step)  # not NaN either

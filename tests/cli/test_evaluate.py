@@ -183,6 +183,17 @@ def test_pairs_that_are_few_by_their_units_or_too_few_to_compare_are_said(tmp_pa
         run_eval(parse(*names[1:], "--no_align", "--rpe"))
 
 
+def test_poses_that_share_one_true_pose_have_no_motion_in_a_second(tmp_path: Path):
+    names = [str(tmp_path / name) for name in ("truth.txt", "estimate.txt")]
+    poses = random_transforms(20, "normal", 0).numpy()
+    write_trajectory(names[0], Trajectory(np.arange(20.0), poses))
+    write_trajectory(names[1], Trajectory(5 + np.arange(10) * 0.03, poses[:10]))
+    flags = ["--t_max_diff", "0.6", "--no_align", "--rpe"]
+    with pytest.raises(InputError, match=r"different true ones, found one .*smaller --t_max_diff"):
+        run_eval(parse(*names, *flags))
+    run_eval(parse(*names, *flags, "--delta", "3", "--delta_unit", "f", "--silent"))  # as evo
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
