@@ -70,6 +70,10 @@ def test_the_script_stays_readable():
     assert max(map(len, template().splitlines())) <= 130
 
 
+def test_what_moves_and_draws_on_the_canvas_counts_its_pixels_alike():
+    assert template().count("devicePixelRatio") == 1  # the canvas has fewer on some phones
+
+
 def test_the_map_comes_back_from_the_page():
     data, map_ = data_of(viewer()), gaussians()
     assert data["count"] == COUNT
