@@ -54,10 +54,11 @@ def require_free(folder: Path | str, overwrite: bool, also: str = "") -> None:
 
 
 def require_new(files: Iterable[Any], overwrite: bool, inputs: Iterable[Path | str]) -> None:
-    """Refuse files to write that exist, are inputs, or cannot be, before they are computed."""
+    """Refuse output files that exist, are inputs or cannot be written, before the work begins."""
     files = list(filter(None, files))  # None: not asked for
-    if len({os.path.realpath(path) for path in files}) < len(files):
-        raise InputError(f"expected files of different names, found {files[0]} twice; rename one")
+    real = [os.path.realpath(path) for path in files]
+    if twice := [path for path in files if real.count(os.path.realpath(path)) > 1]:
+        raise InputError(f"expected files of different names, found {twice[0]} twice; rename one")
     for path in files:
         folder, wrong = os.path.dirname(os.path.realpath(path)), ""
         if not (os.path.isdir(folder) and os.access(folder, os.W_OK)):

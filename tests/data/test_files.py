@@ -138,7 +138,7 @@ def test_only_new_files_are_written_unless_asked_and_inputs_never(tmp_path: Path
     require_new([old], True, [new])
     require_new([link], True, [new])
     with pytest.raises(InputError, match=r"of different names, found .*old twice"):
-        require_new([old, link], True, [])
+        require_new([new, old, link], True, [])
     with pytest.raises(InputError, match="old exists; choose another name or add --overwrite"):
         require_new([new, old], False, [])
     for overwrite in (True, False):
