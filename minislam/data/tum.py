@@ -58,12 +58,12 @@ def read_tum_folder(folder: Path) -> sources.Recording:
     if len(paths) == 0:
         raise InputError(f"expected images in {folder}/rgb.txt, found none; check the list")
     depth_stamps, depths = _images(folder, "depth")
-    truth_path = truth_beside(folder)
+    camera, truth_path = _named_camera(folder), truth_beside(folder)
     trajectory = None
     notes = [f"{len(depths)} depth"] if depths else []
     if truth_path is not None:
         trajectory = read_trajectory(truth_path)
-        if (camera := known_camera(folder.resolve().name)) and camera.origin.startswith("Bonn"):
+        if camera is not None and camera.origin.startswith("Bonn"):
             trajectory = bonn_camera_trajectory(trajectory)
         notes.append(f"ground truth {np.ptp(trajectory.timestamps):.3g} s")
     return sources.Recording(
@@ -71,7 +71,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
         kind="TUM RGB-D folder",
         images=FileImages(paths),
         timestamps=stamps,
-        calibration=calibration_beside(folder) or _calibration_by_name(folder, paths[0]),
+        calibration=calibration_beside(folder) or _if_it_fits(camera, paths[0]),
         trajectory=trajectory,
         depth_paths=_nearest(stamps, depth_stamps, depths),
         mask_paths=_beside(folder / "masks", paths),
@@ -98,17 +98,22 @@ def _images(folder: Path, kind: str) -> tuple[np.ndarray, list[Path]]:
     return np.array(stamps), paths
 
 
-def _calibration_by_name(folder: Path, image: Path) -> Calibration | None:
-    """Return the camera that the folder's name, README or lists name, if the images fit it."""
+def _named_camera(folder: Path) -> Calibration | None:
+    """Return the camera that the folder's name, README or lists name."""
     notes = [folder.resolve().name]
     lists = [folder / "rgb.txt", folder / "groundtruth.txt"]
     for path in [*sorted(folder.glob("README*")), *lists]:
         if path.is_file():
             head = read_bytes(path).decode("utf-8", "replace").splitlines()[:20]
             notes += head if path.name.startswith("README") else [x for x in head if x[:1] == "#"]
-    found = next(filter(None, map(known_camera, notes)), None)
+    return next(filter(None, map(known_camera, notes)), None)
+
+
+def _if_it_fits(camera: Calibration | None, image: Path) -> Calibration | None:
+    if camera is None:
+        return None
     height, width = read_color(image).shape[:2]
-    return found if found is not None and found.fits(width, height) else None
+    return camera if camera.fits(width, height) else None
 
 
 def known_camera(text: str) -> Calibration | None:

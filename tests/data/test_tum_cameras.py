@@ -34,8 +34,11 @@ def test_fr3_has_no_distortion_and_fr1_has():
     assert known_camera("fr1").distortion.k1 == 0.2624
 
 
-def test_a_bonn_folder_has_camera_and_corrected_truth(tmp_path):
-    folder = tum_folder(tmp_path / "rgbd_bonn_crowd", size=(64, 48))
+@pytest.mark.parametrize("name", ["rgbd_bonn_crowd", "renamed"])
+def test_a_bonn_folder_has_camera_and_corrected_truth(tmp_path, name: str):
+    folder = tum_folder(tmp_path / name, size=(64, 48))
+    rows = (folder / "rgb.txt").read_text()
+    (folder / "rgb.txt").write_text(f"# file: 'rgbd_bonn_crowd.bag'\n{rows}")
     (folder / "calibration.txt").unlink()
     recording = read_tum_folder(folder)
     assert recording.calibration.origin == "Bonn intrinsics"
