@@ -48,17 +48,19 @@ class FrameFiles:
         return len(self._files)
 
     def require_frames_of(self, sequence: Sequence) -> None:
-        """Refuse files that are numbered like the images where a frame has another number."""
-        frame, image = len(sequence) - 1, sequence.source_name(len(sequence) - 1)
-        numbered = None if self._number_of is not None else _NUMBER.search(image)
-        number = frame if numbered is None else int(numbered[1])
+        """Refuse files that are numbered like all images where a frame has another number."""
+        frame = len(sequence) - 1
+        image, index = sequence.source_name(frame), sequence.source_index(frame)
         # Of the first images, counted from 1, a file 0 shows that the files are counted from 0.
-        is_right = sequence.source_index(frame) == frame and 0 in self._files
-        is_right = is_right or number == frame or number not in self._files
-        wanted = f"{self.what} files named by the frame of the run, {frame:05d} for {image}"
-        found = f"{self._files.get(number)}, which has the number of that image"
-        advice = f"rename them, or write {INDEX} beside them, as minislam priors does"
-        require(is_right, wanted, f"{found}; {advice}")
+        if self._number_of is not None or (index == frame and 0 in self._files):
+            return
+        numbers = [*(int(found[1]) for found in _NUMBER.finditer(image)), index]
+        wrong = [self._files[n] for n in numbers if n != frame and n in self._files]
+        if wrong:
+            wanted = f"{self.what} files named by the frame of the run, {frame:05d} for {image}"
+            found = f"{wrong[0]}, which has the number of that image"
+            advice = f"rename them, or write {INDEX} beside them, as minislam priors does"
+            raise InputError(f"expected {wanted}, found {found}; {advice}")
 
     def of(self, frame: Frame) -> Path | None:
         """Return the file of a frame, or None if the folder has none for it."""

@@ -163,9 +163,12 @@ class Images:
         (["7", "8", "9"], 7, "00009.npy, which has the number of that image"),  # of ten, from 7 on
         (["1", "2", "3"], 0, None),  # files are numbered from 0, images from 1
         (["1", "2", "3"], 1, "00003.npy, which has the number"),  # both from 0, and the run from 1
-        (["a", "b", "c"], 3, None),
+        (["a", "b", "c"], 3, "00005.npy, which has the number"),  # of ten, from 3 on
+        (["4", "5", "6"], 3, "00006.npy, which has the number"),  # images from 1, files from 0
+        (["14", "15", "16"], 3, "00005.npy, which has the number"),
+        (["a", "b", "c"], 8, None),  # there is no file of image 10
         (["0", "1", "2"], 0, None),
-        (["4.007", "4.008", "4.009"], 7, None),  # times
+        (["4.007", "4.008", "4.009"], 8, None),  # times
     ],
 )
 def test_files_with_the_numbers_of_the_images_are_refused(tmp_path, names, start, refused, kind):
