@@ -90,7 +90,7 @@ def _converted(name: str, value: Any, present: Any, entry: Field[Any]) -> Any:
     try:
         if get_origin(kind) is not tuple:
             return _plain(kind, value)
-        parts = value.split(",") if isinstance(value, str) else value
+        parts = value.strip("()[] ").split(",") if isinstance(value, str) else value
         return tuple(_plain(of, part) for of, part in zip(get_args(kind), parts, strict=True))
     except (KeyError, OverflowError, TypeError, ValueError):
         wanted = "a finite number" if kind is float else f"of type {kind.__name__}"

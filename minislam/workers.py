@@ -226,7 +226,7 @@ def _send(stream: Any, tree: Tree) -> None:
 
     stream.write(json.dumps(tree, default=named).encode() + b"\n")
     for tensor in tensors:
-        stream.write(tensor.numpy().data)
+        stream.write(_bytes(tensor))
     stream.flush()
 
 
@@ -238,8 +238,13 @@ def _receive(stream: Any) -> Tree:
             return node
         name, shape = node[_TENSOR]
         tensor = torch.empty(shape, dtype=getattr(torch, name))
-        if stream.readinto(tensor.numpy().data) != tensor.nbytes:
+        if stream.readinto(_bytes(tensor)) != tensor.nbytes:
             raise EOFError
         return tensor
 
     return json.loads(stream.readline(), object_hook=filled)
+
+
+def _bytes(tensor: Tensor) -> memoryview:
+    """Return the memory of a contiguous tensor of any type; numpy knows no bfloat16."""
+    return tensor.reshape(-1).view(torch.uint8).numpy().data

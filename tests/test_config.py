@@ -81,6 +81,7 @@ def test_every_setting_says_what_it_means():
         ("uncertainty.enabled", "True", True),
         ("tracking.final_prior", "1", True),
         ("networks.metric3d.size", "28,56", (28, 56)),
+        ("networks.metric3d.size", "(28, 56)", (28, 56)),
         ("networks.metric3d.size", [56, 28], (56, 28)),
     ],
 )

@@ -89,6 +89,13 @@ def test_tensors_and_records_come_through_unchanged(two):
             assert back.second.dtype == pair.first.dtype and back.sizes == pair.sizes[::-1]
 
 
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_type_that_numpy_has_not_comes_through(two):
+    pair = Pair(torch.ones(2, 2, dtype=torch.bfloat16), None, (1, 2))
+    for answer in two.map(swapped, [(pair, 1.0)] * 2):  # one of them in the helper
+        assert torch.equal(answer["swapped"].second, pair.first)
+
+
 @pytest.mark.slow
 def test_the_map_has_the_same_bytes_with_one_and_two_workers_and_with_one_killed(two, four_cores):
     def optimised(workers, kills=None):
