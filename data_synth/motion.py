@@ -75,7 +75,7 @@ class HandheldPath:
     phases: Array  # (3,) [rad]
     target: Array  # (3,) [m]
     target_reach: Array  # (3,) [m]
-    follow: float  # part of its own way by which the camera shifts its target; < 0 turns more
+    follow: float  # part of the camera's swing that is added to its target; < 0: it turns more
     tremble: Array  # (6, 4): amplitude [m, rad], frequency [Hz], phase [rad], second phase [rad]
 
     def __call__(self, time: float) -> Array:

@@ -39,7 +39,7 @@ def settings_of(config: SlamConfig) -> dict[str, Any]:
 
 
 # The constants of the paper and of the official code in our units, where they differ from the
-# default tree; a scene has a median depth of 2 m. With a learned flow, the official counts.
+# default tree; a scene has a median depth of 2 m. The rounds of a learned flow are official.
 _PAPER: dict[str, Any] = {
     "tracking.warmup_keyframes": 12,
     "tracking.learned.keyframe_flow": 15.0,  # officially 3 cells, 24 px, in 512x384

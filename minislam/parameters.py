@@ -38,7 +38,7 @@ def user_path(path: Path | str) -> Path:
 
 
 def absolute_path(name: str) -> str:
-    """Return a path, or files:FOLDER, by which what it names is found from any folder."""
+    """Return a path, or files:FOLDER, made absolute: it holds in any working folder."""
     return FILES * name.startswith(FILES) + str(user_path(name.removeprefix(FILES)).absolute())
 
 

@@ -51,8 +51,8 @@ def check_plane_homography(student: Function) -> Verdict:
 def check_plane_cost(student: Function) -> Verdict:
     """Check (grey image (h, w), V warped images (V, h, w)) -> cost of one plane (h, w).
 
-    A negative value is outside of its image. The absolute difference, meant over 5x5 px, of the
-    better half of the views that see the pixel; 1 where none does.
+    A negative value is outside of its image. Of each view the absolute difference is averaged over
+    5x5 px; the cost is the mean of the better half of the views that see the pixel, 1 without any.
     """
 
     def reference(gray: np.ndarray, warped: np.ndarray, flaw: str = "") -> np.ndarray:

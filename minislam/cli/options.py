@@ -83,8 +83,8 @@ def add_talk(parser: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         metavar="N",
-        help="processes that share the work, without effect on the result; default: one per idle"
-        " core, at most 4; on a GPU 1",
+        help="processes that share the work, without effect on the result; default:"
+        " $MINISLAM_WORKERS, or one per idle core, at most 4; on a GPU 1",
     )
 
 

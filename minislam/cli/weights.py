@@ -49,7 +49,7 @@ def _fetch(args: argparse.Namespace) -> None:
         print(f"{row.name}: {row.megabytes} MB, licence {row.licence}, from {row.url}", flush=True)
     for row in rows:
         if row.path.exists():
-            require_published(row, row.path)
+            require_published(row, row.path, "; remove it, then fetch it again")
         else:
             download(row.url, row.path, partial(require_published, row), partial(show, row.file))
         print(f"{row.path}: complete, use it with {row.use}")
@@ -74,13 +74,14 @@ def _check(args: argparse.Namespace) -> None:
         print(f"{file.name:{width}s}  {size:7.1f} MB  {verdict}", flush=True)
 
 
-def require_published(row: PublishedFile, path: Path) -> None:
+def require_published(row: PublishedFile, path: Path, advice: str = "") -> None:
     """Refuse another file than the published one; where it has no hash, one of another network."""
     wanted, found = f"sha256 {row.sha256}", f"sha256 {_sha256(path)}"
     if not row.sha256:
         wanted, found = f"complete: {row.use}", _verdict(path)
     if not found.endswith(wanted):
-        raise InputError(f"expected the published {row.file} ({wanted}) in {path}, found {found}")
+        sentence = f"expected the published {row.file} ({wanted}) in {path}, found {found}"
+        raise InputError(sentence + advice)
 
 
 def _sha256(path: Path) -> str:

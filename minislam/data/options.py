@@ -41,8 +41,8 @@ class InputOptions:
     focal: str = parameter(
         "auto",
         "fixed: the focal length as given, noted or guessed; refine: estimated from the motion, "
-        "starting there; auto: refine if no calibration and no --fx is given, and find a lens that "
-        "bends straight lines, else fixed",
+        "starting there; auto: fixed if a calibration or --fx is given; else refine, and find a "
+        "lens that bends straight lines",
     )
     masks: str | None = parameter(
         None,

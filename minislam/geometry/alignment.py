@@ -45,9 +45,10 @@ def umeyama(
     unique only if D has rank 2 at least, because points on one line do not fix a rotation about it.
     """
     assert source.shape == target.shape and source.shape[1:] == (3,), (source.shape, target.shape)
-    is_enough = len(source) >= 3 and np.isfinite(source).all() and np.isfinite(target).all()
-    found = f"{len(source)} pairs; check that the timestamps of both trajectories belong together"
-    require(bool(is_enough), "at least 3 pairs of finite points to align", found)
+    finite = int(np.isfinite(np.hstack([source, target])).all(1).sum())
+    advice = "check that the timestamps of both trajectories belong together"
+    found = f"{len(source)}, of which {finite} are finite; {advice}"
+    require(finite == len(source) >= 3, "at least 3 pairs of finite points to align", found)
     source_mean, target_mean = source.mean(0), target.mean(0)  # (34), (35)
     source_centred, target_centred = source - source_mean, target - target_mean
     source_variance = (source_centred**2).sum(1).mean()  # (36)

@@ -115,10 +115,9 @@ def test_another_file_than_the_published_one_is_refused(server: Server, tmp_path
     mine = tmp_path / "cache/weights/dinov2_reg_small_finetuned.pth"
     mine.write_bytes(b"mine")
     assert main(["weights", "fetch", "fit3d"]) == 1
-    assert (
-        "expected the published dinov2_reg_small" in said(capsys)[1]
-        and mine.read_bytes() == b"mine"
-    )
+    sentence = said(capsys)[1]
+    assert "expected the published dinov2_reg_small" in sentence and mine.read_bytes() == b"mine"
+    assert sentence.endswith("; remove it, then fetch it again\n")
 
 
 def test_a_name_that_is_not_in_the_list_fetches_nothing(server: Server, capsys):

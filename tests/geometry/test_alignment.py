@@ -106,6 +106,13 @@ def test_too_few_points_are_refused(count: int):
         umeyama(random_points(count, 0), random_points(count, 1))
 
 
+def test_points_that_are_not_finite_are_counted():
+    points = random_points(4, 0)
+    points[1, 2] = np.nan
+    with pytest.raises(InputError, match="found 4, of which 3 are finite"):
+        umeyama(points, random_points(4, 1))
+
+
 def test_points_on_a_line_are_refused():
     line = np.arange(10)[:, None] * np.array([[1.0, 2.0, -0.5]]) + 3
     with pytest.raises(InputError, match="on one line"):

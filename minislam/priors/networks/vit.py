@@ -25,7 +25,7 @@ _BLOCKS = {384: 12, 768: 12, 1024: 24}  # by the width of ViT-S, -B and -L
 _HEAD_WIDTH = 64  # channels per attention head, at every size of the network
 _EPSILON = 1e-6  # of every layer norm of the transformer; torch's default is another
 _TRAINED_GRID = 37  # patches per side of the 518 px images of the training
-# The table of positions is resized to other images as in the training, which no checkpoint states:
+# The table of positions is resized for other images as in training, and no checkpoint says how:
 # with antialiasing (registers, FiT3D), or by (n + _OFFSET) / 37 (DINOv2, the depth networks).
 _OFFSET = 0.1  # patches
 
