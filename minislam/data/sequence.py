@@ -128,7 +128,7 @@ class RecordedSequence:
         every = len(self) + len(left_out)
         if left_out:
             text = f"{len(left_out)} of {every} images are left out because of their size"
-            yield f"{text}, such as {images.odd[left_out[0]]}; crop or resize them"
+            yield f"{text}, such as {images.odd[left_out[0]]}; crop, turn or resize them"
         if similar := [resized[index] for index in self._chosen if index in resized]:
             text = f"{len(similar)} of {every} images are resized to the size of most"
             yield f"{text}, such as {similar[0]}"

@@ -48,7 +48,7 @@ def test_images_of_nearly_the_usual_size_are_resized(tmp_path: Path):
     assert len(sequence) == 3  # the fourth differs by 3 % in one side, and is left out
     assert {frame.image.shape for frame in sequence} == {(66, 100, 3)}
     odd, resized = sequence.warnings[-2:]
-    assert "such as 4.png is 100x64 px, others are 100x66; crop" in odd
+    assert "such as 4.png is 100x64 px, others are 100x66; crop, turn or" in odd
     assert resized == (
         "1 of 4 images are resized to the size of most, such as 2.png is 99x65 px, others are "
         "100x66"
