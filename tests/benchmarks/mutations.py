@@ -201,8 +201,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("tracking/safeguards/diagnostics.py", "tracking/safeguards/test_turns.py"): [
         ("            return True", "            pass"),
-        ("self.confirmed < LEAST_CONFIRMED or", ""), (" or self.resting > MOST_RESTING", ""),
-        ("self.hardly_walked and no_depth", "no_depth"),
+        ("rests or self.confirmed < LEAST_CONFIRMED", "rests"), ("(rests or self", "(self"),
+        ("= self.hardly_walked and (", "= ("), (" and len(self.diagnostics) == 2", ""),
         ("self.beyond_turns is not None and", "self.beyond_turns is None or"),
     ],
     ("slam.py", "test_slam_at_rest.py"): [

@@ -98,8 +98,7 @@ class Watch(Stateful):
             # Depths are arbitrary, and a pan leaves old cells behind.
             judged = [replace(k, depth_error=None, continuity=None) for k in judged]
         elif (self.beyond_turns or 0.0) >= LEAST_BEYOND_TURNS and not graph.keyframes.has_prior:
-            problem = bundle_problem(graph, range(len(graph.edges)))
-            found = scale_deviations(problem, graph.state)
+            found = scale_deviations(bundle_problem(graph, range(len(graph.edges))), graph.state)
             judged = [replace(k, scale_deviation=found.get(i)) for i, k in enumerate(judged)]
             self.diagnostics = judged
         self.breaks = find_breaks(judged)
@@ -108,13 +107,14 @@ class Watch(Stateful):
     def only_turned(self) -> bool:
         """Tell whether the camera stood still or only turned, so that nothing measures depth.
 
-        Either no pose claims parallax. Or hardly any flow is beyond turns, and most keyframes rest
-        or sweeps confirm hardly any depth.
+        Either no pose claims parallax, or both of two keyframes rest. Or hardly any flow is beyond
+        turns, and most keyframes rest or sweeps confirm hardly any depth.
         """
+        rests = self.resting > MOST_RESTING
         if all(k.parallax < self._graph.least_parallax for k in self.diagnostics):
             return True
-        no_depth = self.confirmed < LEAST_CONFIRMED or self.resting > MOST_RESTING
-        return self.hardly_walked and no_depth
+        no_depth = self.hardly_walked and (rests or self.confirmed < LEAST_CONFIRMED)
+        return no_depth or (rests and len(self.diagnostics) == 2)
 
     @property
     def hardly_walked(self) -> bool:

@@ -182,9 +182,9 @@ def test_only_a_camera_at_rest_may_see_other_depths():
 
 @pytest.mark.parametrize(("parallax", "breaks"), [(0.1, []), (30.0, [Break(10, 10)])])
 def test_what_holds_a_camera_at_rest_may_change(monkeypatch, parallax: float, breaks: list):
-    told = [replace(k, parallax=parallax) for k in keyframes(HEALTHY, UNTIED)]
+    told = [replace(k, parallax=parallax) for k in keyframes(HEALTHY, UNTIED, HEALTHY)]
     monkeypatch.setattr(diagnostics, "diagnose", lambda graph, keyframe: told[keyframe])
-    watch = Watch(true_graph([0, 0]))
+    watch = Watch(true_graph([0, 0, 0]))
     watch.conclude()
     assert watch.breaks == breaks
 
