@@ -119,8 +119,10 @@ class Run:
         Of a broken run, those of the piece that the map shows; `trajectory` has all.
         """
         rows = zip(self.trajectory.timestamps, self.trajectory.T_world_camera, strict=True)
-        found = {round(stamp, 6): pose for stamp, pose in rows}
-        stamps = {frame.index: round(frame.timestamp, 6) for frame in self.frames if frame.mapped}
+        # In whole microseconds, as the file was written; round(stamp, 6) rounds 1e9 s otherwise.
+        found = {round(1e6 * stamp): pose for stamp, pose in rows}
+        shown = [frame for frame in self.frames if frame.mapped]
+        stamps = {frame.index: round(1e6 * frame.timestamp) for frame in shown}
         return {index: found[stamp] for index, stamp in stamps.items() if stamp in found}
 
     @property

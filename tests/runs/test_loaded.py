@@ -13,9 +13,11 @@ import torch
 import minislam
 from minislam.data.files import write_json
 from minislam.data.sequence import open_sequence
+from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.mapping import Mapper
+from minislam.records import Trajectory
 from minislam.runs import api
 from minislam.tracking.grid import Grid
 from minislam.tracking.safeguards import diagnostics
@@ -82,6 +84,18 @@ def test_of_a_piece_in_two_stretches_the_frames_between_them_are_not_shown(
     options = {"stride": 3, "max_frames": 10, "size": (96, 72), "preset": "test", "quiet": True}
     run = minislam.run("synth:person", tmp_path / "run", **options)
     assert list(run.poses) == [0, 1, 2, 3, 7, 8, 9] and not {*run.keyframes} & {4, 5, 6}
+
+
+def test_frames_timed_in_nanoseconds_find_their_poses(run: minislam.Run, tmp_path: Path):
+    again = minislam.load(shutil.copytree(run.folder.path, tmp_path / "copy"))
+    stamps = (1403636579763555584 + np.arange(len(again.frames)) * 33333441) * 1e-9  # EuRoC's names
+    trajectory = Trajectory(stamps, again.trajectory.T_world_camera)
+    write_trajectory(again.folder.path / "trajectory.txt", trajectory)
+    scene = json.loads((again.folder.path / "camera.json").read_text(encoding="utf-8"))
+    for frame, stamp in zip(scene["frames"], stamps.tolist(), strict=True):
+        frame["timestamp"] = stamp
+    write_json(again.folder.path / "camera.json", scene)
+    assert list(minislam.load(again.folder.path).poses) == list(run.poses)
 
 
 def test_depth_is_that_of_the_surface_and_a_camera_can_be_given(run: minislam.Run):
