@@ -18,6 +18,7 @@ from minislam.errors import InputError, require
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
+_ROOM = 1 << 16  # bytes that are left over on a disk that has held a whole animation
 _WEBP_QUALITY = 75  # of 100
 _JPEG_QUALITY = 85  # of 100: without visible blocks, a tenth of the bytes of a PNG
 _JPEG_START_OF_SCAN, _JPEG_END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
@@ -101,10 +102,23 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"animation{kind}"
         encoders[kind](file, map(_bgr, images), rate)
+        _require_room(file.with_name("room"))
         if not file.is_file() or not (content := file.read_bytes()):
-            found = f"OpenCV {cv2.__version__}, which cannot; choose .webm or .webp, the other one"
-            raise InputError(f"expected an OpenCV that writes {kind}, found {found}")
+            found = f"OpenCV {cv2.__version__}, which cannot, or has no space in {folder}"
+            advice = "choose .webm or .webp, the other one, or set TMPDIR to another folder"
+            raise InputError(f"expected an OpenCV that writes {kind}, found {found}; {advice}")
     atomic_write(path, content)
+
+
+def _require_room(file: Path) -> None:
+    """Refuse an animation on a full disk, where the encoders cut it short and say nothing."""
+    try:
+        file.write_bytes(bytes(_ROOM))
+    except OSError as error:
+        reason = f"{error.strerror}; free space, or set TMPDIR to another folder"
+        raise InputError(
+            f"expected space for an animation in {file.parent}, but: {reason}"
+        ) from error
 
 
 def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:

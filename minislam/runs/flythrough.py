@@ -69,8 +69,8 @@ def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:
 
 
 def write_clip(folder: str) -> None:
-    """Write the clip of a run into its folder, if this OpenCV can."""
-    with suppress(InputError):
+    """Write the clip of a run into its folder, if this OpenCV can and TMPDIR has space."""
+    with suppress(InputError, OSError):
         write_animation(Path(folder) / CLIP, *clip(Run(folder)))
 
 

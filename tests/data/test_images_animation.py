@@ -1,5 +1,6 @@
 """Animations are read back by OpenCV: as many images, their size, order and colours."""
 
+import errno
 from pathlib import Path
 
 import cv2
@@ -44,3 +45,17 @@ def test_another_kind_and_nothing_to_show_are_said(tmp_path: Path):
         with pytest.raises(InputError, match="expected an OpenCV"):
             write_animation(tmp_path / f"a{kind}", [], 10.0)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", [".webm", ".webp"])
+def test_a_full_disk_leaves_no_film_that_is_cut_short(tmp_path: Path, monkeypatch, kind: str):
+    (tmp_path / f"a{kind}").write_text("before", encoding="utf-8")
+
+    def full(path: Path, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        with pytest.raises(InputError, match=r"expected space for an animation in .*TMPDIR"):
+            write_animation(tmp_path / f"a{kind}", images(), 10.0)
+    assert (tmp_path / f"a{kind}").read_text(encoding="utf-8") == "before"

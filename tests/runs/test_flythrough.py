@@ -1,5 +1,6 @@
 """Where the camera flies, and that input, beta and map stand beside each other."""
 
+import tempfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,3 +77,13 @@ def test_a_clip_of_a_long_run_keeps_its_duration():
     assert next(images).shape == (48, 3 * 64, 3)  # never enlarged
     run.camera = CAMERA.resized(640, 480)
     assert next(flythrough.clip(run)[0]).shape == (180, 3 * 240, 3)
+
+
+def test_a_run_does_not_end_because_there_is_no_space_for_its_clip(tmp_path, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError("no space for a temporary folder")
+
+    monkeypatch.setattr(flythrough, "Run", lambda _: FakeRun())
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", full)
+    flythrough.write_clip(str(tmp_path))
+    assert not [*tmp_path.iterdir()]
