@@ -15,6 +15,7 @@ from minislam.cli.help import UsageError
 from minislam.cli.options import input_options, lpips_of, prior_choice, settings
 from minislam.data.files import make_folder, read_json, write_json, write_text
 from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError, require
+from minislam.parameters import user_path
 from minislam.runs.progress import ending_signals, say
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
@@ -43,7 +44,7 @@ def _bench(args: argparse.Namespace) -> int:
     from minislam.cli.main import parsed  # which imports this module
 
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
-    own.add_argument("-o", "--output", default="output/bench", type=Path)
+    own.add_argument("-o", "--output", default="output/bench", type=user_path)
     given, options = own.parse_known_args(args.options)
     if "--resume" in options:
         raise UsageError("expected no --resume, found it; leave it out, bench resumes by itself")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
+from os.path import expanduser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,8 +37,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add("--rpe", action="store_true", help="relative pose error: the drift over --delta")
     add("--delta", type=float, help="length of each motion for --rpe, 1")
     add("--delta_unit", choices=("s", "f"), help="of --delta: seconds or frames, s")
-    add("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
-    add("--save_results", metavar="FILE.json", help="write the numbers to a file")
+    file = partial(add, type=expanduser)
+    file("--save_plot", metavar="FILE.png", help="draw the trajectories to a file")
+    file("--save_results", metavar="FILE.json", help="write the numbers to a file")
     add("--overwrite", action="store_true", help="replace files of these names")
     add("-v", "--verbose", action="store_true", help="say more")
     add("--silent", action="store_true", help="print nothing")

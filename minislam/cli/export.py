@@ -1,6 +1,8 @@
 """The sub-command `minislam export`: a finished run for COLMAP, nerfstudio and other programs."""
 
 import argparse
+from functools import partial
+from os.path import expanduser
 from pathlib import Path
 
 from minislam.data.files import atomic_write, require_free, require_new
@@ -27,11 +29,12 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     add = parser.add_argument
     add("folder", metavar="RUN", help="folder of a finished run")
-    add("--colmap", metavar="DIR", help="images, masks, COLMAP's sparse model")
-    add("--nerfstudio", metavar="DIR", help="images, masks, transforms.json")
-    add("--points", metavar="FILE.ply", help="the map as a plain point cloud")
-    add("--depth", metavar="DIR", help="rendered z-depth, .npy at the working size")
-    add("--masks", metavar="DIR", help="255 where static, 0 where it moves")
+    where = partial(add, type=expanduser)
+    where("--colmap", metavar="DIR", help="images, masks, COLMAP's sparse model")
+    where("--nerfstudio", metavar="DIR", help="images, masks, transforms.json")
+    where("--points", metavar="FILE.ply", help="the map as a plain point cloud")
+    where("--depth", metavar="DIR", help="rendered z-depth, .npy at the working size")
+    where("--masks", metavar="DIR", help="255 where static, 0 where it moves")
     add("--sh-degree", type=int, choices=(1, 2, 3), help="map with zeros up to this degree, in RUN")
     add("--keyframes", action="store_true", help="only keyframes, not all frames")
     add("--overwrite", action="store_true", help="replace files of these names")

@@ -10,6 +10,8 @@ import sys
 import tempfile
 import time
 from contextlib import suppress
+from functools import partial
+from os.path import expanduser
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +35,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     add = parser.add_argument
     add("notebooks", metavar="NOTEBOOK", nargs="+", help="a student's .ipynb file")
-    add("--json", metavar="FILE", help="write all verdicts as JSON")
-    add("--csv", metavar="FILE", help="write one line an exercise")
+    file = partial(add, type=expanduser, metavar="FILE")
+    file("--json", help="write all verdicts as JSON")
+    file("--csv", help="write one line an exercise")
     add("--overwrite", action="store_true", help="replace files of these names")
     add("--seed", type=int, metavar="N", help="also cases that nobody has seen")
     add("--no-package", action="store_true", help="refuse answers that call the package's own")

@@ -1,6 +1,7 @@
 """`minislam render RUN`: the static map of a finished run as a video or an animated picture."""
 
 import argparse
+from os.path import expanduser
 
 from minislam.cli.options import size_of
 from minislam.data.files import require_new
@@ -16,7 +17,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     add = parser.add_argument
     add("folder", metavar="RUN", help="run folder")
-    add("-o", "--output", required=True, help="file to write: .webm or .webp")
+    what = "file to write: .webm or .webp"
+    add("-o", "--output", required=True, type=expanduser, help=what)
     add(
         "--path",
         choices=("trajectory", "orbit", "side-by-side"),

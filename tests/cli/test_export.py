@@ -44,6 +44,21 @@ def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
     assert len(read_ply(folder / "map_sh.ply")) == len(read_ply(folder / "map.ply"))
 
 
+def test_what_is_written_may_lie_below_the_home_of_the_user(folder: Path, tmp_path, monkeypatch):
+    (home := tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setenv("USERPROFILE", str(home))
+    monkeypatch.chdir(tmp_path)  # no shell makes a path of --points=~/p.ply
+    kinds = ["--colmap=~/c", "--nerfstudio=~/n", "--depth=~/d", "--masks=~/m"]
+    assert export(folder, "--points=~/p.ply", *kinds, "--keyframes") == 0
+    assert {path.name for path in home.iterdir()} == {"c", "n", "d", "m", "p.ply"}
+    assert main(["render", str(folder), "--output=~/fly.webp", "--path", "side-by-side"]) == 0
+    path = str(folder / "trajectory.txt")
+    kinds = ["--save_plot=~/a.png", "--save_results=~/a.json"]
+    assert main(["eval", path, path, "--no_align", *kinds]) == 0
+    assert [*tmp_path.iterdir()] == [home] and len([*home.iterdir()]) == 8
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
