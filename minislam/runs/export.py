@@ -129,8 +129,11 @@ def _make_apart(run: Run, folder: Path, *parts: str) -> None:
     if (folder / RUN).exists():  # whose camera.json would be replaced
         raise InputError(f"expected a folder of no run, found {RUN} in {folder}; choose another")
     if any(folder.iterdir()):  # only then, because depth can be written without the source
-        if inside := [f for f in run.sequence.files if f.resolve().is_relative_to(folder)]:
-            wanted = "a folder without images of the sequence itself"
+        links = (path.resolve() for path in folder.rglob("*") if path.is_symlink())
+        places = {folder, *links}  # what a link points to would be replaced, too
+        files = (file.resolve() for file in run.sequence.files)
+        if inside := [file for file in files if places & {file, *file.parents}]:
+            wanted = "a folder without images of the sequence itself, or links to them"
             raise InputError(f"expected {wanted}, found {inside[0]}; choose another")
     for part in parts:
         make_folder(folder / part)

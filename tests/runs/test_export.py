@@ -248,6 +248,17 @@ def test_images_of_the_sequence_are_never_written_over(run, tmp_path: Path):
     assert {path.name: path.read_bytes() for path in (tmp_path / "images").iterdir()} == before
 
 
+@pytest.mark.parametrize("link", ["images", "images/000002.png", "masks/000002.png"])
+def test_images_of_the_sequence_are_not_written_over_through_a_link(run, tmp_path: Path, link: str):
+    image = tmp_path / "in" / run.sequence.source_name(2)
+    (path := tmp_path / "out" / link).parent.mkdir(parents=True)
+    path.symlink_to(image if path.suffix else image.parent)
+    before = {file: file.read_bytes() for file in image.parent.iterdir()}
+    with pytest.raises(InputError, match="of the sequence itself, or links to them, found"):
+        export.export_colmap(run, tmp_path / "out", FRAMES)
+    assert {file: file.read_bytes() for file in image.parent.iterdir()} == before
+
+
 def test_the_folder_of_a_run_is_never_written_over(run, tmp_path: Path):
     (tmp_path / "run").mkdir()
     for name in ("run.json", "camera.json"):
