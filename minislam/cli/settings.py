@@ -29,7 +29,7 @@ def _settings(args: argparse.Namespace) -> None:
     found = fnmatch.filter(settings, f"*{args.pattern}*")
     hint = nearest(args.pattern, settings, "minislam settings lists all of them")
     require(bool(found), "part of a setting's name", f"{args.pattern!r} in none; {hint}")
-    width = min(shutil.get_terminal_size().columns, 100)
+    width = min(max(shutil.get_terminal_size().columns, 20), 100)
     for name in found:
         value, about = settings[name]
         least, most = about["least"], about["most"]

@@ -32,6 +32,11 @@ def test_a_pattern_is_part_of_a_name_or_a_glob(pattern: str, name: str, capsys):
     assert name in lines and len(lines) < 40
 
 
+def test_a_narrow_terminal_gets_narrow_lines(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "3")
+    assert max(map(len, listing(capsys, "window")[1:3])) <= 20
+
+
 def test_a_pattern_that_nothing_fits_names_the_nearest(capsys):
     assert main(["settings", "tracking.windw"]) == 1
     assert "found 'tracking.windw' in none; the nearest is tracking.window" in (
