@@ -73,6 +73,7 @@ def _bench(args: argparse.Namespace) -> int:
 def find_sequences(folders: list[str]) -> dict[str, Path]:
     """Return the sequences that folders are, or hold one or two levels below, by their names."""
     from minislam.data.tum import is_tum_folder
+    from minislam.evaluation.published import plain_name
 
     found: dict[str, Path] = {}
     for folder in map(Path, folders):
@@ -83,7 +84,8 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
         for path in paths:
             name = path.resolve().name
             two = f"two called {name}; bench them in two commands, each with its own -o"
-            require(name not in found, "sequences of different names", two)
+            is_new = plain_name(name) not in map(plain_name, found)  # in the tables, too
+            require(is_new, "sequences of different names", two)
             found[name] = path
     return found
 

@@ -25,10 +25,10 @@ def compare(ours: dict[str, str]) -> dict[str, list[list[str]]]:
     mean is over the columns shown, "-" where one of them has no number.
     """
     rows, tables = published_errors(), {}
-    known = {_plain(row["folder"]): row for row in rows}
+    known = {plain_name(row["folder"]): row for row in rows}
     datasets: dict[str, dict[str, str]] = {}  # dataset: {sequence: ours}
     for name, ate_cm in ours.items():
-        row = known.get(_plain(name), {"dataset": OTHER, "sequence": name})
+        row = known.get(plain_name(name), {"dataset": OTHER, "sequence": name})
         datasets.setdefault(row["dataset"], {})[row["sequence"]] = ate_cm
     for dataset, mine in datasets.items():
         systems: dict[tuple[str, str], dict[str, str]] = {}
@@ -42,7 +42,8 @@ def compare(ours: dict[str, str]) -> dict[str, list[list[str]]]:
     return tables
 
 
-def _plain(folder: str) -> str:
+def plain_name(folder: str) -> str:
+    """Return the name of a sequence as one folder of it or another is called."""
     return folder.casefold().removeprefix("rgbd_dataset_")
 
 

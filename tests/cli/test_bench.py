@@ -169,6 +169,13 @@ def test_folders_without_sequences_and_equal_names_are_one_sentence(made: Bench,
     assert "found two called crowd" in capsys.readouterr().err
 
 
+def test_two_folders_of_one_published_sequence_are_not_one_column(made: Bench, capsys):
+    made.sequence("freiburg3_walking_xyz")
+    made.sequence("rgbd_dataset_freiburg3_walking_xyz")
+    assert made.run() == 1
+    assert "found two called rgbd_dataset_freiburg3_walking_xyz; bench" in capsys.readouterr().err
+
+
 def test_an_output_that_is_a_file_is_one_sentence(made: Bench, capsys):
     made.sequence("ball")
     made.out.write_text("mine")
