@@ -45,7 +45,9 @@ def idle_cores() -> int:
         return max(1, int(given))
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    busy = 0.0
+    with suppress(AttributeError, OSError):  # of Windows; of a sandbox without /proc/loadavg
+        busy = os.getloadavg()[0]
     return max(1, min(MOST_WORKERS, math.ceil(cores - busy)))
 
 

@@ -182,6 +182,12 @@ def test_one_worker_per_idle_core(monkeypatch):
     monkeypatch.setenv("MINISLAM_WORKERS", "3²")
     assert idle_cores() == 1  # as if it were not set
 
+    def unknown() -> tuple[float, float, float]:
+        raise OSError("Load averages are unobtainable")
+
+    monkeypatch.setattr(os, "getloadavg", unknown, raising=False)
+    assert idle_cores() == MOST_WORKERS
+
 
 # Errors
 
