@@ -7,6 +7,8 @@ from minislam.cli.options import size_of
 from minislam.data.files import require_new
 from minislam.runs.progress import ProgressLine, say
 
+LONGEST_SIDE = 16383  # px, of VP8 and WebP
+
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
@@ -39,7 +41,8 @@ def _render(args: argparse.Namespace) -> None:
     from minislam.runs.loaded import Run
 
     run = Run(args.folder)
-    require_bounds("--size", args.size, MINIMUM_SIDE, 16384)
+    panels = len(flythrough.LABELS) if args.path == "side-by-side" else 1
+    require_bounds("--size", args.size, MINIMUM_SIDE, LONGEST_SIDE // panels)
     inputs = [run.folder.read_config()["sequence"]] if args.overwrite else []  # a video, or none
     require_new([args.output], args.overwrite, inputs)
     camera = run.camera.resized(*args.size) if args.size else run.camera

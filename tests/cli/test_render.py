@@ -51,7 +51,10 @@ def test_nonsense_is_one_sentence(folder: str, tmp_path: Path, capsys):
     assert main(["render", str(tmp_path), "-o", "a.webm"]) == 1
     assert "expected a run with a map" in capsys.readouterr().err
     assert main(["render", folder, "--size", "99999x72", "-o", str(tmp_path / "a.webm")]) == 1
-    assert "--size of at least 16 and at most 16384" in capsys.readouterr().err
+    assert "--size of at least 16 and at most 16383" in capsys.readouterr().err
+    beside = ["--path", "side-by-side", "--size", "5462x72", "-o", str(tmp_path / "a.webm")]
+    assert main(["render", folder, *beside]) == 1  # before it renders three panels of that width
+    assert "--size of at least 16 and at most 5461, found" in capsys.readouterr().err
     assert main(["render", folder, "-o", str(tmp_path / "a.gif")]) == 1
     assert "ends in .webm or .webp, found .gif; write .webm, and convert" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
