@@ -148,10 +148,8 @@ def _bgr(image: np.ndarray) -> np.ndarray:
 
 def _decode(path: Path, mode: int) -> np.ndarray:
     content, decoded = read_bytes(path), None
-    with (
-        _off_screen(_OF_CODECS) as lines,
-        suppress(cv2.error),
-    ):  # of a header that claims 10^10 px
+    # OpenCV raises an error at a header that claims 10^10 px.
+    with _off_screen(_OF_CODECS) as lines, suppress(cv2.error):
         if _is_complete(content):
             decoded = cv2.imdecode(np.frombuffer(content, np.uint8), mode)
     # Only here libjpeg reports damage. What libpng only warns of, such as a broken colour profile,

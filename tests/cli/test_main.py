@@ -117,7 +117,7 @@ INPUTS: list[tuple[Callable[[Path], Path], str]] = [
     (lambda path: path / "nowhere", "nowhere does not exist"),
     (lambda path: Path("/dev/null"), "/dev/null does not exist or is a device"),
     (empty_folder, "found none; give a folder that holds images"),
-    (text_named_png, r"00\.png \(14 bytes\) is damaged"),
+    (text_named_png, r"00\.png \(14 bytes\) is of another format"),
     (truncated_image, r"02\.png \(\d+ bytes\) is damaged"),
     (text_named_mp4, r"\(8 bytes\) cannot be opened as one"),
     (half_a_video, r"\(600 bytes\) cannot be opened as one"),
