@@ -102,7 +102,7 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"animation{kind}"
         encoders[kind](file, map(_bgr, images), rate)
-        _require_room(file.with_name("room"))
+        _require_room(folder)
         if not file.is_file() or not (content := file.read_bytes()):
             found = f"OpenCV {cv2.__version__}, which cannot, or has no space in {folder}"
             advice = "choose .webm or .webp, the other one, or set TMPDIR to another folder"
@@ -110,15 +110,14 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
     atomic_write(path, content)
 
 
-def _require_room(file: Path) -> None:
+def _require_room(folder: str) -> None:
     """Refuse an animation on a full disk, where the encoders cut it short and say nothing."""
     try:
-        file.write_bytes(bytes(_ROOM))
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(_ROOM))
     except OSError as error:
         reason = f"{error.strerror}; free space, or set TMPDIR to another folder"
-        raise InputError(
-            f"expected space for an animation in {file.parent}, but: {reason}"
-        ) from error
+        raise InputError(f"expected space for an animation in {folder}, but: {reason}") from error
 
 
 def _write_webm(file: Path, frames: Iterable[np.ndarray], rate: float) -> None:

@@ -1,6 +1,7 @@
 """Animations are read back by OpenCV: as many images, their size, order and colours."""
 
 import errno
+import tempfile
 from pathlib import Path
 
 import cv2
@@ -51,11 +52,11 @@ def test_another_kind_and_nothing_to_show_are_said(tmp_path: Path):
 def test_a_full_disk_leaves_no_film_that_is_cut_short(tmp_path: Path, monkeypatch, kind: str):
     (tmp_path / f"a{kind}").write_text("before", encoding="utf-8")
 
-    def full(path: Path, content: bytes) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+    def full(dir: str) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", dir)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", full)
+        patch.setattr(tempfile, "TemporaryFile", full)
         with pytest.raises(InputError, match=r"expected space for an animation in .*TMPDIR"):
             write_animation(tmp_path / f"a{kind}", images(), 10.0)
     assert (tmp_path / f"a{kind}").read_text(encoding="utf-8") == "before"
