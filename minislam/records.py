@@ -55,7 +55,7 @@ class Frame(Pictured):
 
 
 @dataclass(frozen=True)
-class Keyframe(Pictured):
+class MapImage(Pictured):
     """An image that the map is fitted to: a keyframe, or at the end a frame between two."""
 
     frame_index: int  # position among the frames

@@ -23,7 +23,7 @@ from minislam.images import resample
 from minislam.mapping import Mapper
 from minislam.priors.features import with_finer_grid
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
-from minislam.records import Frame, Keyframe, Sequence, Trajectory, required_mask
+from minislam.records import Frame, MapImage, Sequence, Trajectory, required_mask
 from minislam.state.memory import SHELF
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
@@ -126,7 +126,7 @@ class Slam(Stateful):
             except MinislamError:
                 self.steps.save_checkpoint(True)
                 raise
-            if not len(self.tracker.keyframes) and self.mapper.keyframes:
+            if not len(self.tracker.keyframes) and self.mapper.images:
                 self.mapper = self._new_mapper(ONLINE_CELL)  # tracking has begun anew
             yield frame
 
@@ -143,10 +143,10 @@ class Slam(Stateful):
 
     def _map_new_keyframes(self) -> None:
         """Add new keyframes to the map. Without a depth prior it is built at the end."""
-        mapped, store = len(self.mapper.keyframes), self.tracker.keyframes
+        mapped, store = len(self.mapper.images), self.tracker.keyframes
         if not store.has_prior or mapped == len(store):
             return
-        new_keyframes = self.keyframes(first=mapped)
+        new_keyframes = self.map_images(first=mapped)
         with self.steps.timed("mapping"):
             if mapped:
                 self._move_map()
@@ -159,9 +159,9 @@ class Slam(Stateful):
 
     def _move_map(self) -> None:
         """Deform the map to follow the keyframes that an adjustment has moved."""
-        if mapped := len(self.mapper.keyframes):
+        if mapped := len(self.mapper.images):
             self.mapper.camera = self.tracker.grid.camera
-            self.mapper.update_keyframes(self.tracker.keyframes.T_camera_world[:mapped])
+            self.mapper.update_poses(self.tracker.keyframes.T_camera_world[:mapped])
 
     def _adjust_all(self) -> None:
         self.tracker.end()
@@ -183,23 +183,23 @@ class Slam(Stateful):
         tracked = [frame.frame_index for frame in graph.keyframes.frames]
         poses = watch.longest_piece(self.poses)
         frames = swept_frames([index for index in tracked if index in poses], list(poses), least=1)
-        keyframes = self.keyframes(others=sorted({*frames} - {*tracked}))
-        keyframes = [keyframe for keyframe in keyframes if keyframe.frame_index in poses]
+        images = self.map_images(others=sorted({*frames} - {*tracked}))
+        images = [image for image in images if image.frame_index in poses]
         if self.tracker.knows_depth:
             inputs = graph, self.sequence, poses, frames, frames
             swept = sweep_frames(*inputs, self.steps.on_progress("dense depth"), self.workers)
-            keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, watch.hardly_walked)
+            images = with_swept_depth(graph.grid.camera, images, swept, watch.hardly_walked)
         else:
-            keyframes = on_backdrop(keyframes)
+            images = on_backdrop(images)
         by_beta = torch.stack([self._static_weight(k).flatten() for k in range(len(tracked))])
         exposures = keyframe_exposures(graph, by_beta)
         self.mapper = self._new_mapper(self.config.mapping.insertion.cell)
         progress = self.steps.on_progress("first map")
-        self.mapper.initialise([with_exposure(k, exposures) for k in keyframes], progress)
+        self.mapper.initialise([with_exposure(image, exposures) for image in images], progress)
 
     def _refine_map(self) -> None:
         stage = "refining the map"
-        iterations = self.config.mapping.refinement(len(self.mapper.keyframes))
+        iterations = self.config.mapping.refinement(len(self.mapper.images))
         self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
@@ -231,7 +231,7 @@ class Slam(Stateful):
         adjustment. Without a depth prior there is no map online, hence no beta: masks alone count.
         """
         keyframes, uncertainty = self.tracker.keyframes, self.config.uncertainty
-        is_known = uncertainty.given_masks or bool(self.mapper.keyframes)
+        is_known = uncertainty.given_masks or bool(self.mapper.images)
         if not (uncertainty.enabled and is_known):
             return torch.ones(self.tracker.grid.shape, device=self.device)
         beta = self._beta(keyframes.frames[index], keyframes.features[index])
@@ -251,8 +251,8 @@ class Slam(Stateful):
             return None
         return torch.from_numpy(required_mask(self.sequence, frame_index)).to(self.device)
 
-    def keyframes(self, first: int = 0, others: Iterable[int] = ()) -> list[Keyframe]:
-        """Return keyframes of the tracker from `first` on, and others, which insert nothing."""
+    def map_images(self, first: int = 0, others: Iterable[int] = ()) -> list[MapImage]:
+        """Return the keyframes from `first` on and other frames, which insert nothing, in order."""
         store = self.tracker.keyframes
         columns = store.frames, store.features, store.metric_depths, store.T_camera_world
         images = [self._view(*row) for row in zip(*(c[first:] for c in columns), strict=True)]
@@ -261,13 +261,13 @@ class Slam(Stateful):
             images.append(replace(self._view(frame, *seen), inserts=False))
         return sorted(images, key=lambda image: image.frame_index)
 
-    def _view(self, frame: Frame, features: Tensor, depth: Tensor | None, pose: Tensor) -> Keyframe:
+    def _view(self, frame: Frame, features: Tensor, depth: Tensor | None, pose: Tensor) -> MapImage:
         pixels = self.tracker.graph.shutter.undone(frame).pixels
         if depth is None:  # it is unknown, 0, everywhere
             depth = torch.zeros((), device=self.device).expand(pixels.shape[:2])
         SHELF.put([pixels, features])
         mask = self._given_mask(frame.frame_index)
-        return Keyframe(frame.frame_index, pixels, features, depth, pose, mask)
+        return MapImage(frame.frame_index, pixels, features, depth, pose, mask)
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames that were not lost; before the end, those of keyframes."""
@@ -291,7 +291,7 @@ class Slam(Stateful):
         camera = self.sequence.camera
         if not self.config.uncertainty.enabled:
             return np.ones((camera.height, camera.width), np.float32)
-        beta = self.mapper.beta_of(self.mapper.keyframes[position])
+        beta = self.mapper.beta_of(self.mapper.images[position])
         return resample(beta, camera.height, camera.width).cpu().numpy()
 
     def lost_frames(self) -> list[tuple[int, float, str]]:

@@ -117,9 +117,9 @@ def test_without_any_depth_camera_and_room_are_found_and_the_person_is_not(witho
 def test_without_a_prior_no_keyframe_is_prepared_for_a_map_before_the_end():
     # Each had all keyframes before it prepared: 3 of 42 s in 140 frames of TUM fr1_desk.
     store = SimpleNamespace(has_prior=False)
-    slam = SimpleNamespace(mapper=SimpleNamespace(keyframes=[]))
+    slam = SimpleNamespace(mapper=SimpleNamespace(images=[]))
     slam.tracker = SimpleNamespace(keyframes=store)
-    Slam._map_new_keyframes(slam)  # it has no `keyframes` to call
+    Slam._map_new_keyframes(slam)  # it has no `map_images` to call
 
 
 def test_beta_finds_the_person_who_then_leaves_the_map(with_depth, without_uncertainty):

@@ -35,7 +35,7 @@ def test_the_online_map_holds_the_longest_part_alone(monkeypatch):
         parts, begun = [], slam._new_mapper
 
         def new_mapper(cell: int):
-            parts.append([keyframe.frame_index for keyframe in slam.mapper.keyframes])
+            parts.append([keyframe.frame_index for keyframe in slam.mapper.images])
             return begun(cell)
 
         monkeypatch.setattr(slam, "_new_mapper", new_mapper)
@@ -43,7 +43,7 @@ def test_the_online_map_holds_the_longest_part_alone(monkeypatch):
             monkeypatch.setattr(slam, f"_{stage}", lambda: None)
         slam.run()
     assert len(parts) == 1 and parts[0][0] == 0 and len(parts[0]) >= 3  # it had been begun
-    mapped = [keyframe.frame_index for keyframe in slam.mapper.keyframes]
+    mapped = [keyframe.frame_index for keyframe in slam.mapper.images]
     assert mapped == [frame.frame_index for frame in slam.tracker.keyframes.frames]
     assert mapped[0] == CUT and mapped[-1] > CUT + 10
     assert set(slam.mapper.gaussians.anchor_keyframe.tolist()) <= set(range(len(mapped)))

@@ -103,7 +103,7 @@ def test_the_map_has_the_same_bytes_with_one_and_two_workers_and_with_one_killed
         mapper._workers = workers
         mapper.initialise([wall_keyframe(0), wall_keyframe(1)], kills)
         poses = [wall_keyframe(k).T_camera_world for k in (0, 1)]
-        images, beta = [wall_keyframe(0).image] * 2, mapper.beta_of(mapper.keyframes[0])
+        images, beta = [wall_keyframe(0).image] * 2, mapper.beta_of(mapper.images[0])
         refined = mapper.refine_poses(poses, images, [beta, beta])
         return [*mapper.gaussians.parameters.values(), *mapper.mlp.parameters(), *refined]
 

@@ -233,7 +233,7 @@ def check_followed_pose(student: Function) -> Verdict:
         image = render(gaussians, camera, true.float()).color
         if mover:  # the left half of the image moves to the right
             image[:, 3:17], weight[:, :17] = image[:, :14].clone(), 0
-        gaussians = gaussians.prune(pixels[:, 0] < last)
+        gaussians = gaussians.keep(pixels[:, 0] < last)
         inputs = gaussians, camera, se3_exp(start) @ true, image, weight, 12
         return Case(inputs, description), true
 

@@ -9,7 +9,7 @@ from minislam.splatting import LearningRates
 
 @dataclass(frozen=True)
 class InsertionConfig:
-    """How densely a keyframe adds Gaussians, and how they start."""
+    """How densely an image adds Gaussians, and how they start."""
 
     cell: int = parameter(2, "one Gaussian per square cell of this side [px of the full image]", 1)
     plain: float = parameter(

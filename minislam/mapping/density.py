@@ -22,10 +22,8 @@ def screen_gradients(
     weight_sums: Tensor,  # (N,) px, as of a `Rendering`: 0 where not seen
     camera: Camera,
 ) -> Tensor:  # (2, N)
-    """Return the length of dL/d(projected mean) in a view, 0 where not seen, and 1 where seen.
-
-    The unit of length is half an image, so that one threshold holds for every image size.
-    """
+    """Return the length of dL/d(projected mean) in a view, 0 where not seen, and 1 where seen."""
+    # The unit of length is half an image, so that one threshold holds for every image size.
     half_image = v_screen.new_tensor([camera.width / 2, camera.height / 2])
     seen = (weight_sums > 0).to(v_screen)
     return torch.stack([seen * (v_screen * half_image).norm(dim=-1), seen])
@@ -50,16 +48,15 @@ def densify(
     lengths, views = gradients
     means = lengths / views.clamp_min(1)
     chosen = means > config.gradient
-    if int(chosen.sum()) > capacity:
-        # There is no place for all: take those of the largest gradients.
+    if int(chosen.sum()) > capacity:  # take those of the largest gradients
         chosen &= means >= means.topk(capacity).values[-1]
     large = gaussians.scales.max(-1).values > SPLIT_SCALE * median_depth
-    clones = gaussians.prune(chosen & ~large)
-    parents = gaussians.prune(chosen & large)
+    clones = gaussians.keep(chosen & ~large)
+    parents = gaussians.keep(chosen & large)
     children = split(parents, generator)
     optimizer.append(clones.concatenate(children))
     added = torch.ones(len(clones) + len(children), dtype=torch.bool, device=chosen.device)
-    optimizer.prune(torch.cat([~(chosen & large), added]))
+    optimizer.keep(torch.cat([~(chosen & large), added]))
 
 
 def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
@@ -74,7 +71,7 @@ def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:
 
 def useful_rows(
     gaussians: GaussianMap,
-    T_camera_world: Tensor,  # (K, 4, 4) of the keyframes that they are anchored to
+    T_camera_world: Tensor,  # (K, 4, 4) of the images that they are anchored to
     median_depth: float,  # world units, of the scene
 ) -> Tensor:  # (N,) bool
     """Tell which Gaussians stay: finite, not faint, not huge beside scene and distance."""

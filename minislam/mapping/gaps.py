@@ -21,7 +21,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.mapping.insertion import nearest_pixels
-from minislam.records import Keyframe
+from minislam.records import MapImage
 
 CELL = 4  # px, side of the cells that are solved for: the depth of a gap is smooth
 VOTERS = 48  # most images of the map that vote, evenly spread; at least 24 of more than 48
@@ -29,7 +29,7 @@ STIFFNESS = 10.0  # of what holds the plate at a known cell, over its own [-]
 FREE = 1e-9  # of what holds it at the mean elsewhere, where known cells leave it free to tilt [-]
 OUTLIERS = (0.02, 0.98)  # quantiles of the known 1/depth
 WITHIN = (0.5, 1.5)  # of these quantiles: the plate is cut off beyond [-]
-MUCH_NEARER = 0.5  # of the distance from which a keyframe guesses a depth [-]
+MUCH_NEARER = 0.5  # of the distance from which an image guesses a depth [-]
 SAME_DEPTH = 0.1  # relative difference from a depth that is known there [-]
 SAME_COLOR = 0.25  # largest difference of a colour, of which 1 is white [-]
 LEAST_DIFFERING = 3  # views that see another colour
@@ -51,15 +51,15 @@ def filled_depth(depth: Tensor) -> Tensor:
 
 
 def is_refuted(
-    means: Tensor,  # (N, 3) world units, of what a keyframe inserts
+    means: Tensor,  # (N, 3) world units, of what an image inserts
     colors: Tensor,  # (N, 3), as bright as the map
     camera: Camera,
-    own: Keyframe,
-    keyframes: Sequence[Keyframe],  # of the map
+    own: MapImage,
+    images: Sequence[MapImage],
 ) -> Tensor:  # (N,) bool
     """Tell which points that fill gaps are refuted, by the depths or by the colours of other views.
 
-    Depths refute only a guess, a point that its own keyframe has no depth for. Either more views
+    Depths refute only a guess, a point that its own image has no depth for. Either more views
     know a surface behind it, which it would hide, than one at its depth. Or a view sees it from
     less than half the distance: it would cover much there, and that view can guess the place
     itself. Colours refute any point if most views in which nothing known hides it, and at least
@@ -70,15 +70,15 @@ def is_refuted(
     is_guessed = own.depth[row, column] == 0
     depth_votes, color_votes = torch.zeros_like(row), torch.zeros_like(row)
     is_near, differing = torch.zeros_like(is_guessed), torch.zeros_like(row)
-    for keyframe in keyframes[:: math.ceil(len(keyframes) / VOTERS)]:
-        z, row, column, inside = nearest_pixels(means, camera, keyframe.T_camera_world)
-        known = keyframe.depth[row, column]
+    for image in images[:: math.ceil(len(images) / VOTERS)]:
+        z, row, column, inside = nearest_pixels(means, camera, image.T_camera_world)
+        known = image.depth[row, column]
         beyond = (known - z) / z
         depth_votes += (inside & (beyond > SAME_DEPTH)).long()
         depth_votes -= (inside & (beyond.abs() <= SAME_DEPTH)).long()
         is_near |= inside & (z < MUCH_NEARER * own_z)
         is_seen = inside & ((known == 0) | (beyond >= -SAME_DEPTH))
-        differs = (keyframe.levelled[row, column] - colors).abs().amax(1) > SAME_COLOR
+        differs = (image.levelled[row, column] - colors).abs().amax(1) > SAME_COLOR
         differing += (is_seen & differs).long()
         color_votes += (is_seen & differs).long() - (is_seen & ~differs).long()
     looks_otherwise = (color_votes > 0) & (differing >= LEAST_DIFFERING)
@@ -86,10 +86,8 @@ def is_refuted(
 
 
 def plate(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the plate (h, w) through the known values that bends least.
-
-    That is the least sum of f_xx^2 + f_yy^2 + 2 f_xy^2, by differences of cells (Terzopoulos 1983).
-    """
+    """Return the plate (h, w) through the known values that bends least (Terzopoulos 1983)."""
+    # It has the least sum of f_xx^2 + f_yy^2 + 2 f_xy^2, by differences of cells.
     height, width = values.shape
     across, down = (partial(differences, n) for n in (width, height))
     pairs = (down(0), across(2)), (down(2), across(0)), (math.sqrt(2) * down(1), across(1))

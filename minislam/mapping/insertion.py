@@ -1,4 +1,4 @@
-"""Insert Gaussians for what a keyframe sees and the map does not show, without dynamic objects."""
+"""Insert Gaussians for what an image shows and the map does not, without dynamic objects."""
 
 import math
 
@@ -22,13 +22,11 @@ def insertable_pixels(
     weight: Tensor,  # (H, W) static weight, 0 on dynamic objects
     rendering: Rendering | None,  # the map from this view, None while it is empty
 ) -> Tensor:  # (H, W) bool
-    """Tell which pixels may add a Gaussian.
+    """Tell which pixels of known, not too far depth may add a Gaussian: the map shows none there.
 
-    The reference depth must be known and not too far, the static weight positive, and the map
-    transparent there. Where the map shows a surface at another depth, nothing is added either. A
-    nearer reference may be a dynamic object that the MLP has not learned yet. A farther one means
-    that the map still holds a dynamic object, which `is_on_dynamic_object` finds, or the blurred
-    edge of a static one.
+    Nothing is added either where the map shows a surface at another depth. A nearer reference may
+    be a dynamic object that the MLP has not learned yet. A farther one means that the map still
+    holds a dynamic object, which `is_on_dynamic_object` finds, or the blurred edge of a static one.
     """
     wanted = (depth > 0) & (depth < far_limit) & (weight > 0)
     if rendering is not None:
@@ -67,10 +65,8 @@ def draw_pixels(
     sides: Tensor,  # (H, W) int64 px, of the cells
     generator: torch.Generator,
 ) -> Tensor:  # (M, 2) int64, column and row
-    """Draw one random known pixel in each cell of the image that has any.
-
-    The official random subset of the image leaves clumps, holes and less where depth is sparse.
-    """
+    """Draw one random known pixel in each cell of the image that has any."""
+    # The official random subset of the image leaves clumps, holes and less where depth is sparse.
     height, width = known.shape
     priority = torch.rand(height, width, generator=generator).to(known.device)
     drawn = []
@@ -89,7 +85,7 @@ def gaussians_at_pixels(
     depth: Tensor,  # (H, W) world units
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4) float64
-    position: int,  # of the keyframe that the new Gaussians are anchored to
+    position: int,  # of the image that the new Gaussians are anchored to
     config: InsertionConfig,
 ) -> GaussianMap:
     """Back-project pixels to round Gaussians that just cover their cells at that depth."""
@@ -114,10 +110,10 @@ def gaussians_at_pixels(
 def is_on_dynamic_object(
     means: Tensor,  # (N, 3) world units
     camera: Camera,
-    T_camera_world: Tensor,  # (4, 4) float64, of the keyframe they were inserted for
-    weight: Tensor,  # (H, W) static weight of that keyframe, 0 on dynamic objects
+    T_camera_world: Tensor,  # (4, 4) float64, of the image they were inserted for
+    weight: Tensor,  # (H, W) static weight of that image, 0 on dynamic objects
 ) -> Tensor:  # (N,) bool
-    """Tell which Gaussians project to pixels of static weight 0 in their own keyframe."""
+    """Tell which Gaussians project to pixels of static weight 0 in their own image."""
     # Optimisation may have moved a Gaussian out of the image: the nearest pixel counts.
     z, row, column, _ = nearest_pixels(means, camera, T_camera_world)
     return (z > 0) & (weight[row, column] == 0)

@@ -1,7 +1,5 @@
 """The terms of L_render, which moves the Gaussians and nothing else (Sec. 3.4)."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -15,14 +13,6 @@ SSIM_WINDOW = 11  # px, the usual window of SSIM, as in 3DGS
 BLACK = 0.01  # summed RGB; darker pixels are the border that undistortion leaves, official
 METRIC_MEDIAN = 2.0  # m, our assumption: median depth of a scene that the official constants fit
 FLOATER_MARGIN = 0.5  # median depths between a floater and the reference behind it
-
-
-@dataclass(frozen=True)
-class RenderLoss:
-    """L_render, and the mean of L_color, which is noted beside it."""
-
-    total: Tensor  # () Eq. (6)
-    color: Tensor  # () weighted mean of L_color
 
 
 def metre(median_depth: float) -> float:
@@ -132,7 +122,7 @@ def render_loss(
     weight: Tensor,  # (H, W) static weight 0.5 / beta^2, without gradient
     median_depth: float,  # world units, of the scene
     config: MappingConfig,
-) -> RenderLoss:
+) -> tuple[Tensor, Tensor]:  # (), () with the weighted mean of L_color
     """Return (lambda_5 L_color + lambda_6 L_depth) / beta^2 + lambda_7 L_iso. Eq. (6).
 
     Means run over all pixels. The factor 1/2 of lambda_5 and lambda_6 is in the weight.
@@ -144,4 +134,4 @@ def render_loss(
     depth = weighted_depth_loss(*depths, weight, *limits).mean() / unit
     isotropic = isotropic_loss(gaussians.scales) / unit
     total = config.color_weight * color + (1 - config.color_weight) * depth
-    return RenderLoss(total + config.lambda_isotropic * isotropic, color)
+    return total + config.lambda_isotropic * isotropic, color

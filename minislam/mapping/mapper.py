@@ -1,7 +1,7 @@
 """The mapper: it decides which Gaussians are inserted and removed, and when they are optimised.
 
 Read `initialise`, `integrate` and `refine` first: they are the three moments at which the map is
-built. `update_keyframes` moves it when the tracker has corrected poses.
+built. An image of the map is a keyframe of the tracker or, at the end, a frame between two.
 """
 
 import math
@@ -11,21 +11,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from minislam.mapping import safeguards
+from minislam.mapping import insertion, safeguards
 from minislam.mapping.deformation import deform_rigidly
 from minislam.mapping.gaps import filled_depth, is_refuted
-from minislam.mapping.insertion import (
-    cell_sides,
-    draw_pixels,
-    gaussians_at_pixels,
-    insertable_pixels,
-    is_on_dynamic_object,
-)
 from minislam.mapping.optimisation import JointOptimisation
 from minislam.mapping.pose_refinement import refine_pose
 from minislam.mapping.views import median_depth, view_gradients
 from minislam.mapping.window import sampling_probabilities, update_window
-from minislam.records import Keyframe, Progress
+from minislam.records import MapImage, Progress
 from minislam.splatting import Rendering
 from minislam.state.memory import release
 from minislam.uncertainty import RenderingError
@@ -40,21 +33,21 @@ class Mapper(JointOptimisation):
 
     def initialise(
         self,
-        keyframes: list[Keyframe],
+        images: list[MapImage],
         progress: Progress | None = None,
         online: bool = False,  # more keyframes will come
     ) -> None:
-        """Begin a map with keyframes, online the first, at the end all; train the MLP on it."""
-        assert keyframes, "a map starts from at least one keyframe"
-        self.median_depth = median_depth(keyframes)
-        self.keyframes = list(keyframes)
+        """Begin a map with images, online the first keyframes; train the MLP on it."""
+        assert images, "a map starts from at least one image"
+        self.median_depth = median_depth(images)
+        self.images = list(images)
         if self.config.mean_background:
             means = []
-            for keyframe in self.keyframes:
-                means.append(keyframe.levelled.mean((0, 1)))
+            for image in images:
+                means.append(image.levelled.mean((0, 1)))
                 release()
             self.background = torch.stack(means).mean(0)
-        count = len(self.keyframes)
+        count = len(images)
         if self.uncertainty.is_learned:
             self._weighted_from = safeguards.FIRST_VIEWS * count
         for position in range(count):
@@ -67,12 +60,12 @@ class Mapper(JointOptimisation):
         self._optimise([self._online_camera] * iterations, progress=progress)
         self._replace_dynamic_gaussians()
 
-    def integrate(self, keyframe: Keyframe) -> None:
+    def integrate(self, keyframe: MapImage) -> None:
         """Add one keyframe: window, removal on dynamic objects, insertion, then optimisation."""
-        assert self.keyframes, "call initialise first"
-        self.keyframes.append(keyframe)
-        new = len(self.keyframes) - 1
-        poses = torch.stack([k.T_camera_world for k in self.keyframes])
+        assert self.images, "call initialise first"
+        self.images.append(keyframe)
+        new = len(self.images) - 1
+        poses = torch.stack([image.T_camera_world for image in self.images])
         camera, among = self._online_camera, [new, *self.window]
         seen = {k: self.render(poses[k], camera).weight_sums > VISIBLE for k in among}
         self.window = update_window(self.window, new, seen, poses, self.config.window_size)
@@ -81,21 +74,18 @@ class Mapper(JointOptimisation):
         if new % self.config.keyframe_stride != 0:
             return  # Fast mode: this keyframe waits for the next optimisation.
         of_window = self.config.window_probability
-        probabilities = sampling_probabilities(len(self.keyframes), self.window, of_window)
+        probabilities = sampling_probabilities(len(self.images), self.window, of_window)
         self._optimise([self._online_camera] * self.config.keyframe_iterations, probabilities)
 
-    def update_keyframes(self, T_camera_world: Tensor) -> None:
-        """Take over new poses (K, 4, 4) of all keyframes: Gaussians move with their anchors.
-
-        Adam's moments are kept, because a bundle adjustment moves the map by little.
-        """
-        assert len(T_camera_world) == len(self.keyframes), len(T_camera_world)
-        old = torch.stack([keyframe.T_camera_world for keyframe in self.keyframes])
-        new = T_camera_world.double()
-        anchors = self.gaussians.anchor_keyframe
+    def update_poses(self, T_camera_world: Tensor) -> None:
+        """Take over corrected poses (K, 4, 4) of all images: Gaussians move with their anchors."""
+        assert len(T_camera_world) == len(self.images), len(T_camera_world)
+        old = torch.stack([image.T_camera_world for image in self.images])
+        new, anchors = T_camera_world.double(), self.gaussians.anchor_keyframe
+        # Adam's moments are kept, because a bundle adjustment moves the map by little.
         self._optimizer.replace(deform_rigidly(self.gaussians, anchors, old, new))
-        rows = zip(self.keyframes, new, strict=True)
-        self.keyframes = [replace(keyframe, T_camera_world=pose) for keyframe, pose in rows]
+        rows = zip(self.images, new, strict=True)
+        self.images = [replace(image, T_camera_world=pose) for image, pose in rows]
 
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all images of the map, the last part at full image size.
@@ -110,9 +100,9 @@ class Mapper(JointOptimisation):
         half = iterations // 2 // self.config.views_per_step * self.config.views_per_step
         if done <= half:
             self._optimise(*schedule, range(done, half))
-            if half >= safeguards.LEAST_VIEWS * len(self.keyframes):
+            if half >= safeguards.LEAST_VIEWS * len(self.images):
                 self._exclude_upper_mode()
-                for position in range(len(self.keyframes)):
+                for position in range(len(self.images)):
                     self._insert(position, fills=True)  # with the depth of the surroundings
         self._optimise(*schedule, range(max(done, half), iterations))
         self._remove_unsupported()
@@ -132,56 +122,52 @@ class Mapper(JointOptimisation):
 
     @torch.no_grad()
     def _insert(self, position: int, fills: bool = False) -> None:
-        """Add Gaussians for what a keyframe sees and the map does not show."""
-        keyframe = self.keyframes[position]
-        if not keyframe.inserts:
+        """Add Gaussians for what an image shows and the map does not."""
+        image, config = self.images[position], self.config.insertion
+        if not image.inserts:
             return
-        rendering = self.render(keyframe.T_camera_world) if len(self.gaussians) else None
+        colors, depth, pose = image.levelled, image.depth, image.T_camera_world
+        rendering = self.render(pose) if len(self.gaussians) else None
         if fills and rendering is not None:
-            known = torch.where(keyframe.depth > 0, keyframe.depth, surface_depth(rendering))
-            farthest = MOST_FAR * FAR_FACTOR * self.median_depth
-            keyframe = replace(keyframe, depth=filled_depth(known).clamp_max(farthest))
-        weight = self.static_weight(self.beta_of(keyframe), self.camera)
+            known = torch.where(depth > 0, depth, surface_depth(rendering))
+            depth = filled_depth(known).clamp_max(MOST_FAR * FAR_FACTOR * self.median_depth)
+        weight = self.static_weight(self.beta_of(image), self.camera)
         far_limit = FAR_FACTOR * self.median_depth
-        allowed = insertable_pixels(keyframe.depth, far_limit, weight, rendering)
-        insertion, image, depth = self.config.insertion, keyframe.levelled, keyframe.depth
-        sides = cell_sides(image, depth, self.cell, insertion.plain)
-        pixels = draw_pixels(depth > 0, sides, self._generator)
+        allowed = insertion.insertable_pixels(depth, far_limit, weight, rendering)
+        sides = insertion.cell_sides(colors, depth, self.cell, config.plain)
+        pixels = insertion.draw_pixels(depth > 0, sides, self._generator)
         pixels = pixels[allowed[pixels[:, 1], pixels[:, 0]]]
-        view = image, depth, self.camera, keyframe.T_camera_world
-        new = gaussians_at_pixels(pixels, sides, *view, position, insertion)
+        view = colors, depth, self.camera, pose
+        new = insertion.gaussians_at_pixels(pixels, sides, *view, position, config)
         if fills:
-            views = self.camera, self.keyframes[position], self.keyframes
-            new = new.prune(~is_refuted(new.means, new.colors, *views))
+            new = new.keep(~is_refuted(new.means, new.colors, self.camera, image, self.images))
         self._optimizer.append(new)
         self._reset_gradients()
 
     def _remove_dynamic_gaussians(self, positions: Iterable[int]) -> None:
-        """Remove Gaussians that keyframes inserted on an object before the MLP knew it moves."""
-        gaussians = self.gaussians
-        keep = torch.ones_like(gaussians.anchor_keyframe, dtype=torch.bool)
+        """Remove Gaussians that images inserted on an object before the MLP knew it moves."""
+        gaussians, camera = self.gaussians, self._online_camera
+        stays = torch.ones_like(gaussians.anchor_keyframe, dtype=torch.bool)
         for position in positions:
-            keyframe = self.keyframes[position]
-            anchored = (gaussians.anchor_keyframe == position).nonzero().squeeze(-1)
-            weight = self.static_weight(self.beta_of(keyframe), self._online_camera)
-            view = self._online_camera, keyframe.T_camera_world, weight
-            keep[anchored] = ~is_on_dynamic_object(gaussians.means[anchored], *view)
-        self._optimizer.prune(keep)
+            image, anchored = self.images[position], gaussians.anchor_keyframe == position
+            view = camera, image.T_camera_world, self.static_weight(self.beta_of(image), camera)
+            stays[anchored] = ~insertion.is_on_dynamic_object(gaussians.means[anchored], *view)
+        self._optimizer.keep(stays)
         self._reset_gradients()
 
     def _exclude_upper_mode(self) -> None:
         """Exclude the upper mode of beta in images with confirmation, if the map is wrong there."""
-        swept = [keyframe for keyframe in self.keyframes if keyframe.confirmation is not None]
+        swept = [image for image in self.images if image.confirmation is not None]
         if not swept or not self.uncertainty.is_learned:
             return
-        least = safeguards.least_weight(torch.cat([self.beta_of(k).flatten() for k in swept]))
+        least = safeguards.least_weight(torch.cat([self.beta_of(i).flatten() for i in swept]))
         if least <= self.least_weight:
             return
         sample = swept[:: math.ceil(len(swept) / safeguards.ASKED)]
-        calls = (self._view_arguments(k, self._online_camera, trains=True) for k in sample)
+        calls = (self._view_arguments(i, self._online_camera, trains=True) for i in sample)
         errors = [vars(v.error).values() for v in self._workers.stream(view_gradients, calls)]
         error = RenderingError(*map(torch.stack, zip(*errors, strict=True)))
-        beta = torch.stack([self.beta_of(keyframe) for keyframe in sample])
+        beta = torch.stack([self.beta_of(image) for image in sample])
         if safeguards.is_wrong(error, beta, least, self.uncertainty):
             self.least_weight = least
             self._replace_dynamic_gaussians()
@@ -189,27 +175,27 @@ class Mapper(JointOptimisation):
     def _remove_unsupported(self) -> None:
         """Remove Gaussians that hardly any static pixel shows, and note what is shown.
 
-        Some were inserted on a dynamic object before the MLP had learned it, and where it always
-        covers the view they have had no gradient since. Others have moved out of all views, and
-        would be floaters in new ones. Where nothing is static, all stay.
+        Some lie on a dynamic object that always covers the view, so they have had no gradient since
+        the MLP has learned it. Others have left all views, and would be floaters in new ones. Where
+        nothing is static, all stay.
         """
         camera, gaussians, self.shown = self._online_camera, self.gaussians, []
-        weights = (self.static_weight(self.beta_of(k), camera) for k in self.keyframes)
-        views = zip(self.keyframes, weights, strict=True)
-        calls = ((gaussians, camera, k.T_camera_world, weight) for k, weight in views)
+        weights = (self.static_weight(self.beta_of(image), camera) for image in self.images)
+        views = zip(self.images, weights, strict=True)
+        calls = ((gaussians, camera, image.T_camera_world, weight) for image, weight in views)
         sums = gaussians.means.new_zeros(2, len(gaussians))
         for of_view, fraction in self._workers.stream(safeguards.static_blending, calls):
             sums += of_view
             self.shown.append(fraction)
         static, total = sums
         if static.any() and self.uncertainty.enabled:
-            self._optimizer.prune(static > safeguards.LEAST_STATIC * total)
+            self._optimizer.keep(static > safeguards.LEAST_STATIC * total)
             self._reset_gradients()
 
     def _replace_dynamic_gaussians(self) -> None:
-        """Remove Gaussians on dynamic objects; let keyframes fill the holes that they see."""
-        self._remove_dynamic_gaussians(range(len(self.keyframes)))
-        for position in range(len(self.keyframes)):
+        """Remove Gaussians on dynamic objects; let images fill the holes that they see."""
+        self._remove_dynamic_gaussians(range(len(self.images)))
+        for position in range(len(self.images)):
             self._insert(position)
 
 

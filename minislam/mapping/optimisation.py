@@ -14,7 +14,7 @@ from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
 from minislam.mapping.views import Comparison, ViewGradients, view_gradients, view_of
 from minislam.mapping.window import in_turn
-from minislam.records import Keyframe, MappingHistory, Progress
+from minislam.records import MapImage, MappingHistory, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.memory import SHELF, release
 from minislam.state.stateful import FrameOf, Stateful, Tree
@@ -25,20 +25,17 @@ from minislam.workers import Workers
 
 
 class JointOptimisation(Stateful):
-    """The map, the MLP and the keyframes, and the iterations that optimise map and MLP.
+    """Map, MLP and images, and the iterations that optimise map and MLP, which `Mapper` starts."""
 
-    What is inserted and removed, and when it is optimised, is decided in `mapper.py`.
-    """
-
-    camera: Camera  # of the keyframe images; the tracker may refine its focal length
-    keyframes: list[Keyframe]
-    window: list[int]  # positions in `keyframes`, newest first
+    camera: Camera  # of the images; the tracker may refine its focal length
+    images: list[MapImage]
+    window: list[int]  # positions in `images`, newest first
     median_depth: float = 1.0  # world units, of the images that the map is begun with
     cell: int  # px, side of the square that gets one Gaussian
     least_weight: float = MAPPING_CUT  # a pixel with less is excluded
-    background: Tensor  # RGB of what no keyframe sees
+    background: Tensor  # RGB of what no image shows
     history: MappingHistory
-    shown: list[float]  # by image of the map, the fraction of its static pixels that is shown [-]
+    shown: list[float]  # by image, the fraction of its static pixels that the map shows [-]
     _trainer: UncertaintyTrainer
     _generator: torch.Generator
     _optimizer: MapOptimizer
@@ -49,22 +46,18 @@ class JointOptimisation(Stateful):
 
     def __init__(
         self,
-        camera: Camera,  # of the keyframe images
+        camera: Camera,  # of the images
         config: MappingConfig,
         uncertainty: UncertaintyConfig,
         feature_dimension: int,  # C
         seed: int,
-        device: str = "cpu",  # of all tensors; keyframes must be there, too
+        device: str = "cpu",  # of all tensors; images must be there, too
         workers: Workers | None = None,  # render the views of a step
         cell: int | None = None,  # px; None: that of the configuration
     ) -> None:
-        self.camera = camera
-        self.config = config
-        self.uncertainty = uncertainty
-        self.seed = seed
+        self.camera, self.config, self.uncertainty, self.seed = camera, config, uncertainty, seed
         self.cell = cell or config.insertion.cell
-        self.keyframes = []
-        self.window, self.shown = [], []
+        self.images, self.window, self.shown = [], [], []
         self.background = torch.zeros(3, device=device)
         self.history = MappingHistory()
         self._workers = workers or Workers()
@@ -75,8 +68,8 @@ class JointOptimisation(Stateful):
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
         super().restore_state(state, frame_of)
-        for keyframe in self.keyframes:
-            SHELF.put([keyframe.pixels, keyframe.features, keyframe.depth])
+        for image in self.images:
+            SHELF.put([image.pixels, image.features, image.depth])
 
     @property
     def gaussians(self) -> GaussianMap:
@@ -86,13 +79,13 @@ class JointOptimisation(Stateful):
     @property
     def _online_camera(self) -> Camera:
         """Return the camera of images of `image_scale`: all online, most in the refinement."""
-        sides = (self.camera.width, self.camera.height)
+        sides = self.camera.width, self.camera.height
         return self.camera.resized(*(max(1, round(self.config.image_scale * s)) for s in sides))
 
     @property
     def exposures(self) -> dict[int, Tensor]:
         """Return the exposures (3,) of the images, by frame index; without differences, none."""
-        return {k.frame_index: k.exposure for k in self.keyframes if k.exposure is not None}
+        return {i.frame_index: i.exposure for i in self.images if i.exposure is not None}
 
     @property
     def mlp(self) -> UncertaintyMLP:
@@ -105,22 +98,22 @@ class JointOptimisation(Stateful):
         camera = camera or self.camera
         return render(self.gaussians, camera, T_camera_world, self.background)
 
-    def renderings(self, keyframes: list[Keyframe]) -> Iterator[Rendering]:
-        """Yield what the map shows of each keyframe; the workers render side by side."""
+    def renderings(self, images: list[MapImage]) -> Iterator[Rendering]:
+        """Yield what the map shows of each image; the workers render side by side."""
         fixed, unused = (self.gaussians, self.camera), (self.background, None, None)
-        calls = ((*fixed, keyframe.T_camera_world, *unused) for keyframe in keyframes)
+        calls = ((*fixed, image.T_camera_world, *unused) for image in images)
         return (Rendering(*found) for found in self._workers.stream(render, calls))
 
     def predict_beta(self, features: Tensor) -> Tensor:
         """Return the raw beta (h', w') of features (h', w', C)."""
         return self._trainer.predict(features)
 
-    def beta_of(self, keyframe: Keyframe) -> Tensor:
-        """Return the raw beta (h', w') of a keyframe: from its mask or from the MLP."""
-        release()  # all that goes from keyframe to keyframe passes here
-        if keyframe.moving_mask is not None:
-            return beta_of_mask(keyframe.moving_mask)
-        return confirmed_beta(self.predict_beta(keyframe.features), keyframe.confirmation)
+    def beta_of(self, image: MapImage) -> Tensor:
+        """Return the raw beta (h', w') of an image: from its mask or from the MLP."""
+        release()  # all that goes from image to image passes here
+        if image.moving_mask is not None:
+            return beta_of_mask(image.moving_mask)
+        return confirmed_beta(self.predict_beta(image.features), image.confirmation)
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
         """Return the static weight (H, W) for a raw beta; 1 at first, or with uncertainty off."""
@@ -131,12 +124,12 @@ class JointOptimisation(Stateful):
     def _optimise(
         self,
         cameras: list[Camera],  # size at which each iteration renders
-        probabilities: Tensor | None = None,  # (K,) of the keyframes; None: all in turn
+        probabilities: Tensor | None = None,  # (K,) of the images; None: all in turn
         progress: Progress | None = None,
         last_rate: float = 1.0,  # last step over the first one, log-linear in between
         iterations: range | None = None,  # of the cameras; None: all
     ) -> None:
-        """Run the iterations. Each renders one keyframe; a few make a step."""
+        """Run the iterations. Each renders one image; a few make a step."""
         if len(self._optimizer.gaussians) == 0:
             return  # There is nothing to optimise: all was pruned, or nothing was inserted.
         interval, views = self.config.density.interval, self.config.views_per_step
@@ -144,7 +137,7 @@ class JointOptimisation(Stateful):
         for done in (range(total) if iterations is None else iterations)[::views]:
             count = min(views, total - done)
             if probabilities is None:
-                positions = in_turn(range(done, done + count), len(self.keyframes), self.seed)
+                positions = in_turn(range(done, done + count), len(self.images), self.seed)
             else:
                 repeats = int((probabilities > 0).sum()) < count  # else none twice
                 drawn = torch.multinomial(probabilities, count, repeats, generator=self._generator)
@@ -157,18 +150,14 @@ class JointOptimisation(Stateful):
                 progress(done + count, total)
 
     def _step(self, positions: list[int], camera: Camera, rate_factor: float) -> None:
-        """Take one step of the map on the mean L_render of some keyframes, then train the MLP.
-
-        The mean of n gradients is less noisy, so the step is sqrt(n) times as long.
-        """
+        """Take one step of the map on the mean L_render of some images, then train the MLP."""
         trains = self.uncertainty.is_learned and self._iteration >= self._frozen_until
-        drawn = [self.keyframes[position] for position in positions]
-        calls = [self._view_arguments(keyframe, camera, trains) for keyframe in drawn]
+        calls = [self._view_arguments(self.images[k], camera, trains) for k in positions]
         views: list[ViewGradients] = self._workers.map(view_gradients, calls)
         for name, values in self._optimizer.gaussians.parameters.items():
             values.grad = torch.stack([view.by_parameter[name] for view in views]).mean(0)
         self._gradients += torch.stack([view.screen for view in views]).sum(0)
-        factor = rate_factor * math.sqrt(len(views))
+        factor = rate_factor * math.sqrt(len(views))  # the mean of n gradients is less noisy
         self._optimizer.rates = self.config.rates_at(self._iteration, self.median_depth, factor)
         self._optimizer.step()
         loss = self._train_mlp(positions, views) if trains else math.nan
@@ -176,24 +165,23 @@ class JointOptimisation(Stateful):
             self.history.add(view.losses, loss, len(self._optimizer.gaussians))
         self._iteration += len(views)
 
-    def _view_arguments(self, keyframe: Keyframe, camera: Camera, trains: bool) -> tuple[Any, ...]:
+    def _view_arguments(self, image: MapImage, camera: Camera, trains: bool) -> tuple[Any, ...]:
         """Return the arguments of `view_gradients`."""
         comparison = None
         if trains:
-            (rows, columns, _), unit = keyframe.features.shape, metre(self.median_depth)
-            small = view_of(keyframe, self._online_camera)
-            grid = small, (rows, columns), keyframe.confirmation, unit
-            comparison = Comparison(*grid, self.uncertainty)
-        pose, weight = keyframe.T_camera_world, self.static_weight(self.beta_of(keyframe), camera)
-        view = camera, pose, self.background, view_of(keyframe, camera), weight
+            (rows, columns, _), unit = image.features.shape, metre(self.median_depth)
+            grid = view_of(image, self._online_camera), (rows, columns), image.confirmation
+            comparison = Comparison(*grid, unit, self.uncertainty)
+        pose, weight = image.T_camera_world, self.static_weight(self.beta_of(image), camera)
+        view = camera, pose, self.background, view_of(image, camera), weight
         return self.gaussians, *view, self.median_depth, self.config, comparison
 
     def _train_mlp(self, positions: list[int], views: list[ViewGradients]) -> float:
-        """Take one step of the MLP on the rendering errors of some keyframes; return L_uncer."""
-        reach, every = self.uncertainty.neighbour_keyframes, range(len(self.keyframes))
+        """Take one step of the MLP on the rendering errors of some images; return L_uncer."""
+        reach, every = self.uncertainty.neighbour_keyframes, range(len(self.images))
         nearby = {k for at in positions for k in every[max(0, at - reach) : at + reach + 1]}
-        around = torch.cat([self.keyframes[k].features.flatten(0, 1) for k in sorted(nearby)])
-        features = torch.stack([self.keyframes[position].features for position in positions])
+        around = torch.cat([self.images[k].features.flatten(0, 1) for k in sorted(nearby)])
+        features = torch.stack([self.images[position].features for position in positions])
         errors = zip(*(vars(view.error).values() for view in views), strict=True)
         return self._trainer.step(features, RenderingError(*map(torch.stack, errors)), around)
 
@@ -204,7 +192,7 @@ class JointOptimisation(Stateful):
         """Clone, split and prune, then let the map settle before the MLP learns again."""
         config = self.config.density
         densify(self._optimizer, self._gradients, self.median_depth, config, self._generator)
-        poses = torch.stack([keyframe.T_camera_world for keyframe in self.keyframes])
-        self._optimizer.prune(useful_rows(self.gaussians, poses, self.median_depth))
+        poses = torch.stack([image.T_camera_world for image in self.images])
+        self._optimizer.keep(useful_rows(self.gaussians, poses, self.median_depth))
         self._reset_gradients()
         self._frozen_until = self._iteration + self.config.freeze_iterations

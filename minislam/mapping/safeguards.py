@@ -20,18 +20,18 @@ CONFIRMED_ERROR = 1.5
 # Fraction of beta that is taken away where other views confirm. A beta above the cut is kept: what
 # it excludes may have stood still for a while. [-]
 CONFIRMED_BETA = 0.4
-# Renderings of each keyframe before which beta weights nothing: as long as the map is not fitted,
+# Renderings of each image before which beta weights nothing: as long as the map is not fitted,
 # its errors are not those of dynamic objects, and what is excluded then would never be fitted.
 FIRST_VIEWS = 4
 LEAST_UPPER_MODE = 0.85  # mean raw beta: a mode with less is what the map does not show yet
 UPPER_MODE = 0.75  # of that mean, from which on a raw beta belongs to the mode
 BINS = 50  # of the histogram, per unit of raw beta
-LEAST_VIEWS = 2  # renderings of each keyframe before which beta of a static room may still be high
+LEAST_VIEWS = 2  # renderings of each image before which beta of a static room may still be high
 # Of the pixels that show a Gaussian, by blending weight, that must be static [-]: 0.01 to 0.1 take
 # a carried table out of the map; from 0.05 on, they also take a wall that beta doubts.
 LEAST_STATIC = 0.02
 LEAST_WRONG = 0.5  # of the cells of the upper mode, else they are kept [-]
-ASKED = 24  # most keyframes, evenly spread, whose rendering errors decide that
+ASKED = 24  # most images, evenly spread, whose rendering errors decide that
 OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [-]
 
 

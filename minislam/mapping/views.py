@@ -1,4 +1,4 @@
-"""Keyframes at the size of a rendering, and what one adds to an optimisation step."""
+"""Images of the map at the size of a rendering, and what one adds to an optimisation step."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,33 +13,32 @@ from minislam.mapping.config import MappingConfig
 from minislam.mapping.density import screen_gradients
 from minislam.mapping.losses import render_loss
 from minislam.mapping.safeguards import doubted_error
-from minislam.records import Keyframe
+from minislam.records import MapImage
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.uncertainty import RenderingError, UncertaintyConfig, rendering_error
 
-MOST_DEPTHS = 100  # keyframes whose depths are sorted together: those of 500 fill 300 MB
+MOST_DEPTHS = 100  # images whose depths are sorted together: those of 500 fill 300 MB
 
 
 @dataclass(frozen=True)
 class View:
-    """A keyframe at one size."""
+    """An image of the map at one size."""
 
     image: Tensor  # (h, w, 3) RGB in [0, 1]
     depth: Tensor  # (h, w) world units, 0 where unknown
-    exposure: Tensor | None = None  # (3,) of its keyframe
+    exposure: Tensor | None = None  # (3,) see `Pictured`
 
 
-def view_of(keyframe: Keyframe, camera: Camera) -> View:
-    """Return a keyframe at the size of a camera."""
+def view_of(whole: MapImage, camera: Camera) -> View:
+    """Return an image of the map at the size of a camera."""
     size = camera.height, camera.width
-    image, depth = shrink_image(keyframe.image, *size), shrink_depth(keyframe.depth, *size)
-    return View(image, depth, keyframe.exposure)
+    return View(shrink_image(whole.image, *size), shrink_depth(whole.depth, *size), whole.exposure)
 
 
-def median_depth(keyframes: list[Keyframe]) -> float:  # world units
-    """Return the median of all known depths, of at most MOST_DEPTHS keyframes, evenly spread."""
-    sample = keyframes[:: math.ceil(len(keyframes) / MOST_DEPTHS)]
-    depths = torch.cat([keyframe.depth[keyframe.depth > 0] for keyframe in sample])
+def median_depth(images: list[MapImage]) -> float:  # world units
+    """Return the median of all known depths, of at most MOST_DEPTHS images, evenly spread."""
+    sample = images[:: math.ceil(len(images) / MOST_DEPTHS)]
+    depths = torch.cat([image.depth[image.depth > 0] for image in sample])
     advice = "move the camera more, past more texture, or give a depth prior"
     require(len(depths) > 0, "some known depth in the keyframes", f"none; {advice}")
     return float(depths.median())
@@ -47,22 +46,22 @@ def median_depth(keyframes: list[Keyframe]) -> float:  # world units
 
 @dataclass(frozen=True)
 class Comparison:
-    """How the MLP compares a keyframe with its rendering.
+    """How the MLP compares an image with its rendering.
 
     All comparisons of a run use one size, because the windows of the SSIM are in pixels: at another
     image size the same rendering has another error, and beta learns another value.
     """
 
-    reference: View  # the keyframe at the size at which they are compared
+    reference: View  # at the size at which they are compared
     grid_shape: tuple[int, int]  # (h', w') cells
-    confirmation: Tensor | None  # (h', w') of the keyframe
+    confirmation: Tensor | None  # (h', w') of the image
     depth_unit: float  # world units that count as 1 in L_depth
     config: UncertaintyConfig
 
 
 @torch.no_grad()
-def keyframe_rendering_error(rendering: Rendering, by: Comparison) -> RenderingError:
-    """Compare a keyframe with its rendering of the same size or a larger one."""
+def image_rendering_error(rendering: Rendering, by: Comparison) -> RenderingError:
+    """Compare an image with its rendering of the same size or a larger one."""
     size = by.reference.depth.shape
     depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
     depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
@@ -74,7 +73,7 @@ def keyframe_rendering_error(rendering: Rendering, by: Comparison) -> RenderingE
 
 @dataclass(frozen=True)
 class ViewGradients:
-    """What a step needs of one keyframe."""
+    """What a step needs of one image."""
 
     by_parameter: dict[str, Tensor]  # dL_render/d(parameter), by its name in the map
     screen: Tensor  # (2, N) `screen_gradients`
@@ -87,23 +86,24 @@ def view_gradients(
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4)
     background: Tensor,  # (3,) RGB
-    view: View,  # of the keyframe, at the size of the camera
+    view: View,  # at the size of the camera
     weight: Tensor,  # (H, W) static weight
     median_depth: float,  # world units, of the scene
     config: MappingConfig,
     comparison: Comparison | None,  # None: the MLP is not trained
 ) -> ViewGradients:
-    """Render a keyframe; return the gradients of L_render, Eq. (6), and the error for the MLP."""
+    """Render an image; return the gradients of L_render, Eq. (6), and the error for the MLP."""
     inputs = {name: p.detach().requires_grad_() for name, p in gaussians.parameters.items()}
     gaussians = replace(gaussians, **inputs)
     offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
     rendering = render(gaussians, camera, T_camera_world, background, screen_offsets=offsets)
     if view.exposure is not None:  # as bright as the image, which is at most white
         rendering = rendering._replace(color=(rendering.color * view.exposure).clamp_max(1))
-    loss = render_loss(gaussians, rendering, view.image, view.depth, weight, median_depth, config)
-    *gradients, by_pixel = torch.autograd.grad(loss.total, [*inputs.values(), offsets])
+    reference = view.image, view.depth, weight, median_depth, config
+    loss, color_loss = render_loss(gaussians, rendering, *reference)
+    *gradients, by_pixel = torch.autograd.grad(loss, [*inputs.values(), offsets])
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.weight_sums, camera)
-    losses = torch.stack([loss.total, loss.color])  # one transfer from a GPU
-    error = keyframe_rendering_error(rendering, comparison) if comparison else None
+    losses = torch.stack([loss, color_loss])  # one transfer from a GPU
+    error = image_rendering_error(rendering, comparison) if comparison else None
     return ViewGradients(by_parameter, screen, losses.tolist(), error)

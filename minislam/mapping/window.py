@@ -1,4 +1,4 @@
-"""The local window of keyframes, and which keyframe each iteration renders (Sec. 3.4)."""
+"""The local window of keyframes, and which image each iteration renders (Sec. 3.4)."""
 
 import torch
 from torch import Tensor
@@ -31,11 +31,8 @@ def update_window(
     still too large, the keyframe far from the new one and close to others leaves (DSO's rule).
     """
     window = [new, *window]
-    non_overlapping = [
-        position
-        for position in window[PROTECTED:]
-        if overlap_coefficient(seen[new], seen[position]) <= LEAST_OVERLAP
-    ]
+    overlaps = {k: overlap_coefficient(seen[new], seen[k]) for k in window[PROTECTED:]}
+    non_overlapping = [k for k, overlap in overlaps.items() if overlap <= LEAST_OVERLAP]
     if non_overlapping:
         window.remove(non_overlapping[-1])
     while len(window) > size:
@@ -62,8 +59,7 @@ def sampling_probabilities(
 ) -> Tensor:  # (N,) float64, sum 1
     """Return the probability of each keyframe: in the paper, 1/2 for the window in total.
 
-    While the window holds more than `window_probability` of all keyframes, all are equally likely,
-    so the window is still drawn at least that often. This includes a window of all keyframes.
+    Where the window holds more than that of all keyframes, all are equally likely.
     """
     if len(window) >= window_probability * count:
         return torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
@@ -74,11 +70,8 @@ def sampling_probabilities(
 
 
 def in_turn(iterations: range, count: int, seed: int) -> list[int]:
-    """Return the keyframe of each iteration: all `count` in turn, each round in another order.
-
-    Drawn one by one, some would be rendered half as often as others.
-    """
-    orders = {}
+    """Return the image of each iteration: all `count` in turn, each round in another order."""
+    orders = {}  # Drawn one by one, some images would be rendered half as often as others.
     for turn in {iteration // count for iteration in iterations}:
         generator = torch.Generator().manual_seed(seed + turn)
         orders[turn] = torch.randperm(count, generator=generator).tolist()

@@ -18,7 +18,7 @@ from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MappedView, ate_cm, measure_run
 from minislam.mapping.mapper import Mapper, surface_depth
 from minislam.priors.choice import PriorChoice
-from minislam.records import Keyframe, Trajectory
+from minislam.records import MapImage, Trajectory
 from minislam.runs.resume import Checkpoints
 from minislam.runs.warnings import guessed_depth, left_out, shown_static, warnings
 from minislam.slam import Slam
@@ -113,7 +113,7 @@ def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
 def mapped_views(slam: Slam) -> Iterator[MappedView]:
     """Yield what the map shows of each of its images, and how well it fits what stands still."""
     mapper = slam.mapper
-    shown = zip(mapper.keyframes, mapper.renderings(mapper.keyframes), strict=True)
+    shown = zip(mapper.images, mapper.renderings(mapper.images), strict=True)
     for index, (keyframe, rendering) in enumerate(shown):
         color, depth = rendering.color.clamp(0, 1), surface_depth(rendering)
         beta = slam.beta_image(index) if slam.config.uncertainty.is_learned else None
@@ -128,18 +128,18 @@ def mapped_views(slam: Slam) -> Iterator[MappedView]:
 
 def unseen_psnr(slam: Slam) -> float | None:
     """Return the PSNR [dB] of up to 20 frames beside the map's, where beta finds them static."""
-    mapper, seen = slam.mapper, {keyframe.frame_index for keyframe in slam.mapper.keyframes}
+    mapper, seen = slam.mapper, {keyframe.frame_index for keyframe in slam.mapper.images}
     mapped = slam.tracker.watch.longest_piece(slam.poses)
     others = [index for index in mapped if index not in seen]
     sample = others[:: math.ceil(len(others) / MOST_UNSEEN) or 1]
-    keyframes = slam.keyframes(first=len(slam.tracker.keyframes), others=sample)
+    keyframes = slam.map_images(first=len(slam.tracker.keyframes), others=sample)
     views = [with_exposure(keyframe, mapper.exposures) for keyframe in keyframes]
     found = [_static_psnr(mapper, view, mapper.render(view.T_camera_world)) for view in views]
     known = [value for value in found if value is not None]
     return float(np.mean(known)) if known else None
 
 
-def _static_psnr(mapper: Mapper, keyframe: Keyframe, rendering: Rendering) -> float | None:
+def _static_psnr(mapper: Mapper, keyframe: MapImage, rendering: Rendering) -> float | None:
     """Compare the map, as it is exposed there, with a keyframe where beta finds it static."""
     static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
     pictures = keyframe.exposed(rendering.color), keyframe.image, static

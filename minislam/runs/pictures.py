@@ -40,7 +40,7 @@ class Preview:
     def update(self, slam: Slam, facts_of: Callable[[str, None], dict[str, Any]]) -> None:
         """Write the report if there is a map and a new one is due; `facts_of` is run.json."""
         begun = time.perf_counter()
-        if begun >= self._due and slam.mapper.keyframes:
+        if begun >= self._due and slam.mapper.images:
             write_preview(self._folder, slam, facts_of("running", None))
             ended = time.perf_counter()
             self._due = ended + (ended - begun) / PREVIEW_FRACTION
@@ -49,7 +49,7 @@ class Preview:
 def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:
     """Write the report of what is known so far; a failure to write it does not end the run."""
     with suppress(Exception):
-        shown = _pictures(slam, len(slam.mapper.keyframes) - 1)
+        shown = _pictures(slam, len(slam.mapper.images) - 1)
         strip = [shown["input"], viz.beta_to_rgb(shown["beta"]), shown["render"]]
         jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
         _write_report(folder, slam, {}, facts, overview=jpeg)
@@ -91,7 +91,7 @@ def write_pictures(
         folder.write_picture(f"{PLOTS}/{name}.png", figures[-1][1])
 
     jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
-    middle = _pictures(slam, len(slam.mapper.keyframes) // 2)
+    middle = _pictures(slam, len(slam.mapper.images) // 2)
     panels = middle["input"], middle["beta"], middle["render"]
     overview = figure_png(viz.overview(*panels, estimate, true_path, unit, broken))
     folder.write_picture(f"{PLOTS}/overview.png", overview)
@@ -146,7 +146,7 @@ def _spread(count: int, most: int) -> list[int]:
 
 def _pictures(slam: Slam, index: int) -> dict[str, np.ndarray]:
     """Return what an image of the map shows, and depth and beta as numbers."""
-    keyframe = slam.mapper.keyframes[index]
+    keyframe = slam.mapper.images[index]
     rendering = slam.mapper.render(keyframe.T_camera_world)
     return {
         "input": keyframe.image.cpu().numpy(),
@@ -164,7 +164,7 @@ def _write_keyframes(
     Return small ones for report and viewer, frame_index: JPEG of input, depth, beta, render; and
     between which depths [world units] and betas all are coloured.
     """
-    views, jpegs = slam.mapper.keyframes, dict[int, list[bytes]]()
+    views, jpegs = slam.mapper.images, dict[int, list[bytes]]()
     keyframes = [index for index, view in enumerate(views) if view.inserts]
     sampled = [_pictures(slam, keyframes[k]) for k in _spread(len(keyframes), COLOUR_SAMPLES)]
     of_depth = viz.depth_limits(np.array([pictures["depth"] for pictures in sampled]))

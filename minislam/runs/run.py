@@ -171,7 +171,7 @@ def _run(
         try:
             slam.run()
         except KeyboardInterrupt:
-            if not slam.mapper.keyframes:  # there is no map to write yet
+            if not slam.mapper.images:  # there is no map to write yet
                 raise
             interrupted = True
         facts = facts_of(*_ending(slam, interrupted))

@@ -104,7 +104,7 @@ def _path_warnings(slam: Slam) -> Iterator[str]:
 
 def _map_warnings(slam: Slam) -> Iterator[str]:
     if has_large_holes(slam):
-        least = slam.mapper.keyframes[int(np.argmin(slam.mapper.shown))].frame_index
+        least = slam.mapper.images[int(np.argmin(slam.mapper.shown))].frame_index
         yield (
             f"the map shows only {shown_static(slam):.0%} of what stands still, least in frame "
             f"{least}: no depth was confirmed elsewhere. The camera hardly moved, its path is "
@@ -278,7 +278,7 @@ def leaves_nearly_all_out(slam: Slam) -> bool:
 def left_out(slam: Slam) -> float:
     """Return the fraction of the map's images that beta leaves out [-]; 0 before the end."""
     mapper = slam.mapper
-    images = mapper.keyframes if mapper.shown else []
+    images = mapper.images if mapper.shown else []
     weights = (mapper.static_weight(mapper.beta_of(k), mapper.camera) for k in images)
     return float(np.mean([float((weight == 0).float().mean()) for weight in weights] or 0.0))
 
@@ -286,7 +286,7 @@ def left_out(slam: Slam) -> float:
 def guessed_depth(slam: Slam) -> float | None:
     """Return the fraction of the keyframes' static pixels whose depth nothing has measured [-]."""
     mapper, guessed = slam.mapper, []
-    for keyframe in mapper.keyframes:
+    for keyframe in mapper.images:
         static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
         if keyframe.inserts and static.any():
             unknown = keyframe.depth == 0 if keyframe.filled is None else keyframe.filled

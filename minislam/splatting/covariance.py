@@ -44,10 +44,7 @@ def covariance_factors(
     quats: Tensor,  # (4, N)
     scales: Tensor,  # (3, N) world units
 ) -> Tensor:  # (3, 3, N) world units
-    """Return L = R(q) diag(s), the factor of Sigma = L L^T.
-
-    Slow twin: reference.covariances.
-    """
+    """Return L = R(q) diag(s), with Sigma = L L^T. Slow twin: reference.covariances."""
     return rotations(quats) * scales
 
 
@@ -65,6 +62,5 @@ def covariance_factors_vjp(
 
 
 def _inverse_norms(quats: Tensor) -> Tensor:
-    # Not norm(dim=0): that reduction is forty times slower on a leading dimension.
-    # The floor turns a zero quaternion into the identity instead of NaN.
+    # Not norm(dim=0), which is forty times slower. The floor turns 0 into the identity, not NaN.
     return (quats * quats).sum(0).clamp_min_(torch.finfo(quats.dtype).tiny).rsqrt_()

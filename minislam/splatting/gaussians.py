@@ -20,7 +20,7 @@ class GaussianMap:
     log_scales: Tensor  # (N, 3) log of the standard deviation in world units
     opacity_logits: Tensor  # (N,) logit of the opacity
     colors: Tensor  # (N, 3) RGB as in the images, not passed through a function
-    anchor_keyframe: Tensor  # (N,) int64, position in the map of the keyframe that inserted it
+    anchor_keyframe: Tensor  # (N,) int64, position in the map of the image that inserted it
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -59,10 +59,10 @@ class GaussianMap:
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return GaussianMap(*map(torch.cat, pairs))
 
-    def prune(self, keep: Tensor) -> "GaussianMap":
-        """Return the map of the rows where `keep` (N,) bool is True, in the same order."""
-        assert keep.dtype == torch.bool and keep.shape == (len(self),), (keep.dtype, keep.shape)
-        return GaussianMap(*(tensor[keep] for tensor in vars(self).values()))
+    def keep(self, rows: Tensor) -> "GaussianMap":
+        """Return the map of the rows where `rows` (N,) bool is True, in the same order."""
+        assert rows.dtype == torch.bool and rows.shape == (len(self),), (rows.dtype, rows.shape)
+        return GaussianMap(*(tensor[rows] for tensor in vars(self).values()))
 
     def detach(self) -> "GaussianMap":
         """Return the same values cut from any graph."""
@@ -71,9 +71,8 @@ class GaussianMap:
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step per parameter group. Source: official WildGS-SLAM.
+    """Adam's step per parameter group. Source: official WildGS-SLAM, whose factor 6 is included.
 
-    The official code multiplies the steps of means and log-scales by 6, which is included here.
     Its colours are c = 0.28209 f + 0.5 with a step of 2.5e-3 for f; ours is the step of c.
     """
 
@@ -87,9 +86,8 @@ class LearningRates:
 class MapOptimizer(Stateful):
     """Adam over the rows of a map; moments and step counts are kept per Gaussian.
 
-    A row that is added starts with zero moments and a step count of zero, so Adam's bias
-    correction holds for it too. With one count for all rows, as torch.optim.Adam has, the first
-    step of a late row would be (1 - decay1) / sqrt(1 - decay2) = 3.2 times too long.
+    With one count for all rows, as torch.optim.Adam has, its bias correction would make the first
+    step of a late row (1 - decay1) / sqrt(1 - decay2) = 3.2 times too long.
     """
 
     gaussians: GaussianMap
@@ -142,13 +140,12 @@ class MapOptimizer(Stateful):
                 moments[name] = torch.cat([moments[name], torch.zeros_like(rows)])
         self._steps = torch.cat([self._steps, torch.zeros_like(new.opacity_logits)])
 
-    def prune(self, keep: Tensor) -> None:
-        """Keep the rows where `keep` (N,) bool is True, with their moments."""
-        self._set_rows(self.gaussians.prune(keep))
+    def keep(self, rows: Tensor) -> None:
+        """Keep the rows where `rows` (N,) bool is True, with their moments."""
+        self._set_rows(self.gaussians.keep(rows))
         for moments in (self._first, self._second):
-            for name in moments:
-                moments[name] = moments[name][keep]
-        self._steps = self._steps[keep]
+            moments.update({name: moment[rows] for name, moment in moments.items()})
+        self._steps = self._steps[rows]
 
     def replace(self, gaussians: GaussianMap) -> None:
         """Set new values for the same rows, for instance after a deformation of the map."""

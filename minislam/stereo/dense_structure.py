@@ -13,7 +13,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.images import resample
-from minislam.records import Frame, Keyframe, Progress
+from minislam.records import Frame, MapImage, Progress
 from minislam.state.memory import SHELF
 from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
@@ -42,10 +42,10 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 
 def with_swept_depth(
     camera: Camera,  # of the images
-    keyframes: list[Keyframe],
+    keyframes: list[MapImage],
     swept: Iterable[tuple[Tensor, Tensor]],  # of each, depth (H, W) and confirmation (H, W)
     fills: bool = False,  # the camera hardly did more than turn
-) -> list[Keyframe]:
+) -> list[MapImage]:
     """Return the keyframes with swept depth and confirmation.
 
     Where the sweep found nothing, the keyframe's own depth fills in, scaled by the swept depth of
@@ -73,7 +73,7 @@ def with_swept_depth(
 
 
 def _completed(
-    small: Camera, keyframe: Keyframe, depth: Tensor, others: list[votes.SweptView]
+    small: Camera, keyframe: MapImage, depth: Tensor, others: list[votes.SweptView]
 ) -> Tensor:
     """Return swept depth (H, W), completed by the keyframe's own where no other view refutes it."""
     both = (depth > 0) & (keyframe.depth > 0)
@@ -93,7 +93,7 @@ def _as_swept(small: Camera, depth: Tensor, cost: np.ndarray, pose: Tensor) -> v
     return votes.SweptView(inverse_depth, cost, 0.0, pose.cpu().numpy())
 
 
-def _filled(keyframe: Keyframe) -> Keyframe:
+def _filled(keyframe: MapImage) -> MapImage:
     """Return a keyframe whose unknown depth is that of the nearest pixel that has one."""
     unknown = keyframe.depth == 0
     if bool(unknown.all()) or not bool(unknown.any()):
@@ -103,7 +103,7 @@ def _filled(keyframe: Keyframe) -> Keyframe:
     return replace(keyframe, depth=filled, filled=unknown)
 
 
-def on_backdrop(keyframes: list[Keyframe]) -> list[Keyframe]:
+def on_backdrop(keyframes: list[MapImage]) -> list[MapImage]:
     """Return the keyframes of a camera that only turned, with all they see one world unit away.
 
     Without parallax every depth explains the images equally well, and no other view confirms any.

@@ -17,9 +17,9 @@ DECAYS, EPSILON = (0.9, 0.999), 1e-8  # of Adam: of its moments; added to the de
 
 @dataclass(frozen=True)
 class RenderingError:
-    """Difference between a keyframe and its rendering on the feature grid, without gradient."""
+    """Difference between an image and its rendering on the feature grid, without gradient."""
 
-    ssim: Tensor  # (h', w') L'_SSIM after the median filter, or (n, h', w') of n keyframes
+    ssim: Tensor  # (h', w') L'_SSIM after the median filter, or (n, h', w') of n images
     depth: Tensor  # the same shape, L_depth in depth units, capped
     opacity: Tensor  # the same shape, in [0, 1]
 
@@ -39,7 +39,7 @@ def rendering_error(
     depth_unit: float,  # world units that count as 1 in L_depth
     config: UncertaintyConfig,
 ) -> RenderingError:
-    """Compare a rendering with its keyframe and resample the errors to the feature grid."""
+    """Compare a rendering with its image and resample the errors to the feature grid."""
     ssim = losses.modified_ssim_loss(image, rendered_color, opacity, config)
     ssim = losses.median_filter(resample(ssim, *grid_shape), config.median_size)
 
@@ -101,11 +101,11 @@ class UncertaintyTrainer(Stateful):
 
     def step(
         self,
-        features: Tensor,  # (h', w', C) of the sampled keyframe, or (n, h', w', C) of several
+        features: Tensor,  # (h', w', C) of the sampled image, or (n, h', w', C) of several
         error: RenderingError,
         nearby_features: Tensor,  # (m, C) cells of it and of its neighbours in time
     ) -> float:
-        """Take one Adam step, n times as long, on the mean L_uncer of n keyframes; return it."""
+        """Take one Adam step, n times as long, on the mean L_uncer of n images; return it."""
         drawn = torch.randperm(len(nearby_features), generator=self.generator)
         sample = nearby_features[drawn[: self.config.variance_samples].to(nearby_features.device)]
         beta, of_sample = self.mlp(features, self.generator), self.mlp(sample, self.generator)

@@ -47,17 +47,17 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("image.sum(-1) > BLACK", "image.sum(-1) >= 0"), ("in_front & (opacity", "(opacity"),
         ("(scales - scales.mean(-1, keepdim=True))", "scales"),
     ],
-    ("mapping/mapper.py", "mapping/test_mapper.py"): [("if not keyframe.inserts", "if False")],
+    ("mapping/mapper.py", "mapping/test_mapper.py"): [("if not image.inserts", "if False")],
     ("mapping/gaps.py", "mapping/test_gaps.py"): [
         ("mean / np.maximum(covered, 1e-6)", "mean"), ("math.sqrt(2) * down(1)", "down(1)"),
         ("inside & (beyond >", "(beyond >"), ("inside & (beyond.abs()", "(beyond.abs()"),
-        ("math.ceil(len(keyframes) / VOTERS)", "1"), ("votes -=", "votes +="),
+        ("math.ceil(len(images) / VOTERS)", "1"), ("votes -=", "votes +="),
         ("is_guessed & ((depth_votes", "((depth_votes"), ("> 0) | is_near", "> 0)"),
         ("inside & (z < MUCH_NEARER", "(z < MUCH_NEARER"), ("votes > 0) & (d", "votes > 0) | (d"),
     ],
     ("mapping/mapper.py", "mapping/test_gaps.py"): [
         ("self._insert(position, fills=True)", "self._insert(position)"),
-        ("new.prune(~is_refuted(new.means, new.colors, *views))", "new"),
+        ("keep(~is_refuted(new.means, new.colors, self.camera, image, self.images))", "detach()"),
     ],
     ("mapping/safeguards.py", "mapping/test_mapper.py"): [
         (".detach()[static] > OPAQUE", ".detach()[weight > -1] > OPAQUE"),

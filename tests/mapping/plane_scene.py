@@ -5,7 +5,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.mapping import InsertionConfig, Mapper, MappingConfig
-from minislam.records import Keyframe
+from minislam.records import MapImage
 from minislam.uncertainty import UncertaintyConfig
 from minislam.workers import Workers
 
@@ -42,7 +42,7 @@ def pose(shift: float) -> Tensor:
     return transform
 
 
-def wall_keyframe(index: int, mover_column: int | None = None) -> Keyframe:
+def wall_keyframe(index: int, mover_column: int | None = None) -> MapImage:
     """Return keyframe `index`; a white square of 8 px stands at depth 1 if a column is given."""
     shift = 0.1 * index
     grid = CAMERA.pixel_grid()
@@ -57,4 +57,4 @@ def wall_keyframe(index: int, mover_column: int | None = None) -> Keyframe:
         depth[square] = 1.0
         first = mover_column // 4
         features[2:4, first : first + 2] = torch.tensor([0.0, 1.0, 0.0])
-    return Keyframe(5 * index, image, features, depth, pose(shift))
+    return MapImage(5 * index, image, features, depth, pose(shift))

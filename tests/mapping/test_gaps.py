@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from minislam.mapping.gaps import CELL, STIFFNESS, VOTERS, filled_depth, is_refuted, plate
-from minislam.records import Keyframe
+from minislam.records import MapImage
 from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 from tests.pretended_gpu import GPU, pretended_gpu
 
@@ -71,7 +71,7 @@ def test_no_other_plate_bends_less(shape: tuple[int, int]):
         assert (up - down) / 2e-3 == pytest.approx(0, abs=1e-6)
 
 
-def views(*depths: float) -> tuple[Keyframe, ...]:
+def views(*depths: float) -> tuple[MapImage, ...]:
     """Return views from the origin along z, each of which knows one depth, or none (0)."""
     view = replace(wall_keyframe(0), T_camera_world=torch.eye(4, dtype=torch.float64))
     view = replace(view, pixels=torch.full_like(view.image, GRAY))
@@ -79,7 +79,7 @@ def views(*depths: float) -> tuple[Keyframe, ...]:
 
 
 def refuted(
-    points: torch.Tensor, own: Keyframe, keyframes: Sequence[Keyframe], shade: float = GRAY
+    points: torch.Tensor, own: MapImage, keyframes: Sequence[MapImage], shade: float = GRAY
 ) -> torch.Tensor:
     return is_refuted(points, torch.full_like(points, shade), CAMERA, own, keyframes)
 

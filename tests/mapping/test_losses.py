@@ -83,10 +83,10 @@ def test_pixels_of_weight_zero_do_not_pull_at_the_rendering_at_all():
     weight[:, 20:] = 0
     color = random_image(4, 40, 40).requires_grad_()
     depth = torch.full((40, 40), 1.9, dtype=torch.float64).requires_grad_()
-    loss = render_loss(
+    loss, _ = render_loss(
         one_gaussian(), rendering_of(color, depth), image, reference, weight, 2.0, MappingConfig()
     )
-    loss.total.backward()
+    loss.backward()
     assert color.grad[:, 26:].abs().max() == 0 and depth.grad[:, 20:].abs().max() == 0
     assert (color.grad[:, :20].abs() > 0).float().mean() > 0.99
 
@@ -98,10 +98,10 @@ def test_world_units_do_not_change_the_loss():
     losses = []
     for unit in [1.0, 250.0]:
         rendering = rendering_of(color, depth * unit)
-        loss = render_loss(
+        loss, _ = render_loss(
             one_gaussian(), rendering, image, reference * unit, weight, 2.5 * unit, config
         )
-        losses.append(float(loss.total))
+        losses.append(float(loss))
     assert losses[0] == pytest.approx(losses[1], rel=1e-9)
 
 
@@ -166,7 +166,7 @@ def test_the_whole_render_loss_has_the_weighted_gradients_of_its_parts():
 
     def loss(color: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         rendering = rendering_of(color, depth)
-        return render_loss(one_gaussian(), rendering, image, reference, weight, 2.5, config).total
+        return render_loss(one_gaussian(), rendering, image, reference, weight, 2.5, config)[0]
 
     leaves = color.clone().requires_grad_(), depth.clone().requires_grad_()
     loss(*leaves).backward()
@@ -187,7 +187,7 @@ def test_black_images_and_unknown_depth_give_zero_and_finite_gradients():
     color = torch.zeros(12, 12, 3, requires_grad=True)
     depth = torch.zeros(12, 12, requires_grad=True)
     weight = torch.ones(12, 12)
-    loss = render_loss(
+    loss, _ = render_loss(
         one_gaussian(),
         rendering_of(color, depth),
         black,
@@ -196,5 +196,5 @@ def test_black_images_and_unknown_depth_give_zero_and_finite_gradients():
         1.0,
         MappingConfig(),
     )
-    loss.total.backward()
-    assert loss.total == 0 and torch.isfinite(color.grad).all()
+    loss.backward()
+    assert loss == 0 and torch.isfinite(color.grad).all()

@@ -73,7 +73,7 @@ def test_exposures_are_those_of_the_views():
     told = torch.tensor([0.5, 0.6, 0.7])
     mapper.initialise([wall_keyframe(0), replace(wall_keyframe(1), exposure=told)])
     assert list(mapper.exposures) == [5]
-    assert view_of(mapper.keyframes[1], CAMERA).exposure is mapper.exposures[5]
+    assert view_of(mapper.images[1], CAMERA).exposure is mapper.exposures[5]
 
 
 def test_a_mover_becomes_uncertain_and_fades_from_the_map():
@@ -161,7 +161,7 @@ def test_a_restored_mapper_has_the_images_that_it_was_given():
     mapper, restored = make_mapper(replace(CONFIG, init_iterations=10)), make_mapper()
     mapper.initialise([wall_keyframe(0), replace(wall_keyframe(1), exposure=torch.ones(3))])
     restored.restore_state(mapper.saved_state(), never)
-    for found, known in zip(restored.keyframes, mapper.keyframes, strict=True):
+    for found, known in zip(restored.images, mapper.images, strict=True):
         assert torch.equal(found.pixels, known.pixels) and found.frame_index == known.frame_index
         assert SHELF.holds(found.pixels)
     assert list(restored.exposures) == [5]
@@ -170,10 +170,10 @@ def test_a_restored_mapper_has_the_images_that_it_was_given():
 def test_a_rigid_motion_of_all_keyframes_moves_the_map_with_them():
     mapper = make_mapper(replace(CONFIG, init_iterations=10))
     mapper.initialise([wall_keyframe(k) for k in range(3)])
-    old = torch.stack([keyframe.T_camera_world for keyframe in mapper.keyframes])
+    old = torch.stack([keyframe.T_camera_world for keyframe in mapper.images])
     before = mapper.render(old[1]).color
     motion = se3_exp(torch.tensor([0.3, 0.1, -0.2, 0.1, 0.4, 0.2], dtype=torch.float64))
-    mapper.update_keyframes(old @ motion)
+    mapper.update_poses(old @ motion)
     moved = (mapper.render((old @ motion)[1]).color - before).abs()
     # Where an alpha is as small as the smallest that counts, rounding decides whether it does.
     assert float(moved.quantile(0.98)) < 1e-4 and float(moved.max()) < 2 * MIN_ALPHA
@@ -222,7 +222,7 @@ def test_given_masks_take_the_place_of_the_mlp():
     mapper.initialise(keyframes[:2])
     mapper.integrate(keyframes[2])
     assert all(torch.equal(a, b) for a, b in zip(before, mapper.mlp.parameters(), strict=True))
-    weight = mapper.static_weight(mapper.beta_of(mapper.keyframes[0]), CAMERA)
+    weight = mapper.static_weight(mapper.beta_of(mapper.images[0]), CAMERA)
     assert torch.equal(weight == 0, keyframes[0].moving_mask)
     assert (mapper.gaussians.means[:, 2] < 1.5).sum() == 0
     empty = wall_keyframe(0)
@@ -262,7 +262,7 @@ def test_a_black_keyframe_without_depth_changes_nothing_for_the_worse():
 def test_a_map_that_lost_all_its_gaussians_recovers_with_the_next_keyframe():
     mapper = make_mapper(replace(CONFIG, init_iterations=1))
     mapper.initialise([wall_keyframe(0)])
-    mapper._optimizer.prune(torch.zeros(len(mapper.gaussians), dtype=torch.bool))
+    mapper._optimizer.keep(torch.zeros(len(mapper.gaussians), dtype=torch.bool))
     assert mapper.render(wall_keyframe(0).T_camera_world).opacity.max() == 0
     mapper.integrate(wall_keyframe(1))
     assert len(mapper.gaussians) > 100
@@ -275,10 +275,10 @@ def test_impossible_calls_are_refused():
     mapper = make_mapper(replace(CONFIG, init_iterations=1))
     with pytest.raises(AssertionError, match="initialise first"):
         mapper.integrate(wall_keyframe(0))
-    with pytest.raises(AssertionError, match="at least one keyframe"):
+    with pytest.raises(AssertionError, match="at least one image"):
         mapper.initialise([])
     with pytest.raises(InputError, match="some known depth"):
         mapper.initialise([replace(wall_keyframe(0), depth=torch.zeros(24, 32))])
     mapper.initialise([wall_keyframe(0)])
     with pytest.raises(AssertionError, match="2"):
-        mapper.update_keyframes(torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+        mapper.update_poses(torch.eye(4, dtype=torch.float64).expand(2, 4, 4))

@@ -45,9 +45,9 @@ def test_workers_render_what_this_process_renders(count: int):
         mapper = make_mapper(CONFIG, workers=workers)
         mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
         mapper.background = torch.tensor([0.1, 0.2, 0.3])
-        found = list(mapper.renderings(mapper.keyframes))
+        found = list(mapper.renderings(mapper.images))
     assert len(found) == 2 and not torch.equal(found[0].color, found[1].color)
-    for keyframe, rendering in zip(mapper.keyframes, found, strict=True):
+    for keyframe, rendering in zip(mapper.images, found, strict=True):
         expected = mapper.render(keyframe.T_camera_world)
         assert all(map(torch.equal, rendering, expected))
         assert not any(part.requires_grad for part in rendering)
@@ -70,7 +70,7 @@ def test_each_loss_trains_only_its_own_side():
     assert all(torch.equal(a, b) for a, b in zip(weights, mapper.mlp.parameters(), strict=True))
     assert not torch.equal(means, mapper.gaussians.means)
 
-    share = view_gradients(*mapper._view_arguments(mapper.keyframes[0], CAMERA, True))
+    share = view_gradients(*mapper._view_arguments(mapper.images[0], CAMERA, True))
     mapper._train_mlp([0], [share])
     leaves = mapper._optimizer.gaussians.parameters.values()
     assert all(leaf.grad is None for leaf in leaves)
@@ -80,7 +80,7 @@ def test_each_loss_trains_only_its_own_side():
 def test_without_uncertainty_all_weights_are_one_and_the_mlp_rests():
     mapper = make_mapper(replace(CONFIG, init_iterations=3), UncertaintyConfig(enabled=False))
     mapper.initialise([wall_keyframe(0)])
-    weight = mapper.static_weight(mapper.beta_of(mapper.keyframes[0]), CAMERA)
+    weight = mapper.static_weight(mapper.beta_of(mapper.images[0]), CAMERA)
     assert torch.equal(weight, torch.ones(24, 32))
     assert all(parameter.grad is None for parameter in mapper.mlp.parameters())
 

@@ -195,13 +195,13 @@ def test_what_only_moving_pixels_show_leaves_the_map_at_the_end():
     mapper = make_mapper()
     mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
     before = len(mapper.gaussians)
-    stray = mapper.gaussians.detach().prune(torch.arange(before) < 5)
+    stray = mapper.gaussians.detach().keep(torch.arange(before) < 5)
     mapper._optimizer.append(replace(stray, means=stray.means + 100))  # out of all views
     mapper.refine(0)
     assert len(mapper.gaussians) >= 0.98 * before and mapper.gaussians.means.max() < 50
-    mapper.keyframes = [replace(k, moving_mask=on_the_right) for k in mapper.keyframes]
+    mapper.images = [replace(k, moving_mask=on_the_right) for k in mapper.images]
     mapper.refine(0)
-    pose = mapper.keyframes[0].T_camera_world
+    pose = mapper.images[0].T_camera_world
     seen = [mapper.render(pose).opacity[:, columns] for columns in (slice(2, 16), slice(27, None))]
     assert seen[0].min() > 0.8 and seen[1].max() < 0.1
 
@@ -212,6 +212,6 @@ def test_where_nothing_is_static_the_map_stays():
     mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
     before = len(mapper.gaussians)
     everywhere = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
-    mapper.keyframes = [replace(k, moving_mask=everywhere) for k in mapper.keyframes]
+    mapper.images = [replace(k, moving_mask=everywhere) for k in mapper.images]
     mapper.refine(0)
     assert len(mapper.gaussians) == before > 0

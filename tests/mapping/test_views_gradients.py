@@ -15,7 +15,7 @@ from tests.mapping.plane_scene import CAMERA, make_mapper, wall_keyframe
 def test_the_gradients_are_those_of_the_loss_of_one_keyframe(exposure):
     mapper = make_mapper()
     mapper.initialise([replace(wall_keyframe(0), exposure=exposure)])
-    keyframe, gaussians = mapper.keyframes[0], mapper._optimizer.gaussians
+    keyframe, gaussians = mapper.images[0], mapper._optimizer.gaussians
     share = view_gradients(*mapper._view_arguments(keyframe, CAMERA, trains=False))
     assert all(parameter.grad is None for parameter in gaussians.parameters.values())
 
@@ -25,17 +25,17 @@ def test_the_gradients_are_those_of_the_loss_of_one_keyframe(exposure):
         rendering = rendering._replace(color=(rendering.color * exposure).clamp_max(1))
     weight = mapper.static_weight(mapper.beta_of(keyframe), CAMERA)
     reference = view.image, view.depth, weight, mapper.median_depth, mapper.config
-    loss = render_loss(gaussians, rendering, *reference)
-    loss.total.backward()
+    loss, _ = render_loss(gaussians, rendering, *reference)
+    loss.backward()
     for name, parameter in gaussians.parameters.items():
         torch.testing.assert_close(share.by_parameter[name], parameter.grad)
-    assert share.losses[0] == float(loss.total.detach())
+    assert share.losses[0] == float(loss.detach())
     assert share.screen.shape == (2, len(gaussians)) and share.error is None
 
 
 def test_the_error_for_the_mlp_comes_on_its_grid():
     mapper = make_mapper()
     mapper.initialise([wall_keyframe(0)])
-    share = view_gradients(*mapper._view_arguments(mapper.keyframes[0], CAMERA, trains=True))
-    assert share.error.ssim.shape == mapper.keyframes[0].features.shape[:2]
+    share = view_gradients(*mapper._view_arguments(mapper.images[0], CAMERA, trains=True))
+    assert share.error.ssim.shape == mapper.images[0].features.shape[:2]
     assert not share.error.ssim.requires_grad

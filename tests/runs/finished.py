@@ -65,7 +65,7 @@ def finished(**parts: object) -> SimpleNamespace:
         for k in range(len(shown))
     ]
     hidden = torch.arange(10) >= 10 * parts.pop("left_out", 0.0)
-    mapper = SimpleNamespace(shown=shown, keyframes=keyframes, camera=CAMERA)
+    mapper = SimpleNamespace(shown=shown, images=keyframes, camera=CAMERA)
     mapper.beta_of, mapper.static_weight = lambda keyframe: hidden, lambda beta, camera: beta
     return SimpleNamespace(
         mapper=mapper,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from minislam.config import with_settings
-from minislam.records import Keyframe, Pictured
+from minislam.records import MapImage, Pictured
 from minislam.runs import facts
 from minislam.splatting import Rendering
 from tests.runs.finished import CAMERA, finished
@@ -22,8 +22,8 @@ def test_what_beta_leaves_out_and_what_is_guessed_is_measured(monkeypatch: pytes
     assert (measured["left_out"], measured["guessed_depth"]) == pytest.approx((0.4, 0.5))
     run.config = with_settings(run.config, {"uncertainty.enabled": False})
     assert facts.measure(run, 1.0, None)["left_out"] is None
-    run.mapper.keyframes[0].filled = torch.arange(10) < 7  # such depth is no measurement
-    run.mapper.keyframes[0].depth = torch.ones(10)
+    run.mapper.images[0].filled = torch.arange(10) < 7  # such depth is no measurement
+    run.mapper.images[0].depth = torch.ones(10)
     assert facts.measure(run, 1.0, None)["guessed_depth"] == pytest.approx(0.5)
 
 
@@ -66,7 +66,7 @@ def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
         picture.pixels, picture.exposure = image, exposure
         keyframe.image, keyframe.exposed = picture.image, picture.exposed
     mapper = SimpleNamespace(
-        keyframes=keyframes,
+        images=keyframes,
         camera=CAMERA,
         renderings=lambda views: (
             rendering._replace(color=color + 0.1 * view.T_camera_world) for view in views
@@ -90,18 +90,18 @@ def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
 def test_the_map_is_compared_with_some_frames_that_it_was_not_fitted_to():
     asked: list[int] = []
 
-    def keyframes(first: int, others: list[int]) -> list[Keyframe]:
+    def map_images(first: int, others: list[int]) -> list[MapImage]:
         assert first == 3  # none of the tracker
         asked[:] = others
         image, none = torch.full((4, 6, 3), 0.5), torch.zeros(4, 6)
-        return [Keyframe(index, image, none, none, torch.tensor(index)) for index in others]
+        return [MapImage(index, image, none, none, torch.tensor(index)) for index in others]
 
     def render(pose: torch.Tensor) -> Rendering:
         opacity = torch.ones(4, 6)
         return Rendering(torch.full((4, 6, 3), 0.2), opacity, opacity, torch.ones(1))
 
     mapper = SimpleNamespace(
-        keyframes=[SimpleNamespace(frame_index=0)],
+        images=[SimpleNamespace(frame_index=0)],
         exposures={0: torch.full((3,), 2.0)},  # so .4 is seen
         camera=CAMERA,
         render=render,
@@ -110,7 +110,7 @@ def test_the_map_is_compared_with_some_frames_that_it_was_not_fitted_to():
     )
     watch = SimpleNamespace(longest_piece=lambda poses: poses)
     tracker = SimpleNamespace(keyframes=[None] * 3, watch=watch)
-    run = SimpleNamespace(mapper=mapper, tracker=tracker, keyframes=keyframes)
+    run = SimpleNamespace(mapper=mapper, tracker=tracker, map_images=map_images)
     run.poses = dict.fromkeys(range(101))
     assert facts.unseen_psnr(run) == pytest.approx(20, abs=1e-3)
     assert len(asked) == facts.MOST_UNSEEN and asked[0] == 1 and asked[-1] == 96

@@ -35,10 +35,10 @@ def test_a_preview_waits_for_a_map_and_then_keeps_its_share_of_the_time(monkeypa
         return {"state": state}
 
     monkeypatch.setattr(pictures, "write_preview", write)
-    slam = SimpleNamespace(mapper=SimpleNamespace(keyframes=[]))
+    slam = SimpleNamespace(mapper=SimpleNamespace(images=[]))
     preview.update(slam, facts_of)
     assert written == []  # no map yet
-    slam.mapper.keyframes.append(object())
+    slam.mapper.images.append(object())
     for _ in range(200):
         preview.update(slam, facts_of)
         now[0] += 1.0

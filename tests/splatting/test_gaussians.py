@@ -56,9 +56,9 @@ def test_concatenate_and_prune_undo_each_other():
     first, second = random_map("ordinary", 4, 3), random_map("ordinary", 6, 4)
     both = first.concatenate(second)
     keep = torch.arange(10) < 4
-    kept, expected = vars(both.prune(keep)), vars(first)
+    kept, expected = vars(both.keep(keep)), vars(first)
     assert all(torch.equal(kept[name], expected[name]) for name in expected)
-    assert len(both.prune(~keep)) == 6
+    assert len(both.keep(~keep)) == 6
 
 
 @pytest.mark.parametrize("order", ["append_then_prune", "prune_then_append"])
@@ -71,9 +71,9 @@ def test_moments_follow_their_rows(order: str):
         descend(optimizer), descend(undisturbed)
     if order == "append_then_prune":
         optimizer.append(new)
-        optimizer.prune(torch.cat([keep, torch.ones(3, dtype=torch.bool)]))
+        optimizer.keep(torch.cat([keep, torch.ones(3, dtype=torch.bool)]))
     else:
-        optimizer.prune(keep)
+        optimizer.keep(keep)
         optimizer.append(new)
     assert optimizer.gaussians.anchor_keyframe.tolist() == [0, 2, 3, 5, 0, 1, 2]
     for mine, other in ((optimizer, [4, 3]), (undisturbed, [6, 0])):
@@ -106,7 +106,7 @@ def test_replace_keeps_moments():
 def test_pruning_everything_and_starting_again():
     optimizer = MapOptimizer(random_map("ordinary", 3, 9), LearningRates())
     descend(optimizer)
-    optimizer.prune(torch.zeros(3, dtype=torch.bool))
+    optimizer.keep(torch.zeros(3, dtype=torch.bool))
     assert len(optimizer.gaussians) == 0
     optimizer.step()
     optimizer.append(one_gaussian())
@@ -127,7 +127,7 @@ def test_errors_say_what_was_expected():
             gaussians.colors, gaussians.anchor_keyframe,
         )  # fmt: skip
     with pytest.raises(AssertionError, match="float32"):
-        gaussians.prune(torch.ones(4))
+        gaussians.keep(torch.ones(4))
     with pytest.raises(AssertionError, match=r"\(1, 4\)"):
         MapOptimizer(gaussians, LearningRates()).replace(one_gaussian())
 

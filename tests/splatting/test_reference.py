@@ -123,7 +123,7 @@ def test_cropping_the_camera_crops_the_image(renderer: Callable):
     # Tiles start elsewhere: nothing may depend on where a tile ends.
     camera = Camera(60.0, 55.0, 20.0, 15.0, 41, 33)
     gaussians = random_map("ordinary", 40, 5)
-    gaussians = gaussians.prune(gaussians.means[:, :2].norm(dim=1) < 0.5)
+    gaussians = gaussians.keep(gaussians.means[:, :2].norm(dim=1) < 0.5)
     whole = renderer(gaussians, camera, IDENTITY)
     part = renderer(gaussians, camera.cropped(5, 3, 30, 27), IDENTITY)
     torch.testing.assert_close(part.color, whole.color[3:30, 5:35], **close)
@@ -164,7 +164,7 @@ def test_faint_and_capped_opacities(renderer: Callable):
 @both
 def test_nothing_to_see_is_the_background(renderer: Callable):
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    empty = one_gaussian((0, 0, 1)).prune(torch.tensor([False]))
+    empty = one_gaussian((0, 0, 1)).keep(torch.tensor([False]))
     for gaussians in (empty, one_gaussian((0, 0, -1)), one_gaussian((9, 0, 1))):
         rendering = renderer(gaussians, CAMERA, IDENTITY, background)
         assert rendering.color.shape == (21, 27, 3)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from minislam.geometry import Camera
-from minislam.records import Keyframe
+from minislam.records import MapImage
 from minislam.stereo import dense_structure
 from minislam.stereo.dense_structure import (
     FARTHEST,
@@ -206,9 +206,9 @@ def test_a_backdrop_is_one_unit_away_and_nothing_measures_or_confirms_it():
     assert flat.filled is not None and flat.filled.all()
 
 
-def keyframe(index: int, depth: torch.Tensor) -> Keyframe:
+def keyframe(index: int, depth: torch.Tensor) -> MapImage:
     features, T_camera_world = torch.zeros(15, 20, 2), torch.from_numpy(pose(index))
-    return Keyframe(index, torch.from_numpy(clip().rgb[index]), features, depth, T_camera_world)
+    return MapImage(index, torch.from_numpy(clip().rgb[index]), features, depth, T_camera_world)
 
 
 def test_swept_depth_comes_first_and_a_prior_of_another_scale_fills_the_rest():

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.records import Frame, Keyframe
+from minislam.records import Frame, MapImage
 from minislam.state.memory import release
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.robust import weighted_median
@@ -31,7 +31,7 @@ KEPT = 20  # blurred images in the cache: most edges join neighbours
 LEAST_CHANGE = 0.03  # log of a factor: if none is larger, one exposure is assumed
 LEAST_WEIGHT = 0.015  # of the heaviest edge: with less, a few chance matches would decide [-]
 STEADY = 1e-6  # weight of "as bright as the keyframe before", for keyframes without an edge
-Shot = TypeVar("Shot", Frame, Keyframe)
+Shot = TypeVar("Shot", Frame, MapImage)
 
 
 def keyframe_exposures(
