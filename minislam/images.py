@@ -40,10 +40,7 @@ def gaussian_blur(
 def _blur_strips(
     length: int, size: int, sigma: float, dtype: torch.dtype, device: torch.device
 ) -> list[tuple[slice, Tensor]]:
-    """Return the banded matrix that blurs a row of `length` pixels, as strips of its columns.
-
-    Each strip comes with the range of pixels that it reads, because its other rows are zero.
-    """
+    """Return the banded matrix that blurs a row, as strips of columns, and what each reads [px]."""
     position = torch.arange(length, dtype=dtype, device=device)
     reach = size // 2
     window = torch.arange(size, dtype=dtype, device=device) - reach
@@ -64,7 +61,7 @@ def resample(
 ) -> Tensor:  # (height, width)
     """Interpolate a grid bilinearly at the cell centres of another one over the same area.
 
-    Both cover the image evenly: on an image of W px, the centre of column j of w' columns lies at
+    Both cover the image evenly: of w' columns on W px, the centre of column j lies at
     (j + 0.5) W / w' - 0.5. Nothing is smoothed before a resampling to fewer cells.
     """
     return functional.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]

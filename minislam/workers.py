@@ -18,10 +18,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
-from functools import cache
 from itertools import islice
 from threading import Lock, Thread
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,11 +28,10 @@ from torch import Tensor
 
 from minislam.errors import require
 from minislam.records import Frame
-from minislam.state.stateful import Tree, from_tree, to_tree
+from minislam.state.stateful import Tree, from_tree, hints_of, to_tree
 
 MOST_WORKERS = 4  # by default
 AT_ONCE = 8  # calls of a stream
-_hints = cache(get_type_hints)
 _TENSOR = "tensor"  # key of what stands for a tensor in the JSON of a message
 _START = "import sys; sys.path[:] = sys.argv[2:]; from minislam.workers import serve; serve()"
 
@@ -123,10 +121,7 @@ class Workers(AbstractContextManager["Workers"]):
             yield from self.map(function, chunk)
 
     def start(self, function: Callable[..., Any], *call: Any) -> Callable[[], Any]:
-        """Begin function(*call) in a helper, as for `map`; return what waits for the result.
-
-        Without a helper, or if that ends or fails, it is computed here when it is asked for.
-        """
+        """Begin function(*call) in a helper; return what waits for the result, or computes it."""
         arguments = _contiguous(to_tree(list(call)))
         answers: list[Tree] = []
 
@@ -194,13 +189,13 @@ def serve() -> None:
 
 def _answer(function: Callable[..., Any], arguments: Tree) -> Tree:
     """Return function(*arguments), both as trees: here as in a helper."""
-    *kinds, _ = _hints(function).values()
+    *kinds, _ = hints_of(function).values()
     values = [from_tree(k, a, _no_frame) for k, a in zip(kinds, arguments, strict=True)]
     return _contiguous(to_tree(function(*values)))
 
 
 def _result(function: Callable[..., Any], answer: Tree) -> Any:
-    return from_tree(_hints(function)["return"], answer, _no_frame)
+    return from_tree(hints_of(function)["return"], answer, _no_frame)
 
 
 def _no_frame(index: int) -> Frame:

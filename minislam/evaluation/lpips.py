@@ -28,10 +28,7 @@ _SMALLEST_LENGTH = 1e-10  # added to the length of a feature vector: where nothi
 
 @dataclass(frozen=True)
 class _Trunk:
-    """The convolutions of one classifier, up to the last that is compared, in five stages.
-
-    Each convolution is followed by a ReLU; the output of the last one of a stage is compared.
-    """
+    """The convolutions of a classifier, with ReLU, in five stages; the last of each is compared."""
 
     name: str
     convs: tuple[tuple[int, ...], ...]  # numbers in the names: features.{number}.weight

@@ -125,16 +125,13 @@ def _view_errors(
     scale: float | None,  # of the truth per unit of the map, None: unknown
     lpips: ImageDistance | None,
 ) -> Iterator[tuple[str, float]]:
-    """Compare the map, seen from one of its images, with image and depth of the static scene.
-
-    `psnr_masked_db` counts only pixels that a dynamic object covered: its ghost would be there.
-    """
+    """Compare the map, seen from one of its images, with image and depth of the static scene."""
     static = truth.static_image(view.frame_index)
     if static is not None:
         yield "psnr_input_db", psnr(view.color, static)
         if lpips is not None:
             yield "lpips_input", lpips(view.color, static)
-        if moving is not None and moving.sum() >= MIN_MASK:
+        if moving is not None and moving.sum() >= MIN_MASK:  # a dynamic object's ghost is there
             yield "psnr_masked_db", psnr(view.color, static, moving)
     if scale is None or view.depth is None:
         return

@@ -115,10 +115,8 @@ def associate(
     second: np.ndarray,  # (M,) second, increasing
     max_difference: float,  # second
 ) -> tuple[np.ndarray, np.ndarray]:  # (K,) and (K,) int, positions in the first and the second
-    """Pair each timestamp of the shorter list with the nearest of the longer, if near enough.
-
-    Several may share one, as in evo.
-    """
+    """Pair each timestamp of the shorter list with the nearest of the longer, if near enough."""
+    # Several of the shorter may share one, as in evo.
     if len(first) > len(second):
         of_second, of_first = associate(second, first, max_difference)
         return of_first, of_second

@@ -10,10 +10,7 @@ from minislam.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class BrownDistortion:
-    """Radial (k1, k2, k3) and tangential (p1, p2) coefficients, in OpenCV's convention.
-
-    OpenCV, like this package, puts the centre of the first pixel at (0, 0).
-    """
+    """Radial (k1, k2, k3) and tangential (p1, p2) coefficients, in OpenCV's convention."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -28,6 +25,7 @@ class BrownDistortion:
 
     def undistortion_maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the two maps of cv2.remap that turn a raw image into that of `camera`."""
+        # OpenCV, like this package, puts the centre of the first pixel at (0, 0).
         K, size = camera_matrix(camera), (camera.width, camera.height)
         return cv2.initUndistortRectifyMap(K, self.coefficients, None, K, size, cv2.CV_32FC1)
 

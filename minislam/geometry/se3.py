@@ -134,10 +134,7 @@ def se3_normalised(transforms: Tensor) -> Tensor:
 
 
 def se3_interpolate(first: Tensor, second: Tensor, fraction: float) -> Tensor:
-    """Return the pose (..., 4, 4) at a fraction of the way from first to second, constant twist.
-
-    A fraction of 2 extrapolates: it repeats the motion once more.
-    """
+    """Return the pose (..., 4, 4) at a fraction of the way at constant twist; 2 extrapolates."""
     motion = se3_log(second @ se3_inverse(first))
     return se3_normalised(se3_exp(fraction * motion) @ first)
 

@@ -52,11 +52,9 @@ def densify(
         chosen &= means >= means.topk(capacity).values[-1]
     large = gaussians.scales.max(-1).values > SPLIT_SCALE * median_depth
     clones = gaussians.keep(chosen & ~large)
-    parents = gaussians.keep(chosen & large)
-    children = split(parents, generator)
+    children = split(gaussians.keep(chosen & large), generator)
+    optimizer.keep(~(chosen & large))
     optimizer.append(clones.concatenate(children))
-    added = torch.ones(len(clones) + len(children), dtype=torch.bool, device=chosen.device)
-    optimizer.keep(torch.cat([~(chosen & large), added]))
 
 
 def split(parents: GaussianMap, generator: torch.Generator) -> GaussianMap:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.state.stateful import FrameOf, Stateful, Tree
 
 ROWS = [(3,), (4,), (3,), (), (3,), ()]  # shape of a Gaussian's row in each tensor of a map
@@ -25,10 +25,9 @@ class GaussianMap:
     def __post_init__(self) -> None:
         count = len(self.means)
         for (name, tensor), row in zip(vars(self).items(), ROWS, strict=True):
-            if tensor.shape != (count, *row):
-                wanted = f"{name} of shape {(count, *row)} in a map of {count} Gaussians"
-                found = f"{tuple(tensor.shape)}; give one row per Gaussian in every tensor"
-                raise InputError(f"expected {wanted}, found {found}")
+            wanted = f"{name} of shape {(count, *row)} in a map of {count} Gaussians"
+            found = f"{tuple(tensor.shape)}; give one row per Gaussian in every tensor"
+            require(tensor.shape == (count, *row), wanted, found)
 
     def __len__(self) -> int:
         return len(self.means)

@@ -68,10 +68,7 @@ def project_means_vjp(
     camera: Camera,
     v_means2d: Tensor,  # (2, N)
 ) -> Tensor:  # (3, N)
-    """Pull a pixel gradient back to the points: v_x = J^T v_mu'.
-
-    J, `Camera.project_jacobian`, is not formed: that takes more operations and rounds otherwise.
-    """
+    """Pull a pixel gradient back to the points, v_x = J^T v_mu'; to form J would take longer."""
     x, y, z = points_camera
     v_x = camera.fx * v_means2d[0] / z
     v_y = camera.fy * v_means2d[1] / z

@@ -77,9 +77,8 @@ def project_covariances(
 ) -> Tensor:  # (N, 2, 2) px^2
     """Return Sigma' = J W Sigma W^T J^T + 0.3 I, low-pass filter included (Sec. 3.1).
 
-    W is the rotation of T_camera_world: the paper's R names that of its camera-to-world pose, but
-    Sigma needs the inverse. J is the Jacobian of the projection at the mean, at most VIEW_MARGIN
-    outside the image.
+    W is the rotation of T_camera_world, the inverse of the paper's R. J is the Jacobian of the
+    projection at the mean, at most VIEW_MARGIN outside the image.
     Fast twin: projection.project_factors, the V of Sigma' = V V^T + 0.3 I.
     """
     z = points_camera[:, 2:]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.geometry import Camera, se3_exp, se3_left_jacobian
 from minislam.splatting.constants import Rendering
 from minislam.splatting.gaussians import GaussianMap
@@ -29,16 +29,13 @@ def render(
 ) -> Rendering:
     """Render colour, depth and opacity of a map from a camera pose.
 
-    Gradients reach the inputs that require them. To refine a pose, give `twist` as zeros that
-    require a gradient and detach the map: nothing is then computed for the Gaussians. For
-    densification, give `screen_offsets` as zeros that require a gradient: after the backward
-    pass its rows are the gradients of the projected means in pixels.
-
+    Gradients reach the inputs that require them. To refine a pose, give a `twist` of zeros and
+    detach the map: nothing is then computed for the Gaussians. For densification, give
+    `screen_offsets` of zeros: the rows of its gradient are those of the projected means in pixels.
     Slow twin: reference.render_reference. Eq. (2).
     """
-    if T_camera_world.shape != (4, 4):
-        found = f"{tuple(T_camera_world.shape)}; give T_camera_world of one view"
-        raise InputError(f"expected a camera pose of shape (4, 4), found {found}")
+    found = f"{tuple(T_camera_world.shape)}; give T_camera_world of one view"
+    require(T_camera_world.shape == (4, 4), "a camera pose of shape (4, 4)", found)
     like = gaussians.means
     channels_behind = like.new_zeros(4)  # of the background: at depth 0, which adds nothing
     if background is not None:
@@ -108,26 +105,16 @@ class _Render(torch.autograd.Function):
             spread(values) if needed and values is not None else None
             for values, needed in zip(by_gaussian, (*needs[:5], needs[6]), strict=True)
         )
-        v_twist = _at_twist(v.twist, twist) if needs[5] else None
+        v_twist = v.twist.to(twist) if needs[5] else None
+        if v_twist is not None and twist.any():  # J of exp(twist + d) = exp(J d) exp(twist), else I
+            v_twist = se3_left_jacobian(twist).T @ v_twist
         return *v_parameters, v_twist, v_offsets2d, None, None, None
-
-
-def _at_twist(v_left: Tensor, twist: Tensor) -> Tensor:  # (6,), (6,) -> (6,)
-    """Turn the gradient of a left update of exp(twist) T into that of the twist itself.
-
-    exp(twist + d) = exp(J d) exp(twist), and J is the identity at twist = 0, the usual case.
-    """
-    if twist.any():
-        v_left = se3_left_jacobian(twist).T.to(v_left) @ v_left
-    return v_left.to(twist)
 
 
 @contextmanager
 def _denormals_flushed() -> Iterator[None]:
-    """Treat denormal numbers as zero in this thread, and restore what was set before.
-
-    Behind twenty nearly opaque Gaussians T is denormal, and each product takes a hundred cycles.
-    """
+    """Treat denormal numbers as zero in this thread, and restore what was set before."""
+    # Behind twenty nearly opaque Gaussians T is denormal, and each product takes a hundred cycles.
     smallest_normal = torch.finfo(torch.float32).tiny
     already = float(torch.full((1,), smallest_normal, device="cpu") * 0.5) == 0
     torch.set_flush_denormal(True)

@@ -36,8 +36,7 @@ class Shelf:
     def put(self, tensors: Iterable[Tensor | None]) -> None:
         """Move tensors (any shape) to the file, for all that hold them; then release.
 
-        What is there already, small, not contiguous or on a GPU is left alone, and so is what finds
-        no room on the disk.
+        Left alone is what is there already, small, not contiguous, on a GPU, or finds no room.
         """
         for tensor in tensors:
             if tensor is None or tensor.device.type != "cpu" or not tensor.is_contiguous():

@@ -24,7 +24,7 @@ from minislam.records import Frame
 
 # Dictionaries (keys are text) and lists of tensors, arrays, numbers, text and None.
 Tree = Any
-_hints = cache(get_type_hints)
+hints_of = cache(get_type_hints)
 FrameOf = Callable[[int], Frame]  # reads a frame again, by its frame_index
 
 
@@ -36,10 +36,8 @@ class Stateful:
         return {name: to_tree(getattr(self, name)) for name in get_type_hints(type(self))}
 
     def restore_state(self, state: Tree, frame_of: FrameOf) -> None:
-        """Replace the present state by a saved one.
-
-        Stateful parts and random generators stay the same objects, since others may hold them.
-        """
+        """Replace the present state by a saved one."""
+        # Stateful parts and random generators stay the same objects, since others may hold them.
         for name, kind in get_type_hints(type(self)).items():
             present = getattr(self, name)
             if isinstance(present, Stateful):
@@ -89,6 +87,6 @@ def from_tree(kind: Any, tree: Tree, frame_of: FrameOf) -> Any:
     if kind is np.ndarray:
         return np.asarray(tree)  # a pipe to another process carries tensors
     if isinstance(kind, type) and is_dataclass(kind):
-        hints = _hints(kind)
+        hints = hints_of(kind)
         return kind(**{name: from_tree(hints[name], tree[name], frame_of) for name in hints})
     return kind(tree) if issubclass(kind, Enum) else tree

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from minislam.errors import InputError
+from minislam.errors import require
 from minislam.parameters import parameter
 
 
@@ -12,8 +12,7 @@ class UncertaintyConfig:
 
     enabled: bool = parameter(True, "off: every weight is 1 and nothing is trained (ablation a)")
     given_masks: bool = parameter(
-        False,
-        "take masks of moving objects that come with the sequence, train nothing (ablation c)",
+        False, "take the masks of moving objects that the sequence has, train nothing (ablation c)"
     )
 
     grid_factor: int = parameter(
@@ -69,6 +68,6 @@ class UncertaintyConfig:
         return self.enabled and self.given_masks
 
     def __post_init__(self) -> None:
-        if self.median_size < 1 or self.median_size % 2 == 0:
-            found = f"{self.median_size}; set uncertainty.median_size to 1, 3 or 5"
-            raise InputError(f"expected an odd median window of at least 1 cell, found {found}")
+        is_right = self.median_size >= 1 and self.median_size % 2 == 1
+        found = f"{self.median_size}; set uncertainty.median_size to 1, 3 or 5"
+        require(is_right, "an odd median window of at least 1 cell", found)

@@ -70,10 +70,8 @@ def depth_loss(
 
 
 def median_filter(values: Tensor, size: int) -> Tensor:  # both (h, w)
-    """Return the median over windows of size x size cells (odd), mirrored at the border.
-
-    It removes thin lines of error: an edge rendered half a pixel off is not a dynamic object.
-    """
+    """Return the median over windows of size x size cells (odd), mirrored at the border."""
+    # It removes thin lines of error: an edge rendered half a pixel off is not a dynamic object.
     margin = min(size // 2, values.shape[0] - 1, values.shape[1] - 1)
     size = 2 * margin + 1
     padded = functional.pad(values[None, None], [margin] * 4, mode="reflect")[0, 0]

@@ -70,8 +70,6 @@ def tracking_weight(
 
 
 def relative_weight(weight: Tensor) -> Tensor:  # both (h, w) in (0, 1]
-    """Return the weights of a frame relative to those of its most static tenth (ours).
-
-    While the map fits nothing well, beta is large everywhere, and only its contrast shows movers.
-    """
+    """Return the weights of a frame relative to those of its most static tenth (ours)."""
+    # While the map fits nothing well, beta is large everywhere: only its contrast shows movers.
     return (weight / weight.quantile(1 - STATIC_FRACTION)).clamp_max(TRACKING_CAP)
