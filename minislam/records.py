@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol
@@ -176,19 +176,3 @@ def required_mask(sequence: Sequence, frame_index: int) -> np.ndarray:  # (H, W)
         advice = "give --masks files:FOLDER, or set uncertainty.given_masks to off"
         raise InputError(f"expected {wanted}, found none for {frame_index}; {advice}")
     return mask
-
-
-@dataclass
-class MappingHistory:
-    """The losses and the size of the map, one entry per iteration, for plots."""
-
-    render: list[float] = field(default_factory=list)  # L_render
-    color: list[float] = field(default_factory=list)  # weighted L_color
-    uncertainty: list[float] = field(default_factory=list)  # L_uncer, nan where frozen or off
-    gaussians: list[int] = field(default_factory=list)  # size of the map
-
-    def add(self, losses: list[float], uncertainty: float, gaussians: int) -> None:
-        """Append one iteration, with L_render and L_color in `losses`."""
-        row = [*losses, uncertainty, gaussians]
-        for column, value in zip(vars(self).values(), row, strict=True):
-            column.append(value)

@@ -69,14 +69,13 @@ class Workers(AbstractContextManager["Workers"]):
         except OSError as error:
             warn(f"a worker could not be started ({error}); the run goes on with fewer")
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
+    def close(self, *_: object) -> None:
         """End all helpers, also one that computes: nobody wants its answer any more."""
         for helper in self._helpers:
             helper.end()
         self._helpers = []
+
+    __exit__ = close
 
     def map(self, function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Return function(*call) for every call, in their order; what it raises is raised here.

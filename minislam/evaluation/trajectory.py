@@ -1,6 +1,6 @@
 """Errors of an estimated trajectory against the truth: ATE and RPE, as evo computes them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -42,7 +42,11 @@ def absolute_trajectory_error(
     """Return the distances between estimated and true camera centres (ATE)."""
     least = 1 if alignment is Alignment.NONE else 3  # pairs
     estimate, truth = paired(estimate, truth, max_difference, least)
-    similarity = fit_alignment(estimate, truth, alignment)
+    similarity = Similarity(1.0, np.eye(3), np.zeros(3))
+    if alignment is not Alignment.NONE:
+        fitted = umeyama(estimate.centres, truth.centres, alignment is not Alignment.SE3)
+        only_scale = alignment is Alignment.SCALE
+        similarity = replace(similarity, scale=fitted.scale) if only_scale else fitted
     aligned = Trajectory(estimate.timestamps, similarity.transform_poses(estimate.T_world_camera))
     errors = np.linalg.norm(aligned.centres - truth.centres, axis=1)
     return TrajectoryError(statistics(errors), errors, similarity, aligned, truth)
@@ -126,16 +130,6 @@ def associate(
     nearest = np.where(earlier_is_nearer, before, after)
     kept = np.flatnonzero(np.abs(second[nearest] - first) <= max_difference)
     return kept, nearest[kept]
-
-
-def fit_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Similarity:
-    """Return the similarity that maps the paired estimate to the truth."""
-    if alignment is Alignment.NONE:
-        return Similarity(1.0, np.eye(3), np.zeros(3))
-    fitted = umeyama(estimate.centres, truth.centres, alignment is not Alignment.SE3)
-    if alignment is Alignment.SCALE:
-        return Similarity(fitted.scale, np.eye(3), np.zeros(3))
-    return fitted
 
 
 def oriented_truth_to_estimate(estimate: Trajectory, truth: Trajectory) -> Similarity:

@@ -14,7 +14,7 @@ from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
 from minislam.mapping.views import Comparison, ViewGradients, view_gradients, view_of
 from minislam.mapping.window import in_turn
-from minislam.records import MapImage, MappingHistory, Progress
+from minislam.records import MapImage, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.memory import SHELF, release
 from minislam.state.stateful import FrameOf, Stateful, Tree
@@ -22,6 +22,9 @@ from minislam.uncertainty import RenderingError, UncertaintyConfig, UncertaintyM
 from minislam.uncertainty.training import UncertaintyTrainer
 from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
 from minislam.workers import Workers
+
+# The weighted mean of L_color; L_uncer is nan where the MLP is frozen or off; size of the map.
+CURVES = "L_render", "L_color", "L_uncer", "Gaussians"
 
 
 class JointOptimisation(Stateful):
@@ -34,7 +37,7 @@ class JointOptimisation(Stateful):
     cell: int  # px, side of the square that gets one Gaussian
     least_weight: float = MAPPING_CUT  # a pixel with less is excluded
     background: Tensor  # RGB of what no image shows
-    history: MappingHistory
+    history: dict[str, list[float]]  # for plots, by the names in CURVES, an entry per iteration
     shown: list[float]  # by image, the fraction of its static pixels that the map shows [-]
     _trainer: UncertaintyTrainer
     _generator: torch.Generator
@@ -59,7 +62,7 @@ class JointOptimisation(Stateful):
         self.cell = cell or config.insertion.cell
         self.images, self.window, self.shown = [], [], []
         self.background = torch.zeros(3, device=device)
-        self.history = MappingHistory()
+        self.history = {name: [] for name in CURVES}
         self._workers = workers or Workers()
         self._trainer = UncertaintyTrainer(feature_dimension, uncertainty, seed, device)
         self._generator = torch.Generator().manual_seed(seed + 1)
@@ -162,7 +165,9 @@ class JointOptimisation(Stateful):
         self._optimizer.step()
         loss = self._train_mlp(positions, views) if trains else math.nan
         for view in views:
-            self.history.add(view.losses, loss, len(self._optimizer.gaussians))
+            entry = *view.losses, loss, len(self._optimizer.gaussians)
+            for curve, value in zip(CURVES, entry, strict=True):
+                self.history[curve].append(value)
         self._iteration += len(views)
 
     def _view_arguments(self, image: MapImage, camera: Camera, trains: bool) -> tuple[Any, ...]:

@@ -79,11 +79,11 @@ def write_pictures(
     stamps, breaks = [t.timestamp for t in slam.tracker.tracked], slam.tracker.watch.breaks
     broken = [(stamps[found.first_frame], stamps[found.last_frame]) for found in breaks]
     path = viz.trajectory_plot(estimate, true_path, unit, broken)
-    curves = {"L_render": history.render, "L_color": history.color, "L_uncer": history.uncertainty}
+    curves = {name: values for name, values in history.items() if name != "Gaussians"}
     plots += [
         ("trajectory", "Path of the camera, in the planes x-z and x-y", path),
         ("losses", "Losses while the map was optimised", viz.loss_curves(curves)),
-        ("gaussians", "Size of the map", viz.map_growth(history.gaussians)),
+        ("gaussians", "Size of the map", viz.map_growth(history["Gaussians"])),
     ]
     figures = []
     for name, caption, figure in plots:

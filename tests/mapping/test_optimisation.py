@@ -23,9 +23,9 @@ def test_the_mlp_rests_until_the_map_has_settled_after_a_change_of_density():
     )
     mapper = make_mapper(config)
     mapper.initialise([wall_keyframe(0), wall_keyframe(1)])
-    resting = [k for k, loss in enumerate(mapper.history.uncertainty) if math.isnan(loss)]
+    resting = [k for k, loss in enumerate(mapper.history["L_uncer"]) if math.isnan(loss)]
     assert resting == [10, 11, 12, 13, 20, 21, 22, 23, 30, 31, 32, 33]
-    assert len(set(mapper.history.gaussians)) > 1
+    assert len(set(mapper.history["Gaussians"])) > 1
 
 
 def test_progress_counts_to_the_end():
