@@ -74,7 +74,7 @@ def _running_mean(values: np.ndarray) -> np.ndarray:
     return (total[end] - total[start]) / (end - start)
 
 
-def map_growth(gaussians: Series[int]) -> Figure:
+def map_growth(gaussians: Series[float]) -> Figure:
     """Draw the number of Gaussians in the map over the iterations."""
     figure, axes = _one_panel("iteration", "Gaussians in the map")
     axes.plot(np.arange(len(gaussians)), gaussians, color=ESTIMATE_STYLE["color"])
