@@ -11,12 +11,8 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # keep flat patches of images in [0, 1] fro
 _STRIP = 32  # px blurred by one matrix product: wider ones multiply more zeros (measured)
 
 
-def local_moments(
-    x: Tensor,  # (C, H, W)
-    y: Tensor,  # (C, H, W)
-    size: int,  # px, side of the window, odd
-) -> Tensor:  # (5, C, H, W)
-    """Return the local means of x, x^2, x y, y and y^2 under the window of SSIM."""
+def local_moments(x: Tensor, y: Tensor, size: int) -> Tensor:  # both (C, H, W) -> (5, C, H, W)
+    """Return the local means of x, x^2, x y, y and y^2 under SSIM's window of `size` px, odd."""
     return gaussian_blur(torch.stack([x, x * x, x * y, y, y * y]), size, SSIM_SIGMA)
 
 
@@ -54,11 +50,7 @@ def _blur_strips(
     return strips
 
 
-def resample(
-    values: Tensor,  # (h, w)
-    height: int,  # rows wanted
-    width: int,  # columns wanted
-) -> Tensor:  # (height, width)
+def resample(values: Tensor, height: int, width: int) -> Tensor:  # (h, w) -> (height, width)
     """Interpolate a grid bilinearly at the cell centres of another one over the same area.
 
     Both cover the image evenly: of w' columns on W px, the centre of column j lies at

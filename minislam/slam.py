@@ -11,6 +11,7 @@ by the MLP's beta. `_move_map` deforms the map when an adjustment has moved keyf
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -200,7 +201,7 @@ class Slam(Stateful):
     def _refine_map(self) -> None:
         stage = "refining the map"
         iterations = self.config.mapping.refinement(len(self.mapper.images))
-        self.mapper.refine(iterations, self.steps.on_step(stage), self.steps.done(stage))
+        self.mapper.refine(iterations, partial(self.steps.finish, stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
         if not self.tracker.watch.only_turned:
@@ -231,8 +232,7 @@ class Slam(Stateful):
         adjustment. Without a depth prior there is no map online, hence no beta: masks alone count.
         """
         keyframes, uncertainty = self.tracker.keyframes, self.config.uncertainty
-        is_known = uncertainty.given_masks or bool(self.mapper.images)
-        if not (uncertainty.enabled and is_known):
+        if not (uncertainty.enabled and (uncertainty.given_masks or self.mapper.images)):
             return torch.ones(self.tracker.grid.shape, device=self.device)
         beta = self._beta(keyframes.frames[index], keyframes.features[index])
         weight = tracking_weight(beta, self.sequence.camera, self._stride)

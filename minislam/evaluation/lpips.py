@@ -84,17 +84,16 @@ class Lpips:
             if 0 < stage <= self._layout.pooled:
                 x = functional.max_pool2d(x, self._layout.pool, stride=2)
             for number in convs:
-                x = self._conv(x, number).relu()
+                name = f"features.{number}"
+                weight, bias = self._trunk[f"{name}.weight"], self._trunk[f"{name}.bias"]
+                stride = self._layout.first_stride if number == 0 else 1
+                # AlexNet's first kernel of 11 px has a border of 2 px, all others keep the size.
+                side = weight.shape[-1]
+                padding = 2 if side == _ALEXNET.first_kernel else side // 2
+                x = functional.conv2d(x, weight, bias, stride, padding).relu()
             length = x.square().sum(1, keepdim=True).sqrt()
             levels.append((x / (length + _SMALLEST_LENGTH))[0])
         return levels
-
-    def _conv(self, x: Tensor, number: int) -> Tensor:
-        weight, bias = (self._trunk[f"features.{number}.{part}"] for part in ("weight", "bias"))
-        stride = self._layout.first_stride if number == 0 else 1
-        # AlexNet's first kernel of 11 px has a border of 2 px, all others keep the size.
-        padding = 2 if weight.shape[-1] == _ALEXNET.first_kernel else weight.shape[-1] // 2
-        return functional.conv2d(x, weight, bias, stride, padding)
 
 
 def recognise_trunk(trunk: Mapping[str, Tensor]) -> _Trunk:

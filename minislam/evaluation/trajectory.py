@@ -57,11 +57,10 @@ def relative_pose_error(
     truth: Trajectory,  # (N)
     step: int = 1,  # poses between the two ends of each compared motion
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of the motions between poses `step` apart (RPE).
+    """Return the errors of the motions between poses `step` apart (RPE), which do not overlap.
 
-    With the motions Q = truth_i^-1 truth_(i+step), and P likewise of the estimate, the error is
-    E = Q^-1 P. Returned are |translation of E| and the angle of E [rad], one per motion. The
-    motions do not overlap. Where the scale is unknown, align it first.
+    With Q = truth_i^-1 truth_(i+step), P likewise of the estimate and E = Q^-1 P, these are
+    |translation of E| and the angle of E [rad]. Where the scale is unknown, align it first.
     """
     wanted = f"a step of 1 to {len(truth) - 1} of {len(truth)} paired poses"
     require(1 <= step < len(truth), wanted, f"{step}; choose a step between")
@@ -76,8 +75,7 @@ def relative_pose_error(
 def straight_line_error(truth: Trajectory) -> float:
     """Return the ATE (rmse) of the straight line at constant speed that fits the truth best.
 
-    An estimate that is not clearly better has not followed the camera: this line needs no
-    images. It is fitted to the true positions over time by least squares.
+    It needs no images: an estimate that is not clearly better has not followed the camera.
     """
     time = truth.timestamps - truth.timestamps.mean()
     design = np.stack([np.ones_like(time), time], axis=1)

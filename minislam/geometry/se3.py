@@ -21,17 +21,6 @@ def hat(vectors: Tensor) -> Tensor:
     return rows.reshape(*vectors.shape[:-1], 3, 3)
 
 
-def _rotation_coefficients(angle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 for angles t >= 0."""
-    small = angle < _SMALL_ANGLE
-    t = torch.where(small, torch.ones_like(angle), angle)
-    t2 = torch.where(small, angle, torch.zeros_like(angle)) ** 2
-    a = torch.where(small, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), t.sin() / t)
-    b = torch.where(small, (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56))) / 2, (1 - t.cos()) / t**2)
-    c = torch.where(small, (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72))) / 6, (t - t.sin()) / t**3)
-    return a, b, c
-
-
 def so3_exp(phi: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) of rotation vectors phi (..., 3) [rad] (Rodrigues)."""
     return _rotation_and_left_jacobian(phi)[0]
@@ -121,11 +110,8 @@ def se3_inverse(transforms: Tensor) -> Tensor:
 
 
 def se3_normalised(transforms: Tensor) -> Tensor:
-    """Return transforms (..., 4, 4) with their rotations made orthonormal again.
-
-    Every product adds one rounding error to a rotation. Where the transpose is used as the inverse,
-    in products of products, the error grows with every further product.
-    """
+    """Return transforms (..., 4, 4) with their rotations made orthonormal again."""
+    # Every product adds a rounding error, which grows where the transpose serves as the inverse.
     rotation = transforms[..., :3, :3]
     eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     for _ in range(_ORTHONORMALISING_STEPS):
@@ -154,11 +140,18 @@ def so3_left_jacobian(phi: Tensor) -> Tensor:
 
 
 def _rotation_and_left_jacobian(phi: Tensor) -> tuple[Tensor, Tensor]:
-    """Return exp(phi) and V(phi), (..., 3, 3) each, because they share their coefficients."""
-    a, b, c = (x[..., None, None] for x in _rotation_coefficients(_safe_norm(phi)))
-    skew = hat(phi)
+    """Return exp(phi) and V(phi), (..., 3, 3) each, because they share their coefficients.
+
+    These are a = sin t / t, b = (1 - cos t) / t^2 and c = (t - sin t) / t^3 of the angle t = |phi|.
+    """
+    angle = _safe_norm(phi)[..., None, None]
+    small = angle < _SMALL_ANGLE
+    t, t2 = torch.where(small, 1, angle), torch.where(small, angle, 0) ** 2
+    a = torch.where(small, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), t.sin() / t)
+    b = torch.where(small, (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56))) / 2, (1 - t.cos()) / t**2)
+    c = torch.where(small, (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72))) / 6, (t - t.sin()) / t**3)
+    skew, eye = hat(phi), torch.eye(3, dtype=phi.dtype, device=phi.device)
     squared = skew @ skew
-    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
     return eye + a * skew + b * squared, eye + b * skew + c * squared
 
 

@@ -118,13 +118,8 @@ class MappingConfig:
         times = images / self.refine_images if self.refine_images else 0.0
         return math.ceil(self.refine_iterations * max(1.0, times))
 
-    def rates_at(
-        self,
-        iteration: int,
-        median_depth: float,  # world units, of the scene
-        factor: float,  # on all steps
-    ) -> LearningRates:
-        """Return the step lengths of an iteration: those of the means decay, log-linear."""
+    def rates_at(self, iteration: int, median_depth: float, factor: float) -> LearningRates:
+        """Return the steps of an iteration, times `factor`; those of means [world units] decay."""
         decay = self.means_rate_end ** min(1.0, iteration / self.rate_iterations)
         return LearningRates(
             means=factor * decay * self.means_rate * median_depth,

@@ -20,11 +20,8 @@ def metre(median_depth: float) -> float:
     return median_depth / METRIC_MEDIAN
 
 
-def ssim_loss(
-    rendered: Tensor,  # (H, W, 3)
-    image: Tensor,  # (H, W, 3) RGB in [0, 1], constant
-) -> Tensor:  # (H, W) in [0, 2]
-    """Return 1 - SSIM per pixel, mean over channels. A map, so that each pixel can be weighted."""
+def ssim_loss(rendered: Tensor, image: Tensor) -> Tensor:  # both (H, W, 3) -> (H, W) in [0, 2]
+    """Return 1 - SSIM of each pixel, mean over RGB in [0, 1]; the image is a constant."""
     return _SsimLoss.apply(rendered, image)
 
 

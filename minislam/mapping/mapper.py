@@ -32,12 +32,9 @@ class Mapper(JointOptimisation):
     """Grow the map of the static scene keyframe by keyframe, and train the MLP on the way."""
 
     def initialise(
-        self,
-        images: list[MapImage],
-        progress: Progress | None = None,
-        online: bool = False,  # more keyframes will come
+        self, images: list[MapImage], progress: Progress | None = None, online: bool = False
     ) -> None:
-        """Begin a map with images, online the first keyframes; train the MLP on it."""
+        """Begin a map with images, online the first keyframes of more; train the MLP on it."""
         assert images, "a map starts from at least one image"
         self.median_depth = median_depth(images)
         self.images = list(images)

@@ -9,11 +9,8 @@ LEAST_OVERLAP = 0.4  # overlap coefficient below which a keyframe leaves the win
 PROTECTED = 2  # the newest keyframes of a window, which always stay, MonoGS
 
 
-def overlap_coefficient(
-    seen_a: Tensor,  # (N,) bool, Gaussians that keyframe a sees
-    seen_b: Tensor,  # (N,) bool
-) -> float:
-    """Return |A and B| / min(|A|, |B|), or 0 if one of them sees nothing."""
+def overlap_coefficient(seen_a: Tensor, seen_b: Tensor) -> float:  # both (N,) bool, Gaussians
+    """Return |A and B| / min(|A|, |B|) of what two keyframes see, or 0 if one sees nothing."""
     smaller = min(int(seen_a.sum()), int(seen_b.sum()))
     return int((seen_a & seen_b).sum()) / smaller if smaller else 0.0
 

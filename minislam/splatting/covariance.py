@@ -40,11 +40,8 @@ def rotations_vjp(quats: Tensor, v_rotations: Tensor) -> Tensor:  # (4, N), (3, 
     return (v_unit - unit * (unit * v_unit).sum(0)) * inverse_norms
 
 
-def covariance_factors(
-    quats: Tensor,  # (4, N)
-    scales: Tensor,  # (3, N) world units
-) -> Tensor:  # (3, 3, N) world units
-    """Return L = R(q) diag(s), with Sigma = L L^T. Slow twin: reference.covariances."""
+def covariance_factors(quats: Tensor, scales: Tensor) -> Tensor:  # (4, N), (3, N) -> (3, 3, N)
+    """Return L = R(q) diag(s) [world units] of Sigma = L L^T. Slow twin: reference.covariances."""
     return rotations(quats) * scales
 
 

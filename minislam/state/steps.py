@@ -64,10 +64,6 @@ class Steps(Stateful):
         self._observer.show(stage, done, total)
         self._save_and_stop_if_asked()
 
-    def on_step(self, stage: str) -> Callable[[int, int], None]:
-        """Return a callback (done, total) for after each step of a stage."""
-        return lambda done, total: self.finish(stage, done, total)
-
     def on_progress(self, stage: str) -> Callable[[int, int], None]:
         """Return a callback (done, total) for progress within a step, where nothing is saved."""
         return lambda done, total: self._observer.show(stage, done, total)

@@ -24,7 +24,7 @@ def test_a_run_is_saved_after_every_step_and_stops_when_asked():
     steps = Steps(watcher, saved.append)
     steps.finish("walking", 1, 3)
     with pytest.raises(KeyboardInterrupt):
-        steps.on_step("walking")(2, 3)
+        steps.finish("walking", 2, 3)
     assert saved == [False, True] and steps.done("walking") == 2
     assert watcher.shown == [("walking", 1, 3), ("walking", 2, 3)]
 
