@@ -27,15 +27,16 @@ from minislam.records import Frame, Keyframe, Sequence, Trajectory, required_mas
 from minislam.state.memory import SHELF
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.stereo.dense_structure import on_backdrop, swept_frames, with_swept_depth
-from minislam.stereo.second_adjustment import adjust_again, sweep_frames
+from minislam.stereo.dense_structure import (
+    on_backdrop,
+    sweep_frames,
+    swept_frames,
+    with_swept_depth,
+)
+from minislam.stereo.second_adjustment import adjust_again
 from minislam.tracking.safeguards.exposure import keyframe_exposures, with_exposure
 from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
-from minislam.tracking.safeguards.focal_length import (
-    FocalLengthFit,
-    check_focal_length,
-    seek_focal_length,
-)
+from minislam.tracking.safeguards.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.safeguards.lens import LensFit, check_lens
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import as_trajectory, pose_all_frames
@@ -166,8 +167,7 @@ class Slam(Stateful):
     def _adjust_all(self) -> None:
         self.tracker.end()
         self._map_new_keyframes()
-        seek_focal_length(self.tracker.graph, self.workers)
-        self.tracker.finish(self.steps.on_progress("final adjustment"))
+        self.tracker.finish(self.steps.on_progress("final adjustment"), self.workers)
         self._move_map()
         if not self.tracker.watch.only_turned:
             self.lens = check_lens(self.tracker.graph, self.sequence.seeks_lens)

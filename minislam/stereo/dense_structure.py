@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,12 +12,14 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.images import resample
-from minislam.records import Frame, Keyframe, Progress
+from minislam.records import Frame, Keyframe, Progress, Sequence
 from minislam.state.memory import SHELF
 from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import filled_from_nearest
+from minislam.tracking.safeguards.depth_agreement import agreed_disparities
 from minislam.workers import Workers
 
 WIDTH = 160  # px of the images that are swept for the map
@@ -61,13 +62,12 @@ def with_swept_depth(
             judging[index] = _as_swept(small, depth, cost, keyframe.T_camera_world)
         confirmation = resample(confirmation, *keyframe.features.shape[:2])
         result.append(replace(keyframe, depth=depth, confirmation=confirmation))
-    for index, (keyframe, found) in enumerate(zip(keyframes, result, strict=True)):
-        depth = found.depth
+    for index, keyframe in enumerate(keyframes):
         if bool(keyframe.depth.any()):
             others = [judge for at, judge in judging.items() if at != index]
-            depth = _completed(small, keyframe, depth, others)
-        SHELF.put([depth])
-        result[index] = replace(found, depth=depth)
+            depth = _completed(small, keyframe, result[index].depth, others)
+            SHELF.put([depth])
+            result[index] = replace(result[index], depth=depth)
     known = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
     return list(map(_filled, result)) if fills and np.mean(known) < LEAST_KNOWN else result
 
@@ -127,6 +127,25 @@ def _small(camera: Camera, width: int) -> Camera:
     return camera.resized(width, max(1, round(width * camera.height / camera.width)))
 
 
+def sweep_frames(
+    graph: KeyframeGraph,
+    sequence: Sequence,
+    poses: dict[int, Tensor],  # this and what follows as for `dense_depths`
+    frames: list[int],
+    wanted: list[int],
+    progress: Progress | None = None,
+    workers: Workers | None = None,
+    width: int = WIDTH,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return what `dense_depths` does, for the images and the structure of a graph."""
+    keyframes = [(k, f.frame_index) for k, f in enumerate(graph.keyframes.frames)]
+    agreed = {i: agreed_disparities(graph, k).cpu().numpy() for k, i in keyframes if i in poses}
+    inputs = graph.grid.camera, poses, agreed, frames, wanted, progress, workers, width
+    swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
+    device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
+    return ((depth.to(device), confirmation.to(device)) for depth, confirmation in swept)
+
+
 def dense_depths(
     read: Callable[[int], Frame],  # a frame by its index
     camera: Camera,  # of its images
@@ -139,15 +158,8 @@ def dense_depths(
     width: int = WIDTH,  # px of the images that are swept, at most
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
-    planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
-    known_frames, known = list(disparities), list(disparities.values())
-    swept = []
-
-    def plan(frame: int) -> tuple[Any, ...]:
-        nearest = int(np.argmin([abs(frame - index) for index in known_frames]))
-        return planner.plan(frame, np.concatenate(known[max(0, nearest - 1) : nearest + 2]))
-
-    for view in workers.stream(swept_view, map(plan, frames)):
+    planner, swept = SweepPlanner(read, camera, poses, disparities, width), []
+    for view in (workers or Workers()).stream(swept_view, map(planner.plan, frames)):
         images = {name: SHELF.array(getattr(view, name)) for name in ("inverse_depth", "cost")}
         swept.append(replace(view, **images))
         if progress:
@@ -201,21 +213,26 @@ class SweepPlanner:
     """Chooses the views and planes of a sweep. It keeps the small grey images that it has read."""
 
     def __init__(
-        self, read: Callable[[int], Frame], camera: Camera, poses: dict[int, Tensor], width: int
+        self,
+        read: Callable[[int], Frame],
+        camera: Camera,
+        poses: dict[int, Tensor],
+        disparities: dict[int, np.ndarray],
+        width: int,
     ) -> None:
         self.camera, self._is_for_map = _small(camera, width), width == WIDTH
-        self._read = read
+        self._read, self._known = read, disparities
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._centres = {k: np.linalg.inv(pose)[:3, 3] for k, pose in self._poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
 
-    def plan(
-        self, frame: int, known: np.ndarray
-    ) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray, bool]:
-        """Return the arguments of `swept_view`; `known` are inverse depths of the scene.
+    def plan(self, frame: int) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray, bool]:
+        """Return the arguments of `swept_view`, by the structure known around a frame.
 
         Only sweeps for the map drop lines: what coarse ones confirm tells turns as well.
         """
+        nearest = int(np.argmin([abs(frame - index) for index in self._known]))
+        known = np.concatenate([*self._known.values()][max(0, nearest - 1) : nearest + 2])
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
         baseline = max(others.values(), default=0.0)

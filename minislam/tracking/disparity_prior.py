@@ -38,12 +38,9 @@ def mask_priors(
     """Set the masks of the keyframes from `first` on, each by the targets of its edges."""
     if not (config.prior_mask and config.lambda_disparity_prior):
         return
-    rows = zip(keyframes.metric_depths, keyframes.features, keyframes.T_camera_world, strict=True)
-    views = {
-        index: DepthView(depth, features, pose)
-        for index, (depth, features, pose) in enumerate(rows)
-        if depth is not None
-    }
+    columns = keyframes.metric_depths, keyframes.features, keyframes.T_camera_world
+    rows = enumerate(zip(*columns, strict=True))
+    views = {k: DepthView(depth, *seen) for k, (depth, *seen) in rows if depth is not None}
     for index, view in views.items():
         if index >= first:
             targets = dict.fromkeys(target for source, target in edges if source == index)
@@ -130,10 +127,6 @@ def sample_features(
     size = pixels.new_tensor([camera.width, camera.height])
     # The image covers [-0.5, size - 0.5], which grid_sample calls [-1, 1].
     position = ((2 * pixels + 1) / size - 1).to(features.dtype)
-    sampled = functional.grid_sample(
-        features.permute(2, 0, 1)[None],
-        position[None, None],
-        align_corners=False,
-        padding_mode="border",
-    )
+    image, places = features.permute(2, 0, 1)[None], position[None, None]
+    sampled = functional.grid_sample(image, places, padding_mode="border", align_corners=False)
     return sampled[0, :, 0].mT

@@ -14,13 +14,10 @@ from minislam.state.memory import SHELF
 from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
-# Fraction of cells that must lie in front of the other camera, inside its image or not, else a pair
-# has no meaningful distance. DROID-SLAM: 0.75
-MIN_VALID_FRACTION = 0.5
+MIN_VALID_FRACTION = 0.5  # of the cells, before the other camera, seen or not; DROID-SLAM: 0.75
 FAR = math.inf  # px, the distance of a pair below this fraction
 COARSE, COARSE_MARGIN = 16, 2.0  # one cell in 16 gives a distance to within a factor of 2
-# New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
-KEPT_FRACTION = 0.8
+KEPT_FRACTION = 0.8  # of the old matched ratio: flow that matches less does not replace the old [-]
 AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
 
 

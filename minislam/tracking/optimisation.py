@@ -17,8 +17,7 @@ from minislam.tracking.reprojection import lengths
 from minislam.tracking.safeguards.parts import in_parts, joined, of_cells, of_rows
 from minislam.tracking.safeguards.robust import weighted_median
 
-# Times the robust width: else the cells of a new keyframe, whose error is large, are outliers.
-FIRST_WIDENING = 8.0
+FIRST_WIDENING = 8.0  # times the robust width: a new keyframe's error makes its cells outliers [-]
 EVERY = 4  # one cell in so many is sampled for the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
 FITTING_RESIDUAL = 1.5  # px at 320x240: new edges that are better fit already (diary/tracking.md)
@@ -109,7 +108,7 @@ def adjust(
         problem = replace(problem, robust=kernel)
     if free_camera:
         columns = graph.shutter.edge_columns(positions) if graph.shutter.is_found else None
-        problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
+        problem = replace(problem, free_focal=graph.focal_is_free, shift_columns=columns)
     # Without parallax the flow does not measure depth. In a local BA such a keyframe keeps its
     # disparities, which hold the scale until the camera moves again; where all keyframes are
     # adjusted, only one with a prior does.
@@ -122,7 +121,7 @@ def adjust(
     state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.grid.zoom(state.log_focal)
-    graph.shutter.lengthen(state.readout)
+    graph.shutter.lengthen(state.shifts)
     graph.count_adjustment(report)
 
 

@@ -13,8 +13,7 @@ from minislam.tracking.safeguards.robust import RobustKernel
 
 INVERSION_STEPS = 4  # of a fixed point; the flow estimator corrects what is left
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
-# Times the final width. A start off by 10 degrees has residuals of 50 px: outliers when narrow.
-ROBUST_WIDENING = (16.0, 4.0, 1.0)
+ROBUST_WIDENING = (16.0, 4.0, 1.0)  # times the width: a start off by 10 degrees has 50 px [-]
 
 
 def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> FlowMatches:

@@ -55,7 +55,7 @@ def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseN
 
     Fast twin: the blocks of bundle_adjustment.normal_equations. Eq. (5).
     """
-    extensions = problem.free_focal, problem.shutter, problem.disparity_damping
+    extensions = problem.free_focal, problem.shift_columns, problem.disparity_damping
     assert extensions == (False, None, None), "the twin has no such terms"
     poses = int(problem.free_poses.sum())
     frames = int(problem.free_disparities.sum())

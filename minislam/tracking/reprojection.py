@@ -16,9 +16,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_inverse
 
-# A point four times closer to the target than to the source changes its scale too much for
-# reliable flow, and its derivatives explode. [-], as in DROID-SLAM.
-MIN_DEPTH_RATIO = 0.25
+MIN_DEPTH_RATIO = 0.25  # [-], DROID-SLAM's: nearer, flow is unreliable and derivatives explode
 
 
 @dataclass(frozen=True)

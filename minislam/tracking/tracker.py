@@ -264,8 +264,9 @@ class Tracker(Stateful):
         warm_up_ba(self.graph, edges, self.config.warmup_rounds_with_beta)
         self.watch.judge()
 
-    def finish(self, progress: Progress | None = None) -> None:
-        """Run the final global BA, with the newest beta."""
+    def finish(self, progress: Progress | None = None, workers: Workers | None = None) -> None:
+        """Run the final global BA, with the newest beta, and with the focal length if unknown."""
+        seek_focal_length(self.graph, workers)
         self._update_static_weights()
         motion_memory.judge_all(self.graph)  # online, depths were hardly settled
         seek_readouts(self.graph)

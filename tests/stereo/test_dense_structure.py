@@ -1,5 +1,7 @@
 """Dense depth of keyframes, against the truth of the ray-caster, and which frames are swept."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from minislam.stereo.dense_structure import (
     dense_depths,
     full_size,
     on_backdrop,
+    sweep_frames,
     swept_frames,
     swept_view,
     with_swept_depth,
@@ -22,6 +25,7 @@ from minislam.stereo.sweep import PosedImage
 from minislam.stereo.votes import ConfirmedDepth, confirm
 from minislam.workers import Workers
 from tests.stereo.clip import KEYFRAMES, SIZE, camera, clip, found, pose, sequence
+from tests.tracking.wall import true_graph
 
 pytestmark = pytest.mark.slow
 
@@ -97,8 +101,8 @@ def test_coarse_sweeps_and_those_of_little_parallax_keep_lines():
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.01 * index
     for width, nearest, leaves in ((160, 8.0, True), (80, 8.0, False), (160, 1.0, False)):
-        planner = SweepPlanner(sequence().frame, camera(), poses, width)
-        assert planner.plan(0, np.full(9, nearest))[-1] is leaves
+        inputs = camera(), poses, {0: np.full(9, nearest)}, width
+        assert SweepPlanner(sequence().frame, *inputs).plan(0)[-1] is leaves
 
 
 # Which frames
@@ -121,7 +125,7 @@ def test_views_of_much_parallax_are_not_used():
     for index in range(20):
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.1 * index
-    planner = SweepPlanner(sequence().frame, camera(), poses, 160)
+    planner = SweepPlanner(sequence().frame, camera(), poses, {}, 160)
     near = planner._views(0, 0.3)
     largest = max(near) * 0.1 * 0.3 * planner.camera.fx
     assert len(near) >= 2 and largest <= 0.125 * planner.camera.width
@@ -143,6 +147,23 @@ def test_a_single_frame_gives_no_depth():
         sequence().frame, camera(), {0: torch.from_numpy(pose(0))}, known(0), [0], [0]
     )
     assert depth.shape == SIZE[::-1] and float(depth.max()) == 0 == float(confirmation.max())
+
+
+def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
+    told = {}
+
+    def dense_depths(read, camera, poses, disparities, *how):
+        told.update(camera=camera, poses=poses, disparities=disparities, how=how)
+        return []
+
+    monkeypatch.setattr(dense_structure, "dense_depths", dense_depths)
+    graph, posed = true_graph([0, 3, 6, 9]), [3, 6, 9]  # a piece of a broken path
+    poses = dict.fromkeys(posed, torch.eye(4))
+    sweep_frames(graph, SimpleNamespace(), poses, [0, 1], [1], width=40)
+    assert told["camera"] == graph.grid.camera and told["poses"] is poses
+    assert list(told["disparities"]) == posed and told["how"] == ([0, 1], [1], None, None, 40)
+    nearest = [float(np.max(d)) for d in told["disparities"].values()]
+    assert nearest == pytest.approx(graph.keyframes.disparities.amax(1)[1:].tolist(), rel=0.2)
 
 
 def test_depths_are_enlarged_one_by_one(monkeypatch):
@@ -192,7 +213,7 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
 
 
 def test_the_swept_camera_sees_what_the_camera_sees():
-    small = SweepPlanner(sequence().frame, camera(), {}, 160).camera
+    small = SweepPlanner(sequence().frame, camera(), {}, {}, 160).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx
 
 

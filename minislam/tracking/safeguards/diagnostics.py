@@ -16,8 +16,8 @@ from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.reprojection import lengths, scaled_points
-from minislam.tracking.safeguards.depth_agreement import depth_difference
+from minislam.tracking.reprojection import lengths
+from minislam.tracking.safeguards.depth_agreement import depth_difference, seen_and_expected
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.pieces import edges_past_a_loss, found_again, pieces
 from minislam.tracking.safeguards.robust import weighted_median
@@ -231,19 +231,6 @@ def continuity(graph: KeyframeGraph, keyframe: int) -> tuple[float | None, float
 def fitting(graph: KeyframeGraph, residual: Tensor) -> Tensor:  # (E, 2, N) px -> (E, N) bool
     """Tell which matches the geometry explains."""
     return lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
-
-
-def seen_and_expected(
-    graph: KeyframeGraph,
-    sources: Tensor | list[int],  # (E,) keyframe index
-    targets: Tensor | list[int],  # (E,)
-    positions: Tensor,  # (E, N, 2) px, where the targets see the cells of the sources
-) -> tuple[Tensor, Tensor]:  # 2 x (E, N) 1/world unit
-    """Return the disparities that the targets have there, and those that the sources expect."""
-    transforms, disparities, rays, _ = graph.geometry(sources, targets)
-    expected = disparities / scaled_points(transforms, disparities, rays)[:, 2].clamp_min(1e-6)
-    there = graph.keyframes.disparities[targets][..., None]
-    return graph.grid.sample(there, positions)[..., 0], expected
 
 
 def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)

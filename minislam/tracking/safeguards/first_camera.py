@@ -147,11 +147,11 @@ class _Search:
         columns = shutter.edge_columns(self.positions) if self.tells_camera else None
         if columns is None or not columns.any():
             return None
-        rolled = self.best(self.adjusted(replace(self.free, shutter=columns), found))
+        rolled = self.best(self.adjusted(replace(self.free, shift_columns=columns), found))
         saves = cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found))
-        if not (saves and shutter.is_possible(rolled[0].readout)):
+        if not (saves and shutter.is_possible(rolled[0].shifts)):
             return None
-        shutter.take(rolled[0].readout)
+        shutter.take(rolled[0].shifts)
         self.problem = bundle_problem(self.graph, self.positions)  # of the corrected flow
         return adjust_narrowing(self.free, rolled[0], WIDENINGS[2:], ITERATIONS)
 

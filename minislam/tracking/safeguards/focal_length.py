@@ -92,7 +92,7 @@ def problem_among(
     if not positions:
         return None
     columns = graph.shutter.edge_columns(positions) if with_readout else None
-    problem = replace(bundle_problem(graph, positions), shutter=columns)
+    problem = replace(bundle_problem(graph, positions), shift_columns=columns)
     rows = torch.tensor(keyframes, device=problem.rays.device)
     cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
     among = of_cells(*of_rows(problem, graph.state, rows), cells[::EVERY, ::EVERY].flatten())
@@ -155,10 +155,10 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     if among is None:
         return
     problem, start = replace(among[0], free_focal=graph.focal_is_free), among[1]
-    _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
+    _, held = bundle_adjust(replace(problem, shift_columns=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = least_cost(problem.weights)
     saved = held.cost_after - free.cost_after
     is_worth_it = saved > READOUT_WORTH_SAVING * max(held.cost_after, floor)
-    if is_worth_it and shutter.is_possible(state.readout):
-        shutter.take(state.readout)
+    if is_worth_it and shutter.is_possible(state.shifts):
+        shutter.take(state.shifts)

@@ -183,9 +183,9 @@ def displacements(columns: Tensor, readout: Readout) -> Tensor:  # (E, 2, N) px
     return readout[0] * columns[:, 0] + readout[1] * columns[:, 1]
 
 
-def with_readout(found: Linearisation, columns: Tensor | None, readout: Readout) -> Linearisation:
-    """Return a reprojection as a rolling shutter sees it; J_target gains c (E, 2, 2, N) [px/s]."""
-    if columns is None:  # the readouts are held
+def with_shifts(found: Linearisation, columns: Tensor | None, shifts: Readout) -> Linearisation:
+    """Return a reprojection as a rolling shutter, or a lens, sees it; J_target gains -columns."""
+    if columns is None:  # they are held
         return found
-    seen = found.positions - displacements(columns, readout)
+    seen = found.positions - displacements(columns, shifts)
     return replace(found, positions=seen, J_target=torch.cat([found.J_target, -columns], 1))
