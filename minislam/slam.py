@@ -28,8 +28,9 @@ from minislam.state.memory import SHELF
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
 from minislam.stereo.dense_structure import (
+    SweepPlanner,
+    dense_depths,
     on_backdrop,
-    sweep_frames,
     swept_frames,
     with_swept_depth,
 )
@@ -186,8 +187,8 @@ class Slam(Stateful):
         keyframes = self.keyframes(others=sorted({*frames} - {*tracked}))
         keyframes = [keyframe for keyframe in keyframes if keyframe.frame_index in poses]
         if self.tracker.knows_depth:
-            inputs = graph, self.sequence, poses, frames, frames
-            swept = sweep_frames(*inputs, self.steps.on_progress("dense depth"), self.workers)
+            inputs = SweepPlanner.of(graph, self.sequence, poses), frames, frames
+            swept = dense_depths(*inputs, self.steps.on_progress("dense depth"), self.workers)
             keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, watch.hardly_walked)
         else:
             keyframes = on_backdrop(keyframes)
@@ -213,14 +214,13 @@ class Slam(Stateful):
         stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
         others = [i for i in self.tracker.watch.longest_piece(self.poses) if i not in keyframes]
+        undo = self.tracker.graph.shutter.undone
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
-            read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
-            undone = [self.tracker.graph.shutter.undone(frame) for frame in read]
+            undone = [undo(self.frame(i)) for i in others[first : first + FRAMES_AT_ONCE]]
             frames = [with_exposure(frame, self.mapper.exposures) for frame in undone]
             start = [self.poses[frame.frame_index] for frame in frames]
-            images = [frame.levelled for frame in frames]
             betas = [self._beta(frame, None) for frame in frames]
-            poses = self.mapper.refine_poses(start, images, betas)
+            poses = self.mapper.refine_poses(start, [f.levelled for f in frames], betas)
             self.poses |= {f.frame_index: pose for f, pose in zip(frames, poses, strict=True)}
             self.steps.finish(stage, first + len(frames), len(others))
 

@@ -127,38 +127,15 @@ def _small(camera: Camera, width: int) -> Camera:
     return camera.resized(width, max(1, round(width * camera.height / camera.width)))
 
 
-def sweep_frames(
-    graph: KeyframeGraph,
-    sequence: Sequence,
-    poses: dict[int, Tensor],  # this and what follows as for `dense_depths`
-    frames: list[int],
-    wanted: list[int],
-    progress: Progress | None = None,
-    workers: Workers | None = None,
-    width: int = WIDTH,
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Return what `dense_depths` does, for the images and the structure of a graph."""
-    keyframes = [(k, f.frame_index) for k, f in enumerate(graph.keyframes.frames)]
-    agreed = {i: agreed_disparities(graph, k).cpu().numpy() for k, i in keyframes if i in poses}
-    inputs = graph.grid.camera, poses, agreed, frames, wanted, progress, workers, width
-    swept = dense_depths(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
-    device = graph.grid.rays.device  # the sweep itself runs on the CPU, in OpenCV
-    return ((depth.to(device), confirmation.to(device)) for depth, confirmation in swept)
-
-
 def dense_depths(
-    read: Callable[[int], Frame],  # a frame by its index
-    camera: Camera,  # of its images
-    poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
-    disparities: dict[int, np.ndarray],  # (n,) 1/world unit, by frame: place the nearest plane
+    planner: "SweepPlanner",
     frames: list[int],  # that are swept, increasing; all of them vote
     wanted: list[int],  # of these, whose depths are returned
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
-    width: int = WIDTH,  # px of the images that are swept, at most
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
-    planner, swept = SweepPlanner(read, camera, poses, disparities, width), []
+    swept: list[votes.SweptView] = []
     for view in (workers or Workers()).stream(swept_view, map(planner.plan, frames)):
         images = {name: SHELF.array(getattr(view, name)) for name in ("inverse_depth", "cost")}
         swept.append(replace(view, **images))
@@ -171,7 +148,8 @@ def dense_depths(
         depths.append(votes.ConfirmedDepth(*map(SHELF.array, vars(found).values())))
     positions = [frames.index(frame) for frame in wanted]
     kept = votes.keep_what_stays(planner.camera, swept, depths, positions)
-    return (full_size(depth, camera) for depth in kept)
+    sized = (full_size(depth, planner.of_images) for depth in kept)
+    return ((depth.to(planner.device), weight.to(planner.device)) for depth, weight in sized)
 
 
 def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
@@ -212,27 +190,41 @@ def swept_view(
 class SweepPlanner:
     """Chooses the views and planes of a sweep. It keeps the small grey images that it has read."""
 
+    device: torch.device | str = "cpu"  # of what is found; OpenCV sweeps on the CPU
+
     def __init__(
         self,
-        read: Callable[[int], Frame],
-        camera: Camera,
-        poses: dict[int, Tensor],
-        disparities: dict[int, np.ndarray],
-        width: int,
+        read: Callable[[int], Frame],  # a frame by its index
+        camera: Camera,  # of its images
+        poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
+        disparities: dict[int, np.ndarray],  # (n,) 1/world unit, by frame: place the nearest plane
+        width: int = WIDTH,  # px of the images that are swept, at most
     ) -> None:
-        self.camera, self._is_for_map = _small(camera, width), width == WIDTH
-        self._read, self._known = read, disparities
+        self.of_images, self.camera = camera, _small(camera, width)
+        self._read, self._known, self._is_for_map = read, disparities, width == WIDTH
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._centres = {k: np.linalg.inv(pose)[:3, 3] for k, pose in self._poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
+
+    @classmethod
+    def of(
+        cls, graph: KeyframeGraph, sequence: Sequence, poses: dict[int, Tensor], width: int = WIDTH
+    ) -> "SweepPlanner":
+        """Return the planner by the disparities on which keyframes agree."""
+        frames = [(k, f.frame_index) for k, f in enumerate(graph.keyframes.frames)]
+        agreed = {i: agreed_disparities(graph, k).cpu().numpy() for k, i in frames if i in poses}
+        inputs = graph.grid.camera, poses, agreed, width
+        planner = cls(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
+        planner.device = graph.grid.rays.device
+        return planner
 
     def plan(self, frame: int) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray, bool]:
         """Return the arguments of `swept_view`, by the structure known around a frame.
 
         Only sweeps for the map drop lines: what coarse ones confirm tells turns as well.
         """
-        nearest = int(np.argmin([abs(frame - index) for index in self._known]))
-        known = np.concatenate([*self._known.values()][max(0, nearest - 1) : nearest + 2])
+        at = int(np.argmin([abs(frame - index) for index in self._known]))
+        known = np.concatenate([*self._known.values()][max(0, at - 1) : at + 2])
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
         baseline = max(others.values(), default=0.0)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from minislam.records import Progress, Sequence
-from minislam.stereo.dense_structure import sweep_frames, swept_frames
+from minislam.stereo.dense_structure import SweepPlanner, dense_depths, swept_frames
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import final_global_ba
 from minislam.tracking.tracker import Tracker
@@ -38,8 +38,8 @@ def adjust_again(
     chosen = [frame for frame in tracker.tracked if frame.frame_index in wanted]
     poses, _ = pose_frames(tracker.graph, chosen, sequence, on_progress("posing frames"))
     on_sweep, on_round = on_progress("coarse depth"), on_progress("second adjustment")
-    inputs = tracker.graph, sequence, poses, sorted(poses), keyframes
-    swept = sweep_frames(*inputs, on_sweep, workers, COARSE_WIDTH)
+    planner = SweepPlanner.of(tracker.graph, sequence, poses, COARSE_WIDTH)
+    swept = dense_depths(planner, sorted(poses), keyframes, on_sweep, workers)
     tracker.watch.confirmed = adjust_confirmed(tracker.graph, swept, on_round)
     tracker.conclude()
 

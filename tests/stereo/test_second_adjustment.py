@@ -113,13 +113,15 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
         assert [frame.frame_index for frame in tracked] == NUMBERS
         return {0: torch.eye(4)}, NUMBERS[1:]
 
-    def sweep(graph, sequence, poses, frames, wanted, progress, workers, width):
-        done.append((sorted(poses), width, frames, wanted))
+    def sweep(planner, frames, wanted, progress, workers):
+        done.append((planner, frames, wanted))
         return swept(graph)
 
     monkeypatch.setattr(second_adjustment, "pose_frames", pose_frames)
-    monkeypatch.setattr(second_adjustment, "sweep_frames", sweep)
+    monkeypatch.setattr(second_adjustment, "dense_depths", sweep)
+    told = SimpleNamespace(of=lambda graph, sequence, poses, width: (sorted(poses), width))
+    monkeypatch.setattr(second_adjustment, "SweepPlanner", told)
     adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
-    swept_first = [0], COARSE_WIDTH, [0], NUMBERS
+    swept_first = ([0], COARSE_WIDTH), [0], NUMBERS
     assert done == [swept_first, ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end
