@@ -68,10 +68,7 @@ def sweep(
     spread = np.sqrt(variance + NCC_VARIANCE)
 
     def dissimilarity(warped: np.ndarray) -> np.ndarray:  # 2 x (h, w), the result in [0, 1]
-        """Return 1 - max(NCC, 0), mixed with the absolute difference, from one warped view.
-
-        One view at a time, because its images stay in the cache.
-        """
+        """Return 1 - max(NCC, 0), mixed with the absolute difference; one view fits the cache."""
         mean_warped, variance_warped = _moments(warped)
         covariance = cv2.blur(gray * warped, NCC_WINDOW) - mean * mean_warped
         ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))

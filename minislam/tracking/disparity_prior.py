@@ -14,7 +14,7 @@ from torch.nn import functional
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.grid import Grid
-from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 
 MIN_DEPTH = 1e-6  # world units: points at or behind the camera are not seen
 
@@ -28,14 +28,9 @@ class DepthView:
     T_camera_world: Tensor  # (4, 4)
 
 
-def mask_priors(
-    keyframes: KeyframeStore,
-    grid: Grid,
-    edges: list[tuple[int, int]],  # (source, target), keyframe index
-    config: TrackingConfig,
-    first: int = 0,
-) -> None:
+def mask_priors(graph: KeyframeGraph, edges: list[Edge], first: int = 0) -> None:
     """Set the masks of the keyframes from `first` on, each by the targets of its edges."""
+    config, keyframes = graph.config, graph.keyframes
     if not (config.prior_mask and config.lambda_disparity_prior):
         return
     columns = keyframes.metric_depths, keyframes.features, keyframes.T_camera_world
@@ -45,16 +40,13 @@ def mask_priors(
         if index >= first:
             targets = dict.fromkeys(target for source, target in edges if source == index)
             others = [views[target] for target in targets if target in views]
-            keyframes.prior_masks[index] = prior_mask(grid, view, others, config)
+            keyframes.prior_masks[index] = prior_mask(graph.grid, view, others, config)
 
 
 def prior_mask(
     grid: Grid, view: DepthView, others: list[DepthView], config: TrackingConfig
 ) -> Tensor:  # (N,) bool
-    """Return M: False where enough views correspond to a cell and too few of them agree with it.
-
-    Otherwise the cell keeps its prior.
-    """
+    """Return M: False where enough views correspond to a cell and too few of them agree with it."""
     limits = config.mask_max_depth_error, config.mask_min_similarity
     corresponding, consistent = depth_consistency(grid, view, others, *limits)
     is_judged = corresponding >= config.mask_min_corresponding

@@ -37,7 +37,7 @@ def local_ba(graph: KeyframeGraph) -> None:
         graph.match_composed(newest)
         adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
     edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
-    mask_priors(graph.keyframes, graph.grid, edges, config, first=newest)
+    mask_priors(graph, edges, first=newest)
     edges += graph.edges.ends[max(0, len(graph.edges) + len(edges) - config.active_edges) :]
     for _ in range(config.rounds):
         graph.match(edges)
@@ -138,10 +138,7 @@ def typical_residual(problem: BundleProblem, state: BundleState) -> float | None
 def adjust_touched(
     problem: BundleProblem, state: BundleState, iterations: int
 ) -> tuple[BundleState, BundleReport]:
-    """Run `bundle_adjust` on the keyframes that it moves or has an edge to; leave the others.
-
-    So a local adjustment costs the same however many keyframes there are.
-    """
+    """Run `bundle_adjust` on the touched keyframes alone: others would cost time, and stay."""
     rows = touched_rows(problem)
     found, report = bundle_adjust(*of_rows(problem, state, rows), iterations)
     poses, disparities = state.T_camera_world.clone(), state.disparities.clone()
@@ -198,8 +195,7 @@ def bundle_problem(
     free_poses = free.clone()
     free_poses[0] = False  # the first camera is the world
     return BundleProblem(
-        camera=grid.camera,
-        rays=grid.rays,
+        camera=grid.camera, rays=grid.rays,
         edges_source=edges_source, edges_target=edges_target,
         targets=targets, weights=weights,
         prior_disparities=prior, prior_weights=strength * (prior > 0) * keyframes.prior_masks,

@@ -259,7 +259,7 @@ class Tracker(Stateful):
         """Adjust the warm-up keyframes again, now that beta is known (second stage)."""
         self._update_static_weights()
         edges = self.graph.edges.ends
-        mask_priors(self.keyframes, self.grid, edges, self.config)
+        mask_priors(self.graph, edges)
         seek_readouts(self.graph)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds_with_beta)
         self.watch.judge()

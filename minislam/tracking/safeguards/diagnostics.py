@@ -26,10 +26,8 @@ from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_re
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px at 320x240 and in smaller images: a residual that the geometry explains
-# Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .88 to 1, two in a
-# row on fast real video .68 and .82; broken ones .24 to .4, the worst of many in a row .6 to .84.
-MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
-LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
+MIN_EXPLAINED = 0.5  # of the matched flow; healthy .88 to 1, two in a row .68, broken .24 to .4
+MIN_EXPLAINED_LONG, LONG = 0.85, 3  # of so many keyframes in a row one must explain more
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .003 to .15, broken .5
 MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
@@ -147,10 +145,7 @@ class Watch(Stateful):
         if self.breaks:
             ties = found_again(self._graph), edges_past_a_loss(self._graph)
             tied = pieces(frames, self.segments, *ties)
-        found = [
-            {i: poses[i] for i in poses if any(first <= i <= last for first, last in spans)}
-            for spans in tied
-        ]
+        found = [{i: poses[i] for i in poses if any(a <= i <= b for a, b in part)} for part in tied]
         longest = max(found, key=len, default=poses)
         return longest if len(longest) >= LEAST_FRAMES else poses
 

@@ -33,8 +33,7 @@ MIN_RISE_OF_BETTER = 0.003  # where it saves much; where right, .006 and more, w
 # A warning needs both: a right focal length has looked 5.4 % off, but the other saved 1.3 %. [-]
 WORTH_SAYING, WORTH_SAVING = 0.05, 0.02
 READOUT_WORTH_SAVING = 0.02  # of the cost: rolling shutters 3 to 37 %, others at most 1.2 %
-# Fewer do not measure it: of fr1_desk 2, 3, 4 and 6 gave fx = 115, 238, 266, 276 px (true: 275).
-LEAST_KEYFRAMES = 4
+LEAST_KEYFRAMES = 4  # fewer do not measure it (diary/focal_length.md)
 LEAST_HALF = 6  # keyframes of half a clip that is checked alone
 HALF_WORTH_SAVING = 0.1  # zooms of 1.5 saved 14 to 53 %, the right focal length at most 1 % [-]
 
@@ -144,10 +143,7 @@ def fit_focal_length(
 
 
 def seek_readouts(graph: KeyframeGraph) -> None:
-    """Set the readout that fits the flow best if it saves enough; poses and depths stay.
-
-    If it saves little it stays 0, because it would follow noise and movers.
-    """
+    """Set the readout that fits best, unless it saves as little as noise and movers would."""
     shutter, count = graph.shutter, len(graph.keyframes)
     if not shutter.is_on or shutter.is_found or count < LEAST_KEYFRAMES:
         return

@@ -15,9 +15,8 @@ from minislam.records import Frame
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
-# Support of a pose, relative to the median of all frames between keyframes: [-]
-DOUBTFUL_SUPPORT = 0.5  # with less, other starts are tried
-LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
+DOUBTFUL_SUPPORT = 0.5  # of the median of all frames: with less, other starts are tried [-]
+LOST_SUPPORT = 0.1  # the same: with less after all starts, the frame is lost [-]
 # The largest residual of a flow that a pose explains: so many px at 320x240, plus this part of the
 # flow, because the first updates of a network fall short, but in the right direction.
 EXPLAINED_PX, EXPLAINED_FRACTION = 3.0, 0.25

@@ -23,8 +23,7 @@ from minislam.tracking.pose_from_flow import warp_disparities
 from minislam.tracking.reprojection import reproject, reproject_with_jacobians
 
 SETTLED = 25.0  # px^2, information of a disparity that is known to a fifth of itself
-# Neighbouring keyframes see much of the same flow, so information is handed on in part. [-]
-HANDED_ON = 0.5
+HANDED_ON = 0.5  # of the information: neighbouring keyframes see much of the same flow [-]
 MOST = 1e6  # px^2, cap of the information: an infinite one could not be interpolated
 LEAST = 0.05  # weight of a cell whose disparity nothing is known of: it still shows a rotation [-]
 
