@@ -128,14 +128,12 @@ def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) fl
     return joined((at.edges, at.costs) for at in _weighted_parts(problem, state))[0]
 
 
-def _cost(
-    problem: BundleProblem, state: BundleState, of_edges: list[Tensor] | None = None
-) -> float:
+def _cost(problem: BundleProblem, state: BundleState, costs: list[Tensor] | None = None) -> float:
     """Return the cost [px^2] of Eq. (5), from the costs of the edges if these are computed."""
-    of_edges = of_edges or [at.costs for at in _weighted_parts(problem, state)]
+    costs = costs or [at.costs for at in _weighted_parts(problem, state)]
     difference = state.disparities - problem.prior_disparities
     prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
-    return float(torch.cat(of_edges).sum() + prior_cost)
+    return float(torch.cat(costs).sum() + prior_cost)
 
 
 def normal_equations(problem: BundleProblem, state: BundleState) -> NormalEquations:

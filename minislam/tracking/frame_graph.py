@@ -63,10 +63,6 @@ class FrameGraph(Stateful):
         for column in (self.ends, self.targets, self.confidences, self.matched_ratios):
             del column[len(column) - count :]
 
-    def select(self, first: int) -> list[int]:
-        """Return the positions of the edges with an end at keyframe `first` or later."""
-        return [p for p, edge in enumerate(self.ends) if max(edge) >= first]
-
 
 def neighbourhood_edges(first: int, count: int, radius: int) -> list[tuple[int, int]]:
     """Link every keyframe in [first, count) with its `radius` predecessors, in both directions."""

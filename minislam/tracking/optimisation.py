@@ -97,7 +97,7 @@ def adjust(
     settled: bool = False,  # poses and depths are, so the robust width follows the residuals
 ) -> None:
     """Run a bundle adjustment over the edges that touch the free keyframes."""
-    positions = graph.edges.select(first_free)
+    positions = [p for p, edge in enumerate(graph.edges.ends) if max(edge) >= first_free]
     if lambda_prior is None:
         lambda_prior = graph.config.lambda_disparity_prior
     problem = bundle_problem(graph, positions, first_free, lambda_prior)

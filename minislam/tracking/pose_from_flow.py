@@ -89,9 +89,7 @@ def start_pose(
     return candidates[int(edge_costs(problem, state).argmin())]
 
 
-def warp_disparities(
-    grid: Grid, T_target_source: Tensor, disparities: Tensor
-) -> Tensor:  # (N,) of the target
+def warp_disparities(grid: Grid, T_target_source: Tensor, disparities: Tensor) -> Tensor:  # (N,)
     """Warp the disparities (N,) of a source to the target.
 
     A cell that no point reaches takes the nearest cell's value; if points reach none, all cells
@@ -103,10 +101,8 @@ def warp_disparities(
     return filled_from_nearest(warped, warped == 0)
 
 
-def splat_disparities(
-    grid: Grid, T_target_source: Tensor, disparities: Tensor
-) -> Tensor:  # (N,) of the target, 0 in cells that no point falls on
-    """Warp the disparities (N,) of a source; where several fall on a cell, the nearest wins."""
+def splat_disparities(grid: Grid, T_target_source: Tensor, disparities: Tensor) -> Tensor:  # (N,)
+    """Warp the disparities (N,) of a source; a cell takes the nearest of several, or 0 of none."""
     cells = T_target_source[None].to(disparities.dtype), disparities[None], grid.rays
     depth_ratio = scaled_points(*cells)[0, 2]
     positions, valid = reproject(*cells, grid.camera)

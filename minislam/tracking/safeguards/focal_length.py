@@ -82,15 +82,13 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
     return fit_focal_length(*among, workers)[0]
 
 
-def problem_among(
-    graph: KeyframeGraph, keyframes: range, with_readout: bool = False
-) -> Start | None:
+def problem_among(graph: KeyframeGraph, keyframes: range, readout: bool = False) -> Start | None:
     """Return problem and state of the edges among some keyframes, at few cells; None: no edge."""
     edges = enumerate(graph.edges.ends)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return None
-    columns = graph.shutter.edge_columns(positions) if with_readout else None
+    columns = graph.shutter.edge_columns(positions) if readout else None
     problem = replace(bundle_problem(graph, positions), shift_columns=columns)
     rows = torch.tensor(keyframes, device=problem.rays.device)
     cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
@@ -147,7 +145,7 @@ def seek_readouts(graph: KeyframeGraph) -> None:
     shutter, count = graph.shutter, len(graph.keyframes)
     if not shutter.is_on or shutter.is_found or count < LEAST_KEYFRAMES:
         return
-    among = problem_among(graph, range(min(MOST_KEYFRAMES, count)), with_readout=True)
+    among = problem_among(graph, range(min(MOST_KEYFRAMES, count)), readout=True)
     if among is None:
         return
     problem, start = replace(among[0], free_focal=graph.focal_is_free), among[1]
