@@ -213,8 +213,7 @@ class KeyframeGraph(Stateful):
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
         """Return those of these new edges, each with its reverse, that flow matches both ways.
 
-        The flow of a far edge starts from poses that may have drifted, and one wrong edge can
-        outweigh all right ones.
+        The flow of a far edge starts from drifted poses; one wrong edge can outweigh all others.
         """
         ratio: dict[Edge, float] = {}
         for part, matches in self._flow_from_geometry(edges):

@@ -250,8 +250,7 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
     One keyframe is a break if it explains very little flow, sees other depths, or has an uncertain
-    scale, low continuity or low agreement. LONG weak keyframes in a row make one, too. Breaks at
-    most HEALED_AFTER keyframes apart are joined.
+    scale, low continuity or agreement; so are LONG weak ones in a row. Near breaks are joined.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little

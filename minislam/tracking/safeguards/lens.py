@@ -10,8 +10,7 @@ image turns little from one keyframe to the other, the flow from x to p~ is that
 
     p~ + k1 (D_1(x) - D_1(p~)) + k2 (D_2(x) - D_2(p~)),
 
-so what k1 and k2 still lack are unknowns of Eq. (5), as the readouts of a rolling shutter are.
-Straightening and adjusting alternate.
+so what k1 and k2 lack is unknown in Eq. (5), as readouts are. Straightening and BA alternate.
 """
 
 import math
