@@ -81,7 +81,7 @@ def dense_step(
     damping: float,  # relative, on disparities and on the marginalised poses
     absolute_damping: float,  # on the poses
 ) -> BundleState:
-    """Return the state after a damped step of all unknowns; `bundle_adjust` is its twin. Eq. (5)."""
+    """Return the state after one step of all unknowns; fast twin: `bundle_adjust`. Eq. (5)."""
     equations = dense_normal_equations(problem, state)
     split, matrix = equations.pose_unknowns, equations.matrix.clone()
     diagonal = matrix.diagonal()  # a view: what is written to it is written to the matrix
