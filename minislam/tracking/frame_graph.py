@@ -45,8 +45,7 @@ class FrameGraph(Stateful):
         """
         flows = SHELF.rows(torch.cat([matches.targets, matches.confidences], 1))
         position_of = {edge: position for position, edge in enumerate(self.ends)}
-        ratios = matches.matched_ratios.tolist()
-        for edge, flow, ratio in zip(edges, flows, ratios, strict=True):
+        for edge, flow, ratio in zip(edges, flows, matches.matched_ratios.tolist(), strict=True):
             target, confidence = flow[:2], flow[2:]
             position = position_of.setdefault(edge, len(self))
             if position == len(self):
@@ -140,8 +139,7 @@ def flow_distances(
         without_rotation = whole.clone()
         without_rotation[:, :3, :3] = torch.eye(3, device=whole.device)
         total, valid_cells = disparities.new_zeros(2, len(source))
-        motions = (whole, full_flow_weight), (without_rotation, 1 - full_flow_weight)
-        for motion, weight in motions:
+        for motion, weight in (whole, full_flow_weight), (without_rotation, 1 - full_flow_weight):
             positions, valid = reproject(motion, disparities[source], rays, camera)
             length = lengths(positions - pixels.T)
             total += weight * (length * valid).sum(1)

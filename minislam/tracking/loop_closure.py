@@ -55,8 +55,7 @@ def close_loops(graph: KeyframeGraph, relocaliser: Relocaliser | None = None) ->
         edges = _loop_edges(graph) if is_moved else []
     if edges:
         graph.match(edges)
-        fitting = FITTING_RESIDUAL * graph.pixel_scale
-        if not is_moved and mean_residual(graph, first_new) <= fitting:
+        if not is_moved and mean_residual(graph, first_new) <= FITTING_RESIDUAL * graph.pixel_scale:
             return False
         adjust(graph, 0, config.global_iterations, widening=FIRST_WIDENING)
         graph.match(edges)

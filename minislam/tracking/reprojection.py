@@ -49,8 +49,7 @@ def scaled_points(
     rays: Tensor,  # (N, 3) of the source cells, z = 1
 ) -> Tensor:  # (E, 3, N)
     """Return X = R r + d t for every cell of every edge."""
-    rotated = T_target_source[:, :3, :3] @ rays.T
-    return rotated + T_target_source[:, :3, 3:] * disparities[:, None]
+    return T_target_source[:, :3, :3] @ rays.T + T_target_source[:, :3, 3:] * disparities[:, None]
 
 
 def reproject(

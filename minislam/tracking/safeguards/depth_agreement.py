@@ -78,8 +78,7 @@ def agreeing_views(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) int
     positions, valid = reproject(*graph.geometry(sources, others))
     seen, expected = seen_and_expected(graph, sources, others, positions.mT)
     visible = valid & graph.grid.camera.contains(positions.mT)
-    error = (seen - expected).abs() / expected
-    return (visible & (error < MAX_DISPARITY_ERROR)).sum(0)
+    return (visible & ((seen - expected).abs() / expected < MAX_DISPARITY_ERROR)).sum(0)
 
 
 def seen_and_expected(

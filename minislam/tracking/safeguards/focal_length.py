@@ -121,8 +121,7 @@ def fit_focal_length(
     (_, present), (found, best) = workers.map(adjust_narrowing, starts)
     for _ in range(MAX_TRIES):
         ends = [replace(found, log_focal=found.log_focal + step) for step in (-STEP, STEP)]
-        calls = [(problem, end, [1.0], ITERATIONS) for end in ends]
-        beside = workers.map(adjust_narrowing, calls)
+        beside = workers.map(adjust_narrowing, [(problem, end, [1.0], ITERATIONS) for end in ends])
         rises = [report.cost_after - best.cost_after for _, report in beside]
         if min(rises) > 0:
             break

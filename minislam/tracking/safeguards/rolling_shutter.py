@@ -157,8 +157,7 @@ class RollingShutter(Stateful):
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
         moved: list[Tensor] = []
-        parts = zip(at_once(self._edges.ends), at_once(self._edges.targets), strict=True)
-        for ends, rows in parts:
+        for ends, rows in zip(at_once(self._edges.ends), at_once(self._edges.targets), strict=True):
             columns = self.columns(ends, targets := torch.stack(rows))
             change = displacements(columns, self.readout) - displacements(columns, before)
             moved += SHELF.rows(targets + change)

@@ -74,8 +74,7 @@ class Settling(Stateful):
         motion = motion[None].to(disparities.dtype)
         positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
         there = grid.sample(inherited[None, :, None], positions.mT)[0, :, 0]
-        seen = valid[0] & grid.camera.contains(positions[0].mT)
-        self.handed_on = torch.where(seen, there, 0)
+        self.handed_on = torch.where(valid[0] & grid.camera.contains(positions[0].mT), there, 0)
         return disparities
 
 
