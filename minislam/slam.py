@@ -28,15 +28,11 @@ from minislam.records import Frame, MapImage, Sequence, Trajectory, required_mas
 from minislam.state.memory import SHELF
 from minislam.state.stateful import Stateful
 from minislam.state.steps import Observer, SilentObserver, Steps
-from minislam.stereo.dense_structure import on_backdrop, swept_frames, with_swept_depth
-from minislam.stereo.second_adjustment import adjust_again, sweep_frames
+from minislam.stereo import dense_structure as dense
+from minislam.stereo.second_adjustment import adjust_again
 from minislam.tracking.safeguards.exposure import keyframe_exposures, with_exposure
 from minislam.tracking.safeguards.first_frame import FirstFrame, has_warmed_up
-from minislam.tracking.safeguards.focal_length import (
-    FocalLengthFit,
-    check_focal_length,
-    seek_focal_length,
-)
+from minislam.tracking.safeguards.focal_length import FocalLengthFit, check_focal_length
 from minislam.tracking.safeguards.lens import LensFit, check_lens
 from minislam.tracking.tracker import Tracker
 from minislam.tracking.trajectory import as_trajectory, pose_all_frames
@@ -167,8 +163,7 @@ class Slam(Stateful):
     def _adjust_all(self) -> None:
         self.tracker.end()
         self._map_new_keyframes()
-        seek_focal_length(self.tracker.graph, self.workers)
-        self.tracker.finish(self.steps.on_progress("final adjustment"))
+        self.tracker.finish(self.steps.on_progress("final adjustment"), self.workers)
         self._move_map()
         if not self.tracker.watch.only_turned:
             self.lens = check_lens(self.tracker.graph, self.sequence.seeks_lens)
@@ -183,15 +178,17 @@ class Slam(Stateful):
         graph, watch = self.tracker.graph, self.tracker.watch
         tracked = [frame.frame_index for frame in graph.keyframes.frames]
         poses = watch.longest_piece(self.poses)
-        frames = swept_frames([index for index in tracked if index in poses], list(poses), least=1)
+        known = [index for index in tracked if index in poses]
+        frames = dense.swept_frames(known, list(poses), least=1)
         images = self.map_images(others=sorted({*frames} - {*tracked}))
         images = [image for image in images if image.frame_index in poses]
         if self.tracker.knows_depth:
-            inputs = graph, self.sequence, poses, frames, frames
-            swept = sweep_frames(*inputs, self.steps.on_progress("dense depth"), self.workers)
-            images = with_swept_depth(graph.grid.camera, images, swept, watch.hardly_walked)
+            planner = dense.SweepPlanner.of(graph, self.sequence, poses)
+            show = self.steps.on_progress("dense depth")
+            swept = dense.dense_depths(planner, frames, frames, show, self.workers)
+            images = dense.with_swept_depth(graph.grid.camera, images, swept, watch.hardly_walked)
         else:
-            images = on_backdrop(images)
+            images = dense.on_backdrop(images)
         by_beta = torch.stack([self._static_weight(k).flatten() for k in range(len(tracked))])
         exposures = keyframe_exposures(graph, by_beta)
         self.mapper = self._new_mapper(self.config.mapping.insertion.cell)
@@ -214,14 +211,13 @@ class Slam(Stateful):
         stage = "refining the poses"
         keyframes = {frame.frame_index for frame in self.tracker.keyframes.frames}
         others = [i for i in self.tracker.watch.longest_piece(self.poses) if i not in keyframes]
+        undo = self.tracker.graph.shutter.undone
         for first in range(self.steps.done(stage), len(others), FRAMES_AT_ONCE):
-            read = [self.frame(index) for index in others[first : first + FRAMES_AT_ONCE]]
-            undone = [self.tracker.graph.shutter.undone(frame) for frame in read]
+            undone = [undo(self.frame(i)) for i in others[first : first + FRAMES_AT_ONCE]]
             frames = [with_exposure(frame, self.mapper.exposures) for frame in undone]
             start = [self.poses[frame.frame_index] for frame in frames]
-            images = [frame.levelled for frame in frames]
             betas = [self._beta(frame, None) for frame in frames]
-            poses = self.mapper.refine_poses(start, images, betas)
+            poses = self.mapper.refine_poses(start, [f.levelled for f in frames], betas)
             self.poses |= {f.frame_index: pose for f, pose in zip(frames, poses, strict=True)}
             self.steps.finish(stage, first + len(frames), len(others))
 

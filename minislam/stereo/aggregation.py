@@ -31,10 +31,7 @@ def aggregate(
 
 
 def _add_paths_down(total: np.ndarray, cost: np.ndarray, gray: np.ndarray, shift: int) -> None:
-    """Add L along paths that come from the row above, `shift` columns to the left.
-
-    A path that would come from outside the image starts with its cost.
-    """
+    """Add L along paths from the row above, `shift` columns to the left; at a border they start."""
     width = gray.shape[1]
     to, come_from = (slice(max(s, 0), width + min(s, 0)) for s in (shift, -shift))
     paths = cost[:, 0].copy()

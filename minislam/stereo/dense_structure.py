@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,12 +12,14 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.images import resample
-from minislam.records import Frame, MapImage, Progress
+from minislam.records import Frame, MapImage, Progress, Sequence
 from minislam.state.memory import SHELF
 from minislam.stereo import votes
 from minislam.stereo.aggregation import aggregate, refined_minimum
 from minislam.stereo.sweep import PosedImage, sweep
+from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import filled_from_nearest
+from minislam.tracking.safeguards.depth_agreement import agreed_disparities
 from minislam.workers import Workers
 
 WIDTH = 160  # px of the images that are swept for the map
@@ -42,45 +43,44 @@ EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on differe
 
 def with_swept_depth(
     camera: Camera,  # of the images
-    keyframes: list[MapImage],
+    images: list[MapImage],
     swept: Iterable[tuple[Tensor, Tensor]],  # of each, depth (H, W) and confirmation (H, W)
     fills: bool = False,  # the camera hardly did more than turn
 ) -> list[MapImage]:
-    """Return the keyframes with swept depth and confirmation.
+    """Return the images with swept depth and confirmation.
 
-    Where the sweep found nothing, the keyframe's own depth fills in, scaled by the swept depth of
-    the same image, because a network errs image by image; where other views look through it, the
-    pixel stays empty. With `fills`, if less than half is known, holes take the nearest known depth.
+    Where the sweep found nothing, the image's own depth fills in, scaled by its swept
+    depth, because a network errs image by image; where other views look through it, the pixel
+    stays empty. With `fills`, if less than half is known, holes take the nearest known depth.
     """
     small, judging, result = _small(camera, WIDTH), dict[int, votes.SweptView](), []
-    judges = votes.judges(len(keyframes))
-    for index, (keyframe, (depth, confirmation)) in enumerate(zip(keyframes, swept, strict=True)):
+    judges = votes.judges(len(images))
+    for index, (image, (depth, confirmation)) in enumerate(zip(images, swept, strict=True)):
         SHELF.put([depth])
         if index in judges:
             cost = 1 - _nearest(confirmation, small)
-            judging[index] = _as_swept(small, depth, cost, keyframe.T_camera_world)
-        confirmation = resample(confirmation, *keyframe.features.shape[:2])
-        result.append(replace(keyframe, depth=depth, confirmation=confirmation))
-    for index, (keyframe, found) in enumerate(zip(keyframes, result, strict=True)):
-        depth = found.depth
-        if bool(keyframe.depth.any()):
+            judging[index] = _as_swept(small, depth, cost, image.T_camera_world)
+        confirmation = resample(confirmation, *image.features.shape[:2])
+        result.append(replace(image, depth=depth, confirmation=confirmation))
+    for index, image in enumerate(images):
+        if bool(image.depth.any()):
             others = [judge for at, judge in judging.items() if at != index]
-            depth = _completed(small, keyframe, depth, others)
-        SHELF.put([depth])
-        result[index] = replace(found, depth=depth)
-    known = [float((keyframe.depth > 0).float().mean()) for keyframe in result]
+            depth = _completed(small, image, result[index].depth, others)
+            SHELF.put([depth])
+            result[index] = replace(result[index], depth=depth)
+    known = [float((image.depth > 0).float().mean()) for image in result]
     return list(map(_filled, result)) if fills and np.mean(known) < LEAST_KNOWN else result
 
 
 def _completed(
-    small: Camera, keyframe: MapImage, depth: Tensor, others: list[votes.SweptView]
+    small: Camera, image: MapImage, depth: Tensor, others: list[votes.SweptView]
 ) -> Tensor:
-    """Return swept depth (H, W), completed by the keyframe's own where no other view refutes it."""
-    both = (depth > 0) & (keyframe.depth > 0)
+    """Return swept depth (H, W), completed by the image's own where no other view refutes it."""
+    both = (depth > 0) & (image.depth > 0)
     enough = int(both.sum()) > LEAST_COMMON
-    guess = keyframe.depth * ((depth / keyframe.depth)[both].median() if enough else 1.0)
+    guess = image.depth * ((depth / image.depth)[both].median() if enough else 1.0)
     free = np.zeros((small.height, small.width), np.float32)
-    guessed = _as_swept(small, guess, free, keyframe.T_camera_world)
+    guessed = _as_swept(small, guess, free, image.T_camera_world)
     agreeing, refuting = votes.count_votes(small, guessed, others)
     moves = torch.from_numpy(refuting > votes.MAX_REFUTED * agreeing).to(depth)
     moves = resample(moves, *depth.shape) > 0.5
@@ -93,25 +93,25 @@ def _as_swept(small: Camera, depth: Tensor, cost: np.ndarray, pose: Tensor) -> v
     return votes.SweptView(inverse_depth, cost, 0.0, pose.cpu().numpy())
 
 
-def _filled(keyframe: MapImage) -> MapImage:
-    """Return a keyframe whose unknown depth is that of the nearest pixel that has one."""
-    unknown = keyframe.depth == 0
+def _filled(image: MapImage) -> MapImage:
+    """Return an image whose unknown depth is that of the nearest pixel that has one."""
+    unknown = image.depth == 0
     if bool(unknown.all()) or not bool(unknown.any()):
-        return keyframe
-    filled = filled_from_nearest(keyframe.depth, unknown).reshape(unknown.shape)
+        return image
+    filled = filled_from_nearest(image.depth, unknown).reshape(unknown.shape)
     SHELF.put([filled, unknown])
-    return replace(keyframe, depth=filled, filled=unknown)
+    return replace(image, depth=filled, filled=unknown)
 
 
-def on_backdrop(keyframes: list[MapImage]) -> list[MapImage]:
-    """Return the keyframes of a camera that only turned, with all they see one world unit away.
+def on_backdrop(images: list[MapImage]) -> list[MapImage]:
+    """Return the images of a camera that only turned, with all they see one world unit away.
 
     Without parallax every depth explains the images equally well, and no other view confirms any.
     """
     flat = []
-    for keyframe in keyframes:
-        one, shape = keyframe.depth.new_ones(()), keyframe.depth.shape
-        flat.append(replace(keyframe, depth=one.expand(shape), filled=one.bool().expand(shape)))
+    for image in images:
+        one, shape = image.depth.new_ones(()), image.depth.shape
+        flat.append(replace(image, depth=one.expand(shape), filled=one.bool().expand(shape)))
     return flat
 
 
@@ -128,26 +128,15 @@ def _small(camera: Camera, width: int) -> Camera:
 
 
 def dense_depths(
-    read: Callable[[int], Frame],  # a frame by its index
-    camera: Camera,  # of its images
-    poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
-    disparities: dict[int, np.ndarray],  # (n,) 1/world unit, by frame: place the nearest plane
+    planner: "SweepPlanner",
     frames: list[int],  # that are swept, increasing; all of them vote
     wanted: list[int],  # of these, whose depths are returned
     progress: Progress | None = None,
     workers: Workers | None = None,  # sweep side by side
-    width: int = WIDTH,  # px of the images that are swept, at most
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Return depth (H, W), 0 where unknown, and confirmation (H, W) of each wanted frame."""
-    planner, workers = SweepPlanner(read, camera, poses, width), workers or Workers()
-    known_frames, known = list(disparities), list(disparities.values())
-    swept = []
-
-    def plan(frame: int) -> tuple[Any, ...]:
-        nearest = int(np.argmin([abs(frame - index) for index in known_frames]))
-        return planner.plan(frame, np.concatenate(known[max(0, nearest - 1) : nearest + 2]))
-
-    for view in workers.stream(swept_view, map(plan, frames)):
+    swept: list[votes.SweptView] = []
+    for view in (workers or Workers()).stream(swept_view, map(planner.plan, frames)):
         images = {name: SHELF.array(getattr(view, name)) for name in ("inverse_depth", "cost")}
         swept.append(replace(view, **images))
         if progress:
@@ -159,7 +148,8 @@ def dense_depths(
         depths.append(votes.ConfirmedDepth(*map(SHELF.array, vars(found).values())))
     positions = [frames.index(frame) for frame in wanted]
     kept = votes.keep_what_stays(planner.camera, swept, depths, positions)
-    return (full_size(depth, camera) for depth in kept)
+    sized = (full_size(depth, planner.of_images) for depth in kept)
+    return ((depth.to(planner.device), weight.to(planner.device)) for depth, weight in sized)
 
 
 def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
@@ -200,22 +190,41 @@ def swept_view(
 class SweepPlanner:
     """Chooses the views and planes of a sweep. It keeps the small grey images that it has read."""
 
+    device: torch.device | str = "cpu"  # of what is found; OpenCV sweeps on the CPU
+
     def __init__(
-        self, read: Callable[[int], Frame], camera: Camera, poses: dict[int, Tensor], width: int
+        self,
+        read: Callable[[int], Frame],  # a frame by its index
+        camera: Camera,  # of its images
+        poses: dict[int, Tensor],  # T_camera_world (4, 4) of what is swept against, by frame index
+        disparities: dict[int, np.ndarray],  # (n,) 1/world unit, by frame: place the nearest plane
+        width: int = WIDTH,  # px of the images that are swept, at most
     ) -> None:
-        self.camera, self._is_for_map = _small(camera, width), width == WIDTH
-        self._read = read
+        self.of_images, self.camera = camera, _small(camera, width)
+        self._read, self._known, self._is_for_map = read, disparities, width == WIDTH
         self._poses = {index: pose.double().cpu().numpy() for index, pose in poses.items()}
         self._centres = {k: np.linalg.inv(pose)[:3, 3] for k, pose in self._poses.items()}
         self._image = lru_cache(maxsize=4 * REACH)(self._read_image)
 
-    def plan(
-        self, frame: int, known: np.ndarray
-    ) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray, bool]:
-        """Return the arguments of `swept_view`; `known` are inverse depths of the scene.
+    @classmethod
+    def of(
+        cls, graph: KeyframeGraph, sequence: Sequence, poses: dict[int, Tensor], width: int = WIDTH
+    ) -> "SweepPlanner":
+        """Return the planner by the disparities on which keyframes agree."""
+        frames = [(k, f.frame_index) for k, f in enumerate(graph.keyframes.frames)]
+        agreed = {i: agreed_disparities(graph, k).cpu().numpy() for k, i in frames if i in poses}
+        inputs = graph.grid.camera, poses, agreed, width
+        planner = cls(lambda index: graph.shutter.undone(sequence.frame(index)), *inputs)
+        planner.device = graph.grid.rays.device
+        return planner
+
+    def plan(self, frame: int) -> tuple[Camera, PosedImage, list[PosedImage], np.ndarray, bool]:
+        """Return the arguments of `swept_view`, by the structure known around a frame.
 
         Only sweeps for the map drop lines: what coarse ones confirm tells turns as well.
         """
+        at = int(np.argmin([abs(frame - index) for index in self._known]))
+        known = np.concatenate([*self._known.values()][max(0, at - 1) : at + 2])
         others = self._views(frame, float(np.median(known)))
         nearest = DEPTH_RANGE * float(np.quantile(known, LARGEST_QUANTILE))
         baseline = max(others.values(), default=0.0)

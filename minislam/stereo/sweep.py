@@ -1,7 +1,6 @@
 """Plane sweep: how well each pixel of an image matches other images at each depth.
 
-A plane parallel to the image, at inverse depth q, warps another image into this one by the
-homography
+A plane parallel to this image, at inverse depth q, warps another one into it by the homography
 
     H(q) = K (R + q t e3^T) K^-1,        with T_other_this = (R, t).
 
@@ -57,8 +56,7 @@ def sweep(
 ) -> np.ndarray:  # (D, h, w) float32 in [0, 1]
     """Return the matching cost of every pixel and plane.
 
-    The better half of the views is averaged: in the worse half the pixel may be covered, or
-    something may have moved there.
+    The better half of the views is averaged: in the other, things may cover the pixel or move.
     """
     T_world_this = np.linalg.inv(reference.T_camera_world)
     motions = [other.T_camera_world @ T_world_this for other in others]
@@ -68,10 +66,7 @@ def sweep(
     spread = np.sqrt(variance + NCC_VARIANCE)
 
     def dissimilarity(warped: np.ndarray) -> np.ndarray:  # 2 x (h, w), the result in [0, 1]
-        """Return 1 - max(NCC, 0), mixed with the absolute difference, from one warped view.
-
-        One view at a time, because its images stay in the cache.
-        """
+        """Return 1 - max(NCC, 0), mixed with the absolute difference; one view fits the cache."""
         mean_warped, variance_warped = _moments(warped)
         covariance = cv2.blur(gray * warped, NCC_WINDOW) - mean * mean_warped
         ncc = covariance / (spread * np.sqrt(variance_warped + NCC_VARIANCE))

@@ -61,10 +61,7 @@ def keep_what_stays(
     depths: list[ConfirmedDepth],  # of the views
     wanted: list[int],  # positions of views
 ) -> Iterator[ConfirmedDepth]:  # of the wanted views
-    """Drop, by confirmed depths alone, what views of other times look through.
-
-    Around a dropped pixel the confirmation fades too.
-    """
+    """Drop, by confirmed depths, what views of other times look through; trust fades around it."""
 
     def confirmed_view(index: int) -> SweptView:
         inverse_depth, cost = depths[index].inverse_depth, 1 - depths[index].confirmation

@@ -23,7 +23,7 @@ from minislam.tracking.reprojection import Linearisation, relative_transforms
 from minislam.tracking.safeguards.focal_column import reproject_with_focal, within_reach
 from minislam.tracking.safeguards.parts import SourceBlocks, in_parts, joined
 from minislam.tracking.safeguards.robust import edge_losses
-from minislam.tracking.safeguards.rolling_shutter import with_readout
+from minislam.tracking.safeguards.rolling_shutter import with_shifts
 from minislam.tracking.schur import NormalEquations, marginalised, source_blocks
 
 MIN_DISPARITY = 1e-5  # 1/world unit: keeps points in front of the camera, as the official code
@@ -49,7 +49,6 @@ class _WeightedPart:
     """Some edges, linearised about a state and weighted."""
 
     edges: Tensor  # (E,) positions in the whole problem
-    problem: BundleProblem  # of these edges
     costs: Tensor  # (E,) float64 px^2
     residual: Tensor  # (E, 2, N) px
     weight: Tensor  # (E, 2, N), the robust one included
@@ -112,7 +111,7 @@ def _weighted_part(state: BundleState, edges: Tensor, part: BundleProblem) -> _W
     transforms = relative_transforms(state.T_camera_world, source, part.edges_target)
     view = part.rays, part.camera, state.log_focal, part.free_focal
     reprojection = reproject_with_focal(transforms.to(dtype), state.disparities[source], *view)
-    reprojection = with_readout(reprojection, part.shutter, state.readout)
+    reprojection = with_shifts(reprojection, part.shift_columns, state.shifts)
     residual = part.targets - reprojection.positions
     weight = part.weights * reprojection.valid[:, None]
     if part.robust is not None:
@@ -121,7 +120,7 @@ def _weighted_part(state: BundleState, edges: Tensor, part: BundleProblem) -> _W
     # v. Were it left out, the cheapest camera would be one that looks away from all points.
     counted = torch.where(reprojection.valid[:, None], residual, float(part.camera.width))
     costs = edge_losses(part.weights, counted, part.robust)
-    return _WeightedPart(edges, part, costs, residual, weight, reprojection, transforms)
+    return _WeightedPart(edges, costs, residual, weight, reprojection, transforms)
 
 
 def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) float64 px^2
@@ -129,14 +128,12 @@ def edge_costs(problem: BundleProblem, state: BundleState) -> Tensor:  # (E,) fl
     return joined((at.edges, at.costs) for at in _weighted_parts(problem, state))[0]
 
 
-def _cost(
-    problem: BundleProblem, state: BundleState, of_edges: list[Tensor] | None = None
-) -> float:
+def _cost(problem: BundleProblem, state: BundleState, costs: list[Tensor] | None = None) -> float:
     """Return the cost [px^2] of Eq. (5), from the costs of the edges if these are computed."""
-    of_edges = of_edges or [at.costs for at in _weighted_parts(problem, state)]
+    costs = costs or [at.costs for at in _weighted_parts(problem, state)]
     difference = state.disparities - problem.prior_disparities
     prior_cost = (problem.prior_weights * difference.square()).sum(dtype=torch.float64)
-    return float(torch.cat(of_edges).sum() + prior_cost)
+    return float(torch.cat(costs).sum() + prior_cost)
 
 
 def normal_equations(problem: BundleProblem, state: BundleState) -> NormalEquations:
@@ -207,6 +204,6 @@ def _damped_step(
     disparities = (state.disparities + inverse_C * step).clamp_min(MIN_DISPARITY)
     disparities = torch.where(problem.free_disparities[:, None], disparities, state.disparities)
     zoom = common.pop(0) if problem.free_focal else 0.0
-    longer = common if common else (0.0, 0.0)
-    readout = state.readout[0] + longer[0], state.readout[1] + longer[1]
-    return BundleState(poses, disparities, within_reach(state.log_focal + zoom), readout)
+    further = common or (0.0, 0.0)
+    shifts = state.shifts[0] + further[0], state.shifts[1] + further[1]
+    return BundleState(poses, disparities, within_reach(state.log_focal + zoom), shifts)

@@ -6,7 +6,6 @@ from torch import Tensor
 
 from minislam.geometry import Camera
 from minislam.tracking.safeguards.robust import RobustKernel
-from minislam.tracking.safeguards.rolling_shutter import Readout
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class BundleProblem:
     robust: RobustKernel | None = None  # None: plain least squares
     disparity_damping: Tensor | None = None  # (K, N) px^2; None: a fraction of the mean diagonal
     free_focal: bool = False  # f is one more unknown, not in the paper
-    shutter: Tensor | None = None  # (E, 2, 2, N) px/s by the readout, in lens.py by k; None: held
+    shift_columns: Tensor | None = None  # (E, 2, 2, N) px per unit of either shift; None: held
 
 
 @dataclass(frozen=True)
@@ -36,4 +35,5 @@ class BundleState:
     T_camera_world: Tensor  # (K, 4, 4) float64
     disparities: Tensor  # (K, N) 1/world unit
     log_focal: float = 0.0  # s = ln(f / f of the problem's camera)
-    readout: Readout = (0.0, 0.0)  # s, added to that by which the targets are corrected
+    # Two unknowns that move the targets: readouts [s] (rolling_shutter.py), or k1 and k2 (lens.py).
+    shifts: tuple[float, float] = (0.0, 0.0)

@@ -68,9 +68,7 @@ class TrackingConfig:
     mask_min_consistent: int = parameter(2, "of which this many must agree, official code")
     global_interval: int = parameter(20, "fewest keyframes between global BAs; 0: none, paper 3.3")
     loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
-    loop_min_gap: int = parameter(
-        20, "least difference of the ends of a loop [keyframes]; official 21", 1
-    )
+    loop_min_gap: int = parameter(20, "least gap between a loop's ends [keyframes]; official 21", 1)
     loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")
     loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
     rolling_shutter: bool = parameter(True, "estimate how long the camera takes to read an image")

@@ -14,7 +14,7 @@ from torch.nn import functional
 from minislam.geometry import Camera, se3_inverse, transform_points
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.grid import Grid
-from minislam.tracking.keyframes import KeyframeStore
+from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 
 MIN_DEPTH = 1e-6  # world units: points at or behind the camera are not seen
 
@@ -28,36 +28,25 @@ class DepthView:
     T_camera_world: Tensor  # (4, 4)
 
 
-def mask_priors(
-    keyframes: KeyframeStore,
-    grid: Grid,
-    edges: list[tuple[int, int]],  # (source, target), keyframe index
-    config: TrackingConfig,
-    first: int = 0,
-) -> None:
+def mask_priors(graph: KeyframeGraph, edges: list[Edge], first: int = 0) -> None:
     """Set the masks of the keyframes from `first` on, each by the targets of its edges."""
+    config, keyframes = graph.config, graph.keyframes
     if not (config.prior_mask and config.lambda_disparity_prior):
         return
-    rows = zip(keyframes.metric_depths, keyframes.features, keyframes.T_camera_world, strict=True)
-    views = {
-        index: DepthView(depth, features, pose)
-        for index, (depth, features, pose) in enumerate(rows)
-        if depth is not None
-    }
+    columns = keyframes.metric_depths, keyframes.features, keyframes.T_camera_world
+    rows = enumerate(zip(*columns, strict=True))
+    views = {k: DepthView(depth, *seen) for k, (depth, *seen) in rows if depth is not None}
     for index, view in views.items():
         if index >= first:
             targets = dict.fromkeys(target for source, target in edges if source == index)
             others = [views[target] for target in targets if target in views]
-            keyframes.prior_masks[index] = prior_mask(grid, view, others, config)
+            keyframes.prior_masks[index] = prior_mask(graph.grid, view, others, config)
 
 
 def prior_mask(
     grid: Grid, view: DepthView, others: list[DepthView], config: TrackingConfig
 ) -> Tensor:  # (N,) bool
-    """Return M: False where enough views correspond to a cell and too few of them agree with it.
-
-    Otherwise the cell keeps its prior.
-    """
+    """Return M: False where enough views correspond to a cell and too few of them agree with it."""
     limits = config.mask_max_depth_error, config.mask_min_similarity
     corresponding, consistent = depth_consistency(grid, view, others, *limits)
     is_judged = corresponding >= config.mask_min_corresponding
@@ -130,10 +119,6 @@ def sample_features(
     size = pixels.new_tensor([camera.width, camera.height])
     # The image covers [-0.5, size - 0.5], which grid_sample calls [-1, 1].
     position = ((2 * pixels + 1) / size - 1).to(features.dtype)
-    sampled = functional.grid_sample(
-        features.permute(2, 0, 1)[None],
-        position[None, None],
-        align_corners=False,
-        padding_mode="border",
-    )
+    image, places = features.permute(2, 0, 1)[None], position[None, None]
+    sampled = functional.grid_sample(image, places, padding_mode="border", align_corners=False)
     return sampled[0, :, 0].mT

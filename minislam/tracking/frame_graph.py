@@ -14,13 +14,10 @@ from minislam.state.memory import SHELF
 from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
-# Fraction of cells that must lie in front of the other camera, inside its image or not, else a pair
-# has no meaningful distance. DROID-SLAM: 0.75
-MIN_VALID_FRACTION = 0.5
+MIN_VALID_FRACTION = 0.5  # of the cells, before the other camera, seen or not; DROID-SLAM: 0.75
 FAR = math.inf  # px, the distance of a pair below this fraction
 COARSE, COARSE_MARGIN = 16, 2.0  # one cell in 16 gives a distance to within a factor of 2
-# New flow replaces the old if its matched ratio is at least this fraction of the old one. [-]
-KEPT_FRACTION = 0.8
+KEPT_FRACTION = 0.8  # of the old matched ratio: flow that matches less does not replace the old [-]
 AT_ONCE = 256  # edges: 100 kB each while they are matched; even, because a pair stays together
 
 
@@ -48,8 +45,7 @@ class FrameGraph(Stateful):
         """
         flows = SHELF.rows(torch.cat([matches.targets, matches.confidences], 1))
         position_of = {edge: position for position, edge in enumerate(self.ends)}
-        ratios = matches.matched_ratios.tolist()
-        for edge, flow, ratio in zip(edges, flows, ratios, strict=True):
+        for edge, flow, ratio in zip(edges, flows, matches.matched_ratios.tolist(), strict=True):
             target, confidence = flow[:2], flow[2:]
             position = position_of.setdefault(edge, len(self))
             if position == len(self):
@@ -65,10 +61,6 @@ class FrameGraph(Stateful):
         """Remove the `count` edges that were added last."""
         for column in (self.ends, self.targets, self.confidences, self.matched_ratios):
             del column[len(column) - count :]
-
-    def select(self, first: int) -> list[int]:
-        """Return the positions of the edges with an end at keyframe `first` or later."""
-        return [p for p, edge in enumerate(self.ends) if max(edge) >= first]
 
 
 def neighbourhood_edges(first: int, count: int, radius: int) -> list[tuple[int, int]]:
@@ -147,8 +139,7 @@ def flow_distances(
         without_rotation = whole.clone()
         without_rotation[:, :3, :3] = torch.eye(3, device=whole.device)
         total, valid_cells = disparities.new_zeros(2, len(source))
-        motions = (whole, full_flow_weight), (without_rotation, 1 - full_flow_weight)
-        for motion, weight in motions:
+        for motion, weight in (whole, full_flow_weight), (without_rotation, 1 - full_flow_weight):
             positions, valid = reproject(motion, disparities[source], rays, camera)
             length = lengths(positions - pixels.T)
             total += weight * (length * valid).sum(1)

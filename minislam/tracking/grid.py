@@ -40,10 +40,7 @@ class Grid(Stateful):
         return row * width + column, inside
 
     def sample(self, values: Tensor, positions: Tensor) -> Tensor:
-        """Return values (..., N, C) of the cells interpolated bilinearly at pixels (..., M, 2).
-
-        Beyond the outermost cells their values are repeated.
-        """
+        """Interpolate the cells' values (..., N, C) at pixels (..., M, 2); the border repeats."""
         height, width = self.shape
         image = values.reshape(-1, height, width, values.shape[-1]).permute(0, 3, 1, 2)
         extent = positions.new_tensor([width - 1, height - 1]) * self.stride

@@ -213,8 +213,7 @@ class KeyframeGraph(Stateful):
     def filter_confirmed(self, edges: list[Edge]) -> list[Edge]:
         """Return those of these new edges, each with its reverse, that flow matches both ways.
 
-        The flow of a far edge starts from poses that may have drifted, and one wrong edge can
-        outweigh all right ones.
+        The flow of a far edge starts from drifted poses; one wrong edge can outweigh all others.
         """
         ratio: dict[Edge, float] = {}
         for part, matches in self._flow_from_geometry(edges):
@@ -231,8 +230,7 @@ class KeyframeGraph(Stateful):
             predicted, _ = reproject(*self.geometry(sources, targets))
             size = predicted.new_tensor([self.grid.camera.width, self.grid.camera.height])[:, None]
             predicted = torch.minimum(predicted.maximum(-0.5 * size), 1.5 * size)
-            matches = self.flow.match(sources, targets, predicted)
-            yield part, self.shutter.corrected(matches, part)
+            yield part, self.shutter.corrected(self.flow.match(sources, targets, predicted), part)
             if len(part) < len(edges):
                 give_back_freed()  # many edges fragment the memory
 
@@ -266,8 +264,7 @@ class KeyframeGraph(Stateful):
         limit *= self.pixel_scale
         shifted = range(newer.start - start, newer.stop - start, newer.step)
         distances = self.distances(start, shifted, limit)
-        existing = self.edges.ends + planned
-        taken = [(i - start, j - start) for i, j in existing if min(i, j) >= start]
+        taken = [(i - start, j - start) for i, j in self.edges.ends + planned if min(i, j) >= start]
         pairs = proximity_pairs(distances, taken, shifted, limit, most)
         return self.filter_confirmed(both_directions([(i + start, j + start) for i, j in pairs]))
 
@@ -291,5 +288,4 @@ class KeyframeGraph(Stateful):
     ) -> tuple[Tensor, Tensor, Tensor, Camera]:
         """Return what a reprojection along edges takes: present poses, disparities and cells."""
         transforms = relative_transforms(self.keyframes.T_camera_world, sources, targets).float()
-        disparities = self.keyframes.disparities[sources]
-        return transforms, disparities, self.grid.rays, self.grid.camera
+        return transforms, self.keyframes.disparities[sources], self.grid.rays, self.grid.camera

@@ -11,12 +11,7 @@ from torch import Tensor
 
 from minislam.tracking.frame_graph import FAR, both_directions, proximity_pairs
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
-from minislam.tracking.optimisation import (
-    FIRST_WIDENING,
-    FITTING_RESIDUAL,
-    adjust,
-    mean_residual,
-)
+from minislam.tracking.optimisation import FIRST_WIDENING, FITTING_RESIDUAL, adjust, mean_residual
 from minislam.tracking.safeguards.relocalisation import Relocaliser
 from minislam.tracking.safeguards.revisits import undo_drift
 
@@ -26,20 +21,24 @@ MAX_LOOP_RESIDUAL = 3.0  # px at 320x240: a loop that stays worse than this is u
 
 def loop_pairs(
     distances: Tensor,  # (K, K) px, flow distances
-    edges: list[tuple[int, int]],  # that exist already
+    edges: list[Edge],  # that exist already
     newest: int,  # keyframe whose loops are looked for
     max_distance: float,  # px
     min_gap: int,  # keyframes, least difference of the ends of a loop
     limit: int,  # pairs at most
-    suppression: int,  # keyframes around a pair that would repeat it
 ) -> list[tuple[int, int]]:
     """Return pairs (newest, old) that close a loop."""
     index = torch.arange(len(distances), device=distances.device)
     near_in_time = (index[:, None] - index).abs() < min_gap
     candidates = distances.masked_fill(near_in_time, FAR)
-    far_edges = [e for e in edges if abs(e[0] - e[1]) >= min_gap and max(e) >= newest - suppression]
-    newer = range(newest, newest + 1)
-    return proximity_pairs(candidates, far_edges, newer, max_distance, limit, suppression)
+    taken, newer = loops_near(edges, newest, min_gap), range(newest, newest + 1)
+    return proximity_pairs(candidates, taken, newer, max_distance, limit, LOOP_SUPPRESSION)
+
+
+def loops_near(edges: list[Edge], newest: int, min_gap: int) -> list[Edge]:
+    """Return the loops that end near the newest keyframe: the geometry predicts more there."""
+    first = newest - LOOP_SUPPRESSION
+    return [(i, j) for i, j in edges if abs(i - j) >= min_gap and max(i, j) >= first]
 
 
 def close_loops(graph: KeyframeGraph, relocaliser: Relocaliser | None = None) -> bool:
@@ -47,20 +46,20 @@ def close_loops(graph: KeyframeGraph, relocaliser: Relocaliser | None = None) ->
 
     The relocaliser finds those that drift hides from the geometry.
     """
-    iterations = graph.config.global_iterations
+    config, newest = graph.config, len(graph.keyframes) - 1
     before, first_new = graph.state, len(graph.edges)
     edges, is_moved = _loop_edges(graph), False
-    if not edges and relocaliser is not None and not _is_linked(graph):
+    is_linked = bool(loops_near(graph.edges.ends, newest, config.loop_min_gap))
+    if not edges and relocaliser is not None and not is_linked:
         is_moved = undo_drift(graph, relocaliser)
         edges = _loop_edges(graph) if is_moved else []
     if edges:
         graph.match(edges)
-        fitting = FITTING_RESIDUAL * graph.pixel_scale
-        if not is_moved and mean_residual(graph, first_new) <= fitting:
+        if not is_moved and mean_residual(graph, first_new) <= FITTING_RESIDUAL * graph.pixel_scale:
             return False
-        adjust(graph, 0, iterations, widening=FIRST_WIDENING)
+        adjust(graph, 0, config.global_iterations, widening=FIRST_WIDENING)
         graph.match(edges)
-        adjust(graph, 0, iterations)
+        adjust(graph, 0, config.global_iterations)
         if mean_residual(graph, first_new) <= MAX_LOOP_RESIDUAL * graph.pixel_scale:
             return True
     graph.keyframes.set_geometry(before.T_camera_world, before.disparities)
@@ -75,12 +74,5 @@ def _loop_edges(graph: KeyframeGraph) -> list[Edge]:
         return []
     limits = config.loop_distance * graph.pixel_scale, config.loop_min_gap, config.loop_edges
     distances = graph.distances(rows=range(newest, newest + 1), limit=limits[0])
-    pairs = loop_pairs(distances, graph.edges.ends, newest, *limits, LOOP_SUPPRESSION)
+    pairs = loop_pairs(distances, graph.edges.ends, newest, *limits)
     return graph.filter_confirmed(both_directions(pairs))
-
-
-def _is_linked(graph: KeyframeGraph) -> bool:
-    """Tell whether a loop ends near the newest keyframe, so that the geometry predicts more."""
-    newest, gap = len(graph.keyframes) - 1, graph.config.loop_min_gap
-    edges = graph.edges.ends
-    return any(abs(i - j) >= gap and max(i, j) >= newest - LOOP_SUPPRESSION for i, j in edges)

@@ -17,8 +17,7 @@ from minislam.tracking.reprojection import lengths
 from minislam.tracking.safeguards.parts import in_parts, joined, of_cells, of_rows
 from minislam.tracking.safeguards.robust import weighted_median
 
-# Times the robust width: else the cells of a new keyframe, whose error is large, are outliers.
-FIRST_WIDENING = 8.0
+FIRST_WIDENING = 8.0  # times the robust width: a new keyframe's error makes its cells outliers [-]
 EVERY = 4  # one cell in so many is sampled for the typical residual
 FEW_KEYFRAMES = 100  # so few are not worth a selection
 FITTING_RESIDUAL = 1.5  # px at 320x240: new edges that are better fit already (diary/tracking.md)
@@ -38,7 +37,7 @@ def local_ba(graph: KeyframeGraph) -> None:
         graph.match_composed(newest)
         adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
     edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
-    mask_priors(graph.keyframes, graph.grid, edges, config, first=newest)
+    mask_priors(graph, edges, first=newest)
     edges += graph.edges.ends[max(0, len(graph.edges) + len(edges) - config.active_edges) :]
     for _ in range(config.rounds):
         graph.match(edges)
@@ -98,7 +97,7 @@ def adjust(
     settled: bool = False,  # poses and depths are, so the robust width follows the residuals
 ) -> None:
     """Run a bundle adjustment over the edges that touch the free keyframes."""
-    positions = graph.edges.select(first_free)
+    positions = [p for p, edge in enumerate(graph.edges.ends) if max(edge) >= first_free]
     if lambda_prior is None:
         lambda_prior = graph.config.lambda_disparity_prior
     problem = bundle_problem(graph, positions, first_free, lambda_prior)
@@ -109,7 +108,7 @@ def adjust(
         problem = replace(problem, robust=kernel)
     if free_camera:
         columns = graph.shutter.edge_columns(positions) if graph.shutter.is_found else None
-        problem = replace(problem, free_focal=graph.focal_is_free, shutter=columns)
+        problem = replace(problem, free_focal=graph.focal_is_free, shift_columns=columns)
     # Without parallax the flow does not measure depth. In a local BA such a keyframe keeps its
     # disparities, which hold the scale until the camera moves again; where all keyframes are
     # adjusted, only one with a prior does.
@@ -122,7 +121,7 @@ def adjust(
     state, report = adjust_touched(problem, graph.state, iterations)
     graph.keyframes.set_geometry(state.T_camera_world, state.disparities)
     graph.grid.zoom(state.log_focal)
-    graph.shutter.lengthen(state.readout)
+    graph.shutter.lengthen(state.shifts)
     graph.count_adjustment(report)
 
 
@@ -139,10 +138,7 @@ def typical_residual(problem: BundleProblem, state: BundleState) -> float | None
 def adjust_touched(
     problem: BundleProblem, state: BundleState, iterations: int
 ) -> tuple[BundleState, BundleReport]:
-    """Run `bundle_adjust` on the keyframes that it moves or has an edge to; leave the others.
-
-    So a local adjustment costs the same however many keyframes there are.
-    """
+    """Run `bundle_adjust` on the touched keyframes alone: others would cost time, and stay."""
     rows = touched_rows(problem)
     found, report = bundle_adjust(*of_rows(problem, state, rows), iterations)
     poses, disparities = state.T_camera_world.clone(), state.disparities.clone()
@@ -199,8 +195,7 @@ def bundle_problem(
     free_poses = free.clone()
     free_poses[0] = False  # the first camera is the world
     return BundleProblem(
-        camera=grid.camera,
-        rays=grid.rays,
+        camera=grid.camera, rays=grid.rays,
         edges_source=edges_source, edges_target=edges_target,
         targets=targets, weights=weights,
         prior_disparities=prior, prior_weights=strength * (prior > 0) * keyframes.prior_masks,

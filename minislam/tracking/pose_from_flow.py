@@ -13,8 +13,7 @@ from minislam.tracking.safeguards.robust import RobustKernel
 
 INVERSION_STEPS = 4  # of a fixed point; the flow estimator corrects what is left
 POSE_ITERATIONS = 6  # Gauss-Newton steps per width of the robust weight
-# Times the final width. A start off by 10 degrees has residuals of 50 px: outliers when narrow.
-ROBUST_WIDENING = (16.0, 4.0, 1.0)
+ROBUST_WIDENING = (16.0, 4.0, 1.0)  # times the width: a start off by 10 degrees has 50 px [-]
 
 
 def compose_matches(first: FlowMatches, second: FlowMatches, grid: Grid) -> FlowMatches:
@@ -90,9 +89,7 @@ def start_pose(
     return candidates[int(edge_costs(problem, state).argmin())]
 
 
-def warp_disparities(
-    grid: Grid, T_target_source: Tensor, disparities: Tensor
-) -> Tensor:  # (N,) of the target
+def warp_disparities(grid: Grid, T_target_source: Tensor, disparities: Tensor) -> Tensor:  # (N,)
     """Warp the disparities (N,) of a source to the target.
 
     A cell that no point reaches takes the nearest cell's value; if points reach none, all cells
@@ -104,10 +101,8 @@ def warp_disparities(
     return filled_from_nearest(warped, warped == 0)
 
 
-def splat_disparities(
-    grid: Grid, T_target_source: Tensor, disparities: Tensor
-) -> Tensor:  # (N,) of the target, 0 in cells that no point falls on
-    """Warp the disparities (N,) of a source; where several fall on a cell, the nearest wins."""
+def splat_disparities(grid: Grid, T_target_source: Tensor, disparities: Tensor) -> Tensor:  # (N,)
+    """Warp the disparities (N,) of a source; a cell takes the nearest of several, or 0 of none."""
     cells = T_target_source[None].to(disparities.dtype), disparities[None], grid.rays
     depth_ratio = scaled_points(*cells)[0, 2]
     positions, valid = reproject(*cells, grid.camera)

@@ -2,8 +2,7 @@
 
 Every pose and every disparity is an unknown of one large system; nothing is marginalised and no
 derivative is written by hand. Read it first. It is slow; its fast twin, bundle_adjustment.py, is
-tested against it. Its unknowns are those of the paper, neither focal length nor readout, and its
-damping is not learned.
+tested against it. Neither focal length nor readout is an unknown here, and no damping is learned.
 """
 
 from dataclasses import dataclass
@@ -51,11 +50,8 @@ def moved(problem: BundleProblem, state: BundleState, step: Tensor) -> BundleSta
 
 
 def dense_normal_equations(problem: BundleProblem, state: BundleState) -> DenseNormalEquations:
-    """Return the weighted normal equations of all unknowns at once.
-
-    Fast twin: the blocks of bundle_adjustment.normal_equations. Eq. (5).
-    """
-    extensions = problem.free_focal, problem.shutter, problem.disparity_damping
+    """Return the equations of all unknowns (bundle_adjustment.py has its fast twin). Eq. (5)."""
+    extensions = problem.free_focal, problem.shift_columns, problem.disparity_damping
     assert extensions == (False, None, None), "the twin has no such terms"
     poses = int(problem.free_poses.sum())
     frames = int(problem.free_disparities.sum())
@@ -85,10 +81,7 @@ def dense_step(
     damping: float,  # relative, on disparities and on the marginalised poses
     absolute_damping: float,  # on the poses
 ) -> BundleState:
-    """Return the state after one damped step, all unknowns solved for together.
-
-    Fast twin: one step of bundle_adjustment.bundle_adjust. Eq. (5).
-    """
+    """Return the state after one step of all unknowns; fast twin: `bundle_adjust`. Eq. (5)."""
     equations = dense_normal_equations(problem, state)
     split, matrix = equations.pose_unknowns, equations.matrix.clone()
     diagonal = matrix.diagonal()  # a view: what is written to it is written to the matrix

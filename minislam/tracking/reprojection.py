@@ -16,9 +16,7 @@ from torch import Tensor
 
 from minislam.geometry import Camera, se3_inverse
 
-# A point four times closer to the target than to the source changes its scale too much for
-# reliable flow, and its derivatives explode. [-], as in DROID-SLAM.
-MIN_DEPTH_RATIO = 0.25
+MIN_DEPTH_RATIO = 0.25  # [-], DROID-SLAM's: nearer, flow is unreliable and derivatives explode
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,7 @@ def scaled_points(
     rays: Tensor,  # (N, 3) of the source cells, z = 1
 ) -> Tensor:  # (E, 3, N)
     """Return X = R r + d t for every cell of every edge."""
-    rotated = T_target_source[:, :3, :3] @ rays.T
-    return rotated + T_target_source[:, :3, 3:] * disparities[:, None]
+    return T_target_source[:, :3, :3] @ rays.T + T_target_source[:, :3, 3:] * disparities[:, None]
 
 
 def reproject(

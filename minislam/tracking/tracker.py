@@ -140,7 +140,7 @@ class Tracker(Stateful):
         self._chain = self.graph.flow.start_chain(frame.image)
         ones = torch.ones_like(self.grid.rays[:, 0])
         world = torch.eye(4, device=ones.device)
-        self._add_keyframe(frame, self._features(frame), world, ones)
+        self._append(frame, self._features(frame), world, ones)
         self._log_followed(frame, 1.0)
 
     def _follow(self, frame: Frame) -> None:
@@ -190,16 +190,14 @@ class Tracker(Stateful):
         self._chain = self._chain.restart()
         self.last_non_keyframe = None
         self.graph.flow_to_next.append(matches)
-        self._add_keyframe(frame, self._features(frame), pose, disparities)
+        self._append(frame, self._features(frame), pose, disparities)
         if self.initialised:
             motion_memory.inherit(self.graph, matches)
             local_ba(self.graph)
             self.watch.judge(first=len(self.keyframes) - 1)
             self._adjust_all_if_due()
 
-    def _add_keyframe(
-        self, frame: Frame, features: Tensor, pose: Tensor, disparities: Tensor
-    ) -> None:
+    def _append(self, frame: Frame, features: Tensor, pose: Tensor, disparities: Tensor) -> None:
         self.graph.append(frame, features, self._depth_prior(frame), pose, disparities)
         if self.initialised:
             self._update_static_weights(first=len(self.keyframes) - 1)
@@ -232,7 +230,7 @@ class Tracker(Stateful):
         """Make a relocalised frame a keyframe, or return False if its flow does not match."""
         disparities = self.graph.warp_disparities(place.keyframe_index, place.T_camera_world)
         self.graph.flow_to_next.append(None)
-        self._add_keyframe(frame, features, place.T_camera_world, disparities)
+        self._append(frame, features, place.T_camera_world, disparities)
         if not attach_newest(self.graph, place.keyframe_index):
             self.graph.remove_newest()
             return False
@@ -259,13 +257,14 @@ class Tracker(Stateful):
         """Adjust the warm-up keyframes again, now that beta is known (second stage)."""
         self._update_static_weights()
         edges = self.graph.edges.ends
-        mask_priors(self.keyframes, self.grid, edges, self.config)
+        mask_priors(self.graph, edges)
         seek_readouts(self.graph)
         warm_up_ba(self.graph, edges, self.config.warmup_rounds_with_beta)
         self.watch.judge()
 
-    def finish(self, progress: Progress | None = None) -> None:
-        """Run the final global BA, with the newest beta."""
+    def finish(self, progress: Progress | None = None, workers: Workers | None = None) -> None:
+        """Run the final global BA, with the newest beta, and with the focal length if unknown."""
+        seek_focal_length(self.graph, workers)
         self._update_static_weights()
         motion_memory.judge_all(self.graph)  # online, depths were hardly settled
         seek_readouts(self.graph)

@@ -82,5 +82,4 @@ def as_trajectory(timestamps: list[float], T_camera_world: list[Tensor]) -> Traj
     """Return poses (4, 4) and their timestamps [s], at least one, as a trajectory."""
     if not T_camera_world:
         raise MinislamError("expected at least one frame with a pose, found none")
-    T_world_camera = se3_inverse(torch.stack(T_camera_world)).cpu().numpy()
-    return Trajectory(np.array(timestamps), T_world_camera)
+    return Trajectory(np.array(timestamps), se3_inverse(torch.stack(T_camera_world)).cpu().numpy())

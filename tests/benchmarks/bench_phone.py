@@ -22,7 +22,6 @@ from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.records import Frame, Trajectory
 from minislam.tracking.safeguards.first_frame import has_warmed_up
-from minislam.tracking.safeguards.focal_length import seek_focal_length
 from minislam.tracking.safeguards.rolling_shutter import Readout
 from minislam.tracking.tracker import Tracker
 
@@ -76,7 +75,6 @@ def follow(
             tracker.initialise()
             tracker.refine_initialisation()
     tracker.end()
-    seek_focal_length(tracker.graph)
     tracker.finish()
     stamps = np.array([frame.timestamp for frame in tracker.keyframes.frames])
     poses = se3_inverse(tracker.keyframes.T_camera_world).numpy()

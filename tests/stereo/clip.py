@@ -11,7 +11,7 @@ import torch
 from data_synth import SyntheticSequence, generate
 from minislam.geometry import Camera
 from minislam.records import Frame, Sequence
-from minislam.stereo.dense_structure import dense_depths, swept_frames
+from minislam.stereo.dense_structure import SweepPlanner, dense_depths, swept_frames
 
 SIZE = (160, 120)
 KEYFRAMES = [0, 8, 16, 24, 31]
@@ -57,7 +57,8 @@ def found() -> list[Found]:
     poses = {index: torch.from_numpy(pose(index)) for index in range(len(clip().rgb))}
     sparse = {k: 1 / clip().depth[k][::8, ::8].reshape(-1) for k in KEYFRAMES}
     frames = swept_frames(KEYFRAMES, list(poses))
-    depths = dense_depths(sequence().frame, camera(), poses, sparse, frames, KEYFRAMES)
+    planner = SweepPlanner(sequence().frame, camera(), poses, sparse)
+    depths = dense_depths(planner, frames, KEYFRAMES)
     return [
         Found(depth.numpy(), confirmation.numpy(), clip().depth[k], clip().masks[k])
         for k, (depth, confirmation) in zip(KEYFRAMES, depths, strict=True)

@@ -1,5 +1,7 @@
 """Dense depth of keyframes, against the truth of the ray-caster, and which frames are swept."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -22,12 +24,14 @@ from minislam.stereo.sweep import PosedImage
 from minislam.stereo.votes import ConfirmedDepth, confirm
 from minislam.workers import Workers
 from tests.stereo.clip import KEYFRAMES, SIZE, camera, clip, found, pose, sequence
+from tests.tracking.wall import true_graph
 
 pytestmark = pytest.mark.slow
 
 
-def known(*frames: int) -> dict[int, np.ndarray]:
-    return {frame: np.ones(3) for frame in frames}
+def planner(poses: dict[int, torch.Tensor], *known: int) -> SweepPlanner:
+    """Return the planner of the clip, with a wall one unit away in the known frames."""
+    return SweepPlanner(sequence().frame, camera(), poses, {k: np.ones(3) for k in known})
 
 
 # Against the truth (measured: known .79 to .93 and .07 to .11, error .7 to 1 %, 95 % below 5.4 %)
@@ -97,8 +101,8 @@ def test_coarse_sweeps_and_those_of_little_parallax_keep_lines():
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.01 * index
     for width, nearest, leaves in ((160, 8.0, True), (80, 8.0, False), (160, 1.0, False)):
-        planner = SweepPlanner(sequence().frame, camera(), poses, width)
-        assert planner.plan(0, np.full(9, nearest))[-1] is leaves
+        inputs = camera(), poses, {0: np.full(9, nearest)}, width
+        assert SweepPlanner(sequence().frame, *inputs).plan(0)[-1] is leaves
 
 
 # Which frames
@@ -121,12 +125,12 @@ def test_views_of_much_parallax_are_not_used():
     for index in range(20):
         poses[index] = torch.eye(4, dtype=torch.float64)
         poses[index][0, 3] = 0.1 * index
-    planner = SweepPlanner(sequence().frame, camera(), poses, 160)
-    near = planner._views(0, 0.3)
-    largest = max(near) * 0.1 * 0.3 * planner.camera.fx
-    assert len(near) >= 2 and largest <= 0.125 * planner.camera.width
-    assert list(planner._views(0, 1e-3)) == [1, 4, 6, 9, 11, 14, 16, 19]  # spread evenly
-    assert list(planner._views(0, 1e3)) == [1, 2]  # the two nearest, if all are too far
+    plan = planner(poses)
+    near = plan._views(0, 0.3)
+    largest = max(near) * 0.1 * 0.3 * plan.camera.fx
+    assert len(near) >= 2 and largest <= 0.125 * plan.camera.width
+    assert list(plan._views(0, 1e-3)) == [1, 4, 6, 9, 11, 14, 16, 19]  # spread evenly
+    assert list(plan._views(0, 1e3)) == [1, 2]  # the two nearest, if all are too far
 
 
 # Degenerate input
@@ -134,22 +138,32 @@ def test_views_of_much_parallax_are_not_used():
 
 def test_a_camera_that_stands_still_gives_no_depth():
     poses = {index: torch.from_numpy(pose(0)) for index in range(6)}
-    depths = dense_depths(sequence().frame, camera(), poses, known(0, 5), [0, 5], [0, 5])
+    depths = dense_depths(planner(poses, 0, 5), [0, 5], [0, 5])
     assert all(float(depth.max()) == 0 == float(c.max()) for depth, c in depths)
 
 
 def test_a_single_frame_gives_no_depth():
-    ((depth, confirmation),) = dense_depths(
-        sequence().frame, camera(), {0: torch.from_numpy(pose(0))}, known(0), [0], [0]
-    )
+    alone = planner({0: torch.from_numpy(pose(0))}, 0)
+    ((depth, confirmation),) = dense_depths(alone, [0], [0])
     assert depth.shape == SIZE[::-1] and float(depth.max()) == 0 == float(confirmation.max())
+
+
+def test_a_graph_tells_the_sweep_its_camera_poses_and_disparities():
+    graph, posed = true_graph([0, 3, 6, 9]), [3, 6, 9]  # a piece of a broken path
+    poses = dict.fromkeys(posed, torch.eye(4))
+    plan = SweepPlanner.of(graph, SimpleNamespace(), poses, width=40)
+    assert plan.of_images == graph.grid.camera and plan.camera.width == 40
+    assert list(plan._poses) == list(plan._known) == posed
+    nearest = [float(np.max(disparities)) for disparities in plan._known.values()]
+    assert nearest == pytest.approx(graph.keyframes.disparities.amax(1)[1:].tolist(), rel=0.2)
 
 
 def test_depths_are_enlarged_one_by_one(monkeypatch):
     enlarged = []
-    monkeypatch.setattr(dense_structure, "full_size", lambda *view: enlarged.append(view))
+    nothing = torch.zeros(SIZE[::-1]), torch.zeros(SIZE[::-1])
+    monkeypatch.setattr(dense_structure, "full_size", lambda *v: enlarged.append(v) or nothing)
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
-    depths = dense_depths(sequence().frame, camera(), poses, known(0, 2), [0, 2], [0, 2])
+    depths = dense_depths(planner(poses, 0, 2), [0, 2], [0, 2])
     assert not enlarged  # hundreds of them would fill the memory
     next(depths)
     assert len(enlarged) == 1
@@ -158,16 +172,15 @@ def test_depths_are_enlarged_one_by_one(monkeypatch):
 def test_progress_counts_the_swept_frames():
     told = []
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
-    inputs = sequence().frame, camera(), poses, known(0, 2)
     for frames in ([0, 2], [0, 1, 2]):
-        found = dense_depths(*inputs, frames, [2], lambda *step: told.append(step))
+        found = dense_depths(planner(poses, 0, 2), frames, [2], lambda *step: told.append(step))
         assert len(list(found)) == 1  # of the frame that is wanted
     assert told == [(1, 2), (2, 2), (1, 3), (2, 3), (3, 3)]
 
 
 def test_a_helper_sweeps_to_the_same_bits():
     poses = {index: torch.from_numpy(pose(index)) for index in range(3)}
-    calls = sequence().frame, camera(), poses, known(0, 2), [0, 2], [0, 2]
+    calls = planner(poses, 0, 2), [0, 2], [0, 2]
     with Workers(2) as two:
         alone, shared = dense_depths(*calls), dense_depths(*calls, workers=two)
     for (depth, confirmation), other in zip(alone, shared, strict=True):
@@ -192,7 +205,7 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
 
 
 def test_the_swept_camera_sees_what_the_camera_sees():
-    small = SweepPlanner(sequence().frame, camera(), {}, 160).camera
+    small = planner({}).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx
 
 

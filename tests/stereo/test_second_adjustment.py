@@ -3,7 +3,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -17,7 +16,6 @@ from minislam.stereo.second_adjustment import (
     UNCONFIRMED_WEIGHT,
     adjust_again,
     adjust_confirmed,
-    sweep_frames,
 )
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -101,23 +99,6 @@ def test_where_nothing_is_confirmed_all_cells_count_alike():
     assert torch.allclose(poses, second.keyframes.T_camera_world, atol=1e-3)
 
 
-def test_a_graph_tells_the_sweep_its_frames_poses_and_disparities(monkeypatch):
-    told = {}
-
-    def dense_depths(read, camera, poses, disparities, *how):
-        told.update(camera=camera, poses=poses, disparities=disparities, how=how)
-        return []
-
-    monkeypatch.setattr(second_adjustment, "dense_depths", dense_depths)
-    graph, posed = true_graph(NUMBERS), NUMBERS[1:]  # a piece of a broken path
-    poses = dict.fromkeys(posed, torch.eye(4))
-    sweep_frames(graph, SimpleNamespace(), poses, [0, 1], [1], width=40)
-    assert told["camera"] == graph.grid.camera and told["poses"] is poses
-    assert list(told["disparities"]) == posed and told["how"] == ([0, 1], [1], None, None, 40)
-    nearest = [float(np.max(d)) for d in told["disparities"].values()]
-    assert nearest == pytest.approx(graph.keyframes.disparities.amax(1)[1:].tolist(), rel=0.2)
-
-
 def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatch):
     graph, done = linked_graph(), []
     ok, count = TrackingStatus.OK, NUMBERS[-1] + 1
@@ -132,13 +113,15 @@ def test_frames_without_a_pose_before_the_adjustment_are_not_yet_lost(monkeypatc
         assert [frame.frame_index for frame in tracked] == NUMBERS
         return {0: torch.eye(4)}, NUMBERS[1:]
 
-    def sweep(graph, sequence, poses, frames, wanted, progress, workers, width):
-        done.append((sorted(poses), width, frames, wanted))
+    def sweep(planner, frames, wanted, progress, workers):
+        done.append((planner, frames, wanted))
         return swept(graph)
 
     monkeypatch.setattr(second_adjustment, "pose_frames", pose_frames)
-    monkeypatch.setattr(second_adjustment, "sweep_frames", sweep)
+    monkeypatch.setattr(second_adjustment, "dense_depths", sweep)
+    told = SimpleNamespace(of=lambda graph, sequence, poses, width: (sorted(poses), width))
+    monkeypatch.setattr(second_adjustment, "SweepPlanner", told)
     adjust_again(tracker, SimpleNamespace())
     assert tracker.tracked == [followed[0], lost, *followed[2:]]
-    swept_first = [0], COARSE_WIDTH, [0], NUMBERS
+    swept_first = ([0], COARSE_WIDTH), [0], NUMBERS
     assert done == [swept_first, ("judged", UNCONFIRMED_WEIGHT)]  # judged at the end

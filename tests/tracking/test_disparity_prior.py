@@ -202,7 +202,7 @@ EDGES = [(3, 0), (0, 3), (3, 1), (1, 3), (3, 2), (2, 3)]
 def test_the_prior_of_a_masked_cell_has_no_weight():
     graph = graph_with_depths(CONFIG)
     graph.match(EDGES)
-    mask_priors(graph.keyframes, graph.grid, EDGES, CONFIG, first=3)
+    mask_priors(graph, EDGES, first=3)
     mask = graph.keyframes.prior_masks
     assert mask[:3].all(), "only the keyframes from `first` on are judged"
     last = mask[3].reshape(graph.grid.shape)
@@ -224,12 +224,12 @@ def test_a_keyframe_that_is_found_again_gets_its_mask():
 def test_the_mask_can_be_switched_off():
     off = replace(CONFIG, prior_mask=False)
     graph = graph_with_depths(off)
-    mask_priors(graph.keyframes, graph.grid, EDGES, off)
+    mask_priors(graph, EDGES)
     assert graph.keyframes.prior_masks.all()
 
 
 def test_keyframes_without_depth_are_passed_over():
     graph = graph_with_depths(CONFIG)
     graph.keyframes.metric_depths[0] = graph.keyframes.metric_depths[3] = None
-    mask_priors(graph.keyframes, graph.grid, EDGES, CONFIG)
+    mask_priors(graph, EDGES)
     assert graph.keyframes.prior_masks.all()

@@ -68,14 +68,6 @@ def test_edges_need_as_many_matches():
         FrameGraph().record([(0, 1), (1, 0)], matches_of(1.0, 1))
 
 
-def test_selected_edges_touch_the_newer_keyframes():
-    graph = FrameGraph()
-    graph.record([(0, 1), (3, 1), (1, 3), (2, 0)], matches_of(0.0, 4))
-    assert graph.select(3) == [1, 2]
-    assert graph.select(2) == [1, 2, 3]
-    assert graph.select(0) == [0, 1, 2, 3]
-
-
 def test_neighbourhood_by_hand():
     assert neighbourhood_edges(2, 4, 2) == [
         (2, 0), (0, 2), (2, 1), (1, 2), (3, 1), (1, 3), (3, 2), (2, 3),

@@ -53,16 +53,16 @@ def test_a_loop_joins_places_far_apart_in_time_and_near_in_space():
     distances = torch.full((10, 10), 50.0)
     distances[9, 2] = distances[2, 9] = 5.0
     distances[9, 8] = distances[8, 9] = 1.0  # near, but only because no time has passed
-    pairs = loop_pairs(distances, [], 9, 100.0, min_gap=5, limit=2, suppression=3)
+    pairs = loop_pairs(distances, [], 9, 100.0, min_gap=5, limit=2)
     assert pairs[0] == (9, 2)
     assert all(newer - older >= 5 for newer, older in pairs)
-    assert loop_pairs(distances, [], 9, 1.5, min_gap=5, limit=2, suppression=3) == []
+    assert loop_pairs(distances, [], 9, 1.5, min_gap=5, limit=2) == []
 
 
 def test_a_loop_that_is_closed_already_is_not_closed_again():
     distances = torch.full((10, 10), 5.0)
     taken = [(8, 2), (2, 8)]
-    pairs = loop_pairs(distances, taken, 9, 100.0, min_gap=5, limit=9, suppression=10)
+    pairs = loop_pairs(distances, taken, 9, 100.0, min_gap=5, limit=9)
     assert (9, 2) not in pairs and (9, 3) not in pairs
 
 

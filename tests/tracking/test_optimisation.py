@@ -52,6 +52,19 @@ def move(graph: KeyframeGraph, keyframe: int) -> None:
 # What enters a problem
 
 
+def test_only_edges_that_touch_a_free_keyframe_are_adjusted(monkeypatch):
+    graph, asked = matched(5), []
+
+    def noted(graph: KeyframeGraph, positions: list[int], *how: float):
+        asked.append([graph.edges.ends[p] for p in positions])
+        return bundle_problem(graph, positions, *how)
+
+    monkeypatch.setattr(optimisation, "bundle_problem", noted)
+    adjust(graph, 4, 1)
+    adjust(graph, 0, 1)
+    assert {*asked[0]} == {(4, 2), (2, 4), (4, 3), (3, 4)} and asked[1] == graph.edges.ends
+
+
 def test_at_the_truth_all_residuals_are_zero():
     graph = matched()
     problem = bundle_problem(graph, range(len(graph.edges)))

@@ -11,7 +11,7 @@ first_frame      chooses the start: not a black frame, a slate, or the shorter s
 first_camera     which minimum the start takes, with an unknown focal length and readout
 diagnostics      how well each keyframe is tied to the others
 pieces           which stretches of a broken trajectory belong together
-depth_agreement  whether earlier and later views measure the same depths
+depth_agreement  whether other views measure the same depths
 turns            recognises a camera that stands or only rotates, and adjusts rotations alone
 focal_length     estimates an unknown focal length and the readout, checks a given focal length
 focal_column     the focal length as one more unknown of the bundle adjustment

@@ -16,8 +16,8 @@ from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
-from minislam.tracking.reprojection import lengths, scaled_points
-from minislam.tracking.safeguards.depth_agreement import depth_difference
+from minislam.tracking.reprojection import lengths
+from minislam.tracking.safeguards.depth_agreement import depth_difference, seen_and_expected
 from minislam.tracking.safeguards.motion_memory import arrived, inherit_motion_weight
 from minislam.tracking.safeguards.pieces import edges_past_a_loss, found_again, pieces
 from minislam.tracking.safeguards.robust import weighted_median
@@ -26,10 +26,8 @@ from minislam.tracking.safeguards.turns import flow_beyond_turns, fraction_at_re
 
 LOOK_BACK = 3  # keyframes before one that it is judged by
 EXPLAINED = 2.0  # px at 320x240 and in smaller images: a residual that the geometry explains
-# Of the matched flow, after the final adjustment [-]. Healthy keyframes explain .88 to 1, two in a
-# row on fast real video .68 and .82; broken ones .24 to .4, the worst of many in a row .6 to .84.
-MIN_EXPLAINED, MIN_EXPLAINED_LONG = 0.5, 0.85
-LONG = 3  # keyframes in a row that must explain more than MIN_EXPLAINED_LONG
+MIN_EXPLAINED = 0.5  # of the matched flow; healthy .88 to 1, two in a row .68, broken .24 to .4
+MIN_EXPLAINED_LONG, LONG = 0.85, 3  # of so many keyframes in a row one must explain more
 MIN_EXPLAINED_AT_ONCE = 0.35  # when a keyframe has just come; broken .15 to .32
 MAX_DEPTH_ERROR = 0.2  # relative; healthy .003 to .15, broken .5
 MIN_CONTINUITY = 0.0155  # healthy .07 and more, .018 in a fast turn; broken 0 to .014
@@ -147,10 +145,7 @@ class Watch(Stateful):
         if self.breaks:
             ties = found_again(self._graph), edges_past_a_loss(self._graph)
             tied = pieces(frames, self.segments, *ties)
-        found = [
-            {i: poses[i] for i in poses if any(first <= i <= last for first, last in spans)}
-            for spans in tied
-        ]
+        found = [{i: poses[i] for i in poses if any(a <= i <= b for a, b in part)} for part in tied]
         longest = max(found, key=len, default=poses)
         return longest if len(longest) >= LEAST_FRAMES else poses
 
@@ -233,19 +228,6 @@ def fitting(graph: KeyframeGraph, residual: Tensor) -> Tensor:  # (E, 2, N) px -
     return lengths(residual) < EXPLAINED * max(graph.pixel_scale, 1.0)
 
 
-def seen_and_expected(
-    graph: KeyframeGraph,
-    sources: Tensor | list[int],  # (E,) keyframe index
-    targets: Tensor | list[int],  # (E,)
-    positions: Tensor,  # (E, N, 2) px, where the targets see the cells of the sources
-) -> tuple[Tensor, Tensor]:  # 2 x (E, N) 1/world unit
-    """Return the disparities that the targets have there, and those that the sources expect."""
-    transforms, disparities, rays, _ = graph.geometry(sources, targets)
-    expected = disparities / scaled_points(transforms, disparities, rays)[:, 2].clamp_min(1e-6)
-    there = graph.keyframes.disparities[targets][..., None]
-    return graph.grid.sample(there, positions)[..., 0], expected
-
-
 def weight_so_far(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,)
     """Return the weight of a keyframe's cells as it was before the next keyframe judged them.
 
@@ -268,8 +250,7 @@ def find_breaks(diagnostics: Sequence[KeyframeDiagnostics]) -> list[Break]:
     """Return the breaks of a trajectory from the diagnostics after the final adjustment.
 
     One keyframe is a break if it explains very little flow, sees other depths, or has an uncertain
-    scale, low continuity or low agreement. LONG weak keyframes in a row make one, too. Breaks at
-    most HEALED_AFTER keyframes apart are joined.
+    scale, low continuity or agreement; so are LONG weak ones in a row. Near breaks are joined.
     """
     found: list[Break] = []
     last = weak = 0  # broken keyframe; keyframes in a row that explain too little

@@ -55,8 +55,7 @@ def keyframe_exposures(
         targets, stride = edges.targets[edge], graph.grid.stride
         here = torch.from_numpy(blurred(source)[::stride, ::stride].reshape(-1, 3))
         u, v = targets.cpu().numpy()
-        moved = cv2.remap(blurred(target), u, v, cv2.INTER_LINEAR)
-        there = torch.from_numpy(moved.reshape(-1, 3))
+        there = torch.from_numpy(cv2.remap(blurred(target), u, v, cv2.INTER_LINEAR).reshape(-1, 3))
         both = torch.cat([here, there], 1)
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
         stands, static = (ends[source] * graph.grid.sample(ends[target], targets.T)).unbind(-1)

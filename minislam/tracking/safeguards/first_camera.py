@@ -28,15 +28,11 @@ from minislam.workers import Workers
 ITERATIONS = 8  # Gauss-Newton steps per width before hypotheses are compared
 WIDENINGS = [*ROBUST_WIDENING, 0.5, 0.25]  # of the robust weight, times the final width [-]
 SAME_COST = 1e-3  # hypotheses that differ less have met in one minimum [-]
-# Starts of an unknown focal length beside its guess: each search reaches a third either way.
-OTHER_FOCALS = (math.log(0.5), math.log(2.0))
-# Chosen on five real clips, four in which the camera hardly does more than turn, judged on others.
+OTHER_FOCALS = (math.log(0.5), math.log(2.0))  # starts, too: each reaches a third either way
 FOCAL_WORTH_SAVING = 0.05  # of the cost: for each doubling of the guess, and to free it [-]
 FARTHEST = math.log(4)  # from the guessed focal length; farther off, the start has failed
 RELIEF_WORTH_SAVING = 0.1  # of the cost, per unit of correlation with the usual disparities [-]
-# More than later (focal_length.py), because in a short pan readout and focal length look alike. In
-# 14 real starts it saved 6 to 26 % of the cost, in 13 others at most 3.7 %, in 22 synthetic < 5 %.
-READOUT_WORTH_SAVING = 0.05  # [-]
+READOUT_WORTH_SAVING = 0.05  # more than later: in a short pan it looks like a focal length [-]
 
 Found = tuple[BundleState, BundleReport]
 
@@ -139,19 +135,16 @@ class _Search:
         return most_plausible(self.graph.grid, self.graph.keyframes.prior_disparities, found)
 
     def with_readout(self, found: list[Found]) -> Found | None:
-        """Let the graph take the readout that fits best; return the geometry with it.
-
-        A readout that saves little stays 0, because it would follow noise or movers; then None.
-        """
+        """Let the graph take the best readout if it saves enough; return the geometry, or None."""
         shutter = self.graph.shutter
         columns = shutter.edge_columns(self.positions) if self.tells_camera else None
         if columns is None or not columns.any():
             return None
-        rolled = self.best(self.adjusted(replace(self.free, shutter=columns), found))
+        rolled = self.best(self.adjusted(replace(self.free, shift_columns=columns), found))
         saves = cost_of(rolled) < (1 - READOUT_WORTH_SAVING) * min(map(cost_of, found))
-        if not (saves and shutter.is_possible(rolled[0].readout)):
+        if not (saves and shutter.is_possible(rolled[0].shifts)):
             return None
-        shutter.take(rolled[0].readout)
+        shutter.take(rolled[0].shifts)
         self.problem = bundle_problem(self.graph, self.positions)  # of the corrected flow
         return adjust_narrowing(self.free, rolled[0], WIDENINGS[2:], ITERATIONS)
 

@@ -33,8 +33,7 @@ MIN_RISE_OF_BETTER = 0.003  # where it saves much; where right, .006 and more, w
 # A warning needs both: a right focal length has looked 5.4 % off, but the other saved 1.3 %. [-]
 WORTH_SAYING, WORTH_SAVING = 0.05, 0.02
 READOUT_WORTH_SAVING = 0.02  # of the cost: rolling shutters 3 to 37 %, others at most 1.2 %
-# Fewer do not measure it: of fr1_desk 2, 3, 4 and 6 gave fx = 115, 238, 266, 276 px (true: 275).
-LEAST_KEYFRAMES = 4
+LEAST_KEYFRAMES = 4  # fewer do not measure it (diary/focal_length.md)
 LEAST_HALF = 6  # keyframes of half a clip that is checked alone
 HALF_WORTH_SAVING = 0.1  # zooms of 1.5 saved 14 to 53 %, the right focal length at most 1 % [-]
 
@@ -83,16 +82,14 @@ def _fit_among(graph: KeyframeGraph, keyframes: range, workers: Workers | None) 
     return fit_focal_length(*among, workers)[0]
 
 
-def problem_among(
-    graph: KeyframeGraph, keyframes: range, with_readout: bool = False
-) -> Start | None:
+def problem_among(graph: KeyframeGraph, keyframes: range, readout: bool = False) -> Start | None:
     """Return problem and state of the edges among some keyframes, at few cells; None: no edge."""
     edges = enumerate(graph.edges.ends)
     positions = [p for p, edge in edges if min(edge) in keyframes and max(edge) in keyframes]
     if not positions:
         return None
-    columns = graph.shutter.edge_columns(positions) if with_readout else None
-    problem = replace(bundle_problem(graph, positions), shutter=columns)
+    columns = graph.shutter.edge_columns(positions) if readout else None
+    problem = replace(bundle_problem(graph, positions), shift_columns=columns)
     rows = torch.tensor(keyframes, device=problem.rays.device)
     cells = torch.arange(len(problem.rays), device=rows.device).view(graph.grid.shape)
     among = of_cells(*of_rows(problem, graph.state, rows), cells[::EVERY, ::EVERY].flatten())
@@ -124,8 +121,7 @@ def fit_focal_length(
     (_, present), (found, best) = workers.map(adjust_narrowing, starts)
     for _ in range(MAX_TRIES):
         ends = [replace(found, log_focal=found.log_focal + step) for step in (-STEP, STEP)]
-        calls = [(problem, end, [1.0], ITERATIONS) for end in ends]
-        beside = workers.map(adjust_narrowing, calls)
+        beside = workers.map(adjust_narrowing, [(problem, end, [1.0], ITERATIONS) for end in ends])
         rises = [report.cost_after - best.cost_after for _, report in beside]
         if min(rises) > 0:
             break
@@ -144,21 +140,18 @@ def fit_focal_length(
 
 
 def seek_readouts(graph: KeyframeGraph) -> None:
-    """Set the readout that fits the flow best if it saves enough; poses and depths stay.
-
-    If it saves little it stays 0, because it would follow noise and movers.
-    """
+    """Set the readout that fits best, unless it saves as little as noise and movers would."""
     shutter, count = graph.shutter, len(graph.keyframes)
     if not shutter.is_on or shutter.is_found or count < LEAST_KEYFRAMES:
         return
-    among = problem_among(graph, range(min(MOST_KEYFRAMES, count)), with_readout=True)
+    among = problem_among(graph, range(min(MOST_KEYFRAMES, count)), readout=True)
     if among is None:
         return
     problem, start = replace(among[0], free_focal=graph.focal_is_free), among[1]
-    _, held = bundle_adjust(replace(problem, shutter=None), start, ITERATIONS)
+    _, held = bundle_adjust(replace(problem, shift_columns=None), start, ITERATIONS)
     state, free = bundle_adjust(problem, start, ITERATIONS)
     floor = least_cost(problem.weights)
     saved = held.cost_after - free.cost_after
     is_worth_it = saved > READOUT_WORTH_SAVING * max(held.cost_after, floor)
-    if is_worth_it and shutter.is_possible(state.readout):
-        shutter.take(state.readout)
+    if is_worth_it and shutter.is_possible(state.shifts):
+        shutter.take(state.shifts)

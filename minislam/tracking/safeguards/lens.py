@@ -10,8 +10,7 @@ image turns little from one keyframe to the other, the flow from x to p~ is that
 
     p~ + k1 (D_1(x) - D_1(p~)) + k2 (D_2(x) - D_2(p~)),
 
-so what k1 and k2 still lack are unknowns of Eq. (5), as the readouts of a rolling shutter are.
-Straightening and adjusting alternate.
+so what k1 and k2 lack is unknown in Eq. (5), as readouts are. Straightening and BA alternate.
 """
 
 import math
@@ -101,11 +100,11 @@ def fit_lens(graph: KeyframeGraph) -> LensFit | None:
         for _ in range(ROUNDS):
             lens = straightened(problem, radial)
             found, _ = adjust_narrowing(lens, state, widenings, focal_length.ITERATIONS)
-            state, widenings = replace(found, readout=(0.0, 0.0)), [1.0]
-            before, radial = radial, _without_fold(problem.camera, radial, found.readout)
+            state, widenings = replace(found, shifts=(0.0, 0.0)), [1.0]
+            before, radial = radial, _without_fold(problem.camera, radial, found.shifts)
             if abs(bend_of(problem.camera, radial) - bend_of(problem.camera, before)) < LAST_BEND:
                 break
-    lens = replace(straightened(problem, radial), shutter=None)
+    lens = replace(straightened(problem, radial), shift_columns=None)
     state, held = adjust_narrowing(lens, state, [1.0], focal_length.ITERATIONS)
     floor = least_cost(problem.weights)
     saved = (pinhole.cost_after - held.cost_after) / max(pinhole.cost_after, floor)
@@ -138,7 +137,7 @@ def straightened(problem: BundleProblem, radial: Radial) -> BundleProblem:
     positions = centre + focal * target
     weights = problem.weights * stretch(target, radial).square().to(dtype)
     targets, columns = positions.to(dtype), columns.to(dtype)
-    return replace(problem, rays=rays, targets=targets, weights=weights, shutter=columns)
+    return replace(problem, rays=rays, targets=targets, weights=weights, shift_columns=columns)
 
 
 def true_rays(seen: Tensor, radial: Radial) -> Tensor:  # (..., 2, N) float64

@@ -22,9 +22,7 @@ from minislam.tracking.pose_from_flow import filled_from_nearest
 from minislam.tracking.reprojection import lengths, reproject
 
 MIN_CONFIDENCE = 0.1  # of a match that passes motion weights on [-]
-# Smoothing factors: the weight falls fast and recovers slowly, since a moving object may pause. [-]
-LOSS_RATE = 0.9
-RECOVERY_RATE = 0.1
+LOSS_RATE, RECOVERY_RATE = 0.9, 0.1  # fast and slow, because a moving object may pause [-]
 DEPTH_ERROR = 0.1  # of a depth prior, relative: so much of the parallax is no motion [-]
 STANDS, MOVES = 0.3, 5.0  # px: flow of a cell that stands, median flow where the camera moves
 CONFIRMED = 0.2  # confidence of a flow that may tell an overlay [-]

@@ -17,9 +17,9 @@ from minislam.tracking.bundle_problem import BundleProblem, BundleState
 CELLS_AT_ONCE = 50_000  # of all edges of a part: 200 bytes a cell
 PARTS_UNTIDIED = 16  # parts after which freed memory is given back: it fragments
 CELLS_COUPLED = 3_000_000  # of all edges whose couplings are in memory: 24 bytes a cell
-_OF_EDGES = "edges_source edges_target targets weights shutter"
+_OF_EDGES = "edges_source edges_target targets weights shift_columns"
 _OF_KEYFRAMES = "prior_disparities prior_weights free_poses free_disparities disparity_damping"
-_OF_CELLS = "targets weights shutter prior_disparities prior_weights disparity_damping"
+_OF_CELLS = "targets weights shift_columns prior_disparities prior_weights disparity_damping"
 
 Start = tuple[BundleProblem, BundleState]  # a problem, and the state it is adjusted from
 

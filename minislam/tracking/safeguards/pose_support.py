@@ -15,11 +15,9 @@ from minislam.records import Frame
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import lengths, relative_transforms, reproject
 
-# Support of a pose, relative to the median of all frames between keyframes: [-]
-DOUBTFUL_SUPPORT = 0.5  # with less, other starts are tried
-LOST_SUPPORT = 0.1  # with less after all starts, the frame is lost
-# The largest residual of a flow that a pose explains: so many px at 320x240, plus this part of the
-# flow, because the first updates of a network fall short, but in the right direction.
+DOUBTFUL_SUPPORT = 0.5  # of the median of all frames: with less, other starts are tried [-]
+LOST_SUPPORT = 0.1  # the same: with less after all starts, the frame is lost [-]
+# Residual that a pose explains: px at 320x240, plus this part of the flow, which first falls short.
 EXPLAINED_PX, EXPLAINED_FRACTION = 3.0, 0.25
 CHANCE = 0.25  # of the weight of a random flow is explained as well; .95 and more of a good one [-]
 REPEATED = 0.001  # mean difference of an image from the one that it repeats, encoded again [-]

@@ -128,7 +128,7 @@ def attach_newest(graph: KeyframeGraph, similar: int) -> bool:
     edges = graph.filter_confirmed(both_directions([(newest, index) for index in around]))
     if (newest, similar) not in edges:
         return False
-    mask_priors(graph.keyframes, graph.grid, edges, graph.config, first=newest)
+    mask_priors(graph, edges, first=newest)
     for _ in range(graph.config.rounds):
         graph.match(edges)
         adjust(graph, newest, graph.config.iterations, widening=FIRST_WIDENING)

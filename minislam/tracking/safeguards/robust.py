@@ -58,8 +58,7 @@ def edge_losses(
     """Return the cost of each edge in Eq. (5): the sum of weighted squares, or of robust losses."""
     if robust is None:
         return (weights * residual.square()).sum((1, 2), dtype=torch.float64)
-    loss = robust.loss(residual.square().sum(1))
-    return (weights.mean(1) * loss).sum(1, dtype=torch.float64)
+    return (weights.mean(1) * robust.loss(residual.square().sum(1))).sum(1, dtype=torch.float64)
 
 
 def least_cost(weights: Tensor) -> float:  # (E, 2, N)

@@ -157,8 +157,7 @@ class RollingShutter(Stateful):
         after = [min(max(-longest, a + b), longest) for a, b in zip(before, seconds, strict=True)]
         self.readout = after[0], after[1]
         moved: list[Tensor] = []
-        parts = zip(at_once(self._edges.ends), at_once(self._edges.targets), strict=True)
-        for ends, rows in parts:
+        for ends, rows in zip(at_once(self._edges.ends), at_once(self._edges.targets), strict=True):
             columns = self.columns(ends, targets := torch.stack(rows))
             change = displacements(columns, self.readout) - displacements(columns, before)
             moved += SHELF.rows(targets + change)
@@ -183,9 +182,9 @@ def displacements(columns: Tensor, readout: Readout) -> Tensor:  # (E, 2, N) px
     return readout[0] * columns[:, 0] + readout[1] * columns[:, 1]
 
 
-def with_readout(found: Linearisation, columns: Tensor | None, readout: Readout) -> Linearisation:
-    """Return a reprojection as a rolling shutter sees it; J_target gains c (E, 2, 2, N) [px/s]."""
-    if columns is None:  # the readouts are held
+def with_shifts(found: Linearisation, columns: Tensor | None, shifts: Readout) -> Linearisation:
+    """Return a reprojection as a rolling shutter, or a lens, sees it; J_target gains -columns."""
+    if columns is None:  # they are held
         return found
-    seen = found.positions - displacements(columns, readout)
+    seen = found.positions - displacements(columns, shifts)
     return replace(found, positions=seen, J_target=torch.cat([found.J_target, -columns], 1))

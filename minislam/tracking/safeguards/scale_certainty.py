@@ -2,9 +2,8 @@
 
 A single camera knows lengths only as multiples of those before, by points that several keyframes
 see from far enough apart. Where a fast turn, a plain wall or a dynamic object leaves few of them,
-two parts of a trajectory can differ in scale although each fits its flow. The normal equations of
-Eq. (5) tell how far: the inverse of their Schur complement, times the mean squared residual, is
-the covariance of the poses.
+two parts of a trajectory can differ in scale although each fits its flow. Eq. (5) tells how far:
+the inverse of its Schur complement, times the mean squared residual, is the poses' covariance.
 """
 
 from collections.abc import Iterator
@@ -57,8 +56,7 @@ def _log_ratio_gradients(state: BundleState) -> Iterator[tuple[int, Tensor]]:  #
     """Yield the derivative of ln(length after / length before) by the twists of all poses.
 
     The length after a keyframe is the distance to the first later one at least as far away as
-    keyframes REACH apart usually are; the length before, to the last such earlier one. A keyframe
-    without both is left out.
+    keyframes REACH apart usually are; the length before, to the last such earlier one.
     """
     poses = state.T_camera_world
     centres = se3_inverse(poses)[:, :3, 3]

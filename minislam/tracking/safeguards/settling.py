@@ -23,8 +23,7 @@ from minislam.tracking.pose_from_flow import warp_disparities
 from minislam.tracking.reprojection import reproject, reproject_with_jacobians
 
 SETTLED = 25.0  # px^2, information of a disparity that is known to a fifth of itself
-# Neighbouring keyframes see much of the same flow, so information is handed on in part. [-]
-HANDED_ON = 0.5
+HANDED_ON = 0.5  # of the information: neighbouring keyframes see much of the same flow [-]
 MOST = 1e6  # px^2, cap of the information: an infinite one could not be interpolated
 LEAST = 0.05  # weight of a cell whose disparity nothing is known of: it still shows a rotation [-]
 
@@ -75,8 +74,7 @@ class Settling(Stateful):
         motion = motion[None].to(disparities.dtype)
         positions, valid = reproject(motion, disparities[None], grid.rays, grid.camera)
         there = grid.sample(inherited[None, :, None], positions.mT)[0, :, 0]
-        seen = valid[0] & grid.camera.contains(positions[0].mT)
-        self.handed_on = torch.where(seen, there, 0)
+        self.handed_on = torch.where(valid[0] & grid.camera.contains(positions[0].mT), there, 0)
         return disparities
 
 

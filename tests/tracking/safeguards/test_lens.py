@@ -93,7 +93,7 @@ def test_the_stretch_is_browns():
 
 
 def test_what_k_lacks_moves_the_flow_along_the_columns():
-    step, columns = 1e-5, bent_problem((K1, K2))[0].shutter
+    step, columns = 1e-5, bent_problem((K1, K2))[0].shift_columns
     assert columns.abs().amax((0, 2, 3)).min() > 1  # px: there is something to tell
     for n, more in enumerate([(step, 0.0), (0.0, step)]):
         ends = [bent_problem((K1 + sign * more[0], K2 + sign * more[1]))[1] for sign in (1, -1)]

@@ -22,7 +22,7 @@ from minislam.tracking.safeguards.rolling_shutter import (
     Readout,
     RollingShutter,
     displacements,
-    with_readout,
+    with_shifts,
 )
 from tests.helpers import generator
 from tests.tracking.safeguards.moving_cloth import GRID, RATE, WIDE, picture, texture
@@ -117,7 +117,7 @@ def rolled(known: KnownProblem, readout: Readout) -> BundleProblem:
     """Return the problem whose flow a rolling shutter has seen: targets p~ = p - rho c."""
     c = columns(known)
     targets = known.problem.targets - displacements(c, readout)
-    return replace(known.problem, targets=targets, shutter=c)
+    return replace(known.problem, targets=targets, shift_columns=c)
 
 
 def test_the_columns_are_those_of_finite_differences():
@@ -125,21 +125,21 @@ def test_the_columns_are_those_of_finite_differences():
     transforms = known.truth.T_camera_world[1:]
     at = reproject_with_jacobians(transforms, known.truth.disparities[1:], RAYS, CAMERA)
     c, h = columns(known)[:2], 1e-3
-    J = with_readout(at, c, READOUT).J_target[:, 6:]
+    J = with_shifts(at, c, READOUT).J_target[:, 6:]
     for axis in range(2):
         ends = [
             tuple(r + sign * h * (k == axis) for k, r in enumerate(READOUT)) for sign in (1, -1)
         ]
-        ahead, behind = (with_readout(at, c, end).positions for end in ends)
+        ahead, behind = (with_shifts(at, c, end).positions for end in ends)
         torch.testing.assert_close(J[:, axis], (ahead - behind) / (2 * h), rtol=1e-8, atol=1e-8)
-    assert with_readout(at, None, READOUT) is at
+    assert with_shifts(at, None, READOUT) is at
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robust", [None, RobustKernel(1.5)])
 def test_normal_equations_are_those_of_all_unknowns_at_once(robust: RobustKernel | None):
     known = known_problem(3)
-    problem = replace(noisy(known, 0.3), robust=robust, shutter=columns(known))
+    problem = replace(noisy(known, 0.3), robust=robust, shift_columns=columns(known))
     start = perturbed(known, 0.02)
     poses = 6 * int(problem.free_poses.sum())
 
@@ -166,16 +166,16 @@ def test_the_true_readouts_are_found_with_poses_and_disparities(free_focal: bool
     known = two_fixed_poses(known_problem(6))
     problem = replace(rolled(known, READOUT), free_focal=free_focal)
     end, report = bundle_adjust(problem, perturbed(known, 0.01), iterations=60)
-    assert end.readout == pytest.approx(READOUT, abs=1e-6)
+    assert end.shifts == pytest.approx(READOUT, abs=1e-6)
     assert distance(end, known.truth) < 1e-4
     assert report.cost_after < 1e-6 * report.cost_before
 
 
 def test_readouts_that_are_not_free_stay():
     known = known_problem()
-    start = replace(perturbed(known, 0.02), readout=READOUT)
+    start = replace(perturbed(known, 0.02), shifts=READOUT)
     end, _ = bundle_adjust(known.problem, start, iterations=5)
-    assert end.readout == READOUT
+    assert end.shifts == READOUT
 
 
 # A new readout corrects what is stored

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from minislam.stereo.second_adjustment import agreed_disparities, agreeing_views
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.reprojection import relative_transforms, reproject
+from minislam.tracking.safeguards.depth_agreement import agreed_disparities, agreeing_views
 from tests.tracking.scene import CAMERA
 from tests.tracking.wall import GRID, disparities_at, true_graph
 
