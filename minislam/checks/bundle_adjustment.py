@@ -195,19 +195,16 @@ def check_prior_mask(student: Function) -> Verdict:
         return (3 - T_this_other[2, 3]) / rays[..., 2]
 
     def case(count: int, patched: float, description: str, seed: int = 2) -> Case:
-        others = [(wall(T), T) for T in se3_exp(0.08 * normals(seed, count, 6).clamp(-2, 2))]
+        poses = se3_exp(0.08 * normals(seed, count, 6).clamp(-2, 2))
+        poses[-1, 2, 3] = -0.5
+        poses[0, :3, 3] = doubles(0.0117, 0.0233, 1) * 0.5  # its centre falls on a cell
+        others = [(wall(T), T) for T in poses]
         depth = wall(torch.eye(4).double())
         depth[10:30, 8:30] *= patched
-        for number, (seen, _) in enumerate(others):
+        for number, (seen, _) in enumerate(others[1:-1], start=1):
             seen[8 * number : 8 * number + 20, 30:50] *= 0.6  # in front of the wall, for one view
-        seen, T = others[-1]
-        T[2, 3] = -0.5
-        seen[:] = wall(T)
-        seen[:20, 40:] = 0.3  # behind this view
-        seen, T = others[0]
-        T[:3, 3] = doubles(0.0117, 0.0233, 1) * 0.5  # its centre falls on a cell
-        seen[:] = wall(T)
-        seen[::2] = 0  # unknown
+        others[-1][0][:20, 40:] = 0.3  # behind this view
+        others[0][0][::2] = 0  # unknown
         return Case((depth, others, camera, stride, 0.02), description)
 
     cases = [
