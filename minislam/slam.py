@@ -22,7 +22,7 @@ from minislam.errors import MinislamError
 from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
-from minislam.priors.features import with_finer_grid
+from minislam.priors.features import HighResolutionFeatures
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.records import Frame, MapImage, Sequence, Trajectory, required_mask
 from minislam.state.memory import SHELF
@@ -77,7 +77,7 @@ class Slam(Stateful):
         self.sequence, self.device, self.workers = sequence, device, workers or Workers()
         self.config = config
         self.steps = Steps(observer or SilentObserver(), save_checkpoint)
-        self._features = with_finer_grid(priors.features, config.uncertainty.grid_factor)
+        self._features = HighResolutionFeatures(priors.features, config.uncertainty.grid_factor)
         parts = priors.flow, self._features, priors.depth, self._static_weight
         self.tracker = Tracker(sequence.camera, config.tracking, *parts, device)
         self.tracker.graph.seeks_focal = sequence.refines_focal

@@ -21,12 +21,11 @@ def check_target_jacobian(student: Function) -> Verdict:
     """Check (points X (N, 3), disparities (N,), camera) -> dp / d(rho, phi) (N, 2, 6) in px."""
     rays = CAMERA.rays(doubles([0.0, 0.0], [100.0, 52.0], [60.5, 10.25]))
 
-    def reference(*view: Any, slide: Any = 1, turn: Any = 1) -> Tensor:
-        points, disparities, camera = view
+    def reference(X: Tensor, d: Tensor, c: Camera, *, slide: Any = 1, turn: Any = 1) -> Tensor:
         # A camera that stands still sees each cell where its ray points: X = ray of the cell.
-        still, depth = torch.eye(4, dtype=points.dtype)[None], points[:, 2:]
-        ratio = (disparities / depth[:, 0])[None]
-        seen = reprojection.reproject_with_jacobians(still, ratio, points / depth, camera)
+        still, depth = torch.eye(4, dtype=X.dtype)[None], X[:, 2:]
+        ratio = (d / depth[:, 0])[None]
+        seen = reprojection.reproject_with_jacobians(still, ratio, X / depth, c)
         J = seen.J_target[0].permute(2, 1, 0)
         return torch.cat([slide * J[..., :3], turn * J[..., 3:]], -1)
 
@@ -130,17 +129,15 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         nudged = se3_exp(0.02 * start[:, :6]) @ truth.T_camera_world
         return Case((problem, BundleState(nudged, none + 0.5), steps, 10.0), description)
 
-    def some(seed: int) -> Tensor:
-        return normals(seed, 6, 2, len(rays)).abs()
-
-    ones = torch.ones(6, 2, len(rays)).double()
+    size = 6, 2, len(rays)
+    ones, differing = torch.ones(size).double(), normals(5, *size).abs()
     hidden = ones * (torch.arange(len(rays)) > 1)
     cases = [
         case(1, 1, ones, "one step and weights of 1"),
-        case(1, 2, some(5), "one step, two poses held, weights that differ"),
+        case(1, 2, differing, "one step, two poses held, weights that differ"),
         case(1, 1, hidden, "two cells that no other view sees"),
-        case(3, 2, some(5), "three steps"),
-        *drawn(lambda seed: case(1 + seed % 2, 1, some(seed), "drawn weights", seed)),
+        case(3, 2, differing, "three steps"),
+        *drawn(lambda n: case(1 + n % 2, 1, normals(n, *size).abs(), "drawn weights", n)),
     ]
     mistakes = [
         ("weights", "Each residual counts with its weight: J^T W J and J^T W r."),
@@ -190,8 +187,7 @@ def check_prior_mask(student: Function) -> Verdict:
         this = DepthView(depth, same, torch.eye(4).double())
         views = [DepthView(there, same, se3_inverse(T)) for there, T in others]
         corresponding, consistent = depth_consistency(grid, this, views, rest[-1], -2.0)
-        trusted = (corresponding < seen) | (consistent >= agree)
-        return trusted.double().view(grid.shape)
+        return ((corresponding < seen) | (consistent >= agree)).double().view(grid.shape)
 
     def wall(T_this_other: Tensor) -> Tensor:
         """Return the depth of a wall, 3 m before this view, as another view sees it."""
@@ -199,19 +195,16 @@ def check_prior_mask(student: Function) -> Verdict:
         return (3 - T_this_other[2, 3]) / rays[..., 2]
 
     def case(count: int, patched: float, description: str, seed: int = 2) -> Case:
-        others = [(wall(T), T) for T in se3_exp(0.08 * normals(seed, count, 6).clamp(-2, 2))]
+        poses = se3_exp(0.08 * normals(seed, count, 6).clamp(-2, 2))
+        poses[-1, 2, 3] = -0.5
+        poses[0, :3, 3] = doubles(0.0117, 0.0233, 1) * 0.5  # its centre falls on a cell
+        others = [(wall(T), T) for T in poses]
         depth = wall(torch.eye(4).double())
         depth[10:30, 8:30] *= patched
-        for number, (seen, _) in enumerate(others):
+        for number, (seen, _) in enumerate(others[1:-1], start=1):
             seen[8 * number : 8 * number + 20, 30:50] *= 0.6  # in front of the wall, for one view
-        seen, T = others[-1]
-        T[2, 3] = -0.5
-        seen[:] = wall(T)
-        seen[:20, 40:] = 0.3  # behind this view
-        seen, T = others[0]
-        T[:3, 3] = doubles(0.0117, 0.0233, 1) * 0.5  # its centre falls on a cell
-        seen[:] = wall(T)
-        seen[::2] = 0  # unknown
+        others[-1][0][:20, 40:] = 0.3  # behind this view
+        others[0][0][::2] = 0  # unknown
         return Case((depth, others, camera, stride, 0.02), description)
 
     cases = [

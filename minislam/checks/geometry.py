@@ -72,8 +72,8 @@ def check_reproject(student: Function) -> Verdict:
 
 def check_warped_photo(student: Function) -> Verdict:
     """Check (photo, depth, camera, T_source_target) -> the photo as the target sees it."""
-    camera = Camera(20.0, 24.0, 8.3, 5.8, 17, 13)
     photo, depth = normals(0, 13, 17, 3).abs(), 1 + normals(1, 13, 17).abs()
+    scene = photo, depth, Camera(20.0, 24.0, 8.3, 5.8, 17, 13)
 
     def warped(*view: Any, flaw: str = "") -> Tensor:
         photo, depth, camera, pose = view
@@ -82,8 +82,10 @@ def check_warped_photo(student: Function) -> Verdict:
         pose = se3_inverse(pose) if flaw == "inverted" else pose
         points = transform_points(pose, points.flatten(0, 1)).view(points.shape)
         pixels, last = camera.project(points), doubles(camera.width - 1, camera.height - 1)
-        seen = ((pixels >= 0) & (pixels <= last)).all(-1) | (flaw in ("unmasked", "faded"))
-        seen &= (points[..., 2] > 0) | (flaw in ("behind", "unmasked", "faded"))
+        inside = ((pixels >= 0) & (pixels <= last)).all(-1)
+        seen = inside & ((points[..., 2] > 0) | (flaw == "behind")) | (
+            flaw in ("unmasked", "faded")
+        )
         pixels = 2 * pixels.floor() + 1 - pixels if flaw == "turned" else pixels
         position = (2 * (pixels.round() if flaw == "rounded" else pixels) / last - 1)[None]
         planes, position = photo.permute(2, 0, 1)[None], position.to(photo)
@@ -91,14 +93,11 @@ def check_warped_photo(student: Function) -> Verdict:
         sampled = functional.grid_sample(planes, position, "bilinear", beyond, True)
         return torch.where(seen[..., None], sampled[0].permute(1, 2, 0), 0)
 
-    def case(pose: Tensor, description: str) -> Case:
-        return Case((photo, depth, camera, pose), description)
-
     cases = [
-        case(se3_exp(doubles(0.2, -0.07, 0.1, 0, 0, 0)), "a small step"),
-        case(se3_exp(doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1)), "any motion"),
-        case(se3_exp(doubles(0.1, 0, 0, 0, 3.0, 0)), "a source camera that looks back"),
-        *drawn(lambda seed: case(any_pose(seed), f"motion {seed}")),
+        Case((*scene, se3_exp(doubles(0.2, -0.07, 0.1, 0, 0, 0))), "a small step"),
+        Case((*scene, se3_exp(doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1))), "any motion"),
+        Case((*scene, se3_exp(doubles(0.1, 0, 0, 0, 3.0, 0))), "a source camera that looks back"),
+        *drawn(lambda seed: Case((*scene, any_pose(seed)), f"motion {seed}")),
     ]
     mistakes = [
         ("inverted", "This is the inverse motion: T_source_target takes points to the source."),

@@ -123,8 +123,7 @@ def check_insertion(student: Function) -> Verdict:
         far = transform_points(T, new.means)[:, 2:] if flaw == "one size" else 1
         return torch.cat([new.means, new.scales[:, :1] / far, new.colors], -1)
 
-    shape = CAMERA.height, CAMERA.width
-    source = torch.Generator().manual_seed(0)
+    shape, source = (CAMERA.height, CAMERA.width), torch.Generator().manual_seed(0)
     values = torch.rand(7, *shape, generator=source, dtype=torch.float64)
     image, weight, opacity = values[:3].permute(1, 2, 0), values[3], values[4]
     depth = torch.where(values[5] < 0.1, 0, 1 + 2 * values[6])
@@ -222,31 +221,31 @@ def check_followed_pose(student: Function) -> Verdict:
     quats = doubles(1, 0, 0, 0).float().expand(count, 4)
     rows = quats, (0.13 * z).log().expand(-1, 3).float()
     looks = torch.full((count,), 2.0).float(), colors.round().float()
+    true_poses: dict[Tensor, Tensor] = {}  # by the first pose of the case
 
-    def case(
-        turn: float, start: Tensor, mover: bool, description: str, last: float = 99.0
-    ) -> tuple[Case, Tensor]:
-        """Return a case, whose map shows what lies left of `last` [px], and the true pose."""
+    def case(turn: float, start: list, what: str, mover: bool = False, last: float = 99.0) -> Case:
+        """Return a case, whose map shows what lies left of `last` [px]."""
         true, weight = se3_exp(doubles(0.1, 0, 0.1, 0, turn, 0)), torch.ones(24, 32).float()
         world = transform_points(se3_inverse(true), means).float()
         gaussians = GaussianMap(world, *rows, *looks, torch.zeros(count, dtype=torch.int64))
         image = render(gaussians, camera, true.float()).color
         if mover:  # the left half of the image moves to the right
             image[:, 3:17], weight[:, :17] = image[:, :14].clone(), 0
+        first = se3_exp(doubles(*start)) @ true
+        true_poses[first] = true
         gaussians = gaussians.keep(pixels[:, 0] < last)
-        inputs = gaussians, camera, se3_exp(start) @ true, image, weight, 12
-        return Case(inputs, description), true
+        return Case((gaussians, camera, first, image, weight, 12), what)
 
-    pairs = [
-        case(0.2, doubles(0.12, -0.09, 0.09, 0, 0, 0), False, "a camera that has moved"),
-        case(0.8, doubles(0.12, 0, 0, 0, 0, 0.09), False, "a camera that has turned"),
-        case(0.2, doubles(-0.03, 0.03, 0, 0, 0, 0), True, "an object that moves in the image"),
-        case(0.2, doubles(0.04, -0.03, 0.03, 0, 0, 0), False, "a map of half of the image", 14.0),
-        case(2.5, doubles(0.12, -0.09, 0.09, 0, 0, 0), False, "a camera that looks back"),
+    cases = [
+        case(0.2, [0.12, -0.09, 0.09, 0, 0, 0], "a camera that has moved"),
+        case(0.8, [0.12, 0, 0, 0, 0, 0.09], "a camera that has turned"),
+        case(0.2, [-0.03, 0.03, 0, 0, 0, 0], "an object that moves in the image", mover=True),
+        case(0.2, [0.04, -0.03, 0.03, 0, 0, 0], "a map of half of the image", last=14.0),
+        case(2.5, [0.12, -0.09, 0.09, 0, 0, 0], "a camera that looks back"),
     ]
 
     def true_pose(*a: Any) -> Tensor:
-        return next(pose for case, pose in pairs if case.arguments[2] is a[2])
+        return true_poses[a[2]]
 
     def pixels_of(follow: Function, *a: Any) -> Any:
         answer = follow(*a)
@@ -278,5 +277,5 @@ def check_followed_pose(student: Function) -> Verdict:
         (one_step, "Repeat the step, each time from the pose of the last one."),
         (lambda *a: refined(*a[:4], a[4] ** 0, steps=30), "Something moves: use the weight."),
     ]
-    cases, returns = [case for case, _ in pairs], ("the Gaussians' pixels",)
+    returns = ("the Gaussians' pixels",)
     return check_function(student, true_pose, cases, 0.02, mistakes, returns, pixels_of)

@@ -12,14 +12,11 @@ from minislam.checks.grading import Function, Verdict, check_function
 def check_gains(student: Function) -> Verdict:
     """Check (first (N, 3), second (N, 3)): colours of points -> gain (3,) of each channel."""
 
-    def reference(*a: Tensor, low: float = 0.05, high: float = 0.95, lower: bool = False) -> Tensor:
+    def reference(*a: Tensor, low: float = 0.05, high: float = 0.95, flaw: str = "") -> Tensor:
         both = (torch.minimum(*a) > low) & (torch.maximum(*a) < high)
+        both &= both.all(1, keepdim=True) | (flaw != "together")
         ratios = torch.where(both, a[1] / a[0], torch.nan)
-        return ratios.nanquantile(0.5, dim=0, interpolation="lower" if lower else "linear")
-
-    def together(*a: Tensor) -> Tensor:
-        usable = ((torch.minimum(*a) > 0.05) & (torch.maximum(*a) < 0.95)).all(1)
-        return reference(*(part[usable] for part in a))
+        return ratios.nanquantile(0.5, 0, interpolation="lower" if flaw == "lower" else "linear")
 
     def case(seed: int, gain: float, what: str) -> Case:
         first, noise = normals(seed, 2, 23, 3).sigmoid()
@@ -38,9 +35,9 @@ def check_gains(student: Function) -> Verdict:
     mistakes = [
         (lambda *a: reference(*a, low=-1, high=2), "Saturated or dark values are no proportion."),
         (lambda *a: reference(*a, low=-1), "Values below 0.05 are nearly all noise."),
-        (lambda *a: reference(*a, lower=True), "torch.median takes the lower of two."),
+        ("lower", "torch.median takes the lower of two."),
         (lambda *a: reference(*a, high=2.0), "Values above 0.95 are cut off."),
-        (together, "Each channel has its own usable points: one may be too bright in red alone."),
+        ("together", "Each channel has its own usable points: one may be too bright in red alone."),
         (lambda a, b: reference(b, a), "This is the gain from the second frame to the first."),
         (lambda a, b: (b / a).mean(0), "A mean follows what moves: take the median."),
         (lambda a, b: reference(a, b).mean().expand(3), "Each channel has a gain of its own."),

@@ -18,13 +18,10 @@ from minislam.splatting.reference import composite, gaussian_alphas, project_cov
 def check_projected_covariance(student: Function) -> Verdict:
     """Check (covariance_world, mean_world, T_camera_world, camera) -> Sigma' (2, 2) in px^2."""
 
-    def reference(covariance: Tensor, mean: Tensor, pose: Tensor, camera: Camera) -> Tensor:
-        point = transform_points(pose, mean[None])
-        return project_covariances(covariance[None], point, pose, camera)[0]
-
-    def turned(times: int, covariance: Tensor, mean: Tensor, pose: Tensor, *a: Camera) -> Tensor:
-        back = torch.linalg.matrix_power(pose[:3, :3].T, times)
-        return reference(back @ covariance @ back.T, mean, pose, *a)
+    def reference(S: Tensor, mean: Tensor, T: Tensor, camera: Camera, flaw: str = "") -> Tensor:
+        back = torch.linalg.matrix_power(T[:3, :3].T, {"world": 1, "back": 2}.get(flaw, 0))
+        point = mean[None] if flaw == "point" else transform_points(T, mean[None])
+        return project_covariances((back @ S @ back.T)[None], point, T, camera)[0]
 
     def case(x: float, turn: float, description: str, seed: int = 0) -> Case:
         factor = doubles([0.3, 0.1, 0.0], [0.0, 0.2, 0.1], [0.1, 0.0, 0.05])
@@ -39,14 +36,13 @@ def check_projected_covariance(student: Function) -> Verdict:
     ]
     low_pass = LOW_PASS_VARIANCE * torch.eye(2).double()
     off_diagonal = LOW_PASS_VARIANCE - low_pass
-    at_world = "J is taken at the world point: move the mean into the camera frame first."
     mistakes = [
         (lambda *a: reference(*a) - low_pass, "The low-pass filter is missing: add 0.3 I."),
-        (lambda *a: turned(1, *a), "Sigma is still in the world frame: turn it by W before J."),
-        (lambda *a: turned(2, *a), "This turns Sigma the wrong way: it is W Sigma W^T."),
+        ("world", "Sigma is still in the world frame: turn it by W before J."),
+        ("back", "This turns Sigma the wrong way: it is W Sigma W^T."),
         (lambda *a: reference(*a) + off_diagonal, "0.3 stands on the diagonal alone: 0.3 I."),
         (lambda *a: torch.linalg.inv(reference(*a)), "This is the conic, the inverse of Sigma'."),
-        (lambda S, x, *a: project_covariances(S[None], x[None], *a)[0], at_world),
+        ("point", "J is taken at the world point: move the mean into the camera frame first."),
     ]
     return check_function(student, reference, cases, 1e-9, mistakes)
 
@@ -230,21 +226,18 @@ def check_picture_gradient(student: Function) -> Verdict:
         with torch.no_grad(), off:
             return student(*a)
 
-    def reference(gaussians: Tensor, target: Tensor, fixed_light: bool = False) -> tuple:
+    def reference(gaussians: Tensor, target: Tensor, flaw: str = "") -> tuple:
         leaf = gaussians.clone().requires_grad_()
         mean_u, mean_v, a, b, c, log_o = leaf[:, :6, None, None].unbind(1)
         rows, columns = torch.meshgrid(*map(torch.arange, target.shape[:2]), indexing="ij")
         du, dv = columns - mean_u, rows - mean_v
         alphas = torch.exp(log_o - 0.5 * (a * du**2 + 2 * b * du * dv + c * dv**2))
         light = torch.cat([torch.ones_like(alphas[:1]), (1 - alphas).cumprod(0)])[:-1]
-        light = light.detach() if fixed_light else light
+        light = light.detach() if flaw == "fixed light" else light
         image = torch.einsum("khw,kc->hwc", light * alphas, leaf[:, 6:])
-        return image.detach(), torch.autograd.grad((image - target).square().sum(), leaf)[0]
-
-    def of_opacity(gaussians: Tensor, target: Tensor) -> tuple:
-        image, gradient = reference(gaussians, target)
-        gradient[:, 5] /= gaussians[:, 5].exp()
-        return image, gradient
+        gradient = torch.autograd.grad((image - target).square().sum(), leaf)[0]
+        gradient[:, 5] /= gaussians[:, 5].exp() if flaw == "of o" else 1
+        return image.detach(), gradient
 
     def scaled(factor: float, columns: slice = slice(9)) -> Function:
         scale = torch.ones(9, dtype=torch.float64)
@@ -270,9 +263,9 @@ def check_picture_gradient(student: Function) -> Verdict:
         (scaled(-1), "The sign is flipped: v = 2 (image - target)."),
         (scaled(0.5), "A factor 2 is missing: L is the sum of the squares."),
         (scaled(1 / target.numel()), "L is a sum over the pixels, not a mean."),
-        (of_opacity, "The sixth column is ln o, not o: dL/d ln o = o dL/do."),
+        ("of o", "The sixth column is ln o, not o: dL/d ln o = o dL/do."),
         (scaled(-1, slice(2)), "The sign of v_mu' is flipped: d = x' - mu' falls as mu' grows."),
         (scaled(0.5, slice(3, 4)), "b stands twice in the quadratic form: v_b = -sum g du dv."),
-        (partial(reference, fixed_light=True), "A Gaussian also hides what is behind it: A_{k+1}."),
+        ("fixed light", "A Gaussian also hides what is behind it: A_{k+1}."),
     ]
     return check_function(by_hand, reference, cases, 1e-7, mistakes, returns)

@@ -239,11 +239,6 @@ def check_motion_memory(student: Function) -> Verdict:
         case([0.1, 0.0, -2.5, 0.0, 0.0, 0.0], 5.0, 1.0, "cells behind the next camera"),
         *drawn(lambda seed: case(any_twist(seed, 0.025), 6.0, 0.8, "a drawn motion", seed)),
     ]
-
-    def all_valid(*a: Any) -> tuple[Tensor, Tensor]:
-        positions, valid = reproject(*a)
-        return positions, torch.ones_like(valid)
-
     behind = "A cell that is not valid, behind the next camera, keeps its weight."
     nearest = "A cell to which nothing flows takes the weight of the nearest one."
     changed: dict[str, dict[str, Any]] = {
@@ -252,11 +247,11 @@ def check_motion_memory(student: Function) -> Verdict:
         "c_m^2 also holds a hundredth of the squared parallax.": {"DEPTH_ERROR": 0.0},
         "Cells with a confidence of at most 0.1 say nothing.": {"MIN_CONFIDENCE": -1.0},
         nearest: {"filled_from_nearest": lambda x, empty: x.masked_fill(empty, 0).flatten()},
+        behind: {"reproject": lambda *a: (reproject(*a)[0], reproject(*a)[1] | True)},
     }
     handed_on = "These are the weights of the source cells: hand them on along the flow."
     mistakes = [
         *((patch.multiple(motion_memory, **c)(reference), hint) for hint, c in changed.items()),
         (motion_memory.update_motion_weight, handed_on),
-        (patch.object(motion_memory, "reproject", all_valid)(reference), behind),
     ]
     return check_function(student, reference, cases, 1e-4, mistakes)

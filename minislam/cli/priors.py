@@ -70,7 +70,7 @@ def _kinds(
 ) -> Iterator[tuple[str, str, Callable[[Frame], Tensor | None]]]:
     """Yield the folders to write: name, a line that identifies the content, function of a frame."""
     from minislam.priors.choice import choose_depth, choose_features
-    from minislam.priors.features import with_finer_grid
+    from minislam.priors.features import HighResolutionFeatures
     from minislam.priors.files import DEPTH, FEATURES
 
     # Everything the result depends on, so that files of another command are not taken for these.
@@ -84,7 +84,7 @@ def _kinds(
         features = choose_features(choice, sequence.camera, config.networks)
         factor = config.uncertainty.grid_factor
         origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
-        yield FEATURES, origin, with_finer_grid(features, factor)
+        yield FEATURES, origin, HighResolutionFeatures(features, factor)
     if choice.depth != "none":
         depth = choose_depth(choice, sequence, config.seed, config.simulated_depth, config.networks)
         origin = f"{choice.depth} {choice.depth_weights}; {conditions}"

@@ -22,7 +22,7 @@ from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.priors.names import FILES, FOLDER, PYTHON, PriorChoice, plugins, require_prior
-from minislam.priors.networks.table import NetworksConfig, find_network, load_network
+from minislam.priors.networks.table import NETWORKS, NetworksConfig, load_network
 from minislam.records import Sequence
 
 Makers = dict[str, Callable[[], Any]]  # by name, of what needs no weights
@@ -73,7 +73,7 @@ def _choose(kind: str, choice: PriorChoice, networks: NetworksConfig, makers: Ma
     """Return the prior that --KIND and --KIND-weights name."""
     name = getattr(choice, kind)
     weights = require_prior(kind, name, getattr(choice, f"{kind}_weights"))
-    network = find_network(kind, name)
+    network = next((n for n in NETWORKS if (n.kind, n.name) == (kind, name)), None)
     if network is not None:
         path, precision = user_path(str(weights)), names.PRECISIONS[choice.precision]
         return load_network(network, path, choice.device, networks, getattr(torch, precision))

@@ -89,27 +89,6 @@ def oriented_edges(brightness: np.ndarray) -> list[np.ndarray]:  # (H, W) float3
     return [magnitude * np.maximum(1 - np.minimum(d, bins - d), 0) for d in distances]
 
 
-def with_finer_grid(extractor: FeatureExtractor, factor: int) -> FeatureExtractor:
-    """Return the extractor, on a grid that is `factor` times as fine; it refuses what is NaN."""
-    return FiniteFeatures(HighResolutionFeatures(extractor, factor) if factor > 1 else extractor)
-
-
-class FiniteFeatures:
-    """The features of an extractor if they are finite: one NaN would reach the MLP and the map."""
-
-    def __init__(self, extractor: FeatureExtractor) -> None:
-        self.extractor = extractor
-        self.stride, self.dimension = extractor.stride, extractor.dimension
-
-    def __call__(self, frame: Frame) -> Tensor:  # (h', w', C)
-        """Return the features of a frame, or raise InputError."""
-        features = self.extractor(frame)
-        wanted = f"finite features of frame {frame.frame_index}"
-        advice = "give --precision fp32, or other --features"
-        require(bool(features.isfinite().all()), wanted, f"NaN or infinity; {advice}")
-        return features
-
-
 class HighResolutionFeatures:
     """A feature extractor whose grid is `factor` times as fine as that of the extractor inside.
 
@@ -118,13 +97,20 @@ class HighResolutionFeatures:
     """
 
     def __init__(self, extractor: FeatureExtractor, factor: int) -> None:
-        self.extractor = extractor
-        self.factor = factor
+        self.extractor, self.factor = extractor, factor
         self.dimension = extractor.dimension
         self.stride = max(1, round(extractor.stride / factor))
 
     def __call__(self, frame: Frame) -> Tensor:  # (factor * h', factor * w', C)
-        """Return the features of a frame on the finer grid."""
+        """Return the features of a frame, finite ones: a NaN would reach the MLP and the map."""
+        features = self.extractor(frame) if self.factor == 1 else self._between(frame)
+        wanted = f"finite features of frame {frame.frame_index}"
+        advice = "give --precision fp32, or other --features"
+        require(bool(features.isfinite().all()), wanted, f"NaN or infinity; {advice}")
+        return features
+
+    def _between(self, frame: Frame) -> Tensor:
+        """Return the features of all patches and of those between them."""
         stride = self.extractor.stride
         patch_height, patch_width = (side / (side // stride) for side in frame.image.shape[:2])
         # A patch is cut into factor x factor parts; the shifts [patches] lead to their centres.
@@ -135,8 +121,7 @@ class HighResolutionFeatures:
             return self.extractor(replace(frame, pixels=image))
 
         rows = [torch.stack([features_at(x, y) for x in shifts], 2) for y in shifts]
-        fine = torch.stack(rows, 1)  # (h', factor, w', factor, C)
-        return fine.flatten(0, 1).flatten(1, 2)
+        return torch.stack(rows, 1).flatten(2, 3).flatten(0, 1)  # of (h', factor, w', factor, C)
 
 
 def shift_image(image: Tensor, right: float, down: float) -> Tensor:  # (H, W, 3), px

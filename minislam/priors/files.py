@@ -31,31 +31,26 @@ class FrameFiles:
     found by its timestamp, so that a run on fewer of the frames finds the right files.
     """
 
-    def __init__(self, folder: Path | str, what: str, endings: tuple[str, ...]) -> None:
-        self.folder = Path(folder)
-        self.what = what  # "depth" or "features", for messages
+    def __init__(self, folder: Path, what: str, endings: tuple[str, ...]) -> None:
+        self.folder, self.what = folder, what  # "depth" or "features", for messages
         # Sorted, so that of 17.npy and 17.png the same one wins on every machine.
         files = sorted(p for p in self.folder.glob("*") if p.suffix.lower() in endings)
-        self._files = {int(path.stem): path for path in files if path.stem.isdecimal()}
+        self.paths = {int(path.stem): path for path in files if path.stem.isdecimal()}
         wanted = f"{' or '.join(endings)} files named by frame index in {self.folder}"
         found = f"{len(files)} such files and none that fits; name them like 00017.npy"
-        require(bool(self._files), wanted, found)
-        self.first = self._files[min(self._files)]
+        require(bool(self.paths), wanted, found)
         index = self.folder / INDEX
         self._number_of = _read_index(index) if index.is_file() else None
-
-    def __len__(self) -> int:
-        return len(self._files)
 
     def require_frames_of(self, sequence: Sequence) -> None:
         """Refuse files that are numbered like all images where a frame has another number."""
         frame = len(sequence) - 1
         image, index = sequence.source_name(frame), sequence.source_index(frame)
         # Of the first images, counted from 1, a file 0 shows that the files are counted from 0.
-        if self._number_of is not None or (index == frame and 0 in self._files):
+        if self._number_of is not None or (index == frame and 0 in self.paths):
             return
         numbers = [*(int(found[1]) for found in _NUMBER.finditer(image)), index]
-        wrong = [self._files[n] for n in numbers if n != frame and n in self._files]
+        wrong = [self.paths[n] for n in numbers if n != frame and n in self.paths]
         if wrong:
             wanted = f"{self.what} files named by the frame of the run, {frame:05d} for {image}"
             found = f"{wrong[0]}, which has the number of that image"
@@ -65,26 +60,26 @@ class FrameFiles:
     def of(self, frame: Frame) -> Path | None:
         """Return the file of a frame, or None if the folder has none for it."""
         if self._number_of is None:
-            return self._files.get(frame.frame_index)
+            return self.paths.get(frame.frame_index)
         moment = round(frame.timestamp, 6)
         found = f"no such frame in {self.folder / INDEX}; {_MAKE}"
         require(moment in self._number_of, f"{self.what} of the frame at {moment:.6f} s", found)
-        return self._files.get(self._number_of[moment])
+        return self.paths.get(self._number_of[moment])
 
 
 class FileFeatures:
     """Features made elsewhere, from .npy files (h', w', C): a `FeatureExtractor`."""
 
-    def __init__(
-        self, folder: Path | str, camera: Camera, sequence: Sequence | None = None
-    ) -> None:
+    def __init__(self, folder: Path, camera: Camera, sequence: Sequence | None = None) -> None:
         """Open a folder; raises InputError where it lacks files of the sequence or has others."""
         self.files = FrameFiles(folder, "features", (".npy",))
         if sequence is not None:
             wanted = f"features of every frame in {folder}, {len(sequence)} files"
-            require(len(self.files) >= len(sequence), wanted, f"{len(self.files)}; {_MAKE}")
+            count = len(self.files.paths)
+            require(count >= len(sequence), wanted, f"{count}; {_MAKE}")
             self.files.require_frames_of(sequence)
-        rows, _, self.dimension = read_array(self.files.first, FEATURES).shape
+        first = self.files.paths[min(self.files.paths)]
+        rows, _, self.dimension = read_array(first, FEATURES).shape
         self.stride = max(1, round(camera.height / rows))
 
     def __call__(self, frame: Frame) -> Tensor:  # (h', w', C) float32
@@ -110,12 +105,8 @@ class FileFeatures:
 class FileDepth:
     """Depth made elsewhere, from .npy (world units) or 16-bit .png files: a `DepthPrior`."""
 
-    def __init__(
-        self,
-        folder: Path | str,
-        read_png: Callable[[Path], np.ndarray],  # (H, W) world units; `Sequence.read_depth`
-    ) -> None:
-        self._read_png = read_png
+    def __init__(self, folder: Path, read_png: Callable[[Path], np.ndarray]) -> None:
+        self._read_png = read_png  # (H, W) world units; `Sequence.read_depth`
         self.files = FrameFiles(folder, "depth", (".npy", ".png"))
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:

@@ -102,8 +102,7 @@ class ClassicalFlow(Stateful):
                 backward = dense_flow.reverse_flow(*images, flow)
             texture = self._textures[i]
             matches = grid_flow.measure_on_grid(*images, flow, backward, texture, self.stride)
-            # A copy: a view would keep the starts of all edges of this call.
-            measured[i, j] = MeasuredEdge(starts[i, j].copy(), *matches)
+            measured[i, j] = MeasuredEdge(starts[i, j], *matches)
         return measured
 
     def _kept(self, *parts: np.ndarray) -> MeasuredEdge:

@@ -24,7 +24,7 @@ from minislam.images import resample
 from minislam.mapping.mapper import surface_depth
 from minislam.parameters import with_values
 from minislam.priors.choice import PriorChoice, choose_features
-from minislam.priors.features import with_finer_grid
+from minislam.priors.features import HighResolutionFeatures
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
 from minislam.runs.facts import unit_of
@@ -221,7 +221,7 @@ class Run:
         on_cpu = {"device": "cpu", "precision": "fp32"}
         choice = PriorChoice(**self.folder.read_config()["priors"] | on_cpu)
         features = choose_features(choice, self.sequence.camera, self.config.networks)
-        return with_finer_grid(features, self.config.uncertainty.grid_factor)
+        return HighResolutionFeatures(features, self.config.uncertainty.grid_factor)
 
     @cached_property
     def _motion(self) -> ImageMotion:

@@ -186,5 +186,5 @@ def test_the_order_in_which_the_system_lists_files_changes_nothing(tmp_path: Pat
             frames = [frame.pixels.sum().item() for frame in sequence]
             named = read_tum_folder(folder).calibration
             files = FrameFiles(tmp_path / "depth", "depth", (".npy", ".npz"))
-            found.append((frames, columns(sequence), named, files.first))
+            found.append((frames, columns(sequence), named, files.paths[min(files.paths)]))
     assert found[0] == found[1] and found[0][1] == [1, 2, 3] and found[0][2] is not None

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from minislam.errors import InputError
-from minislam.priors.features import ClassicalFeatures, oriented_edges, with_finer_grid
+from minislam.priors.features import ClassicalFeatures, HighResolutionFeatures, oriented_edges
 from tests.helpers import frame_of, generator
 
 
@@ -113,7 +113,7 @@ def test_features_that_are_not_finite_are_refused_with_the_number_of_the_frame()
             features[0, 0, 0] = float("nan") if frame.frame_index == 7 else 1.0
             return features
 
-    features = with_finer_grid(Spoilt(), 1)
+    features = HighResolutionFeatures(Spoilt(), 1)
     image = torch.rand(30, 40, 3, generator=generator(0))
     good, spoilt = (replace(frame_of(image), frame_index=number) for number in (6, 7))
     assert torch.equal(features(good), Spoilt()(good))

@@ -38,7 +38,13 @@ class DepthAnything:
     """Metric depth by Depth Anything V2: a `DepthPrior`."""
 
     def __init__(self, weights: Weights, config: DepthAnythingConfig) -> None:
-        self.depth_limit = config.depth_limit or _limit_of_name(Path(weights.file).name)
+        # The file states neither the largest depth of the training nor whether it is metric.
+        name = Path(weights.file).name
+        limits = [limit for part, limit in _LIMIT_OF_NAME.items() if part in name]
+        wanted = f"{' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint"
+        found = f"{name}, whose output may be no metric depth; keep the official name"
+        require(bool(config.depth_limit or limits), wanted, found)
+        self.depth_limit = config.depth_limit or limits[0]
         self.shorter_side = config.shorter_side
         self.device = weights.device
         self._transformer = VisionTransformer(weights.below("pretrained."))
@@ -84,15 +90,3 @@ class DepthAnything:
         pixels = image.double().cpu().numpy()
         resized = cv2.resize(pixels, (cols, rows), interpolation=cv2.INTER_CUBIC)
         return torch.from_numpy(resized).float()
-
-
-def _limit_of_name(name: str) -> float:
-    """Return the largest depth [m] that a checkpoint was trained with, from its official name.
-
-    The file itself states neither this depth nor whether its output is metric.
-    """
-    limits = [limit for part, limit in _LIMIT_OF_NAME.items() if part in name]
-    wanted = f"{' or '.join(_LIMIT_OF_NAME)} in the name of a Depth Anything checkpoint"
-    found = f"{name}, whose output may be no metric depth; keep the official name"
-    require(bool(limits), wanted, found)
-    return limits[0]

@@ -78,11 +78,6 @@ LPIPS_HEADS, CLASSIFIER = "LPIPS linear weights", "an image classifier of torchv
 _OTHER_MARKS = {"lin0.model.1.weight": LPIPS_HEADS, "features.0.weight": CLASSIFIER}
 
 
-def find_network(kind: str, name: str) -> Network | None:
-    """Return the row of a flag --KIND NAME, or None if no network has this name."""
-    return next((n for n in NETWORKS if (n.kind, n.name) == (kind, name)), None)
-
-
 def recognise(weights: Weights) -> Network | None:
     """Return the network that a checkpoint belongs to, by the names of its tensors."""
     return next((n for n in NETWORKS if all(mark in weights for mark in n.marks)), None)

@@ -16,7 +16,6 @@ from minislam.priors.networks.table import (
     NetworksConfig,
     build_checked,
     describe,
-    find_network,
     load_network,
     recognise,
 )
@@ -45,11 +44,6 @@ def on_meta(network: str) -> Weights:
 
 
 # Known answers
-
-
-def test_a_network_is_found_by_its_flag():
-    assert find_network("depth", "metric3d") is METRIC3D
-    assert find_network("flow", "metric3d") is None
 
 
 @pytest.mark.parametrize(
