@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from minislam.cli.help import UsageError, unknown_option
 from minislam.data.files import read_json
 from minislam.data.options import InputOptions
+from minislam.data.run_folder import CONFIG, METRICS, RUN, RunFolder
 from minislam.errors import InputError, require
 from minislam.parameters import flattened, kind_of, user_path, with_values
 from minislam.priors.names import BUILT_IN, PriorChoice, find_weights, require_prior
@@ -137,13 +138,11 @@ def config_file(args: argparse.Namespace) -> dict[str, Any]:
     tree: Any = {}
     if args.config:
         path, is_folder = Path(args.config), os.path.isdir(args.config)
-        wanted = (path if is_folder else path.parent) / "config.json"
-        if (is_folder or path.name in ("run.json", "metrics.json")) and wanted.is_file():
+        wanted = (path if is_folder else path.parent) / CONFIG
+        if (is_folder or path.name in (RUN, METRICS)) and wanted.is_file():
             raise InputError(f"expected a file of settings, found {path} of a run; give {wanted}")
         tree = read_json(args.config)
     elif getattr(args, "resume", False):
-        from minislam.data.run_folder import RunFolder
-
         tree = RunFolder(args.output).read_config()
     flattened(tree)  # refuses what is no JSON object
     return tree
@@ -202,8 +201,6 @@ def settings(args: argparse.Namespace) -> SlamConfig:
 
     base = preset("laptop" if args.preset is None else args.preset)
     if getattr(args, "resume", False) and args.preset is None:
-        from minislam.data.run_folder import RunFolder
-
         base = with_settings(base, settings_in(RunFolder(args.output).read_config()))
     if args.config:
         base = with_settings(base, settings_in(config_file(args)))

@@ -12,6 +12,7 @@ from minislam.cli.help import RUN_EPILOG, SHORT_EPILOG, add_command
 from minislam.cli.log import recorded
 from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
+from minislam.data.run_folder import CHECKPOINT, REPORT
 from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
 from minislam.runs.progress import ProgressLine, ending_signals, say
@@ -73,7 +74,7 @@ def _run(args: argparse.Namespace) -> int:
         from minislam.runs.summary import as_text, summarise
 
         if args.resume and not way_on(args.output):
-            found = f"expected an interrupted run in {args.output}, found no checkpoint.npz"
+            found = f"expected an interrupted run in {args.output}, found no {CHECKPOINT}"
             raise InputError(f"{found}, as in a finished run; see report.html, or start a new run")
         config, lpips = options.settings(args), options.lpips_of(args)
         progress = ProgressLine(args.quiet, args.verbose)
@@ -93,7 +94,7 @@ def _run(args: argparse.Namespace) -> int:
         for warning in facts["warnings"]:
             if warning not in sequence.warnings and not (args.quiet and warning in progress.warned):
                 say(f"WARNING: {warning}", "stderr")
-        say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
+        say(f"results in {output}; open {(Path(output).resolve() / REPORT).as_uri()}")
         if facts["state"] == "interrupted":
             say(way_on(output) or NO_WAY_ON)
         else:

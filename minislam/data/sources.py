@@ -13,6 +13,7 @@ from minislam.data.images import is_image, is_number, list_images
 from minislam.data.metadata import noted_focal_length
 from minislam.data.options import mask_folder
 from minislam.data.raw_images import FileImages, ImageSource, VideoImages
+from minislam.data.run_folder import CONFIG, RUN
 from minislam.data.trajectory import truth_beside
 from minislam.errors import InputError, require
 from minislam.records import Trajectory
@@ -136,8 +137,8 @@ def folder_name(path: Path) -> str:
 
 def _found(folder: Path) -> str:
     """Say what is there, and what to do: often the video or data set lies one level deeper."""
-    if (folder / "run.json").is_file():
-        return f"the folder of a run; to repeat it, give --config {folder / 'config.json'}"
+    if (folder / RUN).is_file():
+        return f"the folder of a run; to repeat it, give --config {folder / CONFIG}"
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     if videos := [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]:
         return f"none; give the video itself, {videos[0]}"

@@ -88,13 +88,13 @@ def write_pictures(
     figures = []
     for name, caption, figure in plots:
         figures.append((caption, figure_png(figure)))
-        folder.write_picture(f"{PLOTS}/{name}.png", figures[-1][1])
+        folder.write_image(f"{PLOTS}/{name}.png", figures[-1][1])
 
     jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
     middle = _pictures(slam, len(slam.mapper.keyframes) // 2)
     panels = middle["input"], middle["beta"], middle["render"]
     overview = figure_png(viz.overview(*panels, estimate, true_path, unit, broken))
-    folder.write_picture(f"{PLOTS}/overview.png", overview)
+    folder.write_image(f"{PLOTS}/overview.png", overview)
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
@@ -175,7 +175,7 @@ def _write_keyframes(
         pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
         pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
         for kind, picture in pictures.items():
-            folder.write_picture(f"{KEYFRAMES}/{frame_index:06d}_{kind}.png", encode_png(picture))
+            folder.write_image(f"{KEYFRAMES}/{frame_index:06d}_{kind}.png", encode_png(picture))
         if number in shown:
             jpegs[frame_index] = [encode_jpeg(p, LONGEST_SIDE) for p in pictures.values()]
     return jpegs, of_depth, of_beta
