@@ -23,9 +23,10 @@ from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
 from minislam.records import Sequence, required_mask
-from minislam.runs.facts import measure, run_facts
+from minislam.runs.facts import run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
+from minislam.runs.measures import measure
 from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints, way_on
 from minislam.runs.warnings import alarms, has_large_holes, leaves_nearly_all_out

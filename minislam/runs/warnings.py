@@ -10,6 +10,7 @@ from minislam.errors import InputError
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
 from minislam.records import TrackingStatus
+from minislam.runs.measures import guessed_depth, left_out, shown_static
 from minislam.runs.summary import span
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import is_unexplained
@@ -259,11 +260,6 @@ def _prior_warnings(slam: Slam, depth: str) -> Iterator[str]:
         yield "without a depth prior the unit of length is arbitrary"
 
 
-def shown_static(slam: Slam) -> float | None:
-    """Return the fraction of what stands still that the map shows [-]; None before the end."""
-    return float(np.mean(slam.mapper.shown)) if slam.mapper.shown else None
-
-
 def has_large_holes(slam: Slam) -> bool:
     """Tell whether the map shows too little for its poses and depths to be right."""
     shown = shown_static(slam)
@@ -273,22 +269,3 @@ def has_large_holes(slam: Slam) -> bool:
 def leaves_nearly_all_out(slam: Slam) -> bool:
     """Tell whether the map holds too little of the images; given masks may be as large."""
     return slam.config.uncertainty.is_learned and left_out(slam) > NEARLY_ALL
-
-
-def left_out(slam: Slam) -> float:
-    """Return the fraction of the map's images that beta leaves out [-]; 0 before the end."""
-    mapper = slam.mapper
-    images = mapper.keyframes if mapper.shown else []
-    weights = (mapper.static_weight(mapper.beta_of(k), mapper.camera) for k in images)
-    return float(np.mean([float((weight == 0).float().mean()) for weight in weights] or 0.0))
-
-
-def guessed_depth(slam: Slam) -> float | None:
-    """Return the fraction of the keyframes' static pixels whose depth nothing has measured [-]."""
-    mapper, guessed = slam.mapper, []
-    for keyframe in mapper.keyframes:
-        static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
-        if keyframe.inserts and static.any():
-            unknown = keyframe.depth == 0 if keyframe.filled is None else keyframe.filled
-            guessed.append(float(unknown[static].float().mean()))
-    return float(np.mean(guessed)) if guessed else None

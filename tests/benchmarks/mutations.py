@@ -282,7 +282,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if slam.lost_frames():", "if False:"), ("if slam.tracker.watch.breaks:", "if False:"),
         ("2 * graph.failed_adjustments >", "graph.failed_adjustments >"),
     ],
-    ("runs/facts.py", "runs/test_facts.py"): [
+    ("runs/measures.py", "runs/test_measures.py"): [
         ("if index not in seen", "if index in seen"),
         ("keyframe.exposed(rendering.color), keyframe", "rendering.color, keyframe"),
         ("keyframe.image, static\n", "keyframe.image, None\n"),
