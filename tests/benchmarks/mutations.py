@@ -289,7 +289,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if static.any() else None", "if True else None"),
     ],
     ("runs/warnings.py", "runs/test_warnings.py"): [
-        ("frames[k - 1] > gap", "frames[k - 1] >= gap"), ("first + 1 >= slam", "first >= slam"),
+        ("(frames) > gap", "(frames) >= gap"), ("first + 1 >= slam", "first >= slam"),
         ("gap = slam.config.tracking.warmup_keyframes", "gap = 1"),
         ("2 * without >= len", "2 * without < len"), ("and not is_broken", "or is_broken"),
     ],
