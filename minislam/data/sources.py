@@ -85,16 +85,15 @@ def read_video(path: Path, limit: int | None) -> Recording:
         is_list = file.read(8).startswith(_LISTS)
     require(not is_list, "a video", f"a list of others in {path}; give one of these")
     images = VideoImages(path, limit)
-    if len(images) == 0:
-        raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")
+    require(len(images) > 0, f"frames in {path}", "none; convert the video to MP4 (H.264)")
     rate, stamps, unread = images.frame_rate, images.timestamps, images.unread()
     warnings: list[str] = []
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         if not (math.isfinite(rate) and rate > 0):
             rate = _ASSUMED_FRAME_RATE
         stamps, unread = np.arange(len(images)) / rate, unread[:0]
-        what = f"{path.name} has no times that increase"
-        warnings.append(f"{what}: {rate:g} frames per second assumed")
+        assumed = f"{rate:g} frames per second assumed"
+        warnings.append(f"{path.name} has no times that increase: {assumed}")
     if len(images) < images.promised:
         warnings.append(
             f"{path.name} promises {images.promised} frames, but only {len(images)} can be decoded"
