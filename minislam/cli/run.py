@@ -40,7 +40,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     options.add_talk(run)
     options.add_settings(run)
     options.add_input(run)
-    options.add_priors(run, default_depth="simulated for synth:, else none", with_flow=True)
+    options.add_priors(run, depth="simulated for synth:, else none", with_flow=True)
     lpips = run.add_argument_group("LPIPS", "measured if both files are given")
     lpips.add_argument("--lpips-trunk", metavar="FILE", help="torchvision's AlexNet or VGG-16")
     lpips.add_argument("--lpips-heads", metavar="FILE", help="the authors' alex.pth or vgg.pth")
