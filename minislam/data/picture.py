@@ -73,14 +73,13 @@ def first_of_two(picture: Window, glances: list[Glance], width: int, height: int
     """
     if not glances:
         return picture
-    left, top, right, bottom = *picture[:2], picture[0] + picture[2], picture[1] + picture[3]
+    left, top, columns, rows = picture
     side_by_side, stacked = np.median([glance.likeness for glance in glances], 0)
     if side_by_side > ALIKE_PICTURES:
-        right = min(right, width // 2)
+        columns = min(columns, width // 2 - left)
     if stacked > ALIKE_PICTURES:
-        bottom = min(bottom, height // 2)
-    is_large = min(right - left, bottom - top) >= MINIMUM_SIDE
-    return (left, top, right - left, bottom - top) if is_large else picture
+        rows = min(rows, height // 2 - top)
+    return (left, top, columns, rows) if min(columns, rows) >= MINIMUM_SIDE else picture
 
 
 def picture_window(glances: list[Glance], width: int, height: int) -> Window:

@@ -1,7 +1,4 @@
-"""The folder of one run: the names of its files, what may be overwritten, how to read it back.
-
-Commands know the names without torch, which is imported where it is used.
-"""
+"""The folder of one run: names of its files (without torch), what may be overwritten, reading."""
 
 from __future__ import annotations
 

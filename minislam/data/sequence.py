@@ -182,9 +182,8 @@ class RecordedSequence:
     def through_lens(self, fx: float, k1: float, k2: float) -> "RecordedSequence":
         """Return the sequence, straightened: fx [px] is of the working size, fy in proportion."""
         raw, zoom = self.prepare.raw_camera, fx / self.camera.fx
-        options = replace(
-            self._options, fx=zoom * raw.fx, fy=zoom * raw.fy, k1=k1, k2=k2, focal="refine"
-        )
+        fx, fy = zoom * raw.fx, zoom * raw.fy
+        options = replace(self._options, fx=fx, fy=fy, k1=k1, k2=k2, focal="refine")
         return RecordedSequence(self._recording, options, self._source)
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB

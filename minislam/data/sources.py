@@ -50,12 +50,10 @@ class Recording:
     def __post_init__(self) -> None:
         stamps = np.round(self.timestamps, 6)
         if len(wrong := np.flatnonzero(np.diff(stamps) <= 0)):
-            index = wrong[0]
-            found = [f"{stamps[k]} s of {self.images.labels[k]}" for k in (index, index + 1)]
-            raise InputError(
-                "expected timestamps that increase by a microsecond at least, found "
-                f"{' before '.join(found)}; sort, remove or rename them"
-            )
+            both = [f"{stamps[k]} s of {self.images.labels[k]}" for k in (wrong[0], wrong[0] + 1)]
+            wanted = "timestamps that increase by a microsecond at least"
+            found = f"{' before '.join(both)}; sort, remove or rename them"
+            raise InputError(f"expected {wanted}, found {found}")
 
 
 def read_image_folder(folder: Path) -> Recording:

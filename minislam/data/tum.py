@@ -30,9 +30,7 @@ _CAMERAS = {
         (0.039903, -0.099343, -0.000730, -0.000144),
     ),
 }
-_NAMES = re.compile(  # of folders
-    r"(?<![a-z])((?:freiburg|fr)[_ -]?([123])(?!\d)|rgbd_bonn(?![a-z]))", re.IGNORECASE
-)
+_NAMES = re.compile(r"(?i)(?<![a-z])((?:freiburg|fr)[_ -]?([123])(?!\d)|rgbd_bonn(?![a-z]))")
 
 # Bonn's ground truth is the pose of a plate of markers in the axes of ROS. The makers give the
 # camera in the frame of the plate; its block is a rotation only up to a few per cent.

@@ -93,8 +93,7 @@ class Checkpoints:
             present = flattened(self._origin)
             then = flattened({name: found.get(name) for name in self._origin})
             if device == "cpu" and then.get("priors.device") != "cpu":
-                for name in ("device", "precision"):
-                    then[f"priors.{name}"] = self._origin["priors"][name]
+                then |= {name: present[name] for name in ("priors.device", "priors.precision")}
             differing = [name for name, now in present.items() if then.get(name) != now]
             # What else of the input differs shows in the images, whose checksums are compared.
             if any(n[:6] != "input." or n == "input.depth_scale" for n in differing):

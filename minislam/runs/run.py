@@ -211,17 +211,15 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     if interrupted:
         return "interrupted", INTERRUPTED_EXIT
     graph = slam.tracker.graph
-    if 2 * graph.failed_adjustments > graph.adjustments:
-        return "finished, most bundle adjustments failed", LOST_EXIT
-    if slam.tracker.watch.breaks:
-        return "finished, broken", LOST_EXIT
-    if has_large_holes(slam) or leaves_nearly_all_out(slam):
-        return "finished, map with large holes", LOST_EXIT
-    if slam.lost_frames():
-        return "finished, partly lost", LOST_EXIT
-    if slam.sequence.unread:
-        return "finished, images left out", LOST_EXIT
-    return "finished", 0
+    flaws = {  # the first that is true is told
+        "most bundle adjustments failed": 2 * graph.failed_adjustments > graph.adjustments,
+        "broken": slam.tracker.watch.breaks,
+        "map with large holes": has_large_holes(slam) or leaves_nearly_all_out(slam),
+        "partly lost": slam.lost_frames(),
+        "images left out": slam.sequence.unread,
+    }
+    flaw = next((words for words, is_so in flaws.items() if is_so), None)
+    return (f"finished, {flaw}", LOST_EXIT) if flaw else ("finished", 0)
 
 
 def _write_trajectories(folder: RunFolder, slam: Slam) -> None:

@@ -28,10 +28,8 @@ def summarise(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> list[Line
 
 def as_text(lines: list[Line]) -> list[str]:
     """Return the lines of a summary for a terminal, in columns."""
-    return [
-        f"  {line.what:35s}{line.value:14s} {line.verdict:6s}{line.detail}".rstrip()
-        for line in lines
-    ]
+    rows = (f"  {line.what:35s}{line.value:14s} {line.verdict:6s}{line.detail}" for line in lines)
+    return [row.rstrip() for row in rows]
 
 
 def judge(value: float, good: float | None, fair: float | None) -> str:
