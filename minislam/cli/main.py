@@ -56,9 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif not isinstance(error, MinislamError):
             found = f"{type(error).__name__}: {' '.join(text.split())[:300]}"
             advice = "check names, permissions, space and settings, and set MINISLAM_DEBUG=1"
-            text = (
-                f"expected to finish this command, found {found}; {advice} to see where it happened"
-            )
+            text = f"expected to finish this command, found {found}; {advice} to see where it was"
         ProgressLine().tell(f"minislam: {text}")
         return USAGE_EXIT if isinstance(error, UsageError) else FAILED_EXIT
     finally:

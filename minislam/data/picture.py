@@ -67,10 +67,7 @@ def _likeness(one: np.ndarray, other: np.ndarray) -> float:  # (HALF, HALF) each
 
 
 def first_of_two(picture: Window, glances: list[Glance], width: int, height: int) -> Window:
-    """Return the left or the upper one where an image of this size shows two that are alike.
-
-    They are those of two eyes, or before and after. Return the same window where it shows one.
-    """
+    """Return the left or upper of two that are alike, as of two eyes; where one is, the same."""
     if not glances:
         return picture
     left, top, columns, rows = picture

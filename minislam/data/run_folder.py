@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from minislam.data import files
 from minislam.errors import InputError, require
@@ -70,13 +70,10 @@ class RunFolder:
         cls,
         path: Path | str,
         overwrite: bool = False,
-        inputs: Sequence[Path] = (),
+        inputs: Sequence[Path] = (),  # images that the run reads
         keeps_log: bool = False,  # the same run begins anew
     ) -> RunFolder:
-        """Make a new run folder for a run that reads the images `inputs`.
-
-        With `overwrite`, what an earlier run wrote is removed, and only that.
-        """
+        """Make a run folder; `overwrite` removes what an earlier run wrote there, and only that."""
         path = Path(path)
         files.require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():
@@ -111,15 +108,15 @@ class RunFolder:
             if _OURS.fullmatch(file.relative_to(self.path).as_posix()):
                 file.unlink()
 
-    def read_config(self) -> dict[str, Any]:
+    def read_config(self) -> files.Json:
         """Return sequence, input, priors and settings."""
         return files.read_json(self.path / CONFIG)
 
-    def read_run(self) -> dict[str, Any]:
+    def read_run(self) -> files.Json:
         """Return version, seed, command, timings and exit state."""
         return files.read_json(self.path / RUN)
 
-    def read_metrics(self) -> dict[str, Any]:
+    def read_metrics(self) -> files.Json:
         """Return the errors against the ground truth."""
         return files.read_json(self.path / METRICS)
 

@@ -3,7 +3,6 @@
 import platform
 import sys
 from dataclasses import asdict
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +10,7 @@ import scipy
 import torch
 
 import minislam
+from minislam.data.files import Json
 from minislam.priors.choice import PriorChoice
 from minislam.runs.resume import Checkpoints
 from minislam.runs.warnings import warnings
@@ -19,7 +19,7 @@ from minislam.slam import Slam
 
 def run_facts(
     slam: Slam, choice: PriorChoice, checkpoints: Checkpoints, state: str, exit_code: int | None
-) -> dict[str, Any]:
+) -> Json:
     """Return the content of run.json."""
     graph, fit = slam.tracker.graph, slam.focal_length
     stamps = [tracked.timestamp for tracked in slam.tracker.tracked]

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
+from minislam.data.files import Json
 from minislam.evaluation.images import psnr
 from minislam.evaluation.lpips import Lpips
 from minislam.evaluation.metrics import MappedView, ate_cm, measure_run
@@ -21,7 +21,7 @@ from minislam.tracking.safeguards.exposure import with_exposure
 MOST_UNSEEN = 20  # frames, evenly spread, that the map is compared with
 
 
-def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> dict[str, Any]:
+def measure(slam: Slam, seconds: float, lpips: Lpips | None) -> Json:
     """Return the measures by name, units in the names; None for what cannot be known."""
     truth, paths = slam.sequence.ground_truth, (slam.trajectory(), slam.keyframe_trajectory())
     return {

@@ -11,7 +11,7 @@ import numpy as np
 
 from minislam import viz
 from minislam.config import PRESETS, SlamConfig, preset, settings_of
-from minislam.data.files import write_text
+from minislam.data.files import Json, write_text
 from minislam.data.images import encode_jpeg, encode_png
 from minislam.data.run_folder import KEYFRAMES, PLOTS, REPORT, VIEWER, RunFolder
 from minislam.evaluation import absolute_trajectory_error
@@ -38,7 +38,7 @@ class Preview:
         self._folder = folder
         self._due = 0.0  # second, when the next one may be written
 
-    def update(self, slam: Slam, facts_of: Callable[[str, None], dict[str, Any]]) -> None:
+    def update(self, slam: Slam, facts_of: Callable[[str, None], Json]) -> None:
         """Write the report if there is a map and a new one is due; `facts_of` is run.json."""
         begun = time.perf_counter()
         if begun >= self._due and slam.mapper.keyframes:
@@ -47,7 +47,7 @@ class Preview:
             self._due = ended + (ended - begun) / PREVIEW_FRACTION
 
 
-def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:
+def write_preview(folder: RunFolder, slam: Slam, facts: Json) -> None:
     """Write the report of what is known so far; a failure to write it does not end the run."""
     with suppress(Exception):
         panels = _panels(slam, len(slam.mapper.keyframes) - 1)
@@ -56,9 +56,7 @@ def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:
         _write_report(folder, slam, {}, facts, overview=jpeg)
 
 
-def write_pictures(
-    folder: RunFolder, slam: Slam, metrics: dict[str, float | None], facts: dict[str, Any]
-) -> None:
+def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) -> None:
     """Write keyframe images, plots, viewer and report."""
     estimate, true_path, unit = slam.trajectory(), None, facts["unit"]
     diagnostics, history = slam.tracker.watch.diagnostics, slam.mapper.history
@@ -107,13 +105,8 @@ def write_pictures(
     )  # fmt: skip
 
 
-def _write_report(
-    folder: RunFolder,
-    slam: Slam,
-    metrics: dict[str, float | None],
-    facts: dict[str, Any],
-    **shown: Any,  # of viz.Report
-) -> None:
+def _write_report(folder: RunFolder, slam: Slam, metrics: Json, facts: Json, **shown: Any) -> None:
+    """Write what is shown, by the names of viz.Report, and what the run tells of itself."""
     program, *arguments = facts["command"]
     by_hand = Path(program).stem in ("minislam", "__main__")  # or else by a program of the user
     report = viz.Report(

@@ -59,10 +59,7 @@ class Checkpoints:
         return time.perf_counter() - self.start
 
     def save(self, slam: Slam, force: bool) -> None:
-        """Save a checkpoint if one is due; with `force`, always. A full disk does not end the run.
-
-        With a checkpoint_fraction of 0 none is saved, forced or not.
-        """
+        """Save a checkpoint if due or forced (not at a fraction of 0); a full disk ends no run."""
         begun = time.perf_counter()
         if self._fraction <= 0 or (begun < self._due and not force):
             return

@@ -8,13 +8,12 @@ from dataclasses import asdict
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from minislam.config import SlamConfig
 from minislam.data import run_folder as names
-from minislam.data.files import atomic_write, write_json
+from minislam.data.files import Json, atomic_write, write_json
 from minislam.data.ply import GaussianArrays, encode_ply
 from minislam.data.run_folder import RunFolder
 from minislam.data.trajectory import write_trajectory
@@ -110,7 +109,7 @@ def run_in_folder(
     resume: bool = False,  # go on with an interrupted one
     workers: int | None = None,  # processes; as many as there are idle cores, at most 4
     bent: BentLens | None = None,  # with which the run has begun anew
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[Json, Json]:
     """Check everything that may be wrong, then run SLAM into a folder; return metrics and run.json.
 
     Nothing of an earlier run is removed before the checks. The threads of torch are afterwards as
@@ -163,9 +162,9 @@ def run_in_folder(
 def _run(
     slam: Slam,
     folder: RunFolder,
-    facts_of: Callable[[str, int | None], dict[str, Any]],  # run.json by state and exit code
+    facts_of: Callable[[str, int | None], Json],  # run.json by state and exit code
     lpips: Lpips | None,
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[Json, Json]:
     """Run SLAM, or what is left of it, and write the folder, however the run ends."""
     interrupted = False
     try:
