@@ -63,7 +63,6 @@ class _Recorded(io.TextIOBase):
         return len(text)
 
     def isatty(self) -> bool:
-        """Tell whether a person reads this."""
         return self._stream.isatty()
 
 

@@ -54,9 +54,8 @@ def _demo(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     require_bounds("--workers", args.workers, 1, 256)
-    has_folder = args.output is not None or not args.resume
     found = "none; give that of the interrupted run"
-    require(has_folder, "--output FOLDER with --resume", found)
+    require(args.output is not None or not args.resume, "--output FOLDER with --resume", found)
     with recorded(args.quiet) as log:
         # What may be wrong is looked for in the order of the time that it takes.
         source, inputs = options.source_of(args), options.input_options(args)

@@ -102,8 +102,8 @@ class RecordedSequence:
         self.description = f"{recording.kind}: {', '.join(self._facts(calibration, picture))}"
         truth = GroundTruth(
             recording.trajectory,
-            moving_mask=partial(self._beside, recording.mask_paths, read_mask),
-            static_image=partial(self._beside, recording.static_paths, read_color),
+            moving_mask=partial(self._image_of, recording.mask_paths, read_mask),
+            static_image=partial(self._image_of, recording.static_paths, read_color),
             depth=self.sensor_depth,
             novel_views=self._novel_views,
         )
@@ -198,12 +198,12 @@ class RecordedSequence:
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
-        return self._beside(self._masks, read_mask, frame_index)
+        return self._image_of(self._masks, read_mask, frame_index)
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
-        return self._beside(self._recording.depth_paths, self.read_depth, frame_index)
+        return self._image_of(self._recording.depth_paths, self.read_depth, frame_index)
 
-    def _beside(self, paths: dict[int, Path], read: Reader, frame: int) -> np.ndarray | None:
+    def _image_of(self, paths: dict[int, Path], read: Reader, frame: int) -> np.ndarray | None:
         """Return the mask, depth or image of a file beside a frame, None if there is none."""
         images, index = self._recording.images, self._chosen[frame]
         if (path := paths.get(index)) is None:

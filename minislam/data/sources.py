@@ -93,10 +93,9 @@ def read_video(path: Path, limit: int | None) -> Recording:
         assumed = f"{rate:g} frames per second assumed"
         warnings.append(f"{path.name} has no times that increase: {assumed}")
     if len(images) < images.promised:
-        warnings.append(
-            f"{path.name} promises {images.promised} frames, but only {len(images)} can be decoded"
-            ": it is damaged, or was trimmed on a phone"
-        )
+        found = f"{images.promised} frames, but only {len(images)} can be decoded"
+        cause = "it is damaged, or was trimmed on a phone"
+        warnings.append(f"{path.name} promises {found}: {cause}")
     return Recording(
         name=folder_name(path.with_suffix("")),
         kind="video" if images.is_whole else f"first {limit} images of a video",
