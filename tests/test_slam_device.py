@@ -29,7 +29,8 @@ from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid import DroidFlow
 from minislam.priors.networks.vit import DinoFeatures
 from minislam.runs import run
-from minislam.runs.facts import measure, run_facts
+from minislam.runs.facts import run_facts
+from minislam.runs.measures import measure
 from minislam.runs.pictures import write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Priors, Slam

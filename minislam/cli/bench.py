@@ -14,6 +14,7 @@ from pathlib import Path
 from minislam.cli.help import UsageError
 from minislam.cli.options import input_options, lpips_of, prior_choice, settings
 from minislam.data.files import make_folder, read_json, write_json, write_text
+from minislam.data.run_folder import CHECKPOINT, METRICS, RUN
 from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError, require
 from minislam.parameters import user_path
 from minislam.runs.progress import ending_signals, say
@@ -92,15 +93,15 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
 
 def _run(path: Path, folder: Path, options: list[str]) -> tuple[int, str]:
     """Run a sequence, or resume it, if it is not finished; return exit code and ATE."""
-    facts = folder / "run.json"
+    facts = folder / RUN
     if facts.exists() and str(read_json(facts).get("state")).startswith("finished"):
         code = read_json(facts)["exit_code"]
     else:
-        start = "--resume" if (folder / "checkpoint.npz").exists() else "--overwrite"
+        start = "--resume" if (folder / CHECKPOINT).exists() else "--overwrite"
         code = _wait_for(["run", str(path), "-o", str(folder), start, *options])
     if code not in (0, LOST_EXIT):
         return code, "F"
-    ate_cm = read_json(folder / "metrics.json")["ate_all_cm"]
+    ate_cm = read_json(folder / METRICS)["ate_all_cm"]
     return code, "-" if ate_cm is None else f"{ate_cm:.2f}{'*' if code else ''}"
 
 

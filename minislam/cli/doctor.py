@@ -3,10 +3,12 @@
 import argparse
 import importlib
 import os
+import platform
 import shutil
 import subprocess
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 
 import minislam
 from minislam.errors import require
@@ -21,9 +23,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def _doctor(args: argparse.Namespace) -> None:
     """Print versions and threads, and compare an estimated flow with the known one."""
-    import platform
-    from importlib.util import find_spec
-
     print(f"minislam {minislam.__version__}, Python {platform.python_version()}")
     names = ("numpy", "scipy", "torch", "cv2", "matplotlib")
     if missing := [name for name in names if find_spec(name) is None]:

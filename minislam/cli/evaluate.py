@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from minislam.data.files import atomic_write, require_new, write_json
+from minislam.data.run_folder import TRAJECTORY
 from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
 from minislam.runs.progress import say
@@ -48,7 +49,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run_eval(args: argparse.Namespace) -> None:
     """Compare two trajectory files."""
-    from minislam.data.run_folder import TRAJECTORY
     from minislam.data.trajectory import read_trajectory
     from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
     from minislam.records import Trajectory

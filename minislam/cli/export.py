@@ -6,6 +6,7 @@ from os.path import expanduser
 from pathlib import Path
 
 from minislam.data.files import atomic_write, require_free, require_new
+from minislam.data.run_folder import MAP, MAP_SH
 from minislam.errors import require
 from minislam.runs.progress import ProgressLine, say
 
@@ -48,7 +49,7 @@ def _export(args: argparse.Namespace) -> None:
     require(is_asked, f"at least one of {flags}", "none; say what to write")
     for folder in filter(None, folders):
         require_free(folder, args.overwrite)
-    padded, own = (Path(args.folder) / name for name in ("map_sh.ply", "map.ply"))
+    padded, own = (Path(args.folder) / name for name in (MAP_SH, MAP))
     require_new([args.points, args.sh_degree and padded], args.overwrite, [own])
     import minislam
     from minislam.data.ply import encode_ply

@@ -58,10 +58,8 @@ def _grade(args: argparse.Namespace) -> int:
         graded.append(result)
         print(result["file"])
         for row in result["exercises"]:
-            verdict = f"{row['status']:7}  {row['sentence']}"
-            print(f"  {row['key']:7} {row['points']}/{row['of']}  {verdict}")
-        total = f"{result['points']} of {result['of']} points"
-        print(f"  {result.get('error', total)}")
+            print("  {key:7} {points}/{of}  {status:7}  {sentence}".format(**row))
+        print("  " + result.get("error", "{points} of {of} points".format(**result)))
     points, of = sum(g["points"] for g in graded), sum(g["of"] for g in graded)
     if len(graded) > 1:
         print(f"all {len(graded)} notebooks: {points} of {of} points")

@@ -95,9 +95,8 @@ def add_command(
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=epilog,
     )
-    parser.add_argument(
-        "-h", "--help", action=Help, nargs=0, help="the most needed options, or all of them"
-    )
+    shown = "the most needed options, or all of them"
+    parser.add_argument("-h", "--help", action=Help, nargs=0, help=shown)
     return parser
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
-RUN, LOG = "run.json", "log.txt"  # of a run folder; run.json is written when the run begins
+from minislam.data.run_folder import LOG, RUN
 
 
 class Log:
@@ -22,7 +22,7 @@ class Log:
         self._begun = ""  # a line whose end is not printed yet
 
     def write_into(self, folder: Path) -> None:
-        """Write into a folder, but only once run.json there is that of this run."""
+        """Write into a folder, but only once run.json, written as a run begins, is this run's."""
         self._folder, self._earlier = folder, _written(folder)
 
     def add(self, text: str) -> None:
@@ -63,7 +63,6 @@ class _Recorded(io.TextIOBase):
         return len(text)
 
     def isatty(self) -> bool:
-        """Tell whether a person reads this."""
         return self._stream.isatty()
 
 

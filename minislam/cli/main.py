@@ -51,16 +51,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         text = str(error)
         if isinstance(error, ModuleNotFoundError) and error.name:
-            text = (
-                f"expected {error.name} in this Python, {sys.executable}, found none; activate the "
-                "environment of minislam, or pip install -r environment.txt"
-            )
+            advice = "activate the environment of minislam, or pip install -r environment.txt"
+            text = f"expected {error.name} in this Python, {sys.executable}, found none; {advice}"
         elif not isinstance(error, MinislamError):
-            text = (
-                f"expected to finish this command, found {type(error).__name__}: "
-                f"{' '.join(text.split())[:300]}; check names, permissions, space and "
-                "settings, and set MINISLAM_DEBUG=1 to see where it happened"
-            )
+            found = f"{type(error).__name__}: {' '.join(text.split())[:300]}"
+            advice = "check names, permissions, space and settings, and set MINISLAM_DEBUG=1"
+            text = f"expected to finish this command, found {found}; {advice} to see where it was"
         ProgressLine().tell(f"minislam: {text}")
         return USAGE_EXIT if isinstance(error, UsageError) else FAILED_EXIT
     finally:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import minislam
 from minislam.data.files import atomic_write, make_folder, read_bytes
-from minislam.errors import InputError
+from minislam.errors import InputError, require
 from minislam.parameters import user_path
 
 SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
@@ -42,10 +42,9 @@ def _notebooks(args: argparse.Namespace) -> None:
         if path.is_file():
             copies[path.name] = read_bytes(path)
     make_folder(folder)
-    if there := [name for name in copies if (folder / name).exists()]:
-        raise InputError(
-            f"expected a folder without these notebooks, found {there[0]} in {folder}; give another"
-        )
+    there = next((name for name in copies if (folder / name).exists()), None)
+    found = f"{there} in {folder}; give another"
+    require(there is None, "a folder without these notebooks", found)
     for name, content in copies.items():
         make_folder((folder / name).parent)
         atomic_write(folder / name, content)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from minislam.cli.help import UsageError, unknown_option
 from minislam.data.files import read_json
 from minislam.data.options import InputOptions
+from minislam.data.run_folder import CONFIG, METRICS, RUN, RunFolder
 from minislam.errors import InputError, require
 from minislam.parameters import flattened, kind_of, user_path, with_values
 from minislam.priors.names import BUILT_IN, PriorChoice, find_weights, require_prior
@@ -29,43 +30,29 @@ PRESETS = ("laptop", "paper", "paper-fast", "test")  # of minislam.config, which
 
 def add_input(parser: argparse.ArgumentParser) -> None:
     """Add the sequence, and a flag for every field of InputOptions."""
-    parser.add_argument(
-        "sequence",
-        nargs="?",
-        help="video file, image folder, TUM folder or synth:NAME[:SEED]; default: that of --config",
-    )
-    group = parser.add_argument_group("input")
+    what = "video file, image folder, TUM folder or synth:NAME[:SEED]; default: that of --config"
+    parser.add_argument("sequence", nargs="?", help=what)
+    add = parser.add_argument_group("input").add_argument
     for option in fields(InputOptions):
-        shown = "" if option.default is None else f"; {option.default}"
-        is_size = option.name == "size"
-        group.add_argument(
-            f"--{option.name.replace('_', '-')}",
-            type=size_of if is_size else kind_of(option),
-            metavar="WIDTHxHEIGHT" if is_size else "VALUE",
-            help=option.metadata["meaning"] + shown,
-        )
+        name, default = option.name, option.default
+        what = option.metadata["meaning"] + ("" if default is None else f"; {default}")
+        kind, like = (size_of, "WIDTHxHEIGHT") if name == "size" else (kind_of(option), "VALUE")
+        add(f"--{name.replace('_', '-')}", type=kind, metavar=like, help=what)
 
 
-def add_priors(
-    parser: argparse.ArgumentParser, default_depth: str, with_flow: bool = False
-) -> None:
-    """Add the options that choose features and depth, and the flow, which only a run needs."""
+def add_priors(parser: argparse.ArgumentParser, depth: str, with_flow: bool = False) -> None:
+    """Add the options for features, depth (its default is given) and, for a run alone, the flow."""
     group = parser.add_argument_group(
         "priors",
         "networks need their official checkpoints: minislam weights list\n"
         "FILE: a path, or a name of that list; default: the name of the network, as metric3d",
     )
     add = group.add_argument
-    add(
-        "--features",
-        help="classical, dinov2, fit3d, files:FOLDER or python:MODULE:FUNCTION; default classical",
-    )
+    what = "classical, dinov2, fit3d, files:FOLDER or python:MODULE:FUNCTION; default classical"
+    add("--features", help=what)
     add("--features-weights", metavar="FILE", help="checkpoint of dinov2 or fit3d")
-    add(
-        "--depth",
-        help="none, simulated (synthetic sequences), sensor, metric3d, depth-anything, "
-        f"files:FOLDER or python:MODULE:FUNCTION; default {default_depth}",
-    )
+    what = "none, simulated (synthetic sequences), sensor, metric3d, depth-anything, files:FOLDER"
+    add("--depth", help=f"{what} or python:MODULE:FUNCTION; default {depth}")
     add("--depth-weights", metavar="FILE", help="checkpoint of metric3d or depth-anything")
     add("--device", help="where everything runs: cpu or cuda; cpu")
     add("--precision", help="of the networks: fp32, bf16 or fp16 (cuda); fp32")
@@ -79,13 +66,9 @@ def add_talk(parser: argparse.ArgumentParser) -> None:
     loudness = parser.add_mutually_exclusive_group()
     loudness.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
     loudness.add_argument("-v", "--verbose", action="store_true", help="a line for every step")
-    parser.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="processes that share the work, without effect on the result; default:"
-        " $MINISLAM_WORKERS, or one per idle core, at most 4; on a GPU 1",
-    )
+    what = "processes that share the work, without effect on the result"
+    default = "$MINISLAM_WORKERS, or one per idle core, at most 4; on a GPU 1"
+    parser.add_argument("--workers", type=int, metavar="N", help=f"{what}; default: {default}")
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -137,13 +120,11 @@ def config_file(args: argparse.Namespace) -> dict[str, Any]:
     tree: Any = {}
     if args.config:
         path, is_folder = Path(args.config), os.path.isdir(args.config)
-        wanted = (path if is_folder else path.parent) / "config.json"
-        if (is_folder or path.name in ("run.json", "metrics.json")) and wanted.is_file():
+        wanted = (path if is_folder else path.parent) / CONFIG
+        if (is_folder or path.name in (RUN, METRICS)) and wanted.is_file():
             raise InputError(f"expected a file of settings, found {path} of a run; give {wanted}")
         tree = read_json(args.config)
     elif getattr(args, "resume", False):
-        from minislam.data.run_folder import RunFolder
-
         tree = RunFolder(args.output).read_config()
     flattened(tree)  # refuses what is no JSON object
     return tree
@@ -202,8 +183,6 @@ def settings(args: argparse.Namespace) -> SlamConfig:
 
     base = preset("laptop" if args.preset is None else args.preset)
     if getattr(args, "resume", False) and args.preset is None:
-        from minislam.data.run_folder import RunFolder
-
         base = with_settings(base, settings_in(RunFolder(args.output).read_config()))
     if args.config:
         base = with_settings(base, settings_in(config_file(args)))

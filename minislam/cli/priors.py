@@ -33,12 +33,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     what = "write features and depth of every frame to files, to run SLAM on elsewhere"
     usage = "SEQUENCE --out DIR [--features NAME] [--depth NAME]"
     parser = add_command(commands, "priors", what, usage, epilog=None)
-    parser.add_argument(
-        "--out", required=True, metavar="DIR", help="gets the folders features and depth"
-    )
+    what = "gets the folders features and depth"
+    parser.add_argument("--out", required=True, metavar="DIR", help=what)
     options.add_settings(parser)
     options.add_input(parser)
-    options.add_priors(parser, default_depth="none")
+    options.add_priors(parser, depth="none")
     for action in parser._actions:  # what is shared with run, but changes nothing here
         if action.dest in ("no_uncertainty", "checkpoint_fraction", "masks"):
             action.help = argparse.SUPPRESS

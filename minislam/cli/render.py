@@ -19,8 +19,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     add = parser.add_argument
     add("folder", metavar="RUN", help="run folder")
-    what = "file to write: .webm or .webp"
-    add("-o", "--output", required=True, type=expanduser, help=what)
+    add("-o", "--output", required=True, type=expanduser, help="file to write: .webm or .webp")
     add(
         "--path",
         choices=("trajectory", "orbit", "side-by-side"),

@@ -12,6 +12,7 @@ from minislam.cli.help import RUN_EPILOG, SHORT_EPILOG, add_command
 from minislam.cli.log import recorded
 from minislam.data.files import require_free
 from minislam.data.options import default_depth, require_source
+from minislam.data.run_folder import CHECKPOINT, REPORT
 from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
 from minislam.runs.progress import ProgressLine, ending_signals, say
@@ -39,7 +40,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     options.add_talk(run)
     options.add_settings(run)
     options.add_input(run)
-    options.add_priors(run, default_depth="simulated for synth:, else none", with_flow=True)
+    options.add_priors(run, depth="simulated for synth:, else none", with_flow=True)
     lpips = run.add_argument_group("LPIPS", "measured if both files are given")
     lpips.add_argument("--lpips-trunk", metavar="FILE", help="torchvision's AlexNet or VGG-16")
     lpips.add_argument("--lpips-heads", metavar="FILE", help="the authors' alex.pth or vgg.pth")
@@ -53,9 +54,8 @@ def _demo(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     require_bounds("--workers", args.workers, 1, 256)
-    has_folder = args.output is not None or not args.resume
     found = "none; give that of the interrupted run"
-    require(has_folder, "--output FOLDER with --resume", found)
+    require(args.output is not None or not args.resume, "--output FOLDER with --resume", found)
     with recorded(args.quiet) as log:
         # What may be wrong is looked for in the order of the time that it takes.
         source, inputs = options.source_of(args), options.input_options(args)
@@ -73,7 +73,7 @@ def _run(args: argparse.Namespace) -> int:
         from minislam.runs.summary import as_text, summarise
 
         if args.resume and not way_on(args.output):
-            found = f"expected an interrupted run in {args.output}, found no checkpoint.npz"
+            found = f"expected an interrupted run in {args.output}, found no {CHECKPOINT}"
             raise InputError(f"{found}, as in a finished run; see report.html, or start a new run")
         config, lpips = options.settings(args), options.lpips_of(args)
         progress = ProgressLine(args.quiet, args.verbose)
@@ -93,7 +93,7 @@ def _run(args: argparse.Namespace) -> int:
         for warning in facts["warnings"]:
             if warning not in sequence.warnings and not (args.quiet and warning in progress.warned):
                 say(f"WARNING: {warning}", "stderr")
-        say(f"results in {output}; open {(Path(output).resolve() / 'report.html').as_uri()}")
+        say(f"results in {output}; open {(Path(output).resolve() / REPORT).as_uri()}")
         if facts["state"] == "interrupted":
             say(way_on(output) or NO_WAY_ON)
         else:

@@ -15,9 +15,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Every constant with its default, its bounds, its meaning and [its unit]. "
         "Change one with minislam run ... --NAME VALUE, or in a file for --config.",
     )
-    parser.add_argument(
-        "pattern", nargs="?", default="", help="part of a name, or a pattern like tracking.*round*"
-    )
+    what = "part of a name, or a pattern like tracking.*round*"
+    parser.add_argument("pattern", nargs="?", default="", help=what)
     parser.set_defaults(run=_settings)
 
 

@@ -5,7 +5,7 @@ import hashlib
 from functools import partial
 from pathlib import Path
 
-from minislam.errors import InputError, MinislamError, nearest, require
+from minislam.errors import MinislamError, nearest, require
 from minislam.parameters import user_path
 from minislam.priors.names import PublishedFile, published_files
 from minislam.runs.progress import ProgressLine
@@ -79,9 +79,8 @@ def require_published(row: PublishedFile, path: Path, advice: str = "") -> None:
     wanted, found = f"sha256 {row.sha256}", f"sha256 {_sha256(path)}"
     if not row.sha256:
         wanted, found = f"complete: {row.use}", _verdict(path)
-    if not found.endswith(wanted):
-        sentence = f"expected the published {row.file} ({wanted}) in {path}, found {found}"
-        raise InputError(sentence + advice)
+    the_file = f"the published {row.file} ({wanted}) in {path}"
+    require(found.endswith(wanted), the_file, found + advice)
 
 
 def _sha256(path: Path) -> str:

@@ -12,7 +12,7 @@ from minislam.geometry import BrownDistortion, Camera
 # with 0.75 to 0.95 (a 26-30 mm equivalent lens, a little cropped by stabilisation).
 _GUESSED_FOCAL_RATIO = 0.85
 
-# Two aspect ratios closer than this belong to the same picture, resized and rounded to pixels.
+# Two aspect ratios closer than this belong to the same image, resized and rounded to pixels.
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -32,15 +32,13 @@ class Calibration:
     def camera_for(self, width: int, height: int) -> Camera:
         """Return the camera of raw images of `width` x `height`."""
         made_for = self.size or (width, height)
+        wanted = "images of {}x{} px or a resized version of that".format(*made_for)
+        found = f"{width}x{height}; calibration and images do not match"
+        require(self.fits(width, height), f"{wanted} ({self.origin})", found)
         try:
-            camera = Camera(self.fx, self.fy, self.cx, self.cy, *made_for)
+            return Camera(self.fx, self.fy, self.cx, self.cy, *made_for).resized(width, height)
         except InputError as error:
             raise InputError(f"{self.origin}: {error}") from error
-        size = f"{made_for[0]}x{made_for[1]} px"
-        wanted = f"images of {size} or a resized version of that ({self.origin})"
-        found = f"{width}x{height}; calibration and images do not match"
-        require(self.fits(width, height), wanted, found)
-        return camera.resized(width, height)
 
     def fits(self, width: int, height: int) -> bool:
         """Tell whether images of this size have the aspect that the calibration was made for."""

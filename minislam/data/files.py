@@ -12,6 +12,8 @@ from typing import Any, BinaryIO
 
 from minislam.errors import InputError, require
 
+Json = dict[str, Any]  # the content of a JSON file
+
 
 def atomic_write(path: Path | str, content: bytes) -> None:
     """Write a file so that a crash leaves the old file or the new one, never half of one."""

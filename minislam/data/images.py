@@ -1,4 +1,4 @@
-"""Decode the image files that cameras write; encode PNG, JPEG and moving pictures."""
+"""Decode the image files that cameras write; encode PNG, JPEG and animations."""
 
 import os
 import re
@@ -28,7 +28,7 @@ _OF_FFMPEG = re.compile(rb"FFMPEG")
 
 
 def is_image(path: Path) -> bool:
-    """Tell by its name whether a file is a picture; hidden files never are."""
+    """Tell by its name whether a file is an image; hidden files never are."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
@@ -43,7 +43,7 @@ def is_number(name: str) -> bool:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the pictures of a folder in their order; none of a folder that is not there."""
+    """Return the images of a folder in their order; none of a folder that is not there."""
     entries = folder.iterdir() if folder.is_dir() else ()
     images = [path for path in entries if is_image(path) and path.is_file()]
     if all(is_number(path.stem) for path in images):  # 0.15 stands before 0.2
@@ -52,12 +52,12 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def read_color(path: Path) -> np.ndarray:  # (H, W, 3) uint8 RGB
-    """Read any picture as 8-bit RGB without alpha, upright as the EXIF header of phones says."""
+    """Read any image as 8-bit RGB without alpha, upright as the EXIF header of phones says."""
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
-    """Read a black and white picture: what is white and not transparent is True."""
+    """Read a black and white image: what is white and not transparent is True."""
     gray = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if path.suffix.lower() == ".png":
         alpha = _decode(path, cv2.IMREAD_UNCHANGED).reshape(*gray.shape, -1)[..., 3:]
@@ -71,7 +71,7 @@ def read_mask(path: Path) -> np.ndarray:  # (H, W) bool
 
 
 def read_depth(path: Path, units_per_metre: float) -> np.ndarray:  # (H, W) float32 metre
-    """Read a 16-bit depth picture, 0 where unknown. TUM files store 5000 units per metre."""
+    """Read a 16-bit depth image, 0 where unknown. TUM files store 5000 units per metre."""
     depth = _decode(path, cv2.IMREAD_UNCHANGED)
     is_depth = depth.ndim == 2 and depth.dtype == np.uint16
     found = f"{depth.dtype} of shape {depth.shape} in {path}; export depth as 16-bit PNG"

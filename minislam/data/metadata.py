@@ -24,7 +24,9 @@ _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution
 _EXIF_NUMBERS = {3: "H", 4: "I", 5: "II"}  # struct codes: short, long, rational
 JPEG, PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"  # the first bytes
 _APP1, _SIZES = 0xE1, {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of JPEG's segments
-_UNREADABLE = OSError, struct.error, LookupError, ValueError, ArithmeticError, RecursionError
+_UNREADABLE = (
+    OSError, struct.error, LookupError, ValueError, ArithmeticError, RecursionError, StopIteration
+)  # fmt: skip
 _VIDEO_NUMBERS = {21: ">i", 22: ">I", 67: ">i", 77: ">I", 66: ">h", 76: ">H", 23: ">f", 24: ">d"}
 
 
@@ -49,12 +51,9 @@ def noted_size(path: Path) -> tuple[int, int] | None:
             return struct.unpack_from(">II", content, 16)
         if content[:2] != JPEG:
             return None
-        height, width = next(
-            struct.unpack_from(">HH", segment, 1)
-            for marker, segment in _segments(content)
-            if marker in _SIZES
-        )
-    except (*_UNREADABLE, StopIteration):
+        frame = next(segment for marker, segment in _segments(content) if marker in _SIZES)
+        height, width = struct.unpack_from(">HH", frame, 1)
+    except _UNREADABLE:
         return None
     with suppress(*_UNREADABLE):
         if _tags(_exif(content)).get(_ORIENTATION, 1) >= 5:  # the camera was held upright
@@ -80,11 +79,9 @@ def _segments(photo: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _exif(photo: memoryview) -> memoryview:
-    """Return the TIFF structure of a JPEG file."""
-    for marker, segment in _segments(photo):
-        if marker == _APP1 and segment[:6] == b"Exif\0\0":
-            return segment[6:]
-    raise ValueError("no EXIF")
+    """Return the TIFF structure of a JPEG file; StopIteration if it has none."""
+    headers = (segment for marker, segment in _segments(photo) if marker == _APP1)
+    return next(header[6:] for header in headers if header[:6] == b"Exif\0\0")
 
 
 def _tags(tiff: memoryview, within: int | None = None) -> dict[int, float]:

@@ -67,20 +67,16 @@ def _likeness(one: np.ndarray, other: np.ndarray) -> float:  # (HALF, HALF) each
 
 
 def first_of_two(picture: Window, glances: list[Glance], width: int, height: int) -> Window:
-    """Return the left or the upper one where an image of this size shows two that are alike.
-
-    They are those of two eyes, or before and after. Return the same window where it shows one.
-    """
+    """Return the left or upper of two that are alike, as of two eyes; where one is, the same."""
     if not glances:
         return picture
-    left, top, right, bottom = *picture[:2], picture[0] + picture[2], picture[1] + picture[3]
+    left, top, columns, rows = picture
     side_by_side, stacked = np.median([glance.likeness for glance in glances], 0)
     if side_by_side > ALIKE_PICTURES:
-        right = min(right, width // 2)
+        columns = min(columns, width // 2 - left)
     if stacked > ALIKE_PICTURES:
-        bottom = min(bottom, height // 2)
-    is_large = min(right - left, bottom - top) >= MINIMUM_SIDE
-    return (left, top, right - left, bottom - top) if is_large else picture
+        rows = min(rows, height // 2 - top)
+    return (left, top, columns, rows) if min(columns, rows) >= MINIMUM_SIDE else picture
 
 
 def picture_window(glances: list[Glance], width: int, height: int) -> Window:

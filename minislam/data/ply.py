@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from minislam.data.files import read_bytes
-from minislam.errors import InputError, require
+from minislam.errors import require
 
 _SH_C0 = 0.28209479177387814  # Y_00 = 1 / (2 sqrt(pi)): colour = 0.5 + Y_00 * f_dc
 
@@ -111,11 +111,10 @@ def _parse_header(header: bytes, name: str) -> tuple[int, list[str]]:
     names = [field[2] for field in fields] if plain else []
     missing = sorted(set(PROPERTIES) - {"nx", "ny", "nz"} - set(names))
     counted = re.fullmatch(r"element vertex \d{1,18}", " ".join(element)) is not None
-    if missing or not counted or len(set(names)) != len(names):
-        raise InputError(
-            "expected 'element vertex N' and the float properties of 3D Gaussians, found a header "
-            f"without {', '.join(missing[:3]) or 'them, or with doubles'} in {name}; give a map.ply"
-        )
+    is_right = not missing and counted and len(set(names)) == len(names)
+    wanted = "'element vertex N' and the float properties of 3D Gaussians"
+    found = f"a header without {', '.join(missing[:3]) or 'them, or with doubles'} in {name}"
+    require(is_right, wanted, f"{found}; give a map.ply")
     return int(element[2]), names
 
 

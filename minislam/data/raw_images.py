@@ -146,9 +146,8 @@ class VideoImages:
             # The table of contents, which cameras write at the end of an MP4
             if content[4:8] == b"ftyp" and not re.search(b"(?s)moov....mvhd", content):
                 hint = "the file is cut short, copy it again"
-            raise InputError(
-                f"expected a video, but {self.path} ({size} bytes) cannot be opened as one; {hint}"
-            )
+            found = f"{self.path} ({size} bytes) cannot be opened as one; {hint}"
+            raise InputError(f"expected a video, but {found}")
 
 
 def _is_sampled(index: int) -> bool:

@@ -1,4 +1,6 @@
-"""The folder of one run: the names of its files, what may be overwritten, how to read it back."""
+"""The folder of one run: names of its files (without torch), what may be overwritten, reading."""
+
+from __future__ import annotations
 
 import io
 import os
@@ -6,25 +8,26 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from minislam.data import files
-from minislam.data.trajectory import read_trajectory
 from minislam.errors import InputError, require
 from minislam.parameters import user_path
-from minislam.records import Trajectory
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from minislam.records import Trajectory
 
 CONFIG, RUN, METRICS, CAMERA = "config.json", "run.json", "metrics.json", "camera.json"
 TRAJECTORY, KEYFRAME_TRAJECTORY = "trajectory.txt", "keyframe_trajectory.txt"
-LOST_FRAMES, MAP, MLP, REPORT = "lost_frames.txt", "map.ply", "uncertainty_mlp.pt", "report.html"
-CHECKPOINT, VIEWER, CLIP, LOG = "checkpoint.npz", "viewer.html", "clip.webp", "log.txt"
+LOST_FRAMES, MAP, MAP_SH, MLP = "lost_frames.txt", "map.ply", "map_sh.ply", "uncertainty_mlp.pt"
+CHECKPOINT, LOG, REPORT = "checkpoint.npz", "log.txt", "report.html"
+VIEWER, CLIP = "viewer.html", "clip.webp"
 
 _FILES = (
-    CONFIG, RUN, METRICS, CAMERA, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MLP, REPORT,
-    CHECKPOINT, VIEWER, CLIP, LOG, "map_sh.ply",
+    CONFIG, RUN, METRICS, CAMERA, TRAJECTORY, KEYFRAME_TRAJECTORY, LOST_FRAMES, MAP, MAP_SH, MLP,
+    CHECKPOINT, LOG, REPORT, VIEWER, CLIP,
 )  # fmt: skip
 KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
 _OURS = re.compile(  # every path that a run writes, inside its folder, also half-written
@@ -67,13 +70,10 @@ class RunFolder:
         cls,
         path: Path | str,
         overwrite: bool = False,
-        inputs: Sequence[Path] = (),
+        inputs: Sequence[Path] = (),  # images that the run reads
         keeps_log: bool = False,  # the same run begins anew
-    ) -> "RunFolder":
-        """Make a new run folder for a run that reads the images `inputs`.
-
-        With `overwrite`, what an earlier run wrote is removed, and only that.
-        """
+    ) -> RunFolder:
+        """Make a run folder; `overwrite` removes what an earlier run wrote there, and only that."""
         path = Path(path)
         files.require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():
@@ -90,11 +90,13 @@ class RunFolder:
 
     def write_mlp(self, state: dict[str, Tensor]) -> None:
         """Write the weights of the uncertainty MLP."""
+        import torch
+
         buffer = io.BytesIO()
         torch.save({name: values.cpu() for name, values in state.items()}, buffer)
         files.atomic_write(self.path / MLP, buffer.getvalue())
 
-    def write_picture(self, name: str, png: bytes) -> None:
+    def write_image(self, name: str, png: bytes) -> None:
         """Write a plot, plots/NAME.png, or what a keyframe shows, keyframes/000123_KIND.png."""
         assert _OURS.fullmatch(name), name
         files.atomic_write(self.path / name, png)
@@ -106,24 +108,28 @@ class RunFolder:
             if _OURS.fullmatch(file.relative_to(self.path).as_posix()):
                 file.unlink()
 
-    def read_config(self) -> dict[str, Any]:
+    def read_config(self) -> files.Json:
         """Return sequence, input, priors and settings."""
         return files.read_json(self.path / CONFIG)
 
-    def read_run(self) -> dict[str, Any]:
+    def read_run(self) -> files.Json:
         """Return version, seed, command, timings and exit state."""
         return files.read_json(self.path / RUN)
 
-    def read_metrics(self) -> dict[str, Any]:
+    def read_metrics(self) -> files.Json:
         """Return the errors against the ground truth."""
         return files.read_json(self.path / METRICS)
 
     def read_trajectory(self) -> Trajectory:
         """Return the poses of all tracked frames."""
+        from minislam.data.trajectory import read_trajectory
+
         return read_trajectory(self.path / TRAJECTORY)
 
     def read_mlp(self) -> dict[str, Tensor]:
         """Return the weights of the uncertainty MLP."""
+        import torch
+
         content = io.BytesIO(files.read_bytes(self.path / MLP))
         try:
             return torch.load(content, weights_only=True)

@@ -23,6 +23,7 @@ from minislam.parameters import absolute_path, user_path
 from minislam.records import Frame, GroundTruth, Progress
 from minislam.state.memory import Shelf, release
 
+Reader = Callable[[Path], np.ndarray]  # of an image file
 _SYNTHETIC_SIZE = (320, 240)  # px
 
 
@@ -36,7 +37,7 @@ def open_sequence(
     options = options or InputOptions()
     require_source(source, options.masks)
     if source.startswith(SYNTHETIC):
-        return _open_synthetic(source, options, progress)
+        return _synthetic(source, options, progress)
     path = user_path(source)
     if path.is_file():
         last = None
@@ -72,13 +73,13 @@ class RecordedSequence:
         if options.masks is not None:
             self._masks = mask_files(images, options.masks, self._chosen)
         self.files = [*images.paths, *self._masks.values()]
-        self.read_depth: Callable[[Path], np.ndarray]
-        self.read_depth = partial(read_depth, units_per_metre=options.depth_scale)
+        self.read_depth: Reader = partial(read_depth, units_per_metre=options.depth_scale)
         self.checksums: dict[int, int] = {}
         self._shelf = Shelf()
         self._kept: dict[int, np.ndarray] = {}  # working images on the shelf, by frame index
 
-        height, width = (image := images.read(self._chosen[0])).shape[:2]
+        image = images.read(self._chosen[0])
+        (height, width), largest = image.shape[:2], int(image.max())
         picture = barless = picture_window(images.glances, width, height)
         if not (recording.calibration or options.calibration):
             picture = first_of_two(barless, images.glances, width, height)
@@ -92,7 +93,7 @@ class RecordedSequence:
         self.focal_origin = "" if is_guess else calibration.origin
         knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
         self.seeks_lens = knows_nothing and options.focal == "auto"
-        self.warnings = [*recording.warnings, *self._doubts(calibration, image, left_out)]
+        self.warnings = [*recording.warnings, *self._doubts(calibration, largest, left_out)]
         if picture != barless:
             self.warnings.append(
                 "the images show two pictures that are alike, as of two eyes: the left or upper "
@@ -101,8 +102,8 @@ class RecordedSequence:
         self.description = f"{recording.kind}: {', '.join(self._facts(calibration, picture))}"
         truth = GroundTruth(
             recording.trajectory,
-            moving_mask=partial(self._picture, recording.mask_paths, read_mask),
-            static_image=partial(self._picture, recording.static_paths, read_color),
+            moving_mask=partial(self._image_of, recording.mask_paths, read_mask),
+            static_image=partial(self._image_of, recording.static_paths, read_color),
             depth=self.sensor_depth,
             novel_views=self._novel_views,
         )
@@ -110,19 +111,16 @@ class RecordedSequence:
         has_truth = recording.trajectory is not None or files  # a sensor's depth is an input
         self.ground_truth = truth if has_truth else None
 
-    def _doubts(
-        self, calibration: Calibration, raw: np.ndarray, left_out: list[int]
-    ) -> Iterator[str]:
+    def _doubts(self, calibration: Calibration, largest: int, left_out: list[int]) -> Iterator[str]:
         """Yield what is likely a mistake in the first raw image, the focal length or the sizes."""
-        images, (height, width) = self._recording.images, raw.shape[:2]
+        images, raw = self._recording.images, self.prepare.raw_camera
         label, resized = images.labels[self._chosen[0]], images.resized
-        if label.lower().endswith(".png") and 0 < raw.max() < 16:
-            what = f"{label} is almost black, its largest value {raw.max()} of 255"
+        if label.lower().endswith(".png") and 0 < largest < 16:
+            what = f"{label} is almost black, its largest value {largest} of 255"
             yield f"{what}: if it holds 10 or 12 bits in 16, multiply all images by 64 or 16"
-        fx = self.prepare.raw_camera.fx
-        angle = 60 if calibration.is_rough else 2 * np.degrees(np.arctan(width / 2 / fx))
+        angle = 60 if calibration.is_rough else 2 * np.degrees(np.arctan(raw.width / 2 / raw.fx))
         if not 15 <= angle <= 130:  # degree
-            means = f"fx {fx:g} px means a field of view of {angle:.0f} degrees"
+            means = f"fx {raw.fx:g} px means a field of view of {angle:.0f} degrees"
             unit = "in millimetres" if angle > 130 else "for larger images"
             yield f"{means}: check if it is {unit}"
         every = len(self) + len(left_out)
@@ -135,7 +133,7 @@ class RecordedSequence:
         if calibration.is_rough and not self.refines_focal:
             unknown = f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}"
             advice = "give --fx, a calibration file, or --focal refine"
-            size = f"for {width}x{height} images"
+            size = f"for {raw.width}x{raw.height} images"
             yield f"{unknown}, {size}, trajectory and map may be bent; {advice}"
 
     def _facts(self, calibration: Calibration, picture: Window) -> Iterator[str]:
@@ -182,9 +180,8 @@ class RecordedSequence:
     def through_lens(self, fx: float, k1: float, k2: float) -> "RecordedSequence":
         """Return the sequence, straightened: fx [px] is of the working size, fy in proportion."""
         raw, zoom = self.prepare.raw_camera, fx / self.camera.fx
-        options = replace(
-            self._options, fx=zoom * raw.fx, fy=zoom * raw.fy, k1=k1, k2=k2, focal="refine"
-        )
+        fx, fy = zoom * raw.fx, zoom * raw.fy
+        options = replace(self._options, fx=fx, fy=fy, k1=k1, k2=k2, focal="refine")
         return RecordedSequence(self._recording, options, self._source)
 
     def full_image(self, frame_index: int) -> np.ndarray:  # (H, W, 3) uint8 RGB
@@ -201,16 +198,14 @@ class RecordedSequence:
 
     def given_mask(self, frame_index: int) -> np.ndarray | None:
         """Return the mask (H, W) bool of --masks, else the recording's own; True: it moves."""
-        return self._picture(self._masks, read_mask, frame_index)
+        return self._image_of(self._masks, read_mask, frame_index)
 
     def sensor_depth(self, frame_index: int) -> np.ndarray | None:
-        return self._picture(self._recording.depth_paths, self.read_depth, frame_index)
+        return self._image_of(self._recording.depth_paths, self.read_depth, frame_index)
 
-    def _picture(
-        self, paths: dict[int, Path], read: Callable[[Path], np.ndarray], frame_index: int
-    ) -> np.ndarray | None:
-        """Return what the file that belongs to a frame shows, None if there is no such file."""
-        images, index = self._recording.images, self._chosen[frame_index]
+    def _image_of(self, paths: dict[int, Path], read: Reader, frame: int) -> np.ndarray | None:
+        """Return the mask, depth or image of a file beside a frame, None if there is none."""
+        images, index = self._recording.images, self._chosen[frame]
         if (path := paths.get(index)) is None:
             return None
         raw = read(path)
@@ -256,9 +251,7 @@ def _calibration(
     )
 
 
-def _open_synthetic(
-    source: str, options: InputOptions, progress: Progress | None
-) -> RecordedSequence:
+def _synthetic(source: str, options: InputOptions, progress: Progress | None) -> RecordedSequence:
     """Render a synthetic sequence, or take it from the cache, and open it."""
     import data_synth  # only here: real footage needs no scene generator
 

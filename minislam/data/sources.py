@@ -13,6 +13,7 @@ from minislam.data.images import is_image, is_number, list_images
 from minislam.data.metadata import noted_focal_length
 from minislam.data.options import mask_folder
 from minislam.data.raw_images import FileImages, ImageSource, VideoImages
+from minislam.data.run_folder import CONFIG, RUN
 from minislam.data.trajectory import truth_beside
 from minislam.errors import InputError, require
 from minislam.records import Trajectory
@@ -49,12 +50,10 @@ class Recording:
     def __post_init__(self) -> None:
         stamps = np.round(self.timestamps, 6)
         if len(wrong := np.flatnonzero(np.diff(stamps) <= 0)):
-            index = wrong[0]
-            found = [f"{stamps[k]} s of {self.images.labels[k]}" for k in (index, index + 1)]
-            raise InputError(
-                "expected timestamps that increase by a microsecond at least, found "
-                f"{' before '.join(found)}; sort, remove or rename them"
-            )
+            both = [f"{stamps[k]} s of {self.images.labels[k]}" for k in (wrong[0], wrong[0] + 1)]
+            wanted = "timestamps that increase by a microsecond at least"
+            found = f"{' before '.join(both)}; sort, remove or rename them"
+            raise InputError(f"expected {wanted}, found {found}")
 
 
 def read_image_folder(folder: Path) -> Recording:
@@ -84,21 +83,19 @@ def read_video(path: Path, limit: int | None) -> Recording:
         is_list = file.read(8).startswith(_LISTS)
     require(not is_list, "a video", f"a list of others in {path}; give one of these")
     images = VideoImages(path, limit)
-    if len(images) == 0:
-        raise InputError(f"expected frames in {path}, found none; convert the video to MP4 (H.264)")
+    require(len(images) > 0, f"frames in {path}", "none; convert the video to MP4 (H.264)")
     rate, stamps, unread = images.frame_rate, images.timestamps, images.unread()
     warnings: list[str] = []
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         if not (math.isfinite(rate) and rate > 0):
             rate = _ASSUMED_FRAME_RATE
         stamps, unread = np.arange(len(images)) / rate, unread[:0]
-        what = f"{path.name} has no times that increase"
-        warnings.append(f"{what}: {rate:g} frames per second assumed")
+        assumed = f"{rate:g} frames per second assumed"
+        warnings.append(f"{path.name} has no times that increase: {assumed}")
     if len(images) < images.promised:
-        warnings.append(
-            f"{path.name} promises {images.promised} frames, but only {len(images)} can be decoded"
-            ": it is damaged, or was trimmed on a phone"
-        )
+        found = f"{images.promised} frames, but only {len(images)} can be decoded"
+        cause = "it is damaged, or was trimmed on a phone"
+        warnings.append(f"{path.name} promises {found}: {cause}")
     return Recording(
         name=folder_name(path.with_suffix("")),
         kind="video" if images.is_whole else f"first {limit} images of a video",
@@ -136,8 +133,8 @@ def folder_name(path: Path) -> str:
 
 def _found(folder: Path) -> str:
     """Say what is there, and what to do: often the video or data set lies one level deeper."""
-    if (folder / "run.json").is_file():
-        return f"the folder of a run; to repeat it, give --config {folder / 'config.json'}"
+    if (folder / RUN).is_file():
+        return f"the folder of a run; to repeat it, give --config {folder / CONFIG}"
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     if videos := [path for path in entries if path.suffix.lower() in _VIDEO_SUFFIXES]:
         return f"none; give the video itself, {videos[0]}"

@@ -9,10 +9,11 @@ import numpy as np
 from minislam.data import sources
 from minislam.data.calibration import Calibration, calibration_beside
 from minislam.data.files import data_rows, finite_numbers, read_bytes, read_text
-from minislam.data.images import list_images, read_color
+from minislam.data.images import list_images
+from minislam.data.metadata import noted_size
 from minislam.data.raw_images import FileImages
 from minislam.data.trajectory import read_trajectory, truth_beside
-from minislam.errors import InputError, require
+from minislam.errors import require
 from minislam.geometry import BrownDistortion
 from minislam.records import Trajectory
 
@@ -29,9 +30,7 @@ _CAMERAS = {
         (0.039903, -0.099343, -0.000730, -0.000144),
     ),
 }
-_NAMES = re.compile(  # of folders
-    r"(?<![a-z])((?:freiburg|fr)[_ -]?([123])(?!\d)|rgbd_bonn(?![a-z]))", re.IGNORECASE
-)
+_NAMES = re.compile(r"(?i)(?<![a-z])((?:freiburg|fr)[_ -]?([123])(?!\d)|rgbd_bonn(?![a-z]))")
 
 # Bonn's ground truth is the pose of a plate of markers in the axes of ROS. The makers give the
 # camera in the frame of the plate; its block is a rotation only up to a few per cent.
@@ -55,12 +54,12 @@ def is_tum_folder(folder: Path) -> bool:
 def read_tum_folder(folder: Path) -> sources.Recording:
     """Read a TUM RGB-D folder; everything but the colour images is optional."""
     stamps, paths = _images(folder, "rgb")
-    if len(paths) == 0:
-        raise InputError(f"expected images in {folder}/rgb.txt, found none; check the list")
+    require(len(paths) > 0, f"images in {folder}/rgb.txt", "none; check the list")
     depth_stamps, depths = _images(folder, "depth")
     camera, truth_path = _named_camera(folder), truth_beside(folder)
-    trajectory = None
-    notes = [f"{len(depths)} depth"] if depths else []
+    size = noted_size(paths[0])
+    fits = camera is not None and size is not None and camera.fits(*size)
+    trajectory, notes = None, [f"{len(depths)} depth"] if depths else []
     if truth_path is not None:
         trajectory = read_trajectory(truth_path)
         if camera is not None and camera.origin.startswith("Bonn"):
@@ -71,7 +70,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
         kind="TUM RGB-D folder",
         images=FileImages(paths),
         timestamps=stamps,
-        calibration=calibration_beside(folder) or _if_it_fits(camera, paths[0]),
+        calibration=calibration_beside(folder) or (camera if fits else None),
         trajectory=trajectory,
         depth_paths=_nearest(stamps, depth_stamps, depths),
         mask_paths=_beside(folder / "masks", paths),
@@ -107,13 +106,6 @@ def _named_camera(folder: Path) -> Calibration | None:
             head = read_bytes(path).decode("utf-8", "replace").splitlines()[:20]
             notes += head if path.name.startswith("README") else [x for x in head if x[:1] == "#"]
     return next(filter(None, map(known_camera, notes)), None)
-
-
-def _if_it_fits(camera: Calibration | None, image: Path) -> Calibration | None:
-    if camera is None:
-        return None
-    height, width = read_color(image).shape[:2]
-    return camera if camera.fits(width, height) else None
 
 
 def known_camera(text: str) -> Calibration | None:
@@ -157,9 +149,9 @@ def _novel_views(folder: Path) -> list[tuple[np.ndarray, Path]]:
         return []
     poses = read_trajectory(folder / "poses.txt")
     by_number = {int(p.stem): p for p in list_images(folder) if p.stem.isdecimal()}
-    numbers = [int(stamp) for stamp in poses.timestamps]
-    for number in numbers:
+    views = []
+    for number, pose in zip(poses.timestamps.astype(int), poses.T_world_camera, strict=True):
         found = f"none for index {number}; complete the folder or remove the row"
         require(number in by_number, f"an image for every pose of {folder / 'poses.txt'}", found)
-    rows = zip(poses.T_world_camera, numbers, strict=True)
-    return [(pose, by_number[number]) for pose, number in rows]
+        views.append((pose, by_number[number]))
+    return views

@@ -58,9 +58,8 @@ def run(
     progress = SilentProgress() if quiet else ProgressLine()
     progress.plan = plan_of(config, choice, sequence)
     with closing(progress), ending_signals(progress.interrupt):
-        run_in_folder(
-            sequence, config, choice, output, progress, overwrite=overwrite, workers=workers
-        )
+        parts = sequence, config, choice, output, progress
+        run_in_folder(*parts, overwrite=overwrite, workers=workers)
     return Run(output)
 
 

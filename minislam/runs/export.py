@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from minislam.data.files import atomic_file, atomic_write, make_folder, write_json, write_text
 from minislam.data.images import encode_png
 from minislam.data.ply import encode_points
-from minislam.data.run_folder import RUN
+from minislam.data.run_folder import CAMERA, RUN
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.dense_flow import sample, warp
@@ -80,7 +80,7 @@ def export_depth(run: Run, folder: Path, frames: Iterable[int]) -> None:
     for frame in frames:
         with atomic_file(folder / _name(frame, ".npy")) as file:
             np.save(file, np.asarray(run.render_depth(run.poses[frame]), np.float32))
-    write_json(folder / "camera.json", {**asdict(run.camera), "unit": run.unit})
+    write_json(folder / CAMERA, {**asdict(run.camera), "unit": run.unit})
 
 
 def export_masks(run: Run, folder: Path, frames: Iterable[int]) -> None:

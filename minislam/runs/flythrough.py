@@ -16,7 +16,8 @@ from minislam.runs.loaded import Run
 from minislam.viz import beta_limits, beta_to_rgb
 
 ORBIT_IMAGES, ORBIT_RATE = 90, 20.0  # images per turn; images per second
-ORBIT_RADIUS = 0.1  # of the distance of the point that stays in the centre
+# Of the distance of the point that stays in the centre: the map holds only what the camera saw.
+ORBIT_RADIUS = 0.1
 LABELS = ("input", "uncertainty", "static map")
 CLIP_IMAGES, CLIP_WIDTH = 60, 240  # most images of a clip; px, most of each of its three panels
 _RATES = 5.0, 30.0  # images per second, least and most
@@ -30,10 +31,7 @@ def frame_rate(run: Run) -> float:
 
 
 def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
-    """Yield the static map from a circle around the middle keyframe, which looks at one point.
-
-    The circle is small, since the map holds only what the camera saw.
-    """
+    """Yield the static map from a circle around the middle keyframe, which looks at one point."""
     start = run.poses[run.keyframes[len(run.keyframes) // 2]]
     depth = run.render_depth(start)
     if not (depth > 0).any():

@@ -172,7 +172,7 @@ class Run:
         return None if is_global else self._motion.displacement(frame_index, (across, down))
 
     def plot(self, frame_index: int | None = None) -> Figure:
-        """Return one picture of the run: a frame (by default the middle keyframe) and the path."""
+        """Draw the run: a frame (by default the middle keyframe) and the path."""
         index = self.keyframes[len(self.keyframes) // 2] if frame_index is None else frame_index
         if index not in self.poses:
             raise InputError(f"expected a frame of the map, found {index}; see run.json")
@@ -191,16 +191,13 @@ class Run:
         return summarise(self.folder.read_metrics(), self.folder.read_run())
 
     def __repr__(self) -> str:
-        """Return the facts of the run in a line."""
         poses = f"{len(self.trajectory)} of {len(self.frames)} frames with a pose"
         size = f"{len(self.keyframes)} keyframes, {len(self.gaussians)} Gaussians"
         return f"Run of {self.name}: {poses}, {size}; {self.folder.path.name}"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows of the run: summary, warnings, one picture."""
-        warnings = self.folder.read_run()["warnings"]
         png = read_bytes(self.folder.path / PLOTS / "overview.png")
-        return summary_html(self.name, self.summary(), warnings, png)
+        return summary_html(self.name, self.summary(), self.folder.read_run()["warnings"], png)
 
     @cached_property
     def sequence(self) -> RecordedSequence:

@@ -11,7 +11,7 @@ import numpy as np
 
 from minislam import viz
 from minislam.config import PRESETS, SlamConfig, preset, settings_of
-from minislam.data.files import write_text
+from minislam.data.files import Json, write_text
 from minislam.data.images import encode_jpeg, encode_png
 from minislam.data.run_folder import KEYFRAMES, PLOTS, REPORT, VIEWER, RunFolder
 from minislam.evaluation import absolute_trajectory_error
@@ -25,9 +25,10 @@ from minislam.tracking.safeguards.diagnostics import MIN_EXPLAINED_LONG
 from minislam.viz import figure_png
 
 MAX_SHOWN = 150  # keyframes in report and viewer, evenly spread: 40 kB each
-LONGEST_SIDE = 320  # px of their pictures there
+LONGEST_SIDE = 320  # px of their panels there
 COLOUR_SAMPLES = 6  # keyframes from which the colours of all are chosen
 PREVIEW_FRACTION = 0.01  # of a run's time that writing reports before its end may take [-]
+Jpegs = dict[int, list[bytes]]  # frame_index: small input, depth, beta, render
 
 
 class Preview:
@@ -37,7 +38,7 @@ class Preview:
         self._folder = folder
         self._due = 0.0  # second, when the next one may be written
 
-    def update(self, slam: Slam, facts_of: Callable[[str, None], dict[str, Any]]) -> None:
+    def update(self, slam: Slam, facts_of: Callable[[str, None], Json]) -> None:
         """Write the report if there is a map and a new one is due; `facts_of` is run.json."""
         begun = time.perf_counter()
         if begun >= self._due and slam.mapper.images:
@@ -46,27 +47,26 @@ class Preview:
             self._due = ended + (ended - begun) / PREVIEW_FRACTION
 
 
-def write_preview(folder: RunFolder, slam: Slam, facts: dict[str, Any]) -> None:
+def write_preview(folder: RunFolder, slam: Slam, facts: Json) -> None:
     """Write the report of what is known so far; a failure to write it does not end the run."""
     with suppress(Exception):
-        shown = _pictures(slam, len(slam.mapper.images) - 1)
-        strip = [shown["input"], viz.beta_to_rgb(shown["beta"]), shown["render"]]
+        panels = _panels(slam, len(slam.mapper.images) - 1)
+        strip = [panels["input"], viz.beta_to_rgb(panels["beta"]), panels["render"]]
         jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
         _write_report(folder, slam, {}, facts, overview=jpeg)
 
 
-def write_pictures(
-    folder: RunFolder, slam: Slam, metrics: dict[str, float | None], facts: dict[str, Any]
-) -> None:
+def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) -> None:
     """Write keyframe images, plots, viewer and report."""
     estimate, true_path, unit = slam.trajectory(), None, facts["unit"]
     diagnostics, history = slam.tracker.watch.diagnostics, slam.mapper.history
+    breaks = [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks]
     health = viz.keyframe_health(
         [keyframe.frame_index for keyframe in diagnostics],
         [keyframe.explained for keyframe in diagnostics],
         [keyframe.agreement for keyframe in diagnostics],
         MIN_EXPLAINED_LONG,
-        [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks],
+        breaks,
         [index for index, _, _ in slam.lost_frames()],
     )
     plots = [("health", "How much of the flow poses and depths explain, by keyframe", health)]
@@ -76,8 +76,8 @@ def write_pictures(
         estimate, true_path, unit = error.estimate, error.truth, "m"
         over_time = viz.ate_over_time(estimate.timestamps, error.errors, unit)
         plots += [("ate_over_time", "Error of the camera's position over time", over_time)]
-    stamps, breaks = [t.timestamp for t in slam.tracker.tracked], slam.tracker.watch.breaks
-    broken = [(stamps[found.first_frame], stamps[found.last_frame]) for found in breaks]
+    stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
+    broken = [(stamps[first], stamps[last]) for first, last in breaks]
     path = viz.trajectory_plot(estimate, true_path, unit, broken)
     curves = {name: values for name, values in history.items() if name != "Gaussians"}
     plots += [
@@ -88,13 +88,13 @@ def write_pictures(
     figures = []
     for name, caption, figure in plots:
         figures.append((caption, figure_png(figure)))
-        folder.write_picture(f"{PLOTS}/{name}.png", figures[-1][1])
+        folder.write_image(f"{PLOTS}/{name}.png", figures[-1][1])
 
     jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
-    middle = _pictures(slam, len(slam.mapper.images) // 2)
+    middle = _panels(slam, len(slam.mapper.images) // 2)
     panels = middle["input"], middle["beta"], middle["render"]
     overview = figure_png(viz.overview(*panels, estimate, true_path, unit, broken))
-    folder.write_picture(f"{PLOTS}/overview.png", overview)
+    folder.write_image(f"{PLOTS}/overview.png", overview)
     run = Run(folder.path)
     small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
@@ -105,13 +105,8 @@ def write_pictures(
     )  # fmt: skip
 
 
-def _write_report(
-    folder: RunFolder,
-    slam: Slam,
-    metrics: dict[str, float | None],
-    facts: dict[str, Any],
-    **pictures: Any,  # of viz.Report
-) -> None:
+def _write_report(folder: RunFolder, slam: Slam, metrics: Json, facts: Json, **shown: Any) -> None:
+    """Write what is shown, by the names of viz.Report, and what the run tells of itself."""
     program, *arguments = facts["command"]
     by_hand = Path(program).stem in ("minislam", "__main__")  # or else by a program of the user
     report = viz.Report(
@@ -124,7 +119,7 @@ def _write_report(
         command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
         settings=named_settings(slam.config),
         next_step=way_on(folder.path) or NO_WAY_ON,
-        **pictures,
+        **shown,
     )
     write_text(folder.path / REPORT, viz.build_report(report))
 
@@ -144,38 +139,35 @@ def _spread(count: int, most: int) -> list[int]:
     return sorted(set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()))
 
 
-def _pictures(slam: Slam, index: int) -> dict[str, np.ndarray]:
-    """Return what an image of the map shows, and depth and beta as numbers."""
-    keyframe = slam.mapper.images[index]
-    rendering = slam.mapper.render(keyframe.T_camera_world)
+def _panels(slam: Slam, index: int) -> dict[str, np.ndarray]:
+    """Return what is shown of an image of the map, depth and beta as numbers."""
+    image = slam.mapper.images[index]
+    rendering = slam.mapper.render(image.T_camera_world)
     return {
-        "input": keyframe.image.cpu().numpy(),
+        "input": image.image.cpu().numpy(),
         "depth": surface_depth(rendering).cpu().numpy(),
         "beta": slam.beta_image(index),
-        "render": keyframe.exposed(rendering.color).cpu().numpy(),
+        "render": image.exposed(rendering.color).cpu().numpy(),
     }
 
 
-def _write_keyframes(
-    folder: RunFolder, slam: Slam
-) -> tuple[dict[int, list[bytes]], tuple[float, float], tuple[float, float]]:
-    """Write the pictures of the tracker's keyframes.
+def _write_keyframes(folder: RunFolder, slam: Slam) -> tuple[Jpegs, viz.Limits, viz.Limits]:
+    """Write the panels of the tracker's keyframes; return small ones for report and viewer.
 
-    Return small ones for report and viewer, frame_index: JPEG of input, depth, beta, render; and
-    between which depths [world units] and betas all are coloured.
+    All are coloured between the same depths [world units] and betas, which are returned, too.
     """
-    views, jpegs = slam.mapper.images, dict[int, list[bytes]]()
+    views, jpegs = slam.mapper.images, Jpegs()
     keyframes = [index for index, view in enumerate(views) if view.inserts]
-    sampled = [_pictures(slam, keyframes[k]) for k in _spread(len(keyframes), COLOUR_SAMPLES)]
-    of_depth = viz.depth_limits(np.array([pictures["depth"] for pictures in sampled]))
-    of_beta = viz.beta_limits(np.array([pictures["beta"] for pictures in sampled]))
+    sampled = [_panels(slam, keyframes[k]) for k in _spread(len(keyframes), COLOUR_SAMPLES)]
+    of_depth = viz.depth_limits(np.array([panels["depth"] for panels in sampled]))
+    of_beta = viz.beta_limits(np.array([panels["beta"] for panels in sampled]))
     shown = set(_spread(len(keyframes), MAX_SHOWN))
     for number, index in enumerate(keyframes):
-        pictures, frame_index = _pictures(slam, index), views[index].frame_index
-        pictures["depth"] = viz.depth_to_rgb(pictures["depth"], of_depth)
-        pictures["beta"] = viz.beta_to_rgb(pictures["beta"], of_beta)
-        for kind, picture in pictures.items():
-            folder.write_picture(f"{KEYFRAMES}/{frame_index:06d}_{kind}.png", encode_png(picture))
+        panels, frame_index = _panels(slam, index), views[index].frame_index
+        panels["depth"] = viz.depth_to_rgb(panels["depth"], of_depth)
+        panels["beta"] = viz.beta_to_rgb(panels["beta"], of_beta)
+        for kind, panel in panels.items():
+            folder.write_image(f"{KEYFRAMES}/{frame_index:06d}_{kind}.png", encode_png(panel))
         if number in shown:
-            jpegs[frame_index] = [encode_jpeg(p, LONGEST_SIDE) for p in pictures.values()]
+            jpegs[frame_index] = [encode_jpeg(panel, LONGEST_SIDE) for panel in panels.values()]
     return jpegs, of_depth, of_beta

@@ -59,10 +59,7 @@ class Checkpoints:
         return time.perf_counter() - self.start
 
     def save(self, slam: Slam, force: bool) -> None:
-        """Save a checkpoint if one is due; with `force`, always. A full disk does not end the run.
-
-        With a checkpoint_fraction of 0 none is saved, forced or not.
-        """
+        """Save a checkpoint if due or forced (not at a fraction of 0); a full disk ends no run."""
         begun = time.perf_counter()
         if self._fraction <= 0 or (begun < self._due and not force):
             return
@@ -93,8 +90,7 @@ class Checkpoints:
             present = flattened(self._origin)
             then = flattened({name: found.get(name) for name in self._origin})
             if device == "cpu" and then.get("priors.device") != "cpu":
-                for name in ("device", "precision"):
-                    then[f"priors.{name}"] = self._origin["priors"][name]
+                then |= {name: present[name] for name in ("priors.device", "priors.precision")}
             differing = [name for name, now in present.items() if then.get(name) != now]
             # What else of the input differs shows in the images, whose checksums are compared.
             if any(n[:6] != "input." or n == "input.depth_scale" for n in differing):

@@ -8,13 +8,12 @@ from dataclasses import asdict
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from minislam.config import SlamConfig
 from minislam.data import run_folder as names
-from minislam.data.files import atomic_write, write_json
+from minislam.data.files import Json, atomic_write, write_json
 from minislam.data.ply import GaussianArrays, encode_ply
 from minislam.data.run_folder import RunFolder
 from minislam.data.trajectory import write_trajectory
@@ -23,9 +22,10 @@ from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
 from minislam.priors.names import FILES
 from minislam.records import Sequence, required_mask
-from minislam.runs.facts import measure, run_facts
+from minislam.runs.facts import run_facts
 from minislam.runs.flythrough import write_clip
 from minislam.runs.loaded import scene_of
+from minislam.runs.measures import measure
 from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints, way_on
 from minislam.runs.warnings import alarms, has_large_holes, leaves_nearly_all_out
@@ -109,7 +109,7 @@ def run_in_folder(
     resume: bool = False,  # go on with an interrupted one
     workers: int | None = None,  # processes; as many as there are idle cores, at most 4
     bent: BentLens | None = None,  # with which the run has begun anew
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[Json, Json]:
     """Check everything that may be wrong, then run SLAM into a folder; return metrics and run.json.
 
     Nothing of an earlier run is removed before the checks. The threads of torch are afterwards as
@@ -162,9 +162,9 @@ def run_in_folder(
 def _run(
     slam: Slam,
     folder: RunFolder,
-    facts_of: Callable[[str, int | None], dict[str, Any]],  # run.json by state and exit code
+    facts_of: Callable[[str, int | None], Json],  # run.json by state and exit code
     lpips: Lpips | None,
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[Json, Json]:
     """Run SLAM, or what is left of it, and write the folder, however the run ends."""
     interrupted = False
     try:
@@ -210,17 +210,15 @@ def _ending(slam: Slam, interrupted: bool) -> tuple[str, int]:
     if interrupted:
         return "interrupted", INTERRUPTED_EXIT
     graph = slam.tracker.graph
-    if 2 * graph.failed_adjustments > graph.adjustments:
-        return "finished, most bundle adjustments failed", LOST_EXIT
-    if slam.tracker.watch.breaks:
-        return "finished, broken", LOST_EXIT
-    if has_large_holes(slam) or leaves_nearly_all_out(slam):
-        return "finished, map with large holes", LOST_EXIT
-    if slam.lost_frames():
-        return "finished, partly lost", LOST_EXIT
-    if slam.sequence.unread:
-        return "finished, images left out", LOST_EXIT
-    return "finished", 0
+    flaws = {  # the first that is true is told
+        "most bundle adjustments failed": 2 * graph.failed_adjustments > graph.adjustments,
+        "broken": slam.tracker.watch.breaks,
+        "map with large holes": has_large_holes(slam) or leaves_nearly_all_out(slam),
+        "partly lost": slam.lost_frames(),
+        "images left out": slam.sequence.unread,
+    }
+    flaw = next((words for words, is_so in flaws.items() if is_so), None)
+    return (f"finished, {flaw}", LOST_EXIT) if flaw else ("finished", 0)
 
 
 def _write_trajectories(folder: RunFolder, slam: Slam) -> None:

@@ -28,10 +28,8 @@ def summarise(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> list[Line
 
 def as_text(lines: list[Line]) -> list[str]:
     """Return the lines of a summary for a terminal, in columns."""
-    return [
-        f"  {line.what:35s}{line.value:14s} {line.verdict:6s}{line.detail}".rstrip()
-        for line in lines
-    ]
+    rows = (f"  {line.what:35s}{line.value:14s} {line.verdict:6s}{line.detail}" for line in lines)
+    return [row.rstrip() for row in rows]
 
 
 def judge(value: float, good: float | None, fair: float | None) -> str:
@@ -81,7 +79,7 @@ def _spent(metrics: Mapping[str, Any], facts: Mapping[str, Any]) -> Iterator[Lin
     is_whole = not facts["breaks"] and not facts["lost_frames"]  # else it fits any focal length
     if focal.get("factor") is not None and is_whole:
         verdict = "poor" if focal["is_doubtful"] else "good"
-        where = "from frame {} to {} ".format(*focal["half"]) if focal.get("half") else ""
+        where = f"from frame {span(*focal['half'])} " if focal.get("half") else ""
         origin += f"; {where}the flow fits {focal['factor']:.2f} times this one best"
     yield Line("focal length", length.partition(" for ")[0], verdict, detail=origin)
     across, down = facts["readout_seconds"]

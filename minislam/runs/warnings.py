@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from itertools import dropwhile, pairwise
+from itertools import dropwhile
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from minislam.errors import InputError
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.evaluation.trajectory import absolute_trajectory_error, doubt_of_units
 from minislam.records import TrackingStatus
+from minislam.runs.measures import guessed_depth, left_out, shown_static
 from minislam.runs.summary import span
 from minislam.slam import Slam
 from minislam.tracking.safeguards.diagnostics import is_unexplained
@@ -31,6 +32,7 @@ _FAR_APART = (
     "If the images lie far apart or out of order, give more from between them (a smaller "
     "--stride), with names in their order"
 )
+_ZOOMED = "the lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
 
 
 def alarms(slam: Slam) -> Iterator[str]:
@@ -145,9 +147,8 @@ def _followed_stretches(slam: Slam) -> list[tuple[int, int]]:
 
 def _stretches(frames: list[int], gap: int) -> list[tuple[int, int]]:
     """Return first and last of the frames that follow each other by at most `gap`."""
-    ends = [k for k in range(1, len(frames)) if frames[k] - frames[k - 1] > gap]
-    bounds = pairwise([0, *ends, len(frames)])
-    return [(frames[first], frames[end - 1]) for first, end in bounds if first < end]
+    parts = np.split(frames, np.flatnonzero(np.diff(frames) > gap) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
 
 
 def _as_options(slam: Slam, stretches: list[tuple[int, int]]) -> str:
@@ -163,15 +164,12 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
     fit, graph, lens = slam.focal_length, slam.tracker.graph, slam.lens
     # The flow of a broken run fits whatever focal length.
     is_broken = slam.tracker.watch.breaks or slam.lost_frames() or graph.failed_adjustments
-    is_other = fit is not None and fit.is_doubtful and not is_broken
+    other = fit if fit is not None and fit.is_doubtful and not is_broken else None
     is_unknown = graph.seeks_focal and graph.adjustments and not graph.focal_is_free
     if is_unknown and slam.tracker.knows_depth:  # a view at one depth needs none
-        fitted = "the lens that the flow fits"
-        origin = fitted if slam.undone_lens else slam.sequence.focal_origin
-        told = zoomed = ""
-        if fit is not None and is_other:
-            told = _of_a_half(slam, fit)
-            zoomed = "; if the lens zoomed, run each part for itself" if fit.half else ""
+        origin = "the lens that the flow fits" if slam.undone_lens else slam.sequence.focal_origin
+        told = _told_by_flow(slam, other) if other else ""
+        zoomed = "; if the lens zoomed, run each part for itself" if other and other.half else ""
         yield (
             f"the focal length is {f'known from {origin} alone' if origin else 'unknown'} "
             f"and the motion does not tell it{told}: trajectory and map may be bent; give --fx or "
@@ -191,23 +189,18 @@ def _camera_warnings(slam: Slam) -> Iterator[str]:
             f"with {lens.saved:.0%} less cost: focal length, trajectory and map may be bent; film "
             "in the linear mode of the camera, or give --fx, --k1 and --k2"
         )
-        return
-    if fit is None or not is_other:
-        return
-    better = f"better, with {fit.saved:.0%} less cost"
-    found = f"the flow fits {fit.factor:.2f} times the present focal length {better}"
-    zoomed = "the lens zoomed while it filmed, no focal length is right, and the trajectory is bent"
-    if fit.half:
-        first, last = fit.half
-        yield f"from frame {first} to {last} {found}: if {zoomed}; run each part for itself"
-    else:
-        advice = f"check the calibration, or give {fit.factor:.2f} times the present --fx and --fy"
-        yield f"{found}: {advice}. If {zoomed}"
+    elif other:
+        times = f"{other.factor:.2f} times the present"
+        found = f"the flow fits {times} focal length better, with {other.saved:.0%} less cost"
+        if other.half:
+            yield f"from frame {span(*other.half)} {found}: if {_ZOOMED}; run each part for itself"
+        else:
+            yield f"{found}: check the calibration, or give {times} --fx and --fy. If {_ZOOMED}"
 
 
-def _of_a_half(slam: Slam, fit: FocalLengthFit) -> str:
-    """Say which focal length of the raw images half of a run tells that as a whole tells none."""
-    where = "from frame {} to {} ".format(*fit.half) if fit.half else ""
+def _told_by_flow(slam: Slam, fit: FocalLengthFit) -> str:
+    """Say which focal length of the raw images the flow fits, of a half or of the whole run."""
+    where = f"from frame {span(*fit.half)} " if fit.half else ""
     raw = slam.sequence.preparation["raw_camera"]["fx"] / slam.sequence.camera.fx  # px per px
     found = raw * fit.present * (fit.factor or 1.0)
     return f", but {where}the flow fits --fx {found:.0f} best, with {fit.saved:.0%} less cost"
@@ -259,11 +252,6 @@ def _prior_warnings(slam: Slam, depth: str) -> Iterator[str]:
         yield "without a depth prior the unit of length is arbitrary"
 
 
-def shown_static(slam: Slam) -> float | None:
-    """Return the fraction of what stands still that the map shows [-]; None before the end."""
-    return float(np.mean(slam.mapper.shown)) if slam.mapper.shown else None
-
-
 def has_large_holes(slam: Slam) -> bool:
     """Tell whether the map shows too little for its poses and depths to be right."""
     shown = shown_static(slam)
@@ -273,22 +261,3 @@ def has_large_holes(slam: Slam) -> bool:
 def leaves_nearly_all_out(slam: Slam) -> bool:
     """Tell whether the map holds too little of the images; given masks may be as large."""
     return slam.config.uncertainty.is_learned and left_out(slam) > NEARLY_ALL
-
-
-def left_out(slam: Slam) -> float:
-    """Return the fraction of the map's images that beta leaves out [-]; 0 before the end."""
-    mapper = slam.mapper
-    images = mapper.images if mapper.shown else []
-    weights = (mapper.static_weight(mapper.beta_of(k), mapper.camera) for k in images)
-    return float(np.mean([float((weight == 0).float().mean()) for weight in weights] or 0.0))
-
-
-def guessed_depth(slam: Slam) -> float | None:
-    """Return the fraction of the keyframes' static pixels whose depth nothing has measured [-]."""
-    mapper, guessed = slam.mapper, []
-    for keyframe in mapper.images:
-        static = mapper.static_weight(mapper.beta_of(keyframe), mapper.camera) > 0
-        if keyframe.inserts and static.any():
-            unknown = keyframe.depth == 0 if keyframe.filled is None else keyframe.filled
-            guessed.append(float(unknown[static].float().mean()))
-    return float(np.mean(guessed)) if guessed else None

@@ -23,6 +23,7 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.viz.style import beta_to_rgb, depth_to_rgb
 
+Lines = Series[tuple[str, ...]]  # of a summary: what, value with unit, verdict, meaning, detail
 _STOPS = 9  # colours of a colour bar
 _TEXTS = "title folder state description command settings next_step".split()  # of a report
 LARGEST = 400_000  # bytes of a flip book
@@ -41,7 +42,7 @@ class Report:
     description: str = ""  # of the sequence, one line
     warnings: Series[str] = ()
     overview: bytes = b""  # PNG or JPEG
-    summary: Series[tuple[str, ...]] = ()  # what, value with unit, verdict, meaning, detail
+    summary: Lines = ()
     keyframes: Mapping[int, Series[bytes]] = field(default_factory=dict)
     # frame_index: JPEG of input, depth, beta, render
     depth_limits: tuple[float, float] = (0.0, 1.0)  # of the colours [unit]
@@ -75,9 +76,7 @@ def build_report(report: Report) -> str:
     )
 
 
-def summary_html(
-    title: str, lines: Series[tuple[str, ...]], warnings: Series[str], png: bytes
-) -> str:
+def summary_html(title: str, lines: Lines, warnings: Series[str], png: bytes) -> str:
     """Return the HTML of a report's summary for a notebook: title, lines, warnings, one picture."""
     left = 'style="text-align: left"'
     rows = "".join(

@@ -25,7 +25,7 @@ from minislam.evaluation.metrics import MappedView, measure_run
 from minislam.geometry import se3_inverse
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence, Trajectory
-from minislam.runs.facts import mapped_views
+from minislam.runs.measures import mapped_views
 from minislam.runs.run import choose_priors
 from minislam.slam import Slam
 from minislam.tracking.config import TrackingConfig

@@ -36,7 +36,7 @@ FILE = {
 def parse(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     add_input(parser)
-    add_priors(parser, default_depth="none", with_flow=True)
+    add_priors(parser, depth="none", with_flow=True)
     add_settings(parser)
     rest, given = take_settings(list(arguments))
     return argparse.Namespace(**vars(parser.parse_args(rest)), settings=given, parser=parser)

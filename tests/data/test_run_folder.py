@@ -35,8 +35,8 @@ def fill(run: RunFolder) -> None:
     ones = np.ones((2, 3), np.float32)
     run.write_lost_frames([(7, 0.233333, "too few matches")])
     run.write_mlp({"0.weight": torch.arange(6.0).reshape(2, 3)})
-    run.write_picture("keyframes/000123_input.png", encode_png(picture(1)))
-    run.write_picture("plots/trajectory.png", b"png")
+    run.write_image("keyframes/000123_input.png", encode_png(picture(1)))
+    run.write_image("plots/trajectory.png", b"png")
     for name in ("trajectory.txt", "keyframe_trajectory.txt"):
         write_trajectory(run.path / name, trajectory)
     gaussians = GaussianArrays(ones, ones, np.ones((2, 4), np.float32), np.zeros(2), ones)
@@ -218,4 +218,4 @@ def test_names_cannot_leave_the_folder(tmp_path: Path):
     run = RunFolder.create(tmp_path / "out")
     for name in ("../escape.png", "plots/../health.png", "keyframes/000001_other.png"):
         with pytest.raises(AssertionError):
-            run.write_picture(name, b"")
+            run.write_image(name, b"")

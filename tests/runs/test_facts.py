@@ -1,30 +1,9 @@
-"""What a run tells about itself: warnings, and the memory it took."""
-
-from types import SimpleNamespace
+"""What a run tells about itself."""
 
 import pytest
-import torch
 
-from minislam.config import with_settings
-from minislam.records import MapImage, Pictured
 from minislam.runs import facts
-from minislam.splatting import Rendering
-from tests.runs.finished import CAMERA, finished
-
-
-def test_what_beta_leaves_out_and_what_is_guessed_is_measured(monkeypatch: pytest.MonkeyPatch):
-    run = finished(left_out=0.4, unknown=0.7, shown=[1.0, 1.0])
-    run.keyframe_trajectory, run.render = run.trajectory, None
-    run.tracker.grid, errors = run.tracker.graph.grid, {"ate_all_cm": 1.0}
-    for name, known in (("measure_run", errors), ("unseen_psnr", None), ("_ties", {})):
-        monkeypatch.setattr(facts, name, lambda *_, known=known: known)
-    measured = facts.measure(run, 1.0, None)
-    assert (measured["left_out"], measured["guessed_depth"]) == pytest.approx((0.4, 0.5))
-    run.config = with_settings(run.config, {"uncertainty.enabled": False})
-    assert facts.measure(run, 1.0, None)["left_out"] is None
-    run.mapper.images[0].filled = torch.arange(10) < 7  # such depth is no measurement
-    run.mapper.images[0].depth = torch.ones(10)
-    assert facts.measure(run, 1.0, None)["guessed_depth"] == pytest.approx(0.5)
+from tests.runs.finished import finished
 
 
 @pytest.mark.parametrize(
@@ -41,82 +20,3 @@ def test_the_focal_length_is_said_with_its_origin(parts: dict, words: str):
     run.tracker.grid, run.tracker.initialised = run.tracker.graph.grid, parts.get("has_begun", True)
     note = facts.focal_length_note(run)
     assert note.startswith("250.0 px for 320x240 images, ") and words in note
-
-
-def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():
-    # Rendered depth is a sum over blending weights: 1.8 at an opacity of 0.9 is a surface at 2.
-    depth, opacity = torch.tensor([[1.8, 0.4]]), torch.tensor([[0.9, 0.2]])
-    rendering = Rendering(torch.zeros(1, 2, 3), depth, opacity, torch.ones(1))
-    torch.testing.assert_close(facts.surface_depth(rendering), torch.tensor([[2.0, 0.0]]))
-
-
-def test_a_mapped_view_is_compared_as_exposed_and_where_it_stands_still():
-    color, opacity = torch.full((4, 6, 3), 0.4), torch.full((4, 6), 0.9)
-    opacity[0, 0] = 0.1  # a gap
-    rendering = Rendering(color, 2 * opacity, opacity, torch.ones(1))
-    static = torch.zeros(4, 6)
-    static[:, :3] = 1
-    image = torch.where(static[..., None] > 0, 0.9, 0.0).expand(4, 6, 3)  # .8 if exposed, .1 off
-    keyframes = [
-        SimpleNamespace(frame_index=8, T_camera_world=0, beta=static),
-        SimpleNamespace(frame_index=16, T_camera_world=1, beta=0 * static),
-    ]
-    for keyframe, exposure in zip(keyframes, (torch.full((3,), 2.0), None), strict=True):
-        picture = Pictured()
-        picture.pixels, picture.exposure = image, exposure
-        keyframe.image, keyframe.exposed = picture.image, picture.exposed
-    mapper = SimpleNamespace(
-        images=keyframes,
-        camera=CAMERA,
-        renderings=lambda views: (
-            rendering._replace(color=color + 0.1 * view.T_camera_world) for view in views
-        ),
-        beta_of=lambda keyframe: keyframe.beta,
-        static_weight=lambda beta, camera: beta,
-    )
-    uncertainty = SimpleNamespace(is_learned=True)
-    run = SimpleNamespace(mapper=mapper, config=SimpleNamespace(uncertainty=uncertainty))
-    run.beta_image = lambda index: 0.5 + index
-    first, second = facts.mapped_views(run)
-    assert (first.frame_index, second.frame_index) == (8, 16)
-    assert first.static_psnr == pytest.approx(20, abs=1e-3) and second.static_psnr is None
-    assert first.color.max() == pytest.approx(0.4) and second.color.max() == pytest.approx(0.5)
-    assert first.depth[0, 0] == 0 and first.depth[1, 1] == pytest.approx(2)
-    assert (first.beta, second.beta) == (0.5, 1.5)
-    uncertainty.is_learned = False
-    assert all(view.beta is None for view in facts.mapped_views(run))
-
-
-def test_the_map_is_compared_with_some_frames_that_it_was_not_fitted_to():
-    asked: list[int] = []
-
-    def map_images(first: int, others: list[int]) -> list[MapImage]:
-        assert first == 3  # none of the tracker
-        asked[:] = others
-        image, none = torch.full((4, 6, 3), 0.5), torch.zeros(4, 6)
-        return [MapImage(index, image, none, none, torch.tensor(index)) for index in others]
-
-    def render(pose: torch.Tensor) -> Rendering:
-        opacity = torch.ones(4, 6)
-        return Rendering(torch.full((4, 6, 3), 0.2), opacity, opacity, torch.ones(1))
-
-    mapper = SimpleNamespace(
-        images=[SimpleNamespace(frame_index=0)],
-        exposures={0: torch.full((3,), 2.0)},  # so .4 is seen
-        camera=CAMERA,
-        render=render,
-        beta_of=lambda keyframe: (torch.arange(6) < keyframe.frame_index).expand(4, 6),
-        static_weight=lambda beta, camera: beta,
-    )
-    watch = SimpleNamespace(longest_piece=lambda poses: poses)
-    tracker = SimpleNamespace(keyframes=[None] * 3, watch=watch)
-    run = SimpleNamespace(mapper=mapper, tracker=tracker, map_images=map_images)
-    run.poses = dict.fromkeys(range(101))
-    assert facts.unseen_psnr(run) == pytest.approx(20, abs=1e-3)
-    assert len(asked) == facts.MOST_UNSEEN and asked[0] == 1 and asked[-1] == 96
-    run.poses = dict.fromkeys(range(9))
-    assert facts.unseen_psnr(run) is not None and asked == [1, 2, 3, 4, 5, 6, 7, 8]
-    tracker.watch.longest_piece = lambda poses: range(3, 6)  # of a broken run
-    assert facts.unseen_psnr(run) is not None and asked == [3, 4, 5]
-    tracker.watch.longest_piece = lambda poses: [0]
-    assert facts.unseen_psnr(run) is None

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from minislam import slam
 from minislam.cli.main import main
 from minislam.config import SlamConfig
 from minislam.data.files import read_json
@@ -17,6 +16,7 @@ from minislam.errors import InputError
 from minislam.priors.choice import PriorChoice
 from minislam.runs import pictures, run
 from minislam.state.steps import SilentObserver, Steps
+from minislam.stereo import dense_structure
 from minislam.tracking import bundle_adjustment
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards.lens import BentLens, LensFit
@@ -151,7 +151,7 @@ def test_a_run_that_ends_without_a_map_keeps_its_trajectory(root: Path, monkeypa
     def no_depth(*arguments: object) -> list:
         raise InputError("expected some known depth, found none")
 
-    monkeypatch.setattr(slam, "with_swept_depth", no_depth)
+    monkeypatch.setattr(dense_structure, "with_swept_depth", no_depth)
     out = root / "no_map"
     assert main([*COMMAND, "-o", str(out)]) == 1
     folder = RunFolder(out)
