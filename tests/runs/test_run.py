@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from minislam import slam
 from minislam.cli.main import main
 from minislam.config import SlamConfig
 from minislam.data.files import read_json
