@@ -35,12 +35,11 @@ def noted_focal_length(path: Path) -> tuple[float, str] | None:
     try:
         content = _mapped(path)
         is_photo = content[:2] == JPEG
-        found = _of_exif(_exif(content)) if is_photo else _of_video(content)
+        found = _of_exif(_exif(content)) if is_photo else next(_of_video(content))
     except _UNREADABLE:
         return None  # Damaged notes are no reason to refuse whole images.
-    if found is None or not POSSIBLE[0] < found < POSSIBLE[1]:
-        return None
-    return found, f"{'EXIF' if is_photo else 'QuickTime tag'} of {path.name}"
+    origin = f"{'EXIF' if is_photo else 'QuickTime tag'} of {path.name}"
+    return (found, origin) if POSSIBLE[0] < found < POSSIBLE[1] else None
 
 
 def noted_size(path: Path) -> tuple[int, int] | None:
@@ -100,7 +99,7 @@ def _tags(tiff: memoryview, within: int | None = None) -> dict[int, float]:
     return values
 
 
-def _of_exif(tiff: memoryview) -> float | None:
+def _of_exif(tiff: memoryview) -> float:
     """Return the focal length over the image diagonal."""
     found = _tags(tiff, within=_POINTER)
     if found.get(_FILM_EQUIVALENT):
@@ -122,12 +121,11 @@ def _boxes(content: memoryview) -> Iterator[tuple[bytes, memoryview]]:
         content = content[size:]
 
 
-def _of_video(video: memoryview) -> float | None:
-    """Return the focal length over the image diagonal that a box, or one inside it, notes."""
+def _of_video(video: memoryview) -> Iterator[float]:
+    """Yield each focal length over the image diagonal that a box, or one inside it, notes."""
     for kind, content in _boxes(video):
-        found = None
         if kind in (b"moov", b"trak", b"udta"):
-            found = _of_video(content)
+            yield from _of_video(content)
         elif kind == b"meta":
             # ISO files have four bytes of version in front of the boxes, QuickTime has none.
             inner = dict(_boxes(content if content[4:8] == b"hdlr" else content[4:]))
@@ -136,7 +134,4 @@ def _of_video(video: memoryview) -> float | None:
                 place = struct.pack(">I", names.index(VIDEO_KEY) + 1)  # values go by position
                 ((_, value),) = _boxes(dict(_boxes(inner[b"ilst"]))[place])
                 number = _VIDEO_NUMBERS[struct.unpack_from(">I", value)[0]]
-                found = struct.unpack_from(number, value, 8)[0] / FILM_DIAGONAL
-        if found:
-            return found
-    return None
+                yield struct.unpack_from(number, value, 8)[0] / FILM_DIAGONAL

@@ -28,7 +28,6 @@ MAX_SHOWN = 150  # keyframes in report and viewer, evenly spread: 40 kB each
 LONGEST_SIDE = 320  # px of their panels there
 COLOUR_SAMPLES = 6  # keyframes from which the colours of all are chosen
 PREVIEW_FRACTION = 0.01  # of a run's time that writing reports before its end may take [-]
-Jpegs = dict[int, list[bytes]]  # frame_index: small input, depth, beta, render
 
 
 class Preview:
@@ -59,16 +58,11 @@ def write_preview(folder: RunFolder, slam: Slam, facts: Json) -> None:
 def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) -> None:
     """Write keyframe images, plots, viewer and report."""
     estimate, true_path, unit = slam.trajectory(), None, facts["unit"]
-    diagnostics, history = slam.tracker.watch.diagnostics, slam.mapper.history
-    breaks = [(found.first_frame, found.last_frame) for found in slam.tracker.watch.breaks]
-    health = viz.keyframe_health(
-        [keyframe.frame_index for keyframe in diagnostics],
-        [keyframe.explained for keyframe in diagnostics],
-        [keyframe.agreement for keyframe in diagnostics],
-        MIN_EXPLAINED_LONG,
-        breaks,
-        [index for index, _, _ in slam.lost_frames()],
-    )
+    rows, names = facts["keyframe_diagnostics"], ("frame_index", "explained", "agreement")
+    frames, explained, agreement = ([row[name] for row in rows] for name in names)
+    breaks = [(found["first_frame"], found["last_frame"]) for found in facts["breaks"]]
+    lost = [index for index, _, _ in slam.lost_frames()]
+    health = viz.keyframe_health(frames, explained, agreement, MIN_EXPLAINED_LONG, breaks, lost)
     plots = [("health", "How much of the flow poses and depths explain, by keyframe", health)]
     truth = slam.sequence.ground_truth
     if metrics["ate_all_cm"] is not None and truth is not None and truth.trajectory is not None:
@@ -79,7 +73,7 @@ def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) ->
     stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
     broken = [(stamps[first], stamps[last]) for first, last in breaks]
     path = viz.trajectory_plot(estimate, true_path, unit, broken)
-    curves = {name: values for name, values in history.items() if name != "Gaussians"}
+    curves = {name: values for name, values in slam.mapper.history.items() if name != "Gaussians"}
     plots += [
         ("trajectory", "Path of the camera, in the planes x-z and x-y", path),
         ("losses", "Losses while the map was optimised", viz.loss_curves(curves)),
@@ -90,19 +84,16 @@ def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) ->
         figures.append((caption, figure_png(figure)))
         folder.write_image(f"{PLOTS}/{name}.png", figures[-1][1])
 
-    jpegs, of_depth, of_beta = _write_keyframes(folder, slam)
+    shown = _write_keyframes(folder, slam)
     middle = _panels(slam, len(slam.mapper.images) // 2)
     panels = middle["input"], middle["beta"], middle["render"]
     overview = figure_png(viz.overview(*panels, estimate, true_path, unit, broken))
     folder.write_image(f"{PLOTS}/overview.png", overview)
     run = Run(folder.path)
-    small = {frame: (shown, beta, render) for frame, (shown, _, beta, render) in jpegs.items()}
+    small = {k: (image, beta, render) for k, (image, _, beta, render) in shown["keyframes"].items()}
     scene = vars(run.gaussians), run.camera, run.background, run.poses, len(run.frames), small
     write_text(folder.path / VIEWER, viz.build_viewer(f"minislam: {run.name}", *scene))
-    _write_report(
-        folder, slam, metrics, facts, overview=overview, keyframes=jpegs, depth_limits=of_depth,
-        beta_limits=of_beta, unit=facts["unit"], figures=figures,
-    )  # fmt: skip
+    _write_report(folder, slam, metrics, facts, overview=overview, figures=figures, **shown)
 
 
 def _write_report(folder: RunFolder, slam: Slam, metrics: Json, facts: Json, **shown: Any) -> None:
@@ -116,6 +107,7 @@ def _write_report(folder: RunFolder, slam: Slam, metrics: Json, facts: Json, **s
         description=slam.sequence.description,
         warnings=facts["warnings"],
         summary=summarise(metrics, facts),
+        unit=facts["unit"],
         command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
         settings=named_settings(slam.config),
         next_step=way_on(folder.path) or NO_WAY_ON,
@@ -151,12 +143,12 @@ def _panels(slam: Slam, index: int) -> dict[str, np.ndarray]:
     }
 
 
-def _write_keyframes(folder: RunFolder, slam: Slam) -> tuple[Jpegs, viz.Limits, viz.Limits]:
-    """Write the panels of the tracker's keyframes; return small ones for report and viewer.
+def _write_keyframes(folder: RunFolder, slam: Slam) -> dict[str, Any]:
+    """Write the panels of the tracker's keyframes; return small ones, and the limits of colours.
 
-    All are coloured between the same depths [world units] and betas, which are returned, too.
+    All have the same limits. The names are those of viz.Report.
     """
-    views, jpegs = slam.mapper.images, Jpegs()
+    views, jpegs = slam.mapper.images, dict[int, list[bytes]]()
     keyframes = [index for index, view in enumerate(views) if view.inserts]
     sampled = [_panels(slam, keyframes[k]) for k in _spread(len(keyframes), COLOUR_SAMPLES)]
     of_depth = viz.depth_limits(np.array([panels["depth"] for panels in sampled]))
@@ -170,4 +162,4 @@ def _write_keyframes(folder: RunFolder, slam: Slam) -> tuple[Jpegs, viz.Limits, 
             folder.write_image(f"{KEYFRAMES}/{frame_index:06d}_{kind}.png", encode_png(panel))
         if number in shown:
             jpegs[frame_index] = [encode_jpeg(panel, LONGEST_SIDE) for panel in panels.values()]
-    return jpegs, of_depth, of_beta
+    return {"keyframes": jpegs, "depth_limits": of_depth, "beta_limits": of_beta}

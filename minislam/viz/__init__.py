@@ -11,7 +11,6 @@ from minislam.viz.figures import (
 )
 from minislam.viz.pages import Page, Report, build_report, build_viewer, flipbook, summary_html
 from minislam.viz.style import (
-    Limits,
     beta_limits,
     beta_to_rgb,
     colour_bar,
