@@ -10,7 +10,7 @@ by the MLP's beta. `_move_map` deforms the map when an adjustment has moved keyf
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
 from minislam.priors.features import with_finer_grid
-from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
+from minislam.priors.interfaces import Priors
 from minislam.records import Frame, Keyframe, Sequence, Trajectory, required_mask
 from minislam.state.memory import SHELF
 from minislam.state.stateful import Stateful
@@ -46,15 +46,6 @@ from minislam.workers import Workers
 
 ONLINE_CELL = 4  # px, side of the square that gets one Gaussian; the final map has its own
 FRAMES_AT_ONCE = 8  # whose poses are refined side by side; with more, Ctrl-C waits longer
-
-
-@dataclass(frozen=True)
-class Priors:
-    """The three estimators that see single images or pairs, without any geometry."""
-
-    flow: FlowEstimator
-    features: FeatureExtractor
-    depth: DepthPrior
 
 
 class Slam(Stateful):
