@@ -10,7 +10,7 @@ by the MLP's beta. `_move_map` deforms the map when an adjustment has moved keyf
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,7 @@ from minislam.geometry import se3_inverse
 from minislam.images import resample
 from minislam.mapping import Mapper
 from minislam.priors.features import HighResolutionFeatures
-from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
+from minislam.priors.interfaces import Priors
 from minislam.records import Frame, MapImage, Sequence, Trajectory, required_mask
 from minislam.state.memory import SHELF
 from minislam.state.stateful import Stateful
@@ -41,15 +41,6 @@ from minislam.workers import Workers
 
 ONLINE_CELL = 4  # px, side of the square that gets one Gaussian; the final map has its own
 FRAMES_AT_ONCE = 8  # whose poses are refined side by side; with more, Ctrl-C waits longer
-
-
-@dataclass(frozen=True)
-class Priors:
-    """The three estimators that see single images or pairs, without any geometry."""
-
-    flow: FlowEstimator
-    features: FeatureExtractor
-    depth: DepthPrior
 
 
 class Slam(Stateful):

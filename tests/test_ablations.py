@@ -18,8 +18,9 @@ from minislam.errors import InputError
 from minislam.priors.depth import SimulatedDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
+from minislam.priors.interfaces import Priors
 from minislam.records import Sequence
-from minislam.slam import Priors, Slam
+from minislam.slam import Slam
 from minislam.stereo import second_adjustment
 from minislam.tracking.safeguards import first_camera
 

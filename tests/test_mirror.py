@@ -18,7 +18,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "tracking/bundle_problem": "tracking/test_bundle_adjustment.py",
     "tracking/reference": "tracking/test_bundle_adjustment.py",
     "runs/api": "runs/test_loaded.py",
-    "priors/interfaces": "priors/test_flow.py",  # protocols and one record
+    "priors/interfaces": "priors/test_flow.py",  # protocols and two records
 }
 
 

@@ -18,7 +18,8 @@ from minislam.images import resample
 from minislam.priors.depth import NoDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
-from minislam.slam import Priors, Slam
+from minislam.priors.interfaces import Priors
+from minislam.slam import Slam
 from tests.recordings import save
 
 pytestmark = pytest.mark.slow

@@ -25,6 +25,7 @@ from minislam.priors.choice import PriorChoice
 from minislam.priors.depth import NoDepth, SimulatedDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
+from minislam.priors.interfaces import Priors
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid import DroidFlow
 from minislam.priors.networks.vit import DinoFeatures
@@ -33,7 +34,7 @@ from minislam.runs.facts import run_facts
 from minislam.runs.measures import measure
 from minislam.runs.pictures import write_pictures
 from minislam.runs.resume import Checkpoints
-from minislam.slam import Priors, Slam
+from minislam.slam import Slam
 from minislam.state.stateful import Tree
 from minislam.stereo import second_adjustment
 from minislam.tracking import pose_from_flow

@@ -17,8 +17,9 @@ from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.images import psnr
 from minislam.priors.depth import SensorDepth
 from minislam.priors.features import ClassicalFeatures
+from minislam.priors.interfaces import Priors
 from minislam.priors.networks.droid import DroidFlowConfig
-from minislam.slam import Priors, Slam
+from minislam.slam import Slam
 from minislam.state.memory import SHELF
 from minislam.stereo import second_adjustment
 from tests.tracking.oracle import Clip, OracleFlow, Skill

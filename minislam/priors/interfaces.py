@@ -84,3 +84,12 @@ class DepthPrior(Protocol):
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return z-depth (H, W) float32 in world units, 0 where unknown, or None."""
+
+
+@dataclass(frozen=True)
+class Priors:
+    """The three estimators that see single images or pairs, without any geometry."""
+
+    flow: FlowEstimator
+    features: FeatureExtractor
+    depth: DepthPrior

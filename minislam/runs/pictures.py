@@ -73,7 +73,8 @@ def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) ->
     stamps = [tracked.timestamp for tracked in slam.tracker.tracked]
     broken = [(stamps[first], stamps[last]) for first, last in breaks]
     path = viz.trajectory_plot(estimate, true_path, unit, broken)
-    curves = {name: values for name, values in slam.mapper.history.items() if name != "Gaussians"}
+    history = slam.mapper.history
+    curves = {name: values for name, values in history.items() if name != "Gaussians"}
     plots += [
         ("trajectory", "Path of the camera, in the planes x-z and x-y", path),
         ("losses", "Losses while the map was optimised", viz.loss_curves(curves)),

@@ -20,6 +20,7 @@ from minislam.data.trajectory import write_trajectory
 from minislam.errors import FAILED_EXIT, INTERRUPTED_EXIT, LOST_EXIT, require
 from minislam.evaluation.lpips import Lpips
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
+from minislam.priors.interfaces import Priors
 from minislam.priors.names import FILES
 from minislam.records import Sequence, required_mask
 from minislam.runs.facts import run_facts
@@ -29,7 +30,7 @@ from minislam.runs.measures import measure
 from minislam.runs.pictures import Preview, write_pictures, write_preview
 from minislam.runs.resume import Checkpoints, way_on
 from minislam.runs.warnings import alarms, has_large_holes, leaves_nearly_all_out
-from minislam.slam import Priors, Slam
+from minislam.slam import Slam
 from minislam.state.steps import Observer
 from minislam.tracking.safeguards.lens import BentLens
 from minislam.workers import Workers, idle_cores

@@ -52,12 +52,11 @@ def chain_state(
     first_disparities: Tensor,  # (N,)
     known_disparities: Tensor,  # (K, N), 0 where there is no depth prior
     robust: RobustKernel | None,
-    first_weights: Tensor,  # (N,) in [0, 1] of the first keyframe
+    weights: Tensor,  # (N,) in [0, 1] of the first keyframe
 ) -> BundleState:
     """Return poses and disparities of K keyframes, each from its predecessor."""
     poses = [torch.eye(4, dtype=torch.float64, device=first_disparities.device)]
     disparities = [first_disparities]
-    weights = first_weights
     for index, matches in enumerate(flow_to_next):
         last, of_last = poses[-1], disparities[-1]
         starts = [last]
@@ -80,9 +79,8 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
     # The camera cannot be relocalised during the warm-up, so no flow is missing.
     flow_to_next = [matches for matches in graph.flow_to_next if matches is not None]
     keyframes = graph.keyframes
-    overlay = motion_memory.overlay_weights(flow_to_next, graph.grid)
+    keyframes.overlay = overlay = motion_memory.overlay_weights(flow_to_next, graph.grid)
     flow_to_next = [motion_memory.without_overlay(matches, overlay) for matches in flow_to_next]
-    keyframes.overlay = overlay
     graph.flow_to_next = [*flow_to_next]
     for target in range(1, len(keyframes)):
         graph.match_composed(target)

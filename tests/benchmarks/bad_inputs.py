@@ -25,8 +25,9 @@ import torch
 
 from minislam.cli import main as command_line
 from minislam.data.run_folder import RunFolder
+from minislam.priors.interfaces import Priors
 from minislam.records import Sequence
-from minislam.slam import Priors, Slam
+from minislam.slam import Slam
 from tests.benchmarks.bad_commands import commands, config_files, options, outputs, whole_runs
 from tests.benchmarks.bad_files import checkpoints, images, lists, priors, videos
 from tests.benchmarks.bad_input_case import REFUSED, RUN, WARNED, Case

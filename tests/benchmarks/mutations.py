@@ -75,7 +75,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         "tracking/safeguards/test_first_camera.py",
     ): [("replace(chain, log_focal=log_focal)", "chain")],
     ("tracking/safeguards/first_camera.py", "tracking/safeguards/test_first_camera.py"): [
-        ("> SAME_COST * cost", "> SAME_COST"),
+        ("> SAME_COST * cost_of(one)", "> SAME_COST"),
         ("for log in OTHER_FOCALS", "for log in ()"),
         ("saving <= FOCAL_WORTH_SAVING", "False"),
         ("edge_columns(self.positions) if self.tells_camera", "None if self.tells_camera"),

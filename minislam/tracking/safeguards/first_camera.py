@@ -55,10 +55,9 @@ def minima(
 def _each_once(found: list[Found]) -> list[Found]:
     """Return the first of those that have met in one minimum."""
     kept: list[Found] = []
-    for state, report in found:
-        cost = report.cost_after
-        if all(abs(cost - other.cost_after) > SAME_COST * cost for _, other in kept):
-            kept.append((state, report))
+    for one in found:
+        if all(abs(cost_of(one) - cost_of(other)) > SAME_COST * cost_of(one) for other in kept):
+            kept.append(one)
     return kept
 
 
