@@ -21,11 +21,9 @@ def gaussian_blur(
     size: int,  # px, side of the window, odd
     sigma: float,  # px
 ) -> Tensor:  # (..., H, W)
-    """Blur by a normalised Gaussian window, zero beyond the border: B_rows @ image @ B_columns.
-
-    On a CPU, products with strips of the banded matrices are far faster than a convolution of a
-    few channels, and three times as fast as products with the whole matrices.
-    """
+    """Blur by a normalised Gaussian window, zero beyond the border: B_rows @ image @ B_columns."""
+    # On a CPU, products with strips of the banded matrices are far faster than a convolution of a
+    # few channels, and three times as fast as products with the whole matrices.
     height, width = images.shape[-2:]
     kind = size, sigma, images.dtype, images.device
     wide = torch.cat([images[..., seen] @ B for seen, B in _blur_strips(width, *kind)], -1)

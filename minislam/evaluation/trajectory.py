@@ -73,10 +73,8 @@ def relative_pose_error(
 
 
 def straight_line_error(truth: Trajectory) -> float:
-    """Return the ATE (rmse) of the straight line at constant speed that fits the truth best.
-
-    It needs no images: an estimate that is not clearly better has not followed the camera.
-    """
+    """Return the ATE (rmse) of the straight line at constant speed that fits the truth best."""
+    # It needs no images: an estimate that is not clearly better has not followed the camera.
     time = truth.timestamps - truth.timestamps.mean()
     design = np.stack([np.ones_like(time), time], axis=1)
     line, *_ = np.linalg.lstsq(design, truth.centres, rcond=None)
@@ -131,11 +129,9 @@ def associate(
 
 
 def oriented_truth_to_estimate(estimate: Trajectory, truth: Trajectory) -> Similarity:
-    """Return the Sim(3) from truth to estimate, paired, with the mean rotation between cameras.
-
-    If the camera moves nearly along a line, its centres hardly determine the rotation about that
-    line, and 3 mrad of it move a held-out view by a pixel. The rest comes from the centres.
-    """
+    """Return the Sim(3) from truth to estimate, paired, with the mean rotation between cameras."""
+    # If the camera moves nearly along a line, its centres hardly determine the rotation about that
+    # line, and 3 mrad of it move a held-out view by a pixel. The rest comes from the centres.
     turned = estimate.T_world_camera[:, :3, :3] @ truth.T_world_camera[:, :3, :3].mT
     rotation = Rotation.from_matrix(turned).mean().as_matrix()
     source, target = truth.centres, estimate.centres

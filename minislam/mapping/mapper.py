@@ -87,7 +87,7 @@ class Mapper(JointOptimisation):
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all images of the map, the last part at full image size.
 
-        Half way, if each had two renderings, the upper mode of beta is excluded and gaps are filled;
+        Half way, if each had two renderings, the upper mode of beta is excluded, gaps are filled;
         at the end, Gaussians that no static pixel shows are removed. A resumed run follows `done`.
         """
         full = round(iterations * self.config.refine_full_fraction)
