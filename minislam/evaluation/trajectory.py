@@ -53,11 +53,9 @@ def absolute_trajectory_error(
 
 
 def relative_pose_error(
-    estimate: Trajectory,  # (N) as the truth, paired
-    truth: Trajectory,  # (N)
-    step: int = 1,  # poses between the two ends of each compared motion
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of the motions between poses `step` apart (RPE), which do not overlap.
+    estimate: Trajectory, truth: Trajectory, step: int = 1
+) -> tuple[np.ndarray, np.ndarray]:  # one per motion: world units, rad
+    """Return the errors of the motions between paired poses `step` apart (RPE), without overlap.
 
     With Q = truth_i^-1 truth_(i+step), P likewise of the estimate and E = Q^-1 P, these are
     |translation of E| and the angle of E [rad]. Where the scale is unknown, align it first.
