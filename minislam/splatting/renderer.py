@@ -68,13 +68,12 @@ class _Render(torch.autograd.Function):
             visible = project_gaussians(means, quats, scales, opacities, offsets2d, T, camera)
             channels = colors.index_select(0, visible.rows)
             channels = torch.cat([channels, visible.points_camera[2:].T], 1)
-            image = composite_image(visible, channels, background, camera)
+            image, opacity, sums, *kept = composite_image(visible, channels, background, camera)
         weight_sums = means.new_zeros(len(means))
-        weight_sums[visible.rows] = image.weight_sums
-        color = image.channels[:3].permute(1, 2, 0).contiguous()
-        ctx.state = visible, image.groups, image.workspace, T, background, camera, len(means), twist
+        weight_sums[visible.rows] = sums
+        ctx.state = visible, *kept, T, background, camera, len(means), twist
         ctx.mark_non_differentiable(weight_sums)
-        return color, image.channels[3].clone(), image.opacity, weight_sums
+        return image[:3].permute(1, 2, 0).contiguous(), image[3].clone(), opacity, weight_sums
 
     @staticmethod
     @once_differentiable

@@ -30,23 +30,17 @@ class CompositedGroup(NamedTuple):
     checkpoints: list[Tensor]  # (b, P)
 
 
-class CompositedImage(NamedTuple):
-    """The composited image, and what its backward needs."""
-
-    channels: Tensor  # (4, H, W) colour and depth
-    opacity: Tensor  # (H, W)
-    weight_sums: Tensor  # (V,) px, blending weight of a Gaussian summed over all pixels
-    groups: list[CompositedGroup]
-    workspace: compositing.Workspace  # reused by the backward, which saves allocating a second one
-
-
 def composite_image(
     visible: VisibleGaussians,
     channels: Tensor,  # (V, 4)
     background: Tensor,  # (4,)
     camera: Camera,
-) -> CompositedImage:
-    """List the Gaussians of every tile and composite them."""
+) -> tuple[Tensor, Tensor, Tensor, list[CompositedGroup], compositing.Workspace]:
+    """List the Gaussians of every tile and composite them.
+
+    Returned are colour and depth (4, H, W), opacity (H, W), the blending weight (V,) [px] of each
+    Gaussian summed over all pixels, and for the backward the groups and the workspace.
+    """
     g = visible
     lists = build_tile_lists(g.means2d, g.conics, g.covariances2d, g.opacities, camera)
     # Padding slots take their values from an additional last row or column.
@@ -76,7 +70,7 @@ def composite_image(
         kept = tiles, gaussians, chunks, offsets, coefficients, group_channels, out.checkpoints
         groups.append(CompositedGroup(*kept))
     opacity = from_tiles(opacities, camera)[0].clone()
-    return CompositedImage(from_tiles(canvas, camera), opacity, weight_sums[:-1], groups, workspace)
+    return from_tiles(canvas, camera), opacity, weight_sums[:-1], groups, workspace
 
 
 def composite_image_vjp(
