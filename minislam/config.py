@@ -21,9 +21,7 @@ class SlamConfig:
     """The whole configuration. Names with dots reach every part: `tracking.window`."""
 
     seed: int = parameter(0, "seed of every random draw: same seed, same bytes", most=2**63 - 1)
-    checkpoint_fraction: float = parameter(
-        0.01, "fraction of a run's time that writing checkpoints may take [-]; 0 writes none"
-    )
+    checkpoint_fraction: float = parameter(0.01, "fraction of the time for checkpoints; 0: none")
     threads: int = parameter(1, "threads of torch; more are slower on a busy machine", 1, 256)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)

@@ -16,10 +16,7 @@ class InputError(MinislamError):
 
 
 def require(is_right: bool, wanted: str, found: object) -> None:
-    """Raise InputError unless that is right: "expected WANTED, found FOUND".
-
-    FOUND ends with a semicolon and what to do.
-    """
+    """Raise InputError unless right: "expected WANTED, found FOUND", which ends with what to do."""
     if not is_right:
         raise InputError(f"expected {wanted}, found {found}")
 

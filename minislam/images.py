@@ -16,16 +16,10 @@ def local_moments(x: Tensor, y: Tensor, size: int) -> Tensor:  # both (C, H, W) 
     return gaussian_blur(torch.stack([x, x * x, x * y, y, y * y]), size, SSIM_SIGMA)
 
 
-def gaussian_blur(
-    images: Tensor,  # (..., H, W)
-    size: int,  # px, side of the window, odd
-    sigma: float,  # px
-) -> Tensor:  # (..., H, W)
-    """Blur by a normalised Gaussian window, zero beyond the border: B_rows @ image @ B_columns.
-
-    On a CPU, products with strips of the banded matrices are far faster than a convolution of a
-    few channels, and three times as fast as products with the whole matrices.
-    """
+def gaussian_blur(images: Tensor, size: int, sigma: float) -> Tensor:  # both (..., H, W)
+    """Blur by a normalised Gaussian window of odd `size` and `sigma` [px], zero beyond it."""
+    # It is B_rows @ image @ B_columns. On a CPU, strips of these banded matrices are far faster
+    # than a convolution of a few channels, and three times as fast as the whole matrices.
     height, width = images.shape[-2:]
     kind = size, sigma, images.dtype, images.device
     wide = torch.cat([images[..., seen] @ B for seen, B in _blur_strips(width, *kind)], -1)

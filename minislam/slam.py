@@ -213,11 +213,9 @@ class Slam(Stateful):
             self.steps.finish(stage, first + len(frames), len(others))
 
     def _static_weight(self, index: int) -> Tensor:
-        """Return the static weight (h, w) of the cells of a keyframe, in (0, 1], by the MLP.
-
-        The tracker asks for it when a keyframe comes, at the end of the warm-up and in the final
-        adjustment. Without a depth prior there is no map online, hence no beta: masks alone count.
-        """
+        """Return the static weight (h, w) of the cells of a keyframe, in (0, 1], by the MLP."""
+        # The tracker asks for it when a keyframe comes, at the end of the warm-up and in the final
+        # adjustment. Without a depth prior there is no map online, hence no beta but by masks.
         keyframes, uncertainty = self.tracker.keyframes, self.config.uncertainty
         if not (uncertainty.enabled and (uncertainty.given_masks or self.mapper.images)):
             return torch.ones(self.tracker.grid.shape, device=self.device)

@@ -109,7 +109,8 @@ class Workers(AbstractContextManager["Workers"]):
         if len(alive) < len(self._helpers):
             self._warn(f"a worker process has ended; the run goes on with {len(alive) + 1}")
         self._helpers = alive
-        return [_result(function, answers[number]) for number in range(len(calls))]
+        kind = hints_of(function)["return"]
+        return [from_tree(kind, answers[number], _no_frame) for number in range(len(calls))]
 
     def stream(
         self, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
@@ -131,7 +132,8 @@ class Workers(AbstractContextManager["Workers"]):
 
         def result() -> Any:
             thread.join()
-            return _result(function, answers[0] if answers else _answer(function, arguments))
+            answer = answers[0] if answers else _answer(function, arguments)
+            return from_tree(hints_of(function)["return"], answer, _no_frame)
 
         thread = Thread(target=ask, daemon=True)
         thread.start()
@@ -191,10 +193,6 @@ def _answer(function: Callable[..., Any], arguments: Tree) -> Tree:
     *kinds, _ = hints_of(function).values()
     values = [from_tree(k, a, _no_frame) for k, a in zip(kinds, arguments, strict=True)]
     return _contiguous(to_tree(function(*values)))
-
-
-def _result(function: Callable[..., Any], answer: Tree) -> Any:
-    return from_tree(hints_of(function)["return"], answer, _no_frame)
 
 
 def _no_frame(index: int) -> Frame:

@@ -13,7 +13,6 @@ MODULES = sorted(p for p in (ROOT / "minislam").glob("*/**/*.py") if p.stem != "
 # Modules that hold no logic of their own, or whose every line runs in the tests of another one.
 TESTED_ELSEWHERE: dict[str, str] = {
     "splatting/constants": "splatting/test_projection.py",
-    "splatting/tile_loop": "splatting/test_renderer.py",
     "tracking/config": "test_config.py",
     "tracking/bundle_problem": "tracking/test_bundle_adjustment.py",
     "tracking/reference": "tracking/test_bundle_adjustment.py",

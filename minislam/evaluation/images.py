@@ -50,10 +50,8 @@ def depth_l1(
     scale: float,  # units of the truth per unit of the map, from a Sim(3) of the trajectories
     moving: ArrayLike | None = None,  # (H, W) bool, True where a dynamic object hides the scene
 ) -> float | None:  # units of the truth
-    """Return the mean |scale D^ - D| over static pixels known to both; None if there is none.
-
-    The scale is that of the trajectory, not of the depths: a map too large for it is an error.
-    """
+    """Return the mean |scale D^ - D| over static pixels known to both; None if there is none."""
+    # The scale is not that of the depths: a map too large for its trajectory is an error.
     depth, reference = np.asarray(depth, np.float64), np.asarray(reference, np.float64)
     hidden = np.zeros(depth.shape, bool) if moving is None else np.asarray(moving, bool)
     assert depth.shape == reference.shape == hidden.shape, (depth.shape, reference.shape)

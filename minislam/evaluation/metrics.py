@@ -99,13 +99,11 @@ def _novel_errors(
     render: Render,
     lpips: ImageDistance | None,
 ) -> Iterator[tuple[str, float]]:
-    """Compare held-out static views with renderings from their Sim(3)-aligned poses.
-
-    The paper aligns by camera centres, here into the world of the map, where the error counts.
-    `psnr_novel_oriented_db` aligns by the orientations too: errors of the alignment count less.
-    """
+    """Compare held-out static views with renderings from their Sim(3)-aligned poses."""
     if not views:
         return
+    # As the paper, by camera centres, but into the world of the map, where the error counts; and
+    # by the orientations, too, so that errors of the alignment count less.
     by_centres = umeyama(path.centres, estimate.centres)
     by_cameras = oriented_truth_to_estimate(estimate, path)
     for pose, image in views:

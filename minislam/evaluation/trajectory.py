@@ -53,11 +53,9 @@ def absolute_trajectory_error(
 
 
 def relative_pose_error(
-    estimate: Trajectory,  # (N) as the truth, paired
-    truth: Trajectory,  # (N)
-    step: int = 1,  # poses between the two ends of each compared motion
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of the motions between poses `step` apart (RPE), which do not overlap.
+    estimate: Trajectory, truth: Trajectory, step: int = 1
+) -> tuple[np.ndarray, np.ndarray]:  # one per motion: world units, rad
+    """Return the errors of the motions between paired poses `step` apart (RPE), without overlap.
 
     With Q = truth_i^-1 truth_(i+step), P likewise of the estimate and E = Q^-1 P, these are
     |translation of E| and the angle of E [rad]. Where the scale is unknown, align it first.
@@ -73,10 +71,8 @@ def relative_pose_error(
 
 
 def straight_line_error(truth: Trajectory) -> float:
-    """Return the ATE (rmse) of the straight line at constant speed that fits the truth best.
-
-    It needs no images: an estimate that is not clearly better has not followed the camera.
-    """
+    """Return the ATE (rmse) of the straight line at constant speed that fits the truth best."""
+    # It needs no images: an estimate that is not clearly better has not followed the camera.
     time = truth.timestamps - truth.timestamps.mean()
     design = np.stack([np.ones_like(time), time], axis=1)
     line, *_ = np.linalg.lstsq(design, truth.centres, rcond=None)
@@ -131,11 +127,9 @@ def associate(
 
 
 def oriented_truth_to_estimate(estimate: Trajectory, truth: Trajectory) -> Similarity:
-    """Return the Sim(3) from truth to estimate, paired, with the mean rotation between cameras.
-
-    If the camera moves nearly along a line, its centres hardly determine the rotation about that
-    line, and 3 mrad of it move a held-out view by a pixel. The rest comes from the centres.
-    """
+    """Return the Sim(3) from truth to estimate, paired, with the mean rotation between cameras."""
+    # If the camera moves nearly along a line, its centres hardly determine the rotation about that
+    # line, and 3 mrad of it move a held-out view by a pixel. The rest comes from the centres.
     turned = estimate.T_world_camera[:, :3, :3] @ truth.T_world_camera[:, :3, :3].mT
     rotation = Rotation.from_matrix(turned).mean().as_matrix()
     source, target = truth.centres, estimate.centres

@@ -27,11 +27,9 @@ def so3_exp(phi: Tensor) -> Tensor:
 
 
 def so3_log(rotations: Tensor) -> Tensor:
-    """Return the rotation vectors (..., 3) [rad] of rotations (..., 3, 3), angle in [0, pi].
-
-    The quaternion is an intermediate step because its largest component never vanishes. The
-    matrix formula phi = t / (2 sin t) * vee(R - R^T) loses all digits near t = pi.
-    """
+    """Return the rotation vectors (..., 3) [rad] of rotations (..., 3, 3), angle in [0, pi]."""
+    # Not by phi = t / (2 sin t) * vee(R - R^T), which loses all digits near t = pi, but by the
+    # quaternion, whose largest component never vanishes.
     q = quaternion_from_rotation(rotations)
     q = torch.where(q[..., :1] < 0, -q, q)
     sin_half = _safe_norm(q[..., 1:])
@@ -43,16 +41,12 @@ def so3_log(rotations: Tensor) -> Tensor:
 
 
 def quaternion_from_rotation(rotations: Tensor) -> Tensor:
-    """Return unit quaternions wxyz (..., 4) of rotations (..., 3, 3).
-
-    Of the four equivalent formulas it takes the one that divides by the largest component
-    (Shepperd's method), so no rotation, 180 degrees included, loses digits.
-    """
+    """Return unit quaternions wxyz (..., 4) of rotations (..., 3, 3) (Shepperd's method)."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotations.flatten(-2).unbind(-1)
     trace = m00 + m11 + m22
     wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
     xy, xz, yz = m10 + m01, m20 + m02, m21 + m12
-    # Row k is 4 q_k q, for k = w, x, y, z.
+    # Row k is 4 q_k q, for k = w, x, y, z. That of the largest q_k loses no digits.
     rows = [
         1 + trace, wx, wy, wz,
         wx, 1 + 2 * m00 - trace, xy, xz,

@@ -15,9 +15,7 @@ class InsertionConfig:
     plain: float = parameter(
         0.12, "largest range of each colour in a cell of 2 or 4 times the side; 0, official: none"
     )
-    footprint: float = parameter(
-        0.45, "first scale over the side of a cell seen at its depth [1]; official 0.22", 0.01
-    )
+    footprint: float = parameter(0.45, "first scale over the side of its cell; official 0.22", 0.01)
     opacity: float = parameter(0.9, "first opacity; official 0.5", 0.01, 0.99)
 
 
@@ -39,9 +37,7 @@ class PoseRefinementConfig:
     """How the poses between the keyframes are refined by re-rendering, at full image size."""
 
     enabled: bool = parameter(False, "off: those poses come from flow alone (paper's fast mode)")
-    iterations: int = parameter(
-        10, "most steps per frame; official 100 of Adam, ours divide by the curvature"
-    )
+    iterations: int = parameter(10, "most steps of a frame; official 100, ours divide by curvature")
     tolerance: float = parameter(
         0.01, "stop when a step moves the picture by less [px]; official |step| < 1e-4"
     )
@@ -93,21 +89,16 @@ class MappingConfig:
         True, "what no image shows has the mean colour of those it begins with; off: official black"
     )
 
-    means_rate: float = parameter(
-        2e-3, "first Adam step of the means [median depths]; official 9.6e-4 m, decayed"
-    )
+    means_rate: float = parameter(2e-3, "first step of means [median depths]; official 9.6e-4 m")
     means_rate_end: float = parameter(
-        0.1,
-        "last step of the means over the first, log-linear over `rate_iterations`; official 0.01",
+        0.1, "last step of the means over the first, log-linear in `rate_iterations`; official 0.01"
     )
     rate_iterations: int = parameter(1500, "iterations of that decay; official 30000", 1)
     quats_rate: float = parameter(2e-2, "Adam step of the quaternions; official 1e-3")
     log_scales_rate: float = parameter(2e-2, "Adam step of the log-scales; official 6e-3")
     opacity_rate: float = parameter(5e-2, "Adam step of the opacity logits, official")
     colors_rate: float = parameter(5e-3, "Adam step of the colours; official 7.05e-4")
-    refine_rate_end: float = parameter(
-        0.2, "last step over the first one in the refinement, all parameters; official 1"
-    )
+    refine_rate_end: float = parameter(0.2, "last step over the first in refinement; official 1")
 
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
     density: DensityConfig = field(default_factory=DensityConfig)

@@ -1,11 +1,9 @@
 """Fill static surfaces whose depth no view could measure, such as a plain road or ceiling: ours.
 
-Without a depth network such a pixel has no depth, so nothing is inserted there. By half of the
-refinement, the MLP has learned what moves. What it calls static and the map leaves transparent then
-gets the depth of its surroundings, continued as a thin plate, which bends least: 1/depth is linear
-over a plane, so a road goes on to the border of the image. Between a table and the wall behind it,
-that is the depth of neither: from elsewhere it would float in front of what is known there, so
-other views vote.
+By half of the refinement, the MLP has learned what moves. What it calls static and the map leaves
+transparent then gets the depth of its surroundings, continued as a thin plate, which bends least:
+1/depth is linear over a plane, so a road goes on to the border of the image. Between a table and
+the wall behind it, that is the depth of neither and would float in other views, which vote.
 """
 
 import math
@@ -62,9 +60,8 @@ def is_refuted(
     Depths refute only a guess, a point that its own image has no depth for. Either more views
     know a surface behind it, which it would hide, than one at its depth. Or a view sees it from
     less than half the distance: it would cover much there, and that view can guess the place
-    itself. Colours refute any point if most views in which nothing known hides it, and at least
-    LEAST_DIFFERING, have another colour there. So it is where the rim of one surface has got the
-    depth of another.
+    itself. Colours refute any point, such as a rim with the depth of another surface, if most views
+    in which nothing known hides it, and at least LEAST_DIFFERING, have another colour there.
     """
     own_z, row, column, _ = nearest_pixels(means, camera, own.T_camera_world)
     is_guessed = own.depth[row, column] == 0

@@ -40,11 +40,9 @@ def cell_sides(
     cell: int,  # px, side of the smallest cells
     plain: float,  # largest range of each colour, in [0, 1], in a wider cell
 ) -> Tensor:  # (H, W) int64 px
-    """Return the side of the cell of each pixel: wide where one Gaussian can stand for many.
-
-    A cell of twice or four times the side shows one surface and hardly any detail: its depths are
-    about the same, and so are its colours once noise is gone, by the mean of 3 x 3 pixels.
-    """
+    """Return the side of the cell of each pixel: wide where one Gaussian can stand for many."""
+    # A cell of twice or four times the side shows one surface and hardly any detail: its depths are
+    # about the same, and so are its colours once noise is gone, by the mean of 3 x 3 pixels.
     height, width = depth.shape
     smooth = functional.avg_pool2d(image.permute(2, 0, 1), 3, 1, 1, count_include_pad=False)
     seen = torch.cat([smooth, depth[None].to(smooth)])

@@ -87,9 +87,8 @@ class Mapper(JointOptimisation):
     def refine(self, iterations: int, progress: Progress | None = None, done: int = 0) -> None:
         """Optimise map and MLP over all images of the map, the last part at full image size.
 
-        Half way, if each had two renderings, the upper mode of beta is excluded and gaps are
-        filled; at the end, Gaussians that no static pixel shows are removed. A resumed run goes on
-        after what is done.
+        Half way, if each had two renderings, the upper mode of beta is excluded, gaps are filled;
+        at the end, Gaussians that no static pixel shows are removed. A resumed run follows `done`.
         """
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full
@@ -172,9 +171,8 @@ class Mapper(JointOptimisation):
     def _remove_unsupported(self) -> None:
         """Remove Gaussians that hardly any static pixel shows, and note what is shown.
 
-        Some lie on a dynamic object that always covers the view, so they have had no gradient since
-        the MLP has learned it. Others have left all views, and would be floaters in new ones. Where
-        nothing is static, all stay.
+        Some lie on a dynamic object that always covers the view: they had no gradient since the MLP
+        learned it. Others have left all views, and would be floaters in new ones.
         """
         camera, gaussians, self.shown = self._online_camera, self.gaussians, []
         weights = (self.static_weight(self.beta_of(image), camera) for image in self.images)
@@ -185,7 +183,7 @@ class Mapper(JointOptimisation):
             sums += of_view
             self.shown.append(fraction)
         static, total = sums
-        if static.any() and self.uncertainty.enabled:
+        if static.any() and self.uncertainty.enabled:  # else all stay
             self._optimizer.keep(static > safeguards.LEAST_STATIC * total)
             self._reset_gradients()
 

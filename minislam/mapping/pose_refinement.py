@@ -67,11 +67,9 @@ def rerendering_loss(
     image: Tensor,  # (H, W, 3) RGB in [0, 1]
     weight: Tensor,  # (H, W) static weight
 ) -> Tensor:  # ()
-    """Return the mean of weight * opacity * |I^ - I|, with |r| as sqrt(r^2 + 0.01^2).
-
-    The opacity is a constant, as in the official code. With its gradient the camera would turn to
-    where the map is empty, because the loss is 0 there.
-    """
+    """Return the mean of weight * opacity * |I^ - I|, with |r| as sqrt(r^2 + 0.01^2)."""
+    # The opacity is a constant, as in the official code. With its gradient the camera would turn to
+    # where the map is empty, because the loss is 0 there.
     absolute = ((rendering.color - image).square() + ROUNDING**2).sqrt().mean(-1)
     return (weight * rendering.opacity.detach() * absolute).mean()
 

@@ -72,8 +72,7 @@ def is_wrong(
     """Tell whether the map is wrong in most cells (..., h', w') that a least weight would exclude.
 
     The MLP sees features, not places: a dark wall, rendered well, gets the beta of a dark dog in
-    front of it. Alone, a cell of error L has its least loss at beta = sqrt(2 L / lambda_3)
-    (`cell_loss`).
+    front of it. Alone, a cell of error L has its least `cell_loss` at beta = sqrt(2 L / lambda_3).
     """
     optimal = (2 * error.total(config.lambda_depth) / config.lambda_log).sqrt()
     excluded, wrong = (

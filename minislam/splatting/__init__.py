@@ -10,8 +10,7 @@ Read the files in this order, the slow twin first:
     visible.py      all steps of projection.py in a row, for the visible Gaussians, nearest first
     compositing.py  Eq. (1), Eq. (2) for a group of tiles
     tiles.py        which Gaussians touch which tile
-    tile_loop.py    compositing over all tiles of an image
-    renderer.py     `render`: the whole chain as one differentiable function
+    renderer.py     `render`: the whole chain over all tiles, as one differentiable function
 
 Layout: a map, and everything in the slow twin, has one row per Gaussian, (N, 3). Inside the fast
 renderer arrays are component-first, (3, N) and (3, 3, N): a component is one run of N numbers, and

@@ -20,15 +20,10 @@ def rotations(quats: Tensor) -> Tensor:  # (4, N) w, x, y, z of any length -> (3
 
 
 def rotations_vjp(quats: Tensor, v_rotations: Tensor) -> Tensor:  # (4, N), (3, 3, N) -> (4, N)
-    """Pull a gradient back from rotation matrices to quaternions.
-
-    With D = dL/dR, the derivative by w collects antisymmetric differences of D, those by x, y, z
-    symmetric sums and two diagonal entries. Only the part across q can change q / |q|.
-    """
-    inverse_norms = _inverse_norms(quats)
-    unit = quats * inverse_norms
-    w, x, y, z = unit
-    d = v_rotations
+    """Pull a gradient back from rotation matrices to quaternions."""
+    inverse_norms, d = _inverse_norms(quats), v_rotations
+    w, x, y, z = unit = quats * inverse_norms
+    # By w it collects antisymmetric differences of d, by x, y, z symmetric sums and the diagonal.
     anti_x, anti_y, anti_z = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]
     sum_x, sum_y, sum_z = d[2, 1] + d[1, 2], d[0, 2] + d[2, 0], d[1, 0] + d[0, 1]
     v_unit = torch.stack([
@@ -37,6 +32,7 @@ def rotations_vjp(quats: Tensor, v_rotations: Tensor) -> Tensor:  # (4, N), (3, 
         w * anti_y + x * sum_z + z * sum_x - 2 * y * (d[0, 0] + d[2, 2]),
         w * anti_z + x * sum_y + y * sum_x - 2 * z * (d[0, 0] + d[1, 1]),
     ]).mul_(2)  # fmt: skip
+    # Only the part across q can change q / |q|.
     return (v_unit - unit * (unit * v_unit).sum(0)) * inverse_norms
 
 
@@ -50,10 +46,8 @@ def covariance_factors_vjp(
     scales: Tensor,  # (3, N)
     v_factors: Tensor,  # (3, 3, N)  dL/dL
 ) -> tuple[Tensor, Tensor]:  # (4, N), (3, N)
-    """Pull a gradient back from the factors to quaternions and scales.
-
-    Column j of L is s_j times column j of R, so v_s_j = v_L_j . R_j and v_R_j = s_j v_L_j.
-    """
+    """Pull a gradient back from the factors to quaternions and scales."""
+    # Column j of L is s_j times column j of R, so v_s_j = v_L_j . R_j and v_R_j = s_j v_L_j.
     v_scales = (v_factors * rotations(quats)).sum(0)
     return rotations_vjp(quats, v_factors * scales), v_scales
 

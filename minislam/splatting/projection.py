@@ -103,10 +103,7 @@ def project_factors_vjp(
     camera: Camera,
     v_factors2d: Tensor,  # (2, 3, N)
 ) -> tuple[Tensor, Tensor]:  # (3, N), (3, 3, N)
-    """Return the gradients of points and factors from those of V; J depends on the points, too.
-
-    V depends on the point by the tangents h, unless limited, and by 1/z: dV/dz at fixed h is -V/z.
-    """
+    """Return the gradients of points and factors from those of V; J depends on the points, too."""
     (tangent_x, tangent_y), inside = _limited_tangents(points_camera, camera)
     x, y, z = points_camera
     inverse_z = 1 / z
@@ -116,7 +113,7 @@ def project_factors_vjp(
 
     v_tangent_x = -(v_along_x * camera_factors[2]).sum(0) * inside[0]
     v_tangent_y = -(v_along_y * camera_factors[2]).sum(0) * inside[1]
-    scaling = (v_factors2d * factors2d).sum((0, 1))
+    scaling = (v_factors2d * factors2d).sum((0, 1))  # dV/dz at fixed tangents is -V/z
     v_z = -(v_tangent_x * x + v_tangent_y * y) * inverse_z - scaling
     v_points = torch.stack([v_tangent_x, v_tangent_y, v_z]) * inverse_z
     return v_points, torch.stack([v_along_x, v_along_y, v_along_z])
@@ -125,17 +122,15 @@ def project_factors_vjp(
 def conics_from_factors2d(
     factors2d: Tensor,  # (2, 3, N) px
 ) -> tuple[Tensor, Tensor]:  # (3, N) px^-2, (3, N) px^2
-    """Return Q = Sigma'^-1 as (a, b, c) of [[a, b], [b, c]], and Sigma' = V V^T + 0.3 I.
-
-    The determinant of Sigma' is written as |V_u x V_v|^2 + 0.3 (|V_u|^2 + |V_v|^2) + 0.3^2, a sum
-    of positive terms: xx yy - xy^2 loses all digits for long thin ellipses in float32.
-    """
+    """Return Q = Sigma'^-1 as (a, b, c) of [[a, b], [b, c]], and Sigma' = V V^T + 0.3 I."""
     (u0, u1, u2), (v0, v1, v2) = factors2d
     norm_u = u0 * u0 + u1 * u1 + u2 * u2
     norm_v = v0 * v0 + v1 * v1 + v2 * v2
     xx = norm_u + LOW_PASS_VARIANCE
     xy = u0 * v0 + u1 * v1 + u2 * v2
     yy = norm_v + LOW_PASS_VARIANCE
+    # The determinant is |V_u x V_v|^2 + 0.3 (|V_u|^2 + |V_v|^2) + 0.3^2, a sum of positive terms:
+    # xx yy - xy^2 loses all digits for long thin ellipses in float32.
     cross = (u1 * v2 - u2 * v1) ** 2 + (u2 * v0 - u0 * v2) ** 2 + (u0 * v1 - u1 * v0) ** 2
     determinant = cross + LOW_PASS_VARIANCE * (norm_u + yy)
     return torch.stack([yy, -xy, xx]) / determinant, torch.stack([xx, xy, yy])

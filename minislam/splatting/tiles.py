@@ -109,12 +109,10 @@ def _chunks(lengths: list[int], slots: int) -> list[Chunk]:
 def _entries(
     means2d: Tensor, conics: Tensor, covariances2d: Tensor, opacities: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:  # (E,), (E,)
-    """Return all pairs (Gaussian, tile) that overlap, ordered by Gaussian.
-
-    alpha reaches MIN_ALPHA on the ellipse d^T Q d = level, level = 2 ln(o / MIN_ALPHA). A closed
-    form gives its columns in each row of tiles; a bounding box lists every fifth tile in vain.
-    """
-    # The small constant keeps pairs that rounding may lift over the threshold.
+    """Return all pairs (Gaussian, tile) that overlap, ordered by Gaussian."""
+    # alpha reaches MIN_ALPHA on the ellipse d^T Q d = level. A closed form gives its columns in a
+    # row of tiles; a bounding box lists every fifth tile in vain. The small constant keeps pairs
+    # that rounding may lift over the threshold.
     level = 2 * (opacities / MIN_ALPHA).log() + 1e-3
     half_height = (level * covariances2d[2]).sqrt()
     top = (means2d[1] - half_height).ceil().clamp(0, camera.height)

@@ -121,11 +121,9 @@ def _visible_front_to_back(
 
 
 def _largest_radius(scales: Tensor, inverse_z: Tensor, camera: Camera) -> Tensor:  # (N,) px
-    """Bound the radius of the support before anything is projected.
-
-    |J| <= f/z sqrt(1 + h_x^2 + h_y^2) for tangents h within their limits, and the support ends
-    at sqrt(2 ln(MAX_OPACITY / MIN_ALPHA)) = 3.33 standard deviations.
-    """
+    """Bound the radius of the support before anything is projected."""
+    # |J| <= f/z sqrt(1 + h_x^2 + h_y^2) for tangents h within their limits, and the support ends
+    # at sqrt(2 ln(MAX_OPACITY / MIN_ALPHA)) = 3.33 standard deviations.
     lower, upper = constants.tangent_limits(camera)
     h_x, h_y = (max(-low, high) for low, high in zip(lower, upper, strict=True))
     stretch = max(camera.fx, camera.fy) * math.sqrt(1 + h_x**2 + h_y**2)

@@ -6,8 +6,7 @@ The state of a `Stateful` class is what its body annotates:
         window: list[int]  # saved and restored
         _optimizer: MapOptimizer  # a Stateful part: saved and restored by itself
 
-Attributes that only `__init__` sets are not saved. They follow from the settings and the sequence:
-cameras, callbacks, caches.
+Attributes that only `__init__` sets, like callbacks and caches, follow from settings and input.
 """
 
 from collections.abc import Callable

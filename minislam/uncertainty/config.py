@@ -16,10 +16,7 @@ class UncertaintyConfig:
     )
 
     grid_factor: int = parameter(
-        1,
-        "the grid of beta is n times as fine, and its features cost n^2 times as much; paper"
-        " supplement, high-resolution uncertainty map",
-        1,
+        1, "the grid of beta is n times as fine, its features cost n^2 times as much; supplement", 1
     )
     hidden_units: int = parameter(64, "width of the two hidden layers [units], official", 1)
     dropout: float = parameter(0.2, "hidden units dropped in training [-], official", most=0.99)
@@ -39,23 +36,15 @@ class UncertaintyConfig:
     ssim_gain: float = parameter(
         668.42, "factor of (1-l)(1-s)(1-c) [1]: 100 + 900 b(0.3; 0.8), NeRF On-the-go"
     )
-    loss_cap: float = parameter(
-        5.0, "cap of the SSIM and of the depth term [1], official: bounds beta by 2 sqrt(6)"
-    )
-    median_size: int = parameter(
-        3, "window of the median filter [cells], odd; official 5 on a grid twice as fine"
-    )
+    loss_cap: float = parameter(5.0, "cap of SSIM and depth term [1], official: beta <= 2 sqrt(6)")
+    median_size: int = parameter(3, "median window [cells], odd; official 5 on a 2x finer grid")
 
-    similarity: float = parameter(
-        0.75, "cosine above which features are similar [1], official", most=1
-    )
+    similarity: float = parameter(0.75, "least cosine of similar features [1], official", most=1)
     neighbours: int = parameter(128, "most similar cells that enter L_reg_V [cells], official", 1)
     variance_samples: int = parameter(
         350, "cells drawn per step for L_reg_V [cells], official: a sixteenth of 5 keyframes", 1
     )
-    neighbour_keyframes: int = parameter(
-        2, "images of the map before and after that L_reg_V looks at, official"
-    )
+    neighbour_keyframes: int = parameter(2, "images before and after that enter L_reg_V, official")
 
     @property
     def is_learned(self) -> bool:
