@@ -46,7 +46,7 @@ def fly_around(run: Run, camera: Camera) -> Iterator[np.ndarray]:  # (H, W, 3)
 
 
 def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarray]:  # (H, 3 W, 3)
-    """Yield input, beta (in one scale) and static map of every n-th frame that has a pose."""
+    """Yield input, beta (in one scale) and map, as bright, of every n-th frame that has a pose."""
     shown = list(run.poses)[::every]
     sampled = shown[:: max(1, len(shown) // _SHOWN_BETAS)]
     limits = beta_limits(np.stack([run.beta(index) for index in sampled]))
@@ -55,7 +55,8 @@ def side_by_side(run: Run, camera: Camera, every: int = 1) -> Iterator[np.ndarra
         image = run.sequence.frame(index).image.numpy()
         beta = beta_to_rgb(run.beta(index), limits)
         panels = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (image, beta)]
-        yield _labelled([*panels, run.render(run.poses[index], camera)])
+        color = run.render(run.poses[index], camera, run.frames[index].exposure)
+        yield _labelled([*panels, color])
 
 
 def clip(run: Run) -> tuple[Iterator[np.ndarray], float]:

@@ -34,6 +34,7 @@ from minislam.runs.warnings import BROKEN
 from minislam.slam import Slam
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.tracking.grid import Grid
+from minislam.tracking.safeguards.exposure import exposure_at
 from minislam.tracking.safeguards.rolling_shutter import ImageMotion
 from minislam.uncertainty import UncertaintyMLP, beta_of_mask
 from minislam.uncertainty.weights import MAPPING_CUT
@@ -48,7 +49,7 @@ class SourceFrame:
     timestamp: float  # second
     source: str  # name of its image file, or of its video with the number in it
     keyframe: bool
-    exposure: list[float] | None = None  # of an image of the map: brightness over the map's
+    exposure: list[float] | None = None  # brightness over the map's; None: it is constant
     mapped: bool = True  # of a broken run: in the piece that the map shows
 
 
@@ -57,11 +58,12 @@ def scene_of(slam: Slam) -> dict[str, Any]:
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
     name = sequence.source_name
     mapped = slam.tracker.watch.longest_piece(slam.poses) or range(len(slam.tracker.tracked))
-    exposures = {index: e.tolist() for index, e in slam.mapper.exposures.items()}
-    frames = [
-        SourceFrame(i, t.timestamp, name(i), i in keyframes, exposures.get(i), i in mapped)
-        for i, t in enumerate(slam.tracker.tracked)
-    ]
+    frames, exposures = [], slam.mapper.exposures
+    for i, tracked in enumerate(slam.tracker.tracked):
+        exposure = exposure_at(i, exposures)
+        level = None if exposure is None else exposure.tolist()
+        row = i, tracked.timestamp, name(i), i in keyframes, level, i in mapped
+        frames.append(asdict(SourceFrame(*row)))
     return {
         "sequence": {"name": sequence.name, "description": sequence.description},
         "camera": asdict(slam.tracker.grid.camera),
@@ -69,7 +71,7 @@ def scene_of(slam: Slam) -> dict[str, Any]:
         "background": slam.mapper.background.tolist(),
         "least_weight": slam.mapper.least_weight,
         "preparation": sequence.preparation,
-        "frames": [asdict(frame) for frame in frames],
+        "frames": frames,
     }
 
 
@@ -177,7 +179,7 @@ class Run:
         if index not in self.poses:
             raise InputError(f"expected a frame of the map, found {index}; see run.json")
         image = self.sequence.frame(index).image.numpy()
-        color = self.render(self.poses[index])
+        color = self.render(self.poses[index], exposure=self.frames[index].exposure)
         stamps, breaks = [f.timestamp for f in self.frames], self.folder.read_run()["breaks"]
         broken = [(stamps[b["first_frame"]], stamps[b["last_frame"]]) for b in breaks]
         return overview(image, self.beta(index), color, self.trajectory, None, self.unit, broken)

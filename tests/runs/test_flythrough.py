@@ -1,6 +1,7 @@
 """Where the camera flies, and that input, beta and map stand beside each other."""
 
 import tempfile
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +21,9 @@ class FakeRun:
 
     def __init__(self, count: int = 7, depth: float = 2.0) -> None:
         self.camera = CAMERA
+        level = [1.0, 1.0, 2.0]  # the camera made blue brighter in the last frame
         self.frames = [SourceFrame(i, i / 12, f"{i}.png", i % 3 == 0) for i in range(count)]
+        self.frames[-1] = replace(self.frames[-1], exposure=level)
         self.keyframes = [frame.index for frame in self.frames if frame.keyframe]
         self.poses = {i: np.eye(4) for i in range(count)}
         for index, pose in self.poses.items():
@@ -31,9 +34,11 @@ class FakeRun:
             frame=lambda i: SimpleNamespace(image=torch.full((48, 64, 3), i / 10))
         )
 
-    def render(self, pose: np.ndarray, camera: Camera) -> np.ndarray:
+    def render(
+        self, pose: np.ndarray, camera: Camera, exposure: list[float] | None = None
+    ) -> np.ndarray:
         self.seen.append(pose)
-        return np.full((camera.height, camera.width, 3), 0.25, np.float32)
+        return np.full((camera.height, camera.width, 3), 0.25) * (exposure or 1.0)
 
     def render_depth(self, pose: np.ndarray) -> np.ndarray:
         return np.full((48, 64), self.depth)
@@ -67,6 +72,7 @@ def test_panels_beside_each_other_in_one_scale_of_beta():
     assert rows[4].shape == (48, 3 * 64, 3)
     assert rows[4][40, 30] == pytest.approx([0.4] * 3, abs=0.01)
     assert rows[4][40, 160] == pytest.approx([0.25] * 3, abs=0.01)
+    assert rows[6][40, 160] == pytest.approx([0.25, 0.25, 0.5], abs=0.01)  # as bright as the input
     assert rows[0][40, 96].sum() < 0.1 < 2 < rows[6][40, 96].sum()
 
 

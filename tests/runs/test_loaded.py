@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,11 +19,12 @@ from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.mapping import Mapper
 from minislam.records import Trajectory
-from minislam.runs import api
+from minislam.runs import api, loaded
 from minislam.tracking.grid import Grid
 from minislam.tracking.safeguards import diagnostics
 from minislam.tracking.safeguards.rolling_shutter import ImageMotion
 from minislam.viz import figures
+from tests.runs.finished import finished
 
 pytestmark = pytest.mark.slow
 
@@ -50,6 +52,30 @@ def test_every_keyframe_is_rendered_again_within_one_grey_level(run: minislam.Ru
         stored = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
         rendered = np.round(255 * again.render(again.poses[index]))
         assert np.abs(rendered - stored).max() <= 1
+
+
+def test_a_frame_is_plotted_as_bright_as_it_is_exposed(run: minislam.Run, monkeypatch):
+    again, shown = minislam.load(run.folder.path), []
+    monkeypatch.setattr(loaded, "overview", lambda image, beta, color, *_: shown.append(color))
+    index, level = again.keyframes[1], [0.5, 0.5, 0.25]
+    again.plot(index)
+    again.frames[index] = replace(again.frames[index], exposure=level)
+    again.plot(index)
+    np.testing.assert_allclose(shown[1], shown[0] * level, atol=1e-6)
+
+
+def test_every_frame_knows_how_bright_it_is_beside_the_map():
+    slam = finished()
+    slam.tracker.keyframes.frames, slam.tracker.grid = [], slam.tracker.graph.grid
+    slam.mapper.exposures = {4: torch.ones(3), 8: torch.tensor([4.0, 1.0, 1.0])}
+    slam.mapper.background, slam.mapper.least_weight = torch.zeros(3), 0.0
+    slam.sequence.name, slam.sequence.description, slam.sequence.source_name = "a", "", str
+    levels = [frame["exposure"] for frame in loaded.scene_of(slam)["frames"]]
+    assert len(levels) == 20 and levels[0] == [1, 1, 1]
+    np.testing.assert_allclose(levels[6], [2, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(levels[19], [4, 1, 1], rtol=1e-6)
+    slam.mapper.exposures = {}
+    assert loaded.scene_of(slam)["frames"][6]["exposure"] is None
 
 
 def test_a_run_is_found_below_the_home_of_the_user(run: minislam.Run, monkeypatch):

@@ -91,10 +91,15 @@ def _levels(
 
 
 def with_exposure(frame: Shot, exposures: dict[int, Tensor]) -> Shot:
-    """Return a frame with its exposure, interpolated between the nearest known ones in time."""
+    """Return a frame with its exposure."""
+    return replace(frame, exposure=exposure_at(frame.frame_index, exposures))
+
+
+def exposure_at(frame_index: int, exposures: dict[int, Tensor]) -> Tensor | None:  # (3,)
+    """Return the exposure of any frame, interpolated between the nearest known ones in time."""
     if not exposures:
-        return frame
+        return None
     levels = torch.stack(list(exposures.values())).log()
     channels = levels.T.cpu().numpy()
-    here = [np.interp(frame.frame_index, list(exposures), channel) for channel in channels]
-    return replace(frame, exposure=torch.tensor(here, device=levels.device).exp().to(levels))
+    here = [np.interp(frame_index, list(exposures), channel) for channel in channels]
+    return torch.tensor(here, device=levels.device).exp().to(levels)
