@@ -6,7 +6,6 @@ and the files of a run folder. Everything else may move.
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,7 @@ from minislam.runs.loaded import Run
 from minislam.runs.progress import ProgressLine, SilentProgress, ending_signals
 from minislam.runs.run import default_output, plan_of, run_in_folder
 
-_INPUTS = {field.name for field in fields(InputOptions)}
-_PRIORS = {field.name for field in fields(PriorChoice)}
+_INPUTS, _PRIORS = vars(InputOptions()).keys(), vars(PriorChoice()).keys()  # names of options
 
 
 def run(

@@ -4,7 +4,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from torch.linalg import det
 
 from minislam.config import SlamConfig, settings_in, settings_of, with_settings
-from minislam.data.files import read_bytes, read_json, read_text
+from minislam.data.files import Json, read_bytes, read_json, read_text
 from minislam.data.images import is_image
 from minislam.data.options import InputOptions
 from minislam.data.ply import GaussianArrays, read_ply
@@ -53,7 +52,7 @@ class SourceFrame:
     mapped: bool = True  # of a broken run: in the piece that the map shows
 
 
-def scene_of(slam: Slam) -> dict[str, Any]:
+def scene_of(slam: Slam) -> Json:
     """Return the content of camera.json: what it takes to render the map as the run did."""
     sequence, keyframes = slam.sequence, {f.frame_index for f in slam.tracker.keyframes.frames}
     name = sequence.source_name
