@@ -46,8 +46,7 @@ def check_reproject(student: Function) -> Verdict:
     """Check (pixels, disparities, camera, T_target_source) -> pixels in the target view."""
 
     def reference(pixels: Tensor, disparities: Tensor, camera: Camera, pose: Tensor) -> Tensor:
-        points = camera.backproject(pixels, 1 / disparities)
-        return camera.project(transform_points(pose, points))
+        return camera.project(transform_points(pose, camera.backproject(pixels, 1 / disparities)))
 
     def case(twist: Tensor, description: str, seed: int = 0) -> Case:
         pixels = doubles(50, 25) + 15 * normals(seed, 4, 2)

@@ -1,6 +1,7 @@
 """Grade an answer against the package, case by case, up to the first wrong number."""
 
 import dis
+import inspect
 import os
 import sys
 import time
@@ -96,7 +97,7 @@ def _verdict(status: str, sentence: str, hint: str = "") -> Verdict:
 
 def is_written(function: Function) -> bool:
     """Say whether an exercise's function has a body; where not, print what to do."""
-    steps = list(dis.get_instructions(function))
+    steps = list(dis.get_instructions(inspect.unwrap(function)))
     is_stub = any(step.argval == "NotImplementedError" for step in steps)
     is_empty = {step.argval for step in steps if step.opname != "RESUME"} <= {None, ""}
     if is_stub or is_empty:

@@ -51,11 +51,9 @@ def check_pixel_color(student: Function) -> Verdict:
     """Check (alphas, colors, background) -> color (3,) of one pixel, nearest Gaussian first."""
 
     def blended(alphas: Tensor, colors: Tensor, background: Tensor, flaw: str = "") -> Tensor:
-        light = torch.cat([alphas.new_ones(1), (1 - alphas).cumprod(0)])  # (K + 1,)
+        left = 1 - alphas.cumsum(0) if flaw == "sum" else (1 - alphas).cumprod(0)
+        light = torch.cat([alphas.new_ones(1), left])  # (K + 1,)
         end = {"unattenuated": 1, "no background": 0}.get(flaw, light[-1])
-        if flaw == "sum":
-            light = torch.cat([light[:1], 1 - alphas.cumsum(0)])
-            end = light[-1]
         before = {"itself": light[1:], "unshaded": light[:-1] ** 0}.get(flaw, light[:-1])
         return (before * alphas ** (flaw != "opaque")) @ colors + end * background
 

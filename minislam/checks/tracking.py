@@ -228,8 +228,7 @@ def check_motion_memory(student: Function) -> Verdict:
         disparities, motion = 0.2 + 0.3 * random[0], se3_exp(torch.tensor(twist))
         flow, _ = reproject(motion[None], disparities[None], grid.rays, CAMERA)
         flow = flow + aside * (random[1] < 0.4) * torch.tensor([[1.0], [-0.5]])
-        confidences = (random[2] < sure).to(flow).expand(1, 2, -1)
-        matches = FlowMatches(flow, confidences, torch.ones(1))
+        matches = FlowMatches(flow, (random[2] < sure).to(flow).expand(1, 2, -1), torch.ones(1))
         return Case((grid, matches, disparities, motion, random[3], 2.0), what)
 
     cases = [

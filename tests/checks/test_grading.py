@@ -1,5 +1,7 @@
 """Grading: what is wrong with an answer is said in words, whatever it returns."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +51,8 @@ def test_a_stub_is_not_written_and_any_body_is(capsys):
     )
     assert is_written(identity) and is_written(careful)
     assert capsys.readouterr().out == ""
+    for decorator in (cache, torch.no_grad()):
+        assert is_written(decorator(identity)) and not is_written(decorator(stub))
 
 
 def double(x):

@@ -67,8 +67,7 @@ class Metric3DDepth:
     def __call__(self, frame: Frame, camera: Camera) -> Tensor:
         """Return the depth (H, W) in metres of an image taken by a camera."""
         canonical, scale = self.canonical_depth(frame.image)
-        full = resample(canonical, *frame.image.shape[:2])
-        metric = full * (camera.fx * scale / CANONICAL_FOCAL)
+        metric = resample(canonical, *frame.image.shape[:2]) * (camera.fx * scale / CANONICAL_FOCAL)
         return metric.clamp(0, LARGEST_SCALED).to(frame.image.device)
 
     @torch.no_grad()

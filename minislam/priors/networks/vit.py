@@ -101,8 +101,7 @@ def _transformer_block(weights: Weights, x: Tensor) -> Tensor:
     qkv = weights.linear("attn.qkv", weights.layer_norm("norm1", x, _EPSILON))
     q, k, v = qkv.unflatten(-1, (3, -1, _HEAD_WIDTH)).permute(2, 0, 3, 1, 4)  # (B, heads, N, 64)
     read = functional.scaled_dot_product_attention(q, k, v)
-    attended = weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
-    x = x + weights["ls1.gamma"] * attended
+    x = x + weights["ls1.gamma"] * weights.linear("attn.proj", read.transpose(1, 2).flatten(2))
     hidden = weights.linear("mlp.fc1", weights.layer_norm("norm2", x, _EPSILON))
     return x + weights["ls2.gamma"] * weights.linear("mlp.fc2", functional.gelu(hidden))
 
