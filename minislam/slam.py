@@ -178,8 +178,8 @@ class Slam(Stateful):
         keyframes = self.keyframes(others=sorted({*frames} - {*tracked}))
         keyframes = [keyframe for keyframe in keyframes if keyframe.frame_index in poses]
         if self.tracker.knows_depth:
-            inputs = SweepPlanner.of(graph, self.sequence, poses), frames, frames
-            swept = dense_depths(*inputs, self.steps.on_progress("dense depth"), self.workers)
+            how = frames, frames, self.steps.on_progress("dense depth"), self.workers
+            swept = dense_depths(SweepPlanner.of(graph, self.sequence, poses), *how)
             keyframes = with_swept_depth(graph.grid.camera, keyframes, swept, watch.hardly_walked)
         else:
             keyframes = on_backdrop(keyframes)
