@@ -174,9 +174,8 @@ class Slam(Stateful):
         images = self.map_images(others=sorted({*frames} - {*tracked}))
         images = [image for image in images if image.frame_index in poses]
         if self.tracker.knows_depth:
-            planner = dense.SweepPlanner.of(graph, self.sequence, poses)
-            show = self.steps.on_progress("dense depth")
-            swept = dense.dense_depths(planner, frames, frames, show, self.workers)
+            how = frames, frames, self.steps.on_progress("dense depth"), self.workers
+            swept = dense.dense_depths(dense.SweepPlanner.of(graph, self.sequence, poses), *how)
             images = dense.with_swept_depth(graph.grid.camera, images, swept, watch.hardly_walked)
         else:
             images = dense.on_backdrop(images)

@@ -148,8 +148,9 @@ def dense_depths(
         depths.append(votes.ConfirmedDepth(*map(SHELF.array, vars(found).values())))
     positions = [frames.index(frame) for frame in wanted]
     kept = votes.keep_what_stays(planner.camera, swept, depths, positions)
-    sized = (full_size(depth, planner.of_images) for depth in kept)
-    return ((depth.to(planner.device), weight.to(planner.device)) for depth, weight in sized)
+    camera, device = planner.of_images, planner.device  # the images that it keeps are done with
+    sized = (full_size(depth, camera) for depth in kept)
+    return ((depth.to(device), confirmation.to(device)) for depth, confirmation in sized)
 
 
 def swept_frames(keyframes: list[int], followed: list[int], least: int = 0) -> list[int]:
