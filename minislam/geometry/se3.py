@@ -134,10 +134,8 @@ def so3_left_jacobian(phi: Tensor) -> Tensor:
 
 
 def _rotation_and_left_jacobian(phi: Tensor) -> tuple[Tensor, Tensor]:
-    """Return exp(phi) and V(phi), (..., 3, 3) each, because they share their coefficients.
-
-    These are a = sin t / t, b = (1 - cos t) / t^2 and c = (t - sin t) / t^3 of the angle t = |phi|.
-    """
+    """Return exp(phi) and V(phi), (..., 3, 3) each, because they share their coefficients."""
+    # a = sin t / t, b = (1 - cos t) / t^2 and c = (t - sin t) / t^3 of the angle t = |phi|.
     angle = _safe_norm(phi)[..., None, None]
     small = angle < _SMALL_ANGLE
     t, t2 = torch.where(small, 1, angle), torch.where(small, angle, 0) ** 2

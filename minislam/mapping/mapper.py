@@ -88,7 +88,7 @@ class Mapper(JointOptimisation):
         """Optimise map and MLP over all images of the map, the last part at full image size.
 
         Half way, if each had two renderings, the upper mode of beta is excluded, gaps are filled;
-        at the end, Gaussians that no static pixel shows are removed. A resumed run follows `done`.
+        at the end, Gaussians that no static pixel shows go. A resumed run goes on after `done`.
         """
         full = round(iterations * self.config.refine_full_fraction)
         cameras = [self._online_camera] * (iterations - full) + [self.camera] * full

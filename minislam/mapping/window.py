@@ -22,17 +22,13 @@ def update_window(
     T_camera_world: Tensor,  # (K, 4, 4) of all keyframes
     size: int,  # most keyframes in a window
 ) -> list[int]:
-    """Prepend the new keyframe; drop at most one keyframe that no longer overlaps it.
-
-    That is the oldest one whose overlap with the new keyframe is too small. If the window is
-    still too large, the keyframe far from the new one and close to others leaves (DSO's rule).
-    """
+    """Prepend the new keyframe; drop at most one keyframe that no longer overlaps it."""
     window = [new, *window]
     overlaps = {k: overlap_coefficient(seen[new], seen[k]) for k in window[PROTECTED:]}
     non_overlapping = [k for k, overlap in overlaps.items() if overlap <= LEAST_OVERLAP]
     if non_overlapping:
-        window.remove(non_overlapping[-1])
-    while len(window) > size:
+        window.remove(non_overlapping[-1])  # the oldest
+    while len(window) > size:  # the keyframe far from the new one and close to others (DSO's rule)
         window.remove(_most_redundant(window, T_camera_world))
     return window
 
@@ -54,11 +50,8 @@ def sampling_probabilities(
     window: list[int],  # positions of keyframes
     window_probability: float,  # that the sample comes from the window
 ) -> Tensor:  # (N,) float64, sum 1
-    """Return the probability of each keyframe: in the paper, 1/2 for the window in total.
-
-    Where the window holds more than that of all keyframes, all are equally likely.
-    """
-    if len(window) >= window_probability * count:
+    """Return the probability of each keyframe: in the paper, 1/2 for the window in total."""
+    if len(window) >= window_probability * count:  # it is drawn as often if all are equally likely
         return torch.full((count,), 1 / count, dtype=torch.float64, device="cpu")
     others = (1 - window_probability) / (count - len(window))
     probabilities = torch.full((count,), others, dtype=torch.float64, device="cpu")

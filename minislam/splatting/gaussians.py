@@ -70,16 +70,13 @@ class GaussianMap:
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step per parameter group. Source: official WildGS-SLAM, whose factor 6 is included.
+    """Adam's step per parameter group. Source: official WildGS-SLAM."""
 
-    Its colours are c = 0.28209 f + 0.5 with a step of 2.5e-3 for f; ours is the step of c.
-    """
-
-    means: float = 9.6e-4  # world units
+    means: float = 9.6e-4  # world units, its factor 6 included
     quats_wxyz: float = 1e-3
-    log_scales: float = 6e-3
+    log_scales: float = 6e-3  # its factor 6 included
     opacity_logits: float = 5e-2
-    colors: float = 7.05e-4
+    colors: float = 7.05e-4  # of c = 0.28209 f + 0.5, official 2.5e-3 of f
 
 
 class MapOptimizer(Stateful):

@@ -28,13 +28,11 @@ class Chunk(NamedTuple):
 
 
 class TileGroup(NamedTuple):
-    """Tiles with lists of similar length, the shortest first; a slot holds one Gaussian.
-
-    A list that ends within a chunk is padded with the index N, one past the last Gaussian.
-    """
+    """Tiles with lists of similar length, the shortest first; a slot holds one Gaussian."""
 
     tiles: Tensor  # (B,) int64, tile index, row by row
-    gaussians: Tensor  # (S,) int64, chunk by chunk, slot by slot, tile by tile
+    # (S,) int64, chunk by chunk, slot by slot, tile by tile; N, one past the last, pads a list.
+    gaussians: Tensor
     chunks: list[Chunk]
 
 

@@ -47,5 +47,5 @@ def test_a_preview_waits_for_a_map_and_then_keeps_its_share_of_the_time(monkeypa
 
 
 def test_a_preview_never_ends_a_run():
-    slam = SimpleNamespace(mapper=SimpleNamespace(keyframes=[None]))
+    slam = SimpleNamespace(mapper=SimpleNamespace(images=[None]))
     pictures.write_preview(None, slam, {})  # the run has no picture to show, and the folder is none

@@ -23,7 +23,7 @@ def ended(
     graph = SimpleNamespace(adjustments=5, failed_adjustments=failed)
     tracker = SimpleNamespace(graph=graph, watch=SimpleNamespace(breaks=broken))
     sequence = SimpleNamespace(unread=[(0.1, "damaged")] * unread)
-    mapper = SimpleNamespace(shown=shown, keyframes=[None], camera=None, beta_of=lambda _: None)
+    mapper = SimpleNamespace(shown=shown, images=[None], camera=None, beta_of=lambda _: None)
     mapper.static_weight = lambda beta, camera: (torch.arange(100) >= 100 * left_out).float()
     config = replace(SlamConfig(), uncertainty=UncertaintyConfig(**uncertainty))
     parts = {"tracker": tracker, "sequence": sequence, "mapper": mapper, "config": config}
