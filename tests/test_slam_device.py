@@ -29,9 +29,8 @@ from minislam.priors.interfaces import Priors
 from minislam.priors.networks.checkpoints import Weights
 from minislam.priors.networks.droid import DroidFlow
 from minislam.priors.networks.vit import DinoFeatures
-from minislam.runs import run
+from minislam.runs import measures, run
 from minislam.runs.facts import run_facts
-from minislam.runs.measures import measure
 from minislam.runs.pictures import write_pictures
 from minislam.runs.resume import Checkpoints
 from minislam.slam import Slam
@@ -199,7 +198,7 @@ def written(slam: Slam, out: Path) -> dict[str, object]:
     folder, choice = RunFolder.create(out, False, []), PriorChoice(depth="simulated")
     checkpoints = Checkpoints(folder, slam.sequence, slam.config, choice)
     facts = run_facts(slam, choice, checkpoints, "finished", 0)
-    metrics = measure(slam, 1.0, None)
+    metrics = measures.measure(slam, 1.0, None)
     run._write_estimates(folder, slam)
     with plots_left_out():
         write_pictures(folder, slam, metrics, facts)

@@ -284,8 +284,8 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("runs/measures.py", "runs/test_measures.py"): [
         ("if index not in seen", "if index in seen"),
-        ("keyframe.exposed(rendering.color), keyframe", "rendering.color, keyframe"),
-        ("keyframe.image, static\n", "keyframe.image, None\n"),
+        ("image.exposed(rendering.color), image.image", "rendering.color, image.image"),
+        ("image.image, static\n", "image.image, None\n"),
         ("if static.any() else None", "if True else None"),
     ],
     ("runs/warnings.py", "runs/test_warnings.py"): [
