@@ -138,7 +138,7 @@ def typical_residual(problem: BundleProblem, state: BundleState) -> float | None
 def adjust_touched(
     problem: BundleProblem, state: BundleState, iterations: int
 ) -> tuple[BundleState, BundleReport]:
-    """Run `bundle_adjust` on the touched keyframes alone: others would cost time, and stay."""
+    """Run `bundle_adjust` on the touched keyframes alone; the others stay, so they cost no time."""
     rows = touched_rows(problem)
     found, report = bundle_adjust(*of_rows(problem, state, rows), iterations)
     poses, disparities = state.T_camera_world.clone(), state.disparities.clone()
