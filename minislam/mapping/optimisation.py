@@ -1,7 +1,9 @@
 """Optimise the map on L_render and the uncertainty MLP on L_uncer, in turn."""
 
 import math
+import operator
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,12 +14,13 @@ from minislam.mapping.config import MappingConfig
 from minislam.mapping.density import densify, useful_rows
 from minislam.mapping.losses import metre
 from minislam.mapping.safeguards import confirmed_beta
-from minislam.mapping.views import Comparison, ViewGradients, view_gradients, view_of
+from minislam.mapping.views import Comparison, View, ViewGradients, view_gradients
 from minislam.mapping.window import in_turn
 from minislam.records import MapImage, Progress
 from minislam.splatting import GaussianMap, LearningRates, MapOptimizer, Rendering, render
 from minislam.state.memory import SHELF, release
 from minislam.state.stateful import FrameOf, Stateful, Tree
+from minislam.state.threads import side_by_side
 from minislam.uncertainty import RenderingError, UncertaintyConfig, UncertaintyMLP, beta_of_mask
 from minislam.uncertainty.training import UncertaintyTrainer
 from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
@@ -153,7 +156,7 @@ class JointOptimisation(Stateful):
                 progress(done + count, total)
 
     def _step(self, positions: list[int], camera: Camera, rate_factor: float) -> None:
-        """Take one step of the map on the mean L_render of some images, then train the MLP."""
+        """Take one step of the map on the mean L_render of some images, and one of the MLP."""
         trains = self.uncertainty.is_learned and self._iteration >= self._frozen_until
         calls = [self._view_arguments(self.images[k], camera, trains) for k in positions]
         views: list[ViewGradients] = self._workers.map(view_gradients, calls)
@@ -162,8 +165,8 @@ class JointOptimisation(Stateful):
         self._gradients += torch.stack([view.screen for view in views]).sum(0)
         factor = rate_factor * math.sqrt(len(views))  # the mean of n gradients is less noisy
         self._optimizer.rates = self.config.rates_at(self._iteration, self.median_depth, factor)
-        self._optimizer.step()
-        loss = self._train_mlp(positions, views) if trains else math.nan
+        learn = partial(self._train_mlp, positions, views) if trains else lambda: math.nan
+        _, loss = side_by_side(operator.call, [(self._optimizer.step,), (learn,)])
         for view in views:
             entry = *view.losses, loss, len(self._optimizer.gaussians)
             for curve, value in zip(CURVES, entry, strict=True):
@@ -175,10 +178,11 @@ class JointOptimisation(Stateful):
         comparison = None
         if trains:
             (rows, columns, _), unit = image.features.shape, metre(self.median_depth)
-            grid = view_of(image, self._online_camera), (rows, columns), image.confirmation
+            grid = self._online_camera, (rows, columns), image.confirmation
             comparison = Comparison(*grid, unit, self.uncertainty)
         pose, weight = image.T_camera_world, self.static_weight(self.beta_of(image), camera)
-        view = camera, pose, self.background, view_of(image, camera), weight
+        whole = View(image.pixels, image.depth, image.exposure)
+        view = camera, pose, self.background, whole, weight
         return self.gaussians, *view, self.median_depth, self.config, comparison
 
     def _train_mlp(self, positions: list[int], views: list[ViewGradients]) -> float:

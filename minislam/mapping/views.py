@@ -13,7 +13,7 @@ from minislam.mapping.config import MappingConfig
 from minislam.mapping.density import screen_gradients
 from minislam.mapping.losses import render_loss
 from minislam.mapping.safeguards import doubted_error
-from minislam.records import MapImage
+from minislam.records import MapImage, Pictured
 from minislam.splatting import GaussianMap, Rendering, render
 from minislam.uncertainty import RenderingError, UncertaintyConfig, rendering_error
 
@@ -21,16 +21,16 @@ MOST_DEPTHS = 100  # images whose depths are sorted together: those of 500 fill 
 
 
 @dataclass(frozen=True)
-class View:
-    """An image of the map at one size."""
+class View(Pictured):
+    """What a rendering is compared with: an image at one size."""
 
-    image: Tensor  # (h, w, 3) RGB in [0, 1]
+    pixels: Tensor  # (h, w, 3) uint8 RGB, or RGB in [0, 1]
     depth: Tensor  # (h, w) world units, 0 where unknown
     exposure: Tensor | None = None  # (3,) see `Pictured`
 
 
-def view_of(whole: MapImage, camera: Camera) -> View:
-    """Return an image of the map at the size of a camera."""
+def view_of(whole: MapImage | View, camera: Camera) -> View:
+    """Return an image at the size of a camera."""
     size = camera.height, camera.width
     return View(shrink_image(whole.image, *size), shrink_depth(whole.depth, *size), whole.exposure)
 
@@ -52,7 +52,7 @@ class Comparison:
     image size the same rendering has another error, and beta learns another value.
     """
 
-    reference: View  # at the size at which they are compared
+    camera: Camera  # at whose size they are compared
     grid_shape: tuple[int, int]  # (h', w') cells
     confirmation: Tensor | None  # (h', w') of the image
     depth_unit: float  # world units that count as 1 in L_depth
@@ -60,14 +60,14 @@ class Comparison:
 
 
 @torch.no_grad()
-def image_rendering_error(rendering: Rendering, by: Comparison) -> RenderingError:
+def image_rendering_error(rendering: Rendering, view: View, by: Comparison) -> RenderingError:
     """Compare an image with its rendering of the same size or a larger one."""
-    size = by.reference.depth.shape
+    size = view.depth.shape
     depth_and_opacity = torch.stack([rendering.depth, rendering.opacity], -1)
     depth, opacity = shrink_image(depth_and_opacity, *size).unbind(-1)
-    color, reference = shrink_image(rendering.color, *size), by.reference
+    color = shrink_image(rendering.color, *size)
     grid = by.grid_shape, by.depth_unit, by.config
-    error = rendering_error(reference.image, reference.depth, color, depth, opacity, *grid)
+    error = rendering_error(view.image, view.depth, color, depth, opacity, *grid)
     return doubted_error(error, by.confirmation)
 
 
@@ -86,13 +86,14 @@ def view_gradients(
     camera: Camera,
     T_camera_world: Tensor,  # (4, 4)
     background: Tensor,  # (3,) RGB
-    view: View,  # at the size of the camera
+    whole: View,  # at its full size
     weight: Tensor,  # (H, W) static weight
     median_depth: float,  # world units, of the scene
     config: MappingConfig,
     comparison: Comparison | None,  # None: the MLP is not trained
 ) -> ViewGradients:
     """Render an image; return the gradients of L_render, Eq. (6), and the error for the MLP."""
+    view = view_of(whole, camera)
     inputs = {name: p.detach().requires_grad_() for name, p in gaussians.parameters.items()}
     gaussians = replace(gaussians, **inputs)
     offsets = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
@@ -105,5 +106,8 @@ def view_gradients(
     by_parameter = dict(zip(inputs, gradients, strict=True))
     screen = screen_gradients(by_pixel, rendering.weight_sums, camera)
     losses = torch.stack([loss, color_loss])  # one transfer from a GPU
-    error = image_rendering_error(rendering, comparison) if comparison else None
+    error = None
+    if comparison is not None:
+        same = view if comparison.camera == camera else view_of(whole, comparison.camera)
+        error = image_rendering_error(rendering, same, comparison)
     return ViewGradients(by_parameter, screen, losses.tolist(), error)

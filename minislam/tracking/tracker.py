@@ -268,13 +268,13 @@ class Tracker(Stateful):
         self._update_static_weights()
         motion_memory.judge_all(self.graph)  # online, depths were hardly settled
         seek_readouts(self.graph)
-        if not self.config.lambda_disparity_prior:  # else the prior holds the scale itself
-            undo_scale_drift(self.keyframes)
         final_global_ba(self.graph, progress)
         self.conclude()
 
     def conclude(self) -> None:
-        """Judge all keyframes, once all are adjusted; without depth, adjust rotations alone."""
+        """Undo a drift of the scale and judge all keyframes; without depth, adjust rotations."""
+        if not self.config.lambda_disparity_prior:  # else the prior holds the scale itself
+            undo_scale_drift(self.graph)
         self.watch.conclude()
         if not self.knows_depth:
             adjust_turns(self.graph)

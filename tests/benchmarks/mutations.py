@@ -131,10 +131,10 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("if slots[source] >= 0 else []", "if True else []"),
     ],
     ("tracking/safeguards/scale_drift.py", "tracking/safeguards/test_scale_drift.py"): [
-        ("(-drift).exp()", "drift.exp()"), ("(drift[1:] + drift[:-1]) / 2", "drift[1:]"),
-        ("drift - drift.mean()", "drift"), ("SLOW_ERROR**2 + noise", "0 * noise"),
-        ("log_ratio[has_prior].diff()", "0 * log_ratio[has_prior]"),
-        ("-0.5 * ((position", "-5.0 * ((position"),
+        ("(-drift).exp()", "drift.exp()"), ("+ drift[:-1]) / 2).exp()", "- drift[:-1]) / 2).exp()"),
+        ("drift - drift.mean()", "drift"), ("SLOW_ERROR**2 + (noise", "0 * (noise"),
+        ("(information * ratios)", "ratios"), ("(length / before)", "(before / length)"),
+        ("-0.5 * ((position", "-5.0 * ((position"), ("length**4 /", "length**2 /"),
     ],
     ("tracking/safeguards/motion_memory.py",
      "tracking/safeguards/test_motion_memory_overlay.py"): [
