@@ -69,9 +69,9 @@ def neighbourhood_edges(first: int, count: int, radius: int) -> list[tuple[int, 
     return both_directions(pairs)
 
 
-def at_once(edges: Any, most: int = AT_ONCE) -> Iterator[Any]:
+def at_once(edges: Any) -> Iterator[Any]:
     """Cut a list of edges, or a tensor with a row per edge: all at once would take gigabytes."""
-    return (edges[first : first + most] for first in range(0, len(edges), most))
+    return (edges[first : first + AT_ONCE] for first in range(0, len(edges), AT_ONCE))
 
 
 def both_directions(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:

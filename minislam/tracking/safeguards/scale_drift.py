@@ -14,7 +14,6 @@ from torch import Tensor
 from minislam.geometry import se3_inverse
 from minislam.tracking.bundle_adjustment import bundle_adjust, normal_equations
 from minislam.tracking.bundle_problem import BundleState
-from minislam.tracking.frame_graph import at_once
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.pose_from_flow import POSE_ITERATIONS, motion_only_problem
 from minislam.tracking.reprojection import relative_transforms
@@ -48,7 +47,7 @@ def step_ratios(graph: KeyframeGraph) -> tuple[Tensor, Tensor]:  # (K - 1,), (K 
     ends, poses = graph.edges.ends, graph.keyframes.T_camera_world
     steps = [p for p, (i, j) in enumerate(ends) if abs(i - j) == 1]
     total, information = poses.new_zeros(2, len(poses) - 1)
-    for part in at_once(steps, FITTED):
+    for part in (steps[first : first + FITTED] for first in range(0, len(steps), FITTED)):
         step = torch.tensor([min(ends[p]) for p in part], device=total.device)
         ratios, of_edges = _ratios_by_prior(graph, part)
         total.index_add_(0, step, of_edges * ratios)
