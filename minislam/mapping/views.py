@@ -108,6 +108,6 @@ def view_gradients(
     losses = torch.stack([loss, color_loss])  # one transfer from a GPU
     error = None
     if comparison is not None:
-        same = view if comparison.camera == camera else view_of(whole, comparison.camera)
-        error = image_rendering_error(rendering, same, comparison)
+        compared = view if comparison.camera == camera else view_of(whole, comparison.camera)
+        error = image_rendering_error(rendering, compared, comparison)
     return ViewGradients(by_parameter, screen, losses.tolist(), error)

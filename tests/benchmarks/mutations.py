@@ -133,7 +133,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ("tracking/safeguards/scale_drift.py", "tracking/safeguards/test_scale_drift.py"): [
         ("(-drift).exp()", "drift.exp()"), ("+ drift[:-1]) / 2).exp()", "- drift[:-1]) / 2).exp()"),
         ("drift - drift.mean()", "drift"), ("SLOW_ERROR**2 + (noise", "0 * (noise"),
-        ("(information * ratios)", "ratios"), ("(length / before)", "(before / length)"),
+        ("+ information.log()", ""), ("(length / before)", "(before / length)"),
         ("-0.5 * ((position", "-5.0 * ((position"), ("length**4 /", "length**2 /"),
     ],
     ("tracking/safeguards/motion_memory.py",

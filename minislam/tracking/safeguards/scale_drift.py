@@ -5,7 +5,7 @@ keyframes see the same, and the scales of distant ones are hardly tied at all: t
 together with the steps between them costs next to nothing in Eq. (5). A depth prior errs from
 keyframe to keyframe, but not more and more. So the length of each step on the depth of the prior
 alone, over its length as estimated, is averaged over many steps, each by how well its flow tells
-it. That is the drift. It is undone after an adjustment of all keyframes, which brings it back.
+it. That is the drift. It is undone after all keyframes are adjusted, which brings a part back.
 """
 
 import torch
@@ -94,12 +94,13 @@ def told_drift(ratios: Tensor, information: Tensor) -> Tensor:  # (K,) float64
         return information.new_zeros(len(information) + 1)
     position = torch.arange(len(ratios) + 1, device=ratios.device).to(ratios)
     middle = (position[1:] + position[:-1]) / 2
-    window = (-0.5 * ((position[:, None] - middle) / SMOOTHED) ** 2).exp()
-    total = (window @ information).clamp_min(torch.finfo(window.dtype).tiny)
-    drift = window @ (information * ratios) / total
+    window = -0.5 * ((position[:, None] - middle) / SMOOTHED) ** 2  # its logarithm
+    weights = (window + information.log()).softmax(1)  # far from all priors: the nearest step's
+    drift = weights @ ratios
     drift = drift - drift.mean()
     # What differs from the drift is noise, of which the window leaves little.
     rest = information * (ratios - (drift[1:] + drift[:-1]) / 2).square()
     noise = rest[information > 0].mean()
-    error = SLOW_ERROR**2 + (noise * (window.square() @ information) / total.square()).mean()
+    spread = weights.square() / information.clamp_min(torch.finfo(information.dtype).tiny)
+    error = SLOW_ERROR**2 + (noise * spread.sum(1)).mean()
     return drift * (1 - error / torch.maximum(drift.square().mean(), error))

@@ -183,6 +183,14 @@ def test_few_steps_with_a_prior_tell_a_large_drift(monkeypatch: MonkeyPatch):
     assert centre_error(keyframes) < 0.4 * before
 
 
+def test_a_prior_for_a_small_part_of_a_long_run_tells_a_finite_drift():
+    ratios, information = torch.linspace(-0.3, 0.3, 600).double(), torch.zeros(600).double()
+    information[:60] = 400.0
+    found = told_drift(ratios, information)
+    assert torch.isfinite(found).all()
+    assert (found[100:] - found[-1]).abs().max() < 1e-9  # as the nearest step that is told
+
+
 def test_one_step_or_none_tells_nothing():
     ratios, information = steps_with(bend(0.2), every=KEYFRAMES)
     assert not told_drift(ratios, information).any()
