@@ -64,7 +64,8 @@ class MapImage(Pictured):
     depth: Tensor  # (H, W) float32 world units, 0 where unknown: the mapper's reference D~
     T_camera_world: Tensor  # (4, 4) float64
     moving_mask: Tensor | None = None  # (H, W) bool, True on dynamic objects, if given (ablation)
-    confirmation: Tensor | None = None  # (h', w') in [0, 1], near 1 where several views agree
+    # (h', w') near 1 where several views agree, below 0 where those of other times look through
+    confirmation: Tensor | None = None
     exposure: Tensor | None = None  # (3,) see `Pictured`
     inserts: bool = True  # whether it adds Gaussians; else it only enters the losses
     filled: Tensor | None = None  # (H, W) bool, True where depth is not measured, but filled in

@@ -156,14 +156,15 @@ class Mapper(JointOptimisation):
         swept = [image for image in self.images if image.confirmation is not None]
         if not swept or not self.uncertainty.is_learned:
             return
-        least = safeguards.least_weight(torch.cat([self.beta_of(i).flatten() for i in swept]))
+        beta = torch.stack([self.learned_beta(image) for image in swept])
+        least = safeguards.least_weight(beta.flatten())
         if least <= self.least_weight:
             return
-        sample = swept[:: math.ceil(len(swept) / safeguards.ASKED)]
-        calls = (self._view_arguments(i, self._online_camera, trains=True) for i in sample)
+        asked = slice(None, None, math.ceil(len(swept) / safeguards.ASKED))
+        calls = (self._view_arguments(i, self._online_camera, trains=True) for i in swept[asked])
         errors = [vars(v.error).values() for v in self._workers.stream(view_gradients, calls)]
         error = RenderingError(*map(torch.stack, zip(*errors, strict=True)))
-        beta = torch.stack([self.beta_of(image) for image in sample])
+        beta = beta[asked]
         if safeguards.is_wrong(error, beta, least, self.uncertainty):
             self.least_weight = least
             self._replace_dynamic_gaussians()

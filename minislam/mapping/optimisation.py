@@ -3,6 +3,7 @@
 import math
 import operator
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from minislam.geometry import Camera
 from minislam.mapping.config import MappingConfig
 from minislam.mapping.density import densify, useful_rows
 from minislam.mapping.losses import metre
-from minislam.mapping.safeguards import confirmed_beta
+from minislam.mapping.safeguards import confirmed_beta, without_acquitted
 from minislam.mapping.views import Comparison, View, ViewGradients, view_gradients
 from minislam.mapping.window import in_turn
 from minislam.records import MapImage, Progress
@@ -23,7 +24,7 @@ from minislam.state.stateful import FrameOf, Stateful, Tree
 from minislam.state.threads import side_by_side
 from minislam.uncertainty import RenderingError, UncertaintyConfig, UncertaintyMLP, beta_of_mask
 from minislam.uncertainty.training import UncertaintyTrainer
-from minislam.uncertainty.weights import MAPPING_CUT, mapping_weight
+from minislam.uncertainty.weights import BETA_OF_MASK, MAPPING_CUT, UNIT_BETA, mapping_weight
 from minislam.workers import Workers
 
 # The weighted mean of L_color; L_uncer is nan where the MLP is frozen or off; size of the map.
@@ -115,15 +116,26 @@ class JointOptimisation(Stateful):
         return self._trainer.predict(features)
 
     def beta_of(self, image: MapImage) -> Tensor:
-        """Return the raw beta (h', w') of an image: from its mask or from the MLP."""
+        """Return the raw beta (h', w') of an image: from its mask, or from the MLP and the votes.
+
+        Where views of other times look through the image, the map would learn to show what moves.
+        """
         release()  # all that goes from image to image passes here
         if image.moving_mask is not None:
             return beta_of_mask(image.moving_mask)
-        return confirmed_beta(self.predict_beta(image.features), image.confirmation)
+        beta = self.learned_beta(image)
+        if image.confirmation is None:
+            return beta
+        return torch.where(image.confirmation < 0, BETA_OF_MASK, beta)
+
+    def learned_beta(self, image: MapImage) -> Tensor:
+        """Return the raw beta (h', w') by the MLP, less where other views confirm; at first one."""
+        beta = confirmed_beta(self.predict_beta(image.features), image.confirmation)
+        return beta if self._iteration >= self._weighted_from else torch.full_like(beta, UNIT_BETA)
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
-        """Return the static weight (H, W) for a raw beta; 1 at first, or with uncertainty off."""
-        if not self.uncertainty.enabled or self._iteration < self._weighted_from:
+        """Return the static weight (H, W) for a raw beta; 1 with uncertainty off."""
+        if not self.uncertainty.enabled:
             return torch.ones(camera.height, camera.width, device=beta.device)
         return mapping_weight(beta, camera, self.least_weight)
 
@@ -167,7 +179,11 @@ class JointOptimisation(Stateful):
         self._optimizer.rates = self.config.rates_at(self._iteration, self.median_depth, factor)
         learn = partial(self._train_mlp, positions, views) if trains else lambda: math.nan
         _, loss = side_by_side(operator.call, [(self._optimizer.step,), (learn,)])
-        for view in views:
+        for position, view in zip(positions, views, strict=True):
+            if view.error is not None:
+                image = self.images[position]
+                left = without_acquitted(image.confirmation, view.error, self.uncertainty)
+                self.images[position] = replace(image, confirmation=left)
             entry = *view.losses, loss, len(self._optimizer.gaussians)
             for curve, value in zip(CURVES, entry, strict=True):
                 self.history[curve].append(value)

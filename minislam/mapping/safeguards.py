@@ -36,17 +36,18 @@ OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [
 
 
 def confirmed_beta(beta: Tensor, confirmation: Tensor | None) -> Tensor:
-    """Return the raw beta (h', w'), less where other views confirm (h', w')."""
+    """Return the raw beta (h', w') of the MLP, less where other views confirm (h', w')."""
     if confirmation is None:
         return beta
-    return torch.where(beta > weights.BETA_CUT, beta, beta * (1 - CONFIRMED_BETA * confirmation))
+    lowered = beta * (1 - CONFIRMED_BETA * confirmation.clamp_min(0))
+    return torch.where(beta > weights.BETA_CUT, beta, lowered)
 
 
 def doubted_error(error: RenderingError, confirmation: Tensor | None) -> RenderingError:
     """Return the rendering error that the MLP learns from, less where other views confirm."""
     if confirmation is None:
         return error
-    doubt = (1 - CONFIRMED_ERROR * confirmation).clamp_min(0)
+    doubt = (1 - CONFIRMED_ERROR * confirmation).clamp(0, 1)
     return replace(error, ssim=doubt * error.ssim, depth=doubt * error.depth)
 
 
@@ -66,15 +67,36 @@ def least_weight(beta_raw: Tensor) -> float:
     return max(weights.MAPPING_CUT, float(at_cut))
 
 
+def without_acquitted(
+    confirmation: Tensor | None,  # (h', w')
+    error: RenderingError,
+    config: UncertaintyConfig,
+) -> Tensor | None:
+    """Return the confirmation with 0 where the map shows rightly what other views look through.
+
+    The depth there is wrong, because something moves or because it was mistaken. The map has
+    learned the place from other images alone: if it looks the same in this one, nothing moves.
+    """
+    if confirmation is None:
+        return None
+    is_right = optimal_beta(error, config) < weights.UNIT_BETA
+    return torch.where((confirmation < 0) & is_right, 0, confirmation)
+
+
+def optimal_beta(error: RenderingError, config: UncertaintyConfig) -> Tensor:  # (..., h', w')
+    """Return the beta with the least `cell_loss` of each cell alone: sqrt(2 L / lambda_3)."""
+    return (2 * error.total(config.lambda_depth) / config.lambda_log).sqrt()
+
+
 def is_wrong(
     error: RenderingError, beta_raw: Tensor, least: float, config: UncertaintyConfig
 ) -> bool:
     """Tell whether the map is wrong in most cells (..., h', w') that a least weight would exclude.
 
     The MLP sees features, not places: a dark wall, rendered well, gets the beta of a dark dog in
-    front of it. Alone, a cell of error L has its least `cell_loss` at beta = sqrt(2 L / lambda_3).
+    front of it.
     """
-    optimal = (2 * error.total(config.lambda_depth) / config.lambda_log).sqrt()
+    optimal = optimal_beta(error, config)
     excluded, wrong = (
         weights.weight_of(weights.clipped_beta(beta)) < least for beta in (beta_raw, optimal)
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from minislam.geometry import Camera
 from minislam.stereo.sweep import plane_homographies
@@ -18,12 +19,19 @@ from minislam.stereo.sweep import plane_homographies
 TOLERANCE = 0.05  # relative error of the inverse depth that still agrees [-]
 WELL_MATCHED = 0.5  # a view with a larger matching cost cannot refute [-]
 MIN_AGREEING = 3  # views
-MAX_REFUTED = 0.5  # refuting views per agreeing view [-]
+MAX_REFUTED = 0.5  # refuting views per agreeing view of its time [-]
 WINDOW = 7  # px, side of the window around a pixel
 LEAST_KNOWN_AROUND = 0.4  # fraction of this window that must be known, too [-]
 CONFIRMING_COST = 0.6  # a pixel with a larger matching cost confirms nothing [-]
 MOST_SPREAD = 0.075  # image widths from a good match: so far aggregation may carry a depth
 JUDGES = 24  # views, spread evenly over the clip, that tell what stays
+SURFACE = (
+    15  # px, side of a larger window, whose pixels of about the same depth are judged together
+)
+SAME_SURFACE = 0.1  # relative difference of their inverse depth [-]
+LEAST_REFUTING = 1.0  # judges, in the mean of these pixels
+LEAST_REFUTED = 0.15  # refuting judges per agreeing one [-]
+LOOKED_THROUGH = 0.3  # refuted fraction of the window around a pixel, from which it may move [-]
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,8 @@ class ConfirmedDepth:
     """The depths of one image that other views confirm."""
 
     inverse_depth: np.ndarray  # (h, w) float32 1/world unit, 0 where unknown
-    confirmation: np.ndarray  # (h, w) float32 in [0, 1]: near 1, all around stands still
+    # (h, w) float32: near 1, all around stands still; -1 where views of other times look through it
+    confirmation: np.ndarray
 
 
 def confirm(camera: Camera, view: SweptView, others: list[SweptView]) -> ConfirmedDepth:
@@ -61,7 +70,11 @@ def keep_what_stays(
     depths: list[ConfirmedDepth],  # of the views
     wanted: list[int],  # positions of views
 ) -> Iterator[ConfirmedDepth]:  # of the wanted views
-    """Drop, by confirmed depths, what views of other times look through; trust fades around it."""
+    """Drop, by confirmed depths, what views of other times look through; trust fades around it.
+
+    What moves at a steady pace beside a steady camera agrees, in all views of its time, with a
+    wrong depth. There a view of another time knows a surface behind it, in many pixels at once.
+    """
 
     def confirmed_view(index: int) -> SweptView:
         inverse_depth, cost = depths[index].inverse_depth, 1 - depths[index].confirmation
@@ -73,10 +86,12 @@ def keep_what_stays(
         depth = depths[index]
         others = [view for judge, view in judging.items() if judge != index]
         agreeing, refuting = count_votes(camera, confirmed_view(index), others)
-        refuted = refuting >= np.maximum(MIN_AGREEING, MAX_REFUTED * agreeing)
+        refuted = _is_looked_through(depth.inverse_depth, agreeing, refuting)
         known = (depth.inverse_depth > 0) & ~refuted
         known &= _fraction_around(known) >= LEAST_KNOWN_AROUND
-        confirmation = depth.confirmation * np.maximum(1 - 2 * _fraction_around(refuted), 0)
+        fraction = _fraction_around(refuted)
+        confirmation = depth.confirmation * np.maximum(1 - 2 * fraction, 0)
+        confirmation[fraction > LOOKED_THROUGH] = -1
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
@@ -90,6 +105,24 @@ def _distance(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32 
 def _fraction_around(mask: np.ndarray) -> np.ndarray:  # (h, w) bool -> (h, w) float32
     """Return the fraction of the window around each pixel in which the mask is true."""
     return cv2.blur(mask.astype(np.float32), (WINDOW, WINDOW))
+
+
+def _is_looked_through(
+    inverse_depth: np.ndarray,  # (h, w) 1/world unit, 0 where unknown
+    agreeing: np.ndarray,  # (h, w) judges
+    refuting: np.ndarray,
+) -> np.ndarray:  # (h, w) bool
+    """Tell which pixels are refuted, on average over the surface around each of them."""
+    square = np.ones((SURFACE, SURFACE), np.uint8)
+    doubted = (inverse_depth > 0) & (cv2.dilate(refuting.astype(np.float32), square) > 0)
+    padded = (np.pad(a, SURFACE // 2) for a in (inverse_depth, agreeing, refuting))
+    depths, *votes = (sliding_window_view(a, square.shape)[doubted] for a in padded)
+    own = inverse_depth[doubted, None, None]
+    same = np.abs(depths - own) < SAME_SURFACE * own
+    agreeing, refuting = ((same * a).sum((1, 2)) / same.sum((1, 2)) for a in votes)
+    result = np.zeros_like(doubted)
+    result[doubted] = refuting >= np.maximum(LEAST_REFUTING, LEAST_REFUTED * agreeing)
+    return result
 
 
 def judges(count: int) -> list[int]:

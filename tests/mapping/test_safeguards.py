@@ -13,6 +13,7 @@ from minislam.mapping.safeguards import (
 )
 from minislam.uncertainty import RenderingError, UncertaintyConfig
 from minislam.uncertainty.weights import (
+    BETA_OF_MASK,
     MAPPING_CUT,
     clipped_beta,
     mapping_weight,
@@ -26,7 +27,7 @@ from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_ke
 def test_confirmation_lessens_doubt_but_not_a_beta_above_the_cut():
     beta = torch.tensor([[0.2, 1.0, 1.4, 1.6, 3.0]])
     assert confirmed_beta(beta, None) is beta
-    confirmation = torch.tensor([[0.0, 0.5, 1.0, 1.0, 1.0]])
+    confirmation = torch.tensor([[0.0, 0.5, 1.0, 1.0, -1.0]])
     expected = torch.tensor([[0.2, 0.8, 0.84, 1.6, 3.0]])
     torch.testing.assert_close(confirmed_beta(beta, confirmation), expected)
 
@@ -37,6 +38,7 @@ def test_the_rendering_error_of_what_is_confirmed_fades():
     faded = doubted_error(error, torch.tensor([[0.0, 0.5, 1.0]]))
     torch.testing.assert_close(faded.ssim, torch.tensor([[1.0, 0.25, 0.0]]))
     torch.testing.assert_close(faded.depth, torch.tensor([[2.0, 0.5, 0.0]]))
+    assert torch.equal(doubted_error(error, torch.full((1, 3), -1.0)).ssim, error.ssim)
     assert faded.opacity is error.opacity
 
 
@@ -149,6 +151,25 @@ def test_what_looks_like_a_mover_is_kept_where_the_map_is_right(moves: bool):
     mapper.initialise(keyframes)
     mapper.refine(48)
     assert (mapper.least_weight > MAPPING_CUT) == moves
+
+
+def test_what_views_of_other_times_look_through_is_never_painted_into_the_map():
+    # To the MLP the square is as static as the wall.
+    keyframes = [wall_keyframe(k, mover_column=4 + 4 * k) for k in range(3)]
+    found = [0 * keyframe.features[..., 1] for keyframe in keyframes]
+    looked_through = [-keyframe.features[..., 1] for keyframe in keyframes]
+    nearer = []
+    for confirmations in (found, looked_through):
+        rows = zip(keyframes, confirmations, strict=True)
+        mapper = make_mapper(replace(CONFIG, init_iterations=40))
+        mapper.predict_beta = lambda features: torch.full(features.shape[:2], 0.1)
+        mapper.initialise([replace(keyframe, confirmation=c) for keyframe, c in rows])
+        mapper.refine(24)
+        beta = torch.stack([mapper.beta_of(image) for image in mapper.images])
+        nearer.append(int((mapper.gaussians.means[:, 2] < 1.5).sum()))
+    at_mover = torch.stack(looked_through) < 0
+    assert (beta[at_mover] == BETA_OF_MASK).all() and (beta[~at_mover] == 0.1).all()
+    assert nearer[1] < 0.2 * nearer[0]
 
 
 def test_without_confirmation_the_usual_cut_stays():
