@@ -129,9 +129,10 @@ class JointOptimisation(Stateful):
         return torch.where(image.confirmation < 0, BETA_OF_MASK, beta)
 
     def learned_beta(self, image: MapImage) -> Tensor:
-        """Return the raw beta (h', w') by the MLP, less where other views confirm; at first one."""
+        """Return the raw beta (h', w') by the MLP, less where other views confirm."""
         beta = confirmed_beta(self.predict_beta(image.features), image.confirmation)
-        return beta if self._iteration >= self._weighted_from else torch.full_like(beta, UNIT_BETA)
+        is_trained = self._iteration >= self._weighted_from
+        return beta if is_trained else torch.full_like(beta, UNIT_BETA)
 
     def static_weight(self, beta: Tensor, camera: Camera) -> Tensor:
         """Return the static weight (H, W) for a raw beta; 1 with uncertainty off."""

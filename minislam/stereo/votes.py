@@ -2,8 +2,8 @@
 
 The point of a pixel is projected into another swept view. If the depth found there is the depth of
 the point, the view agrees. If the view has a good match behind the point, it looks through it, and
-the point is refuted. With a moving object no other view agrees. What stands still for a while is
-refuted by views of all times, which look through it before it came or after it left.
+the point is refuted. With a moving object no other view agrees, unless it stands still for a while or
+moves steadily beside the camera: then views of other times refute it, which look through it.
 """
 
 from collections.abc import Iterator
@@ -25,13 +25,11 @@ LEAST_KNOWN_AROUND = 0.4  # fraction of this window that must be known, too [-]
 CONFIRMING_COST = 0.6  # a pixel with a larger matching cost confirms nothing [-]
 MOST_SPREAD = 0.075  # image widths from a good match: so far aggregation may carry a depth
 JUDGES = 24  # views, spread evenly over the clip, that tell what stays
-SURFACE = (
-    15  # px, side of a larger window, whose pixels of about the same depth are judged together
-)
-SAME_SURFACE = 0.1  # relative difference of their inverse depth [-]
+SURFACE = 15  # px, side of the window in which pixels of a surface are judged together
+SAME_SURFACE = 0.1  # relative difference of their inverse depths [-]
 LEAST_REFUTING = 1.0  # judges, in the mean of these pixels
-LEAST_REFUTED = 0.15  # refuting judges per agreeing one [-]
-LOOKED_THROUGH = 0.3  # refuted fraction of the window around a pixel, from which it may move [-]
+PER_AGREEING = 0.15  # least refuting judges per agreeing one [-]
+LOOKED_THROUGH = 0.3  # refuted fraction of the small window, from which a pixel may move [-]
 
 
 @dataclass(frozen=True)
@@ -70,11 +68,7 @@ def keep_what_stays(
     depths: list[ConfirmedDepth],  # of the views
     wanted: list[int],  # positions of views
 ) -> Iterator[ConfirmedDepth]:  # of the wanted views
-    """Drop, by confirmed depths, what views of other times look through; trust fades around it.
-
-    What moves at a steady pace beside a steady camera agrees, in all views of its time, with a
-    wrong depth. There a view of another time knows a surface behind it, in many pixels at once.
-    """
+    """Drop, by confirmed depths, what views of other times look through; trust fades around it."""
 
     def confirmed_view(index: int) -> SweptView:
         inverse_depth, cost = depths[index].inverse_depth, 1 - depths[index].confirmation
@@ -114,14 +108,15 @@ def _is_looked_through(
 ) -> np.ndarray:  # (h, w) bool
     """Tell which pixels are refuted, on average over the surface around each of them."""
     square = np.ones((SURFACE, SURFACE), np.uint8)
-    doubted = (inverse_depth > 0) & (cv2.dilate(refuting.astype(np.float32), square) > 0)
+    agreeing, refuting = agreeing.astype(np.uint8), refuting.astype(np.uint8)
+    doubted = (inverse_depth > 0) & (cv2.dilate(refuting, square) > 0)
     padded = (np.pad(a, SURFACE // 2) for a in (inverse_depth, agreeing, refuting))
     depths, *votes = (sliding_window_view(a, square.shape)[doubted] for a in padded)
     own = inverse_depth[doubted, None, None]
     same = np.abs(depths - own) < SAME_SURFACE * own
     agreeing, refuting = ((same * a).sum((1, 2)) / same.sum((1, 2)) for a in votes)
     result = np.zeros_like(doubted)
-    result[doubted] = refuting >= np.maximum(LEAST_REFUTING, LEAST_REFUTED * agreeing)
+    result[doubted] = refuting >= np.maximum(LEAST_REFUTING, PER_AGREEING * agreeing)
     return result
 
 
