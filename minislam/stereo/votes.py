@@ -2,8 +2,8 @@
 
 The point of a pixel is projected into another swept view. If the depth found there is the depth of
 the point, the view agrees. If the view has a good match behind the point, it looks through it, and
-the point is refuted. With a moving object no other view agrees, unless it stands still for a while or
-moves steadily beside the camera: then views of other times refute it, which look through it.
+the point is refuted. With a moving object no other view agrees, unless it stands still for a while
+or moves steadily beside the camera: then views of other times refute it, which look through it.
 """
 
 from collections.abc import Iterator
