@@ -29,7 +29,6 @@ SURFACE = 15  # px, side of the window in which pixels of a surface are judged t
 SAME_SURFACE = 0.1  # relative difference of their inverse depths [-]
 LEAST_REFUTING = 1.0  # judges, in the mean of these pixels
 PER_AGREEING = 0.15  # least refuting judges per agreeing one [-]
-LOOKED_THROUGH = 0.3  # refuted fraction of the small window, from which a pixel may move [-]
 
 
 @dataclass(frozen=True)
@@ -84,8 +83,8 @@ def keep_what_stays(
         known = (depth.inverse_depth > 0) & ~refuted
         known &= _fraction_around(known) >= LEAST_KNOWN_AROUND
         fraction = _fraction_around(refuted)
-        confirmation = depth.confirmation * np.maximum(1 - 2 * fraction, 0)
-        confirmation[fraction > LOOKED_THROUGH] = -1
+        fades = depth.confirmation * (1 - 2 * fraction)
+        confirmation = np.where(fraction < 0.5, fades, -1).astype(np.float32)
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
