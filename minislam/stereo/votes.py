@@ -83,8 +83,7 @@ def keep_what_stays(
         known = (depth.inverse_depth > 0) & ~refuted
         known &= _fraction_around(known) >= LEAST_KNOWN_AROUND
         fraction = _fraction_around(refuted)
-        fades = depth.confirmation * (1 - 2 * fraction)
-        confirmation = np.where(fraction < 0.5, fades, -1).astype(np.float32)
+        confirmation = np.where(fraction < 0.5, depth.confirmation * (1 - 2 * fraction), -1)
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
