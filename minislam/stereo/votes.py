@@ -29,6 +29,7 @@ SURFACE = 15  # px, side of the window in which pixels of a surface are judged t
 SAME_SURFACE = 0.1  # relative difference of their inverse depths [-]
 LEAST_REFUTING = 1.0  # judges, in the mean of these pixels
 PER_AGREEING = 0.15  # least refuting judges per agreeing one [-]
+LOOKED_THROUGH = 0.3  # refuted fraction of the small window, from which it may move [-]
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,10 @@ def keep_what_stays(
         agreeing, refuting = count_votes(camera, confirmed_view(index), others)
         refuted = _is_looked_through(depth.inverse_depth, agreeing, refuting)
         known = (depth.inverse_depth > 0) & ~refuted
-        known &= _fraction_around(known) >= LEAST_KNOWN_AROUND
         fraction = _fraction_around(refuted)
-        confirmation = np.where(fraction < 0.5, depth.confirmation * (1 - 2 * fraction), -1)
+        confirmation = depth.confirmation * np.maximum(1 - 2 * fraction, 0)
+        confirmation[~known & (fraction > LOOKED_THROUGH)] = -1
+        known &= _fraction_around(known) >= LEAST_KNOWN_AROUND
         yield ConfirmedDepth(np.where(known, depth.inverse_depth, 0), confirmation)
 
 
