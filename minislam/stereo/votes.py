@@ -29,7 +29,7 @@ SURFACE = 15  # px, side of the window in which pixels of a surface are judged t
 SAME_SURFACE = 0.1  # relative difference of their inverse depths [-]
 LEAST_REFUTING = 1.0  # judges, in the mean of these pixels
 PER_AGREEING = 0.15  # least refuting judges per agreeing one [-]
-LOOKED_THROUGH = 0.3  # refuted fraction of the small window, from which it may move [-]
+LOOKED_THROUGH = 0.3  # refuted fraction of the small window around a pixel that may move [-]
 
 
 @dataclass(frozen=True)
