@@ -29,7 +29,7 @@ from tests.mapping.plane_scene import CAMERA, CONFIG, GRID, make_mapper, wall_ke
 def test_confirmation_lessens_doubt_but_not_a_beta_above_the_cut():
     beta = torch.tensor([[0.2, 1.0, 1.4, 1.6, 3.0]])
     assert confirmed_beta(beta, None) is beta
-    confirmation = torch.tensor([[0.0, 0.5, 1.0, 1.0, -1.0]])
+    confirmation = torch.tensor([[-1.0, 0.5, 1.0, 1.0, 1.0]])
     expected = torch.tensor([[0.2, 0.8, 0.84, 1.6, 3.0]])
     torch.testing.assert_close(confirmed_beta(beta, confirmation), expected)
 

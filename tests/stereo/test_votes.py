@@ -161,6 +161,7 @@ def test_the_wall_at_the_edge_of_a_box_that_leaves_is_kept():
     for depth in kept([True] * 6 + [False] * 4)[:6]:
         rim = depth.inverse_depth[7:10, 8:22]
         assert (rim[rim > 0] == np.float32(WALL)).all() and (rim > 0).mean() > 0.9
+        assert (depth.confirmation[depth.inverse_depth > 0] >= 0).all()
 
 
 def test_a_surface_is_judged_by_all_its_pixels_around():
