@@ -26,7 +26,7 @@ BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: what the capp
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
 BETA_CUT = 1.41  # the beta_raw of that weight
-UNIT_BETA = 0.471  # of the weight 1
+UNIT_BETA = (WEIGHT_SCALE**0.5 - BETA_FLOOR) / DATA_RATE + BETA_FLOOR - BETA_OFFSET  # of weight 1
 STATIC_FRACTION = 0.1  # ours: so much of a frame counts fully in tracking, whatever its beta [-]
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
 

@@ -61,7 +61,8 @@ def test_a_frame_is_plotted_as_bright_as_it_is_exposed(run: minislam.Run, monkey
     again.plot(index)
     again.frames[index] = replace(again.frames[index], exposure=level)
     again.plot(index)
-    np.testing.assert_allclose(shown[1], shown[0] * level, atol=1e-6)
+    dark = shown[0] < 1  # brighter ones are cut off
+    np.testing.assert_allclose(shown[1][dark], (shown[0] * level)[dark], atol=1e-6)
 
 
 def test_every_frame_knows_how_bright_it_is_beside_the_map():
