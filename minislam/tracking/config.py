@@ -7,7 +7,7 @@ from minislam.parameters import parameter
 
 @dataclass(frozen=True)
 class LearnedFlowConfig:
-    """The defaults that differ where the confidence of the flow is learned.
+    """What a learned flow takes instead: its own defaults, and what preset `paper` sets for it.
 
     Flow and geometry take turns: one update of the flow, two Gauss-Newton steps, and again. Whoever
     sets tracking.X sets tracking.learned.X as well, unless both are given (`with_settings`).
@@ -20,7 +20,9 @@ class LearnedFlowConfig:
     warmup_iterations: int = parameter(2, "Gauss-Newton steps per round of the warm-up", 1)
     window: int = parameter(10, "newest keyframes that the local BA moves", 1)
     rounds: int = parameter(4, "rounds per keyframe", 1)
-    active_edges: int = parameter(0, "edges of a round, the newest keyframe's too, at most")
+    active_edges: int = parameter(
+        0, "edges of a round: the newest keyframe's, filled up with old ones to this many"
+    )
     iterations: int = parameter(2, "Gauss-Newton steps per round", 1)
     global_iterations: int = parameter(2, "Gauss-Newton steps per round of a global BA", 1)
     robust_scale: float = parameter(0.0, "as tracking.robust_scale: none is needed [px]")
@@ -66,13 +68,13 @@ class TrackingConfig:
     )
     mask_min_corresponding: int = parameter(2, "views that must see a cell, paper supplement")
     mask_min_consistent: int = parameter(2, "of which this many must agree, official code")
-    global_interval: int = parameter(20, "fewest keyframes between global BAs; 0: none, paper 3.3")
+    global_interval: int = parameter(20, "fewest keyframes between global BAs, official; 0: none")
     loop_closure: bool = parameter(True, "link a new keyframe with places seen long ago")
     loop_min_gap: int = parameter(20, "least gap between a loop's ends [keyframes]; official 21", 1)
     loop_distance: float = parameter(120.0, "largest flow distance of a loop [px]")
     loop_edges: int = parameter(2, "loops of one keyframe, nearest by flow distance")
     rolling_shutter: bool = parameter(True, "estimate how long the camera takes to read an image")
-    final_rounds: int = parameter(2, "rounds of the final global BA, paper supplement")
+    final_rounds: int = parameter(2, "rounds of the final global BA; official 7 + 12")
     final_prior: bool = parameter(False, "keep the disparity prior in the final BA (an ablation)")
     pose_rounds: int = parameter(1, "rounds of flow and pose per frame between keyframes", 1)
     pose_iterations: int = parameter(8, "Gauss-Newton steps per round of such a frame", 1)

@@ -52,18 +52,16 @@ def chain_state(
     first_disparities: Tensor,  # (N,)
     known_disparities: Tensor,  # (K, N), 0 where there is no depth prior
     robust: RobustKernel | None,
-    weights: Tensor,  # (N,) in [0, 1] of the first keyframe
 ) -> BundleState:
     """Return poses and disparities of K keyframes, each from its predecessor."""
     poses = [torch.eye(4, dtype=torch.float64, device=first_disparities.device)]
-    disparities = [first_disparities]
+    disparities, ones = [first_disparities], torch.ones_like(first_disparities)
     for index, matches in enumerate(flow_to_next):
         last, of_last = poses[-1], disparities[-1]
         starts = [last]
         if index > 0:
             starts.append(se3_interpolate(poses[-2], last, 2.0))
-        pose = start_pose(grid, matches, of_last, weights, last, starts, robust)
-        weights = motion_memory.inherit_motion_weight(grid, matches, weights)
+        pose = start_pose(grid, matches, of_last, ones, last, starts, robust)
         warped = warp_disparities(grid, pose @ se3_inverse(last), of_last)
         known = known_disparities[index + 1]
         poses.append(pose)
@@ -84,13 +82,13 @@ def first_geometry(graph: KeyframeGraph, workers: Workers | None = None) -> None
     graph.flow_to_next = [*flow_to_next]
     for target in range(1, len(keyframes)):
         graph.match_composed(target)
-    known, weights = keyframes.prior_disparities, keyframes.cell_weights[0]
+    known = keyframes.prior_disparities
 
     def start(log_focal: float) -> list[BundleState]:
         grid = replace(graph.grid)
         grid.zoom(log_focal)
         guesses = first_disparity_hypotheses(grid, known)
-        chains = [chain_state(grid, flow_to_next, *g, graph.robust, weights) for g in guesses]
+        chains = [chain_state(grid, flow_to_next, *g, graph.robust) for g in guesses]
         return [replace(chain, log_focal=log_focal) for chain in chains]
 
     state, report = lowest_minimum(graph, start, workers)

@@ -5,6 +5,7 @@ both directions, to older keyframes that see the same place (covisibility, by th
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from minislam.records import Frame
 from minislam.state.memory import give_back_freed
 from minislam.state.stateful import Stateful
 from minislam.tracking.bundle_adjustment import BundleReport, bundle_adjust, residuals
-from minislam.tracking.bundle_problem import BundleState
+from minislam.tracking.bundle_problem import BundleProblem, BundleState
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import (
     FAR,
@@ -97,6 +98,11 @@ class KeyframeGraph(Stateful):
         """Return poses and disparities of all keyframes."""
         return BundleState(self.keyframes.T_camera_world, self.keyframes.disparities)
 
+    def fitting_weights(self, problem: BundleProblem, state: BundleState) -> Tensor:  # (E, 2, N)
+        """Return the weights of a problem, lowered by a robust weight where it does not fit."""
+        robust = problem.robust or RobustKernel(max(self.pixel_scale, 1.0))  # None if learned
+        return residuals(replace(problem, robust=robust), state)[1]
+
     def count_adjustment(self, report: BundleReport) -> None:
         """Count an adjustment; a run warns at its end of those that failed."""
         self.adjustments += 1
@@ -154,7 +160,8 @@ class KeyframeGraph(Stateful):
         Support is the robust weight of the flow over the weight of the keyframes' cells. So where
         a dynamic object fills the view, the few static cells are enough.
         """
-        keyframes, grid, newest, count = self.keyframes, self.grid, len(self.keyframes), len(around)
+        keyframes, grid, count = self.keyframes, self.grid, len(around)
+        slot = len(keyframes)  # under which the flow knows the frame
         poses, weights = keyframes.T_camera_world[around], keyframes.cell_weights[around]
         robust = self.robust and self.robust.widened(ROBUST_NARROWING)
         numbers = torch.arange(count + 1, device=poses.device)
@@ -162,12 +169,12 @@ class KeyframeGraph(Stateful):
         unused = grid.rays.new_zeros(1, len(grid.rays))  # disparities of the image itself
         disparities = torch.cat([keyframes.disparities[around], unused])
         state = BundleState(torch.cat([poses, start[None]]), disparities)
-        self.flow.add_frame(newest, frame.image)
-        edges = [(keyframe, len(keyframes)) for keyframe in around]
+        self.flow.add_frame(slot, frame.image)
+        edges = [(keyframe, slot) for keyframe in around]
         for _ in range(self.config.pose_rounds):
             transforms = relative_transforms(state.T_camera_world, *ends).float()
             predicted, _ = reproject(transforms, disparities[:-1], grid.rays, grid.camera)
-            matches = self.flow.match(around, [newest] * count, predicted)
+            matches = self.flow.match(around, [slot] * count, predicted)
             matches = self.shutter.corrected(matches, edges, frame.frame_index)
             measured = *ends, matches.targets, matches.confidences * weights[:, None]
             problem = motion_only_problem(grid, *measured, numbers == count, robust)
@@ -177,9 +184,9 @@ class KeyframeGraph(Stateful):
                 pose = start_pose(grid, matches, *source, starts, self.robust)
                 state = BundleState(torch.cat([poses, pose[None]]), disparities)
             state, _ = bundle_adjust(problem, state, self.config.pose_iterations)
-        self.flow.remove_frame(newest)
-        _, final_weights = residuals(problem, state)
-        support = final_weights.mean() / weights.mean().clamp_min(LEAST_WEIGHT)
+        self.flow.remove_frame(slot)
+        fitting = self.fitting_weights(problem, state)
+        support = fitting.mean() / weights.mean().clamp_min(LEAST_WEIGHT)
         return state.T_camera_world[-1], float(support)
 
     def warp_disparities(self, keyframe: int, T_camera_world: Tensor) -> Tensor:  # (N,)

@@ -36,7 +36,11 @@ def loop_pairs(
 
 
 def loops_near(edges: list[Edge], newest: int, min_gap: int) -> list[Edge]:
-    """Return the loops that end near the newest keyframe: the geometry predicts more there."""
+    """Return the existing loops that end near the newest keyframe.
+
+    With one, the drift there is corrected, so the geometry predicts the next, and none is sought by
+    appearance.
+    """
     first = newest - LOOP_SUPPRESSION
     return [(i, j) for i, j in edges if abs(i - j) >= min_gap and max(i, j) >= first]
 

@@ -38,7 +38,8 @@ def local_ba(graph: KeyframeGraph) -> None:
         adjust(graph, first_free, config.iterations, widening=FIRST_WIDENING)
     edges = graph.neighbour_edges(newest) + graph.proximity_edges(newest)
     mask_priors(graph, edges, first=newest)
-    edges += graph.edges.ends[max(0, len(graph.edges) + len(edges) - config.active_edges) :]
+    old = [edge for edge in graph.edges.ends if edge not in edges]
+    edges += old[max(0, len(old) + len(edges) - config.active_edges) :]
     for _ in range(config.rounds):
         graph.match(edges)
         adjust(graph, first_free, config.iterations)
@@ -109,9 +110,9 @@ def adjust(
     if free_camera:
         columns = graph.shutter.edge_columns(positions) if graph.shutter.is_found else None
         problem = replace(problem, free_focal=graph.focal_is_free, shift_columns=columns)
-    # Without parallax the flow does not measure depth. In a local BA such a keyframe keeps its
-    # disparities, which hold the scale until the camera moves again; where all keyframes are
-    # adjusted, only one with a prior does.
+    # Without parallax the flow does not measure depth. Where older keyframes are held, such a
+    # keyframe keeps its disparities, which hold the scale until the camera moves again; where all
+    # keyframes are adjusted, only one with a prior does.
     largest = graph.grid.rays.new_zeros(len(graph.keyframes))
     parallaxes = graph.parallaxes(problem.edges_source, problem.edges_target)
     largest.scatter_reduce_(0, problem.edges_source, parallaxes, "amax")

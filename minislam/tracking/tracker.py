@@ -203,7 +203,10 @@ class Tracker(Stateful):
             self._update_static_weights(first=len(self.keyframes) - 1)
 
     def _adjust_all_if_due(self) -> None:
-        """Close loops; run online global BA if `global_interval` keyframes and half are new."""
+        """Close loops; run online global BA if enough keyframes are new since the last one.
+
+        Enough are at least `global_interval`, and at least half of all.
+        """
         interval, count, last = self.config.global_interval, len(self.keyframes), self._last_global
         closed = self.config.loop_closure and close_loops(self.graph, self._relocaliser)
         is_due = interval > 0 and count - last >= max(interval, last)

@@ -37,7 +37,7 @@ def test_a_chain_with_known_disparities_finds_every_pose():
         truth.append(se3_exp(0.02 * normal(seed, 6)) @ sideways(0.2) @ truth[-1])
     known = torch.stack([room_disparities(seed) for seed in range(4)])
     chain = [seen_matches(truth[k + 1] @ se3_inverse(truth[k]), known[k]) for k in range(3)]
-    state = chain_state(GRID, chain, known[0], known, RobustKernel(2.0), torch.ones(CELLS))
+    state = chain_state(GRID, chain, known[0], known, RobustKernel(2.0))
     torch.testing.assert_close(state.T_camera_world, torch.stack(truth), rtol=0, atol=1e-4)
     assert torch.equal(state.disparities, known)
 
@@ -47,7 +47,7 @@ def test_a_chain_carries_disparities_where_none_are_known():
     forward = torch.eye(4, dtype=torch.float64)
     forward[2, 3] = -0.4  # depth 2 becomes 1.6
     chain = [seen_matches(forward, first)]
-    state = chain_state(GRID, chain, first, unknown, None, torch.ones(CELLS))
+    state = chain_state(GRID, chain, first, unknown, None)
     torch.testing.assert_close(state.T_camera_world[1], forward, rtol=0, atol=1e-5)
     expected = torch.full((CELLS,), 1 / 1.6)
     torch.testing.assert_close(state.disparities[1], expected, rtol=1e-4, atol=0)

@@ -3,13 +3,14 @@
 from copy import deepcopy
 
 import pytest
+import torch
 
 from minislam.state import memory
 from minislam.state.memory import SHELF
 from minislam.tracking import frame_graph, keyframe_graph
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import FrameGraph
-from tests.tracking.wall import TrueFlow, true_graph
+from tests.tracking.wall import TrueFlow, true_graph, true_poses, wall_frame
 
 # What is refused
 
@@ -20,6 +21,25 @@ def test_a_new_link_needs_both_directions():
     asked = [(0, 3), (3, 0), (1, 3), (3, 1)]
     assert graph.filter_confirmed(asked) == [(1, 3), (3, 1)]
     assert graph.filter_confirmed([]) == [] and len(graph.edges) == 0
+
+
+@pytest.mark.parametrize("is_learned", [False, True])
+def test_a_pose_has_the_support_of_the_flow_that_fits_it(
+    monkeypatch: pytest.MonkeyPatch, is_learned: bool
+):
+    graph = true_graph([0, 4], flow=TrueFlow(is_learned=is_learned))
+    asked = wall_frame(2), [0, 1], true_poses()[2]
+    _, support = graph.fit_pose(*asked)
+    match, generator = graph.flow.match, torch.Generator().manual_seed(0)
+
+    def mismatched(*edges):
+        matches = match(*edges)
+        matches.targets[:] = 60 * torch.rand(matches.targets.shape, generator=generator)
+        return matches
+
+    monkeypatch.setattr(graph.flow, "match", mismatched)
+    assert graph.fit_pose(*asked)[1] < 0.1 * support
+    assert 0.5 < support <= 1
 
 
 def test_flow_between_the_newest_keyframe_and_its_predecessors_is_measured_both_ways():

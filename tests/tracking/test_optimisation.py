@@ -10,7 +10,7 @@ from minislam.geometry import se3_exp, se3_inverse, se3_log
 from minislam.tracking import frame_graph, optimisation
 from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.bundle_problem import BundleState
-from minislam.tracking.config import TrackingConfig
+from minislam.tracking.config import LearnedFlowConfig, TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.optimisation import (
@@ -25,7 +25,7 @@ from minislam.tracking.safeguards import parts
 from minislam.tracking.safeguards.parts import in_parts
 from minislam.tracking.safeguards.robust import RobustKernel
 from tests.tracking.scene import CAMERA, assert_same_bits
-from tests.tracking.wall import true_graph, true_poses
+from tests.tracking.wall import TrueFlow, true_graph, true_poses
 
 # As a network errs: a scale of its own in each of four keyframes.
 WRONG = torch.tensor([[1.3], [0.8], [1.2], [0.7]])
@@ -172,6 +172,19 @@ def test_a_new_keyframe_is_linked_and_adjusted_without_knowing_where_it_is():
     found, truth = (T[:3, 3] / T[:3, 3].norm() for T in (last, true_poses()[3]))
     assert float((found - truth).norm()) < 1e-2
     assert float((last[:3, :3] - true_poses()[3][:3, :3]).norm()) < 1e-3
+
+
+@pytest.mark.parametrize("is_learned", [False, True])
+def test_old_edges_fill_up_those_of_a_new_keyframe(monkeypatch, is_learned: bool):
+    config = TrackingConfig(learned=LearnedFlowConfig(active_edges=24), active_edges=24)
+    graph = true_graph(list(range(9)), config, TrueFlow(is_learned=is_learned))
+    graph.match(neighbourhood_edges(0, 8, 5))
+    old, asked = list(graph.edges.ends), []
+    monkeypatch.setattr(graph, "match", asked.append)
+    monkeypatch.setattr(optimisation, "adjust", lambda *_, **how: None)
+    local_ba(graph)
+    of_newest = [edge for edge in asked[0] if 8 in edge]
+    assert asked[0] == of_newest + old[len(of_newest) - 24 :] and len({*asked[0]}) == 24
 
 
 def test_a_wrong_prior_does_not_bend_a_new_keyframe_while_the_weight_is_wide():

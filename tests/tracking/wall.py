@@ -41,9 +41,11 @@ class TrueFlow:
     """Flow as the geometry says, wherever it is asked to start from."""
 
     stride = STRIDE
-    learned_confidence = False
 
-    def __init__(self, ratios: dict[tuple[int, int], float] | None = None) -> None:
+    def __init__(
+        self, ratios: dict[tuple[int, int], float] | None = None, is_learned: bool = False
+    ) -> None:
+        self.learned_confidence = is_learned
         self.numbers: dict[int, int] = {}  # of the frame that a keyframe is
         self.ratios = ratios or {}  # of edges that are not matched as a whole
 

@@ -50,7 +50,7 @@ class KeyframeDiagnostics:
     """How one keyframe is tied to the others, after its adjustment or after the final one."""
 
     frame_index: int
-    matched_ratio: float  # of its cells, in the best of its edges [-]
+    matched_ratio: float  # in the best edge from or to it [-]
     parallax: float  # px, the largest mean flow by translation alone among its edges
     explained: float | None  # of the matched flow from its predecessors; None: no edge
     depth_error: float | None  # median relative difference from them; None: no common cell

@@ -54,7 +54,7 @@ def keyframe_exposures(
     for edge, (source, target) in enumerate(edges.ends):
         targets, stride = edges.targets[edge], graph.grid.stride
         here = torch.from_numpy(blurred(source)[::stride, ::stride].reshape(-1, 3))
-        u, v = targets.cpu().numpy()
+        u, v = targets.cpu().numpy().reshape(2, *graph.grid.shape)
         there = torch.from_numpy(cv2.remap(blurred(target), u, v, cv2.INTER_LINEAR).reshape(-1, 3))
         both = torch.cat([here, there], 1)
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)

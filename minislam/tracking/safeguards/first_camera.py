@@ -95,8 +95,8 @@ def lowest_minimum(
 ) -> Found:
     """Return the geometry of the warm-up that is most plausible, adjusted with its camera.
 
-    The graph takes a readout that is told, and is told whether the focal length is free from now
-    on. Of few keyframes both stay as guessed.
+    A readout that the flow measures is set in the graph, and so is whether the focal length is free
+    from now on. With few keyframes both stay as guessed.
     """
     search = _Search(graph, workers or Workers())
     found = at_guess = minima(search.problem, start(0.0), search.workers)

@@ -24,7 +24,7 @@ from minislam.workers import Workers
 STEP = math.log(1.05)  # to either side, where the cost must have risen
 ITERATIONS = 10  # Gauss-Newton steps of each adjustment
 WIDENINGS = [4.0, 1.0]  # of the robust weight: a focal length far off has large residuals [-]
-MOST_KEYFRAMES = 100  # from the first on, that a check adjusts, dozens of times
+MOST_KEYFRAMES = 100  # that a check adjusts, dozens of times: the first, of a second half the last
 EVERY = 2  # cells of a check along each side: it adjusts so often, and few unknowns ask for few
 MAX_TRIES = 8  # adjustments, each from the better side of the one before
 LARGEST = math.log(2.0)  # either way; what is further off is no focal length but a failed run
@@ -57,9 +57,10 @@ class FocalLengthFit:
 def check_focal_length(
     graph: KeyframeGraph, workers: Workers | None = None
 ) -> FocalLengthFit | None:
-    """Fit a given focal length to all edges, or to half of them if another one fits there.
+    """Fit a given focal length to the first MOST_KEYFRAMES, or to a half if another one fits there.
 
-    Nothing is changed. A focal length that was found, not given, is checked in the halves alone.
+    Nothing is changed. Of a longer half, its outer MOST_KEYFRAMES count. A focal length that was
+    found, not given, is checked in the halves alone.
     """
     every = range(len(graph.keyframes))
     whole = None if graph.seeks_focal else _fit_among(graph, every[:MOST_KEYFRAMES], workers)
@@ -67,6 +68,8 @@ def check_focal_length(
         return whole
     middle = len(every) // 2
     for half in every[:middle][:MOST_KEYFRAMES], every[middle:][-MOST_KEYFRAMES:]:
+        if whole and half == every[:MOST_KEYFRAMES]:
+            continue  # fitted already
         first, last = (graph.keyframes.frames[end].frame_index for end in (half[0], half[-1]))
         fit = replace(_fit_among(graph, half, workers), half=(first, last))
         if fit.is_doubtful:

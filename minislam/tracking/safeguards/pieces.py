@@ -7,7 +7,6 @@ before the last break, and not to the one before the loss.
 
 from collections.abc import Iterable, Sequence
 
-from minislam.tracking.bundle_adjustment import residuals
 from minislam.tracking.keyframe_graph import Edge, KeyframeGraph
 from minislam.tracking.optimisation import bundle_problem
 
@@ -27,8 +26,8 @@ def edges_past_a_loss(graph: KeyframeGraph) -> list[Edge]:
     if not past:
         return []
     problem = bundle_problem(graph, past)
-    _, weights = residuals(problem, graph.state)
-    support = weights.mean((1, 2)) / problem.weights.mean((1, 2)).clamp_min(1e-9)
+    fitting = graph.fitting_weights(problem, graph.state)
+    support = fitting.mean((1, 2)) / problem.weights.mean((1, 2)).clamp_min(1e-9)
     return [ends[p] for p, is_tied in zip(past, support >= MIN_SUPPORT, strict=True) if is_tied]
 
 

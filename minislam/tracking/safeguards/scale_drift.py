@@ -5,7 +5,8 @@ keyframes see the same, and the scales of distant ones are hardly tied at all: t
 together with the steps between them costs next to nothing in Eq. (5). A depth prior errs from
 keyframe to keyframe, but not more and more. So the length of each step on the depth of the prior
 alone, over its length as estimated, is averaged over many steps, each by how well its flow tells
-it. That is the drift. It is undone after all keyframes are adjusted, which brings a part back.
+it. That is the drift. It is undone after the last adjustment of all keyframes, because an
+adjustment would bring a part of the drift back.
 """
 
 import torch

@@ -5,12 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from minislam.geometry import Camera
+from minislam.priors.interfaces import FlowMatches
 from minislam.records import Frame
+from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
 from minislam.tracking.safeguards import exposure
 from minislam.tracking.safeguards.exposure import with_exposure
-from tests.tracking.wall import true_graph
+from tests.tracking.wall import TrueFlow, true_graph
 
 FRAMES = [0, 3, 6, 9]
 FACTORS = torch.tensor([[1.0, 1.0, 1.0], [0.7, 0.8, 0.9], [1.3, 1.2, 1.0], [1.0, 1.0, 1.0]])
@@ -112,6 +115,20 @@ def test_a_keyframe_without_links_is_exposed_like_its_neighbour():
     torch.testing.assert_close(
         found[FRAMES[2]] / found[0], torch.full((3,), 1.3 / 0.7), rtol=0.02, atol=0
     )
+
+
+def test_the_grid_may_have_more_cells_than_opencv_has_rows():
+    flow = TrueFlow()
+    flow.stride = 1
+    graph = KeyframeGraph(Camera(200, 200, 128, 64, 256, 128), TrackingConfig(), flow)
+    ones, pose = torch.ones(128 * 256), torch.eye(4)
+    for index, light in enumerate([0.4, 0.6]):
+        frame = Frame(index, 0.1 * index, torch.full((128, 256, 3), light))
+        graph.keyframes.append(frame, torch.zeros(1, 1, 1), None, pose, ones, ones)
+    still = graph.grid.pixels.T[None]
+    graph.edges.record([(0, 1)], FlowMatches(still, torch.ones_like(still), torch.ones(1)))
+    found = factors(keyframe_exposures(graph))
+    torch.testing.assert_close(found[1] / found[0], torch.full((3,), 1.5))
 
 
 # Degenerate input

@@ -175,16 +175,18 @@ def test_a_check_adjusts_the_first_keyframes_alone(monkeypatch: pytest.MonkeyPat
     assert expected.factor == pytest.approx(1 / 1.2, rel=FOUND)
 
 
-@pytest.mark.parametrize("keyframes", [99, 100, 101, 130])
-def test_a_check_costs_no_more_above_a_hundred_keyframes(monkeypatch, keyframes: int):
+@pytest.mark.parametrize(
+    "parts", [(99, 49, 50), (100, 50, 50), (100, 50, 51), (100, 65, 65), (100, 100)]
+)
+def test_a_check_costs_no_more_above_a_hundred_keyframes(monkeypatch, parts: tuple[int, ...]):
     asked, fits = [], FocalLengthFit(272.0, 1.0, 0.0)
     monkeypatch.setattr(
         focal_length, "fit_focal_length", lambda *parts: asked.append(parts) or [fits]
     )
+    keyframes = sum(parts[-2:])  # the halves; of 200 the first is the whole that was adjusted
     graph = true_graph([number % 12 for number in range(keyframes)])
     graph.match(neighbourhood_edges(1, keyframes, 1))
     check_focal_length(graph)
-    parts = min(keyframes, 100), keyframes // 2, keyframes - keyframes // 2
     for (problem, state, _), used in zip(asked, parts, strict=True):
         assert len(state.T_camera_world) == len(state.disparities) == used
         assert len(problem.edges_source) == len(problem.targets) == 2 * (used - 1)

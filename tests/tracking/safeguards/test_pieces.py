@@ -33,8 +33,9 @@ def test_two_edges_tie_three_stretches():
     assert pieces(FRAMES, [(0, 70)], [3, 6], [(4, 1), (7, 3)]) == [[(0, 29), (30, 59), (60, 70)]]
 
 
-def test_only_edges_past_a_loss_that_fit_tie():
-    graph = true_graph([0, 1, 2, 3], CONFIG, TrueFlow())
+@pytest.mark.parametrize("is_learned", [False, True])
+def test_only_edges_past_a_loss_that_fit_tie(is_learned: bool):
+    graph = true_graph([0, 1, 2, 3], CONFIG, TrueFlow(is_learned=is_learned))
     edges = both_directions([(1, 0), (2, 1), (3, 1), (3, 2)])
     graph.match(edges)
     graph.flow_to_next = [object(), None, object()]
