@@ -12,7 +12,7 @@ from .scenes import SUMMARIES, default_frames
 from .sequence import Progress
 from .writing import write_sequence
 
-EXIT_KNOWN_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_KNOWN_ERROR, EXIT_INTERRUPTED = 1, 130
 BAR_WIDTH = 40  # characters
 
 
@@ -42,7 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_KNOWN_ERROR
     except OSError as error:
-        print(f"error: could not write {options.out}: {error.strerror}", file=sys.stderr)
+        cause = error.strerror or error
+        print(f"error: could not write {options.out}: {cause}", file=sys.stderr)
         return EXIT_KNOWN_ERROR
     except KeyboardInterrupt:
         print("interrupted: nothing was written", file=sys.stderr)

@@ -67,7 +67,7 @@ def curve(*points: tuple[float, float]) -> Callable[[float], float]:
 
 @dataclass(frozen=True)
 class HandheldPath:
-    """A walk on a closed curve while looking at the scene, with the tremble of a hand."""
+    """A trembling walk that swings along each axis at a rate of its own and looks at the scene."""
 
     centre: Array  # (3,) [m]
     reach: Array  # (3,) amplitude per axis [m]
@@ -137,9 +137,9 @@ def round_path(rng: np.random.Generator, centre: Array) -> RoundPath:
     )
 
 
-def path_length(path: Callable[[float], Array], frames: int = CLIP_FRAMES) -> float:
+def path_length(path: Callable[[float], Array]) -> float:
     """Return the length of the way between the frames of a clip [m]."""
-    positions = np.array([path(frame / FRAME_RATE)[:3, 3] for frame in range(frames)])
+    positions = np.array([path(frame / FRAME_RATE)[:3, 3] for frame in range(CLIP_FRAMES)])
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 

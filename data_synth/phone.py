@@ -18,15 +18,7 @@ import numpy as np
 
 from .errors import SynthError
 from .poses import Array, Intrinsics, default_intrinsics
-from .render import (
-    SUPERSAMPLE,
-    average,
-    camera_rays,
-    lamp_visibility,
-    look_up_surface,
-    through_lens,
-    trace,
-)
+from .render import SUPERSAMPLE, average, camera_rays, ray_colours, through_lens
 from .scenes import Scene
 
 DRIFT_SECONDS = 2.4  # s, in which exposure and white balance swing once
@@ -87,18 +79,8 @@ def film(
 
 def _photograph(view: Scene, time: float, intrinsics: Intrinsics) -> Array:
     """Return the image of one moment, (h, w, 3) float32, and none of the truth beside it."""
-    statics, lamp = view.room.parts, view.room.lamp
-    movers = view.mover_parts(time)
     rays = camera_rays(intrinsics, view.path(time), SUPERSAMPLE, np.float32)
-    depth, index = trace(statics, rays)
-    background = look_up_surface(statics, rays, depth, index, lamp)
-    lit = lamp_visibility(background.points, lamp, movers)
-    image = np.zeros((*depth.shape, 3), np.float32)
-    image.reshape(-1, 3)[background.rays] = background.colours(lit)
-    moving = [part for parts in movers for part in parts]
-    front_depth, index = trace(moving, rays, depth)
-    foreground = look_up_surface(moving, rays, front_depth, index, lamp)
-    image.reshape(-1, 3)[foreground.rays] = foreground.colours()
+    image, _ = ray_colours(view.room.parts, view.mover_parts(time), view.room.lamp, rays)
     return average(image, intrinsics)
 
 

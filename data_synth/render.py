@@ -223,6 +223,29 @@ def enclosing_sphere(parts: Sequence[Part]) -> tuple[Array, float]:
     return centre, max(float(np.linalg.norm(c - centre)) + r for c, r in spheres)
 
 
+def ray_colours(
+    statics: Sequence[Part],
+    movers: Sequence[Sequence[Part]],
+    lamp: Array,  # (3,)
+    rays: RayGrid,
+) -> tuple[Array, Array]:  # each (rows, columns, 3) float32
+    """Return what the rays see with and without movers, sharing everything that does not move."""
+    depth, index = trace(statics, rays)
+    background = look_up_surface(statics, rays, depth, index, lamp)
+    without = np.zeros((*depth.shape, 3), np.float32)
+    without.reshape(-1, 3)[background.rays] = background.colours()
+    if not movers:
+        return without, without
+    moving = [part for parts in movers for part in parts]
+    depth, index = trace(moving, rays, depth)
+    foreground = look_up_surface(moving, rays, depth, index, lamp)
+    lit = lamp_visibility(background.points, lamp, movers)
+    image = np.zeros_like(without)
+    image.reshape(-1, 3)[background.rays] = background.colours(lit)
+    image.reshape(-1, 3)[foreground.rays] = foreground.colours()
+    return image, without
+
+
 def develop(colours: Array, intrinsics: Intrinsics) -> Array:
     """Average the rays of each pixel and blur like a lens: (h, w, 3) float32 in [0, 1]."""
     return through_lens(average(colours, intrinsics))
@@ -257,27 +280,13 @@ def expose(
     T_world_camera: Array,  # (4, 4)
     intrinsics: Intrinsics,
 ) -> Exposure:
-    """Render one pose with and without movers, sharing everything that does not move."""
+    """Render one pose with and without movers."""
     rays = camera_rays(intrinsics, T_world_camera, SUPERSAMPLE, np.float32)
+    both = ray_colours(statics, movers, lamp, rays)
+    rgb, static_rgb = (develop(colours, intrinsics) for colours in both)
     centre_rays = camera_rays(intrinsics, T_world_camera)
-    static_depth, index = trace(statics, rays)
-    background = look_up_surface(statics, rays, static_depth, index, lamp)
-    image = np.zeros((*static_depth.shape, 3), np.float32)
-    image.reshape(-1, 3)[background.rays] = background.colours()
-    static_rgb = develop(image, intrinsics)
     depth, _ = trace(statics, centre_rays)
-
-    moving = [part for parts in movers for part in parts]
-    if not moving:
-        mask = np.zeros(depth.shape, bool)
-        return Exposure(static_rgb, depth.astype(np.float32), mask, static_rgb)
-    depth, centre_index = trace(moving, centre_rays, depth)
-    front_depth, index = trace(moving, rays, static_depth)
-    foreground = look_up_surface(moving, rays, front_depth, index, lamp)
-    lit = lamp_visibility(background.points, lamp, movers)
-    image.reshape(-1, 3)[background.rays] = background.colours(lit)
-    image.reshape(-1, 3)[foreground.rays] = foreground.colours()
-    rgb = develop(image, intrinsics)
-    in_mask = np.repeat(counted, [len(parts) for parts in movers])
-    mask = (centre_index != NOTHING) & in_mask[centre_index]
+    depth, index = trace([part for parts in movers for part in parts], centre_rays, depth)
+    in_mask = [counts for parts, counts in zip(movers, counted, strict=True) for _ in parts]
+    mask = np.array([*in_mask, False])[index]  # the last is that of NOTHING
     return Exposure(rgb, depth.astype(np.float32), mask, static_rgb)

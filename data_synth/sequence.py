@@ -143,14 +143,12 @@ def novel_poses(view: Scene, frames: int) -> Array:  # (N, 4, 4)
     return np.array(poses)
 
 
-def check_request(name: str, seed: int, frames: int, size: tuple[int, int]) -> None:
+def check_request(frames: int, size: tuple[int, int]) -> None:
     """Raise SynthError where a sequence cannot be generated as asked."""
     if frames < 1:
         raise SynthError(f"a sequence needs at least 1 frame, not {frames}")
     if min(size) < 16 or max(size) > 4096:
         raise SynthError(f"width and height must be 16 to 4096 pixels, not {size[0]}x{size[1]}")
-    if seed < 0:
-        raise SynthError(f"a seed is a whole number from 0 on, not {seed}")
 
 
 def generate(
@@ -158,17 +156,11 @@ def generate(
     seed: int = 0,
     frames: int = 100,
     size: tuple[int, int] = (320, 240),  # width, height
-    noise: bool = True,
-    progress: Progress | None = None,
 ) -> SyntheticSequence:
     """Generate a sequence in memory."""
-    check_request(name, seed, frames, size)
+    check_request(frames, size)
     view, intrinsics = scene(name, seed), default_intrinsics(size)
-    rendered = []
-    for frame in in_order(lambda index: render_frame(view, intrinsics, index, noise), frames):
-        rendered.append(frame)
-        if progress:
-            progress(len(rendered), frames)
+    rendered = list(in_order(lambda i: render_frame(view, intrinsics, i), frames))
     poses = novel_poses(view, frames)
     novel = list(in_order(lambda i: novel_image(view, intrinsics, poses[i]), len(poses)))
     full = np.float32(255)

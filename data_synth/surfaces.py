@@ -122,11 +122,11 @@ def rug(rng: np.random.Generator, size: Size, palette: Sequence[Colour]) -> Text
     return finish(rng, image, TEXEL, contrast=0.06)
 
 
-def furniture(rng: np.random.Generator, base: Colour, size: Size = (1.2, 1.2)) -> Texture:
+def furniture(rng: np.random.Generator, base: Colour) -> Texture:
     """Paint worn wood or lacquer with panels, stains and stickers."""
-    image = canvas(size, TEXEL, base)
+    image = canvas((1.2, 1.2), TEXEL, base)
     tones = [tuple(np.array(base) * factor) for factor in (0.6, 0.8, 1.2, 1.4)]
-    scatter_patches(rng, image, TEXEL, tones, int(70 * size[0] * size[1]), (0.012, 0.12))
+    scatter_patches(rng, image, TEXEL, tones, 100, (0.012, 0.12))
     return finish(rng, image, TEXEL, contrast=0.06, stretch=3.0)
 
 

@@ -130,7 +130,7 @@ def scatter_patches(
     texel: float,
     palette: Sequence[Colour],
     count: int,
-    extent: tuple[float, float] = (0.02, 0.3),  # m, smallest and largest radius
+    extent: tuple[float, float],  # m, smallest and largest radius
 ) -> None:
     """Paint discs and polygons of all sizes, the large ones first."""
     rows, columns = image.shape[:2]

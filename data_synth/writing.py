@@ -56,8 +56,8 @@ def write_sequence(
     phone: Phone | None = None,
 ) -> Path:
     """Write a sequence into a folder; a complete one with the same parameters is kept."""
-    check_request(name, seed, frames, size)
-    folder = Path(folder)
+    check_request(frames, size)
+    folder = Path(folder).resolve()  # of a link, what it points to is replaced
     record = {
         "name": name,
         "seed": seed,
@@ -70,6 +70,8 @@ def write_sequence(
     replaces = _may_replace(folder, record)
     if replaces is None:
         return folder
+    if replaces and folder.samefile("."):  # a shell in it would stand in a folder that is gone
+        raise SynthError(f"{folder} is the folder you are in and cannot be replaced: name another")
     view = scene(name, seed)
     intrinsics = phone_intrinsics(size) if phone else default_intrinsics(size)
     folder.parent.mkdir(parents=True, exist_ok=True)

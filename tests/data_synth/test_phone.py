@@ -13,7 +13,7 @@ from data_synth.phone import DRIFT_SECONDS
 from data_synth.poses import Intrinsics, look_at, upright
 from data_synth.rooms import Room
 from data_synth.shapes import Box, Interior, Part
-from data_synth.textures import build_texture
+from tests.data_synth.paints import plain
 
 CAMERA = Intrinsics(fx=70.0, fy=70.0, cx=40.3, cy=29.1, width=80, height=60)
 UPRIGHT = replace(CAMERA, cx=29.1, cy=40.3, width=60, height=80)
@@ -21,11 +21,6 @@ NOTHING = Phone(0.0, 0.0, 0.0, 0.0)
 AWAY = 2.0  # m, from the camera to the red plate
 SPEED = 6.0  # m/s
 READOUT = 0.03  # s
-
-
-def plain(red, green, blue):
-    return (build_texture(np.full((16, 16, 3), (red, green, blue), np.float32), 0.01),)
-
 
 WALLS = Part(Interior((9.0, 9.0, 9.0)), upright([0, 0, 0]), plain(0.4, 0.4, 0.4))
 ROOM = Room((WALLS,), np.array([0.0, -3.0, 3.0]), np.zeros(3), np.zeros(3))

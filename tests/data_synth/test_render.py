@@ -16,15 +16,10 @@ from data_synth.render import (
     trace,
 )
 from data_synth.shapes import Box, Capsule, Ellipsoid, Interior, Part
-from data_synth.textures import build_texture
+from tests.data_synth.paints import plain
 
 CAMERA = Intrinsics(fx=70.0, fy=72.0, cx=40.3, cy=29.1, width=80, height=60)
 LAMP = np.array([0.0, 0.0, 2.5])
-
-
-def plain(red, green, blue):
-    return (build_texture(np.full((16, 16, 3), (red, green, blue), np.float32), 0.01),)
-
 
 ROOM = Part(Interior((6.0, 6.0, 3.0)), upright([0, 0, 1.5]), plain(0.5, 0.5, 0.5))
 BALL = Part(Ellipsoid((0.4, 0.4, 0.4)), upright([0.2, 0.5, 1.1]), plain(0.9, 0.1, 0.1))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import cv2
@@ -111,6 +112,20 @@ def test_foreign_content_is_refused_and_left_alone(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+def test_a_link_to_an_empty_folder_stays_a_link(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    write_sequence("static", 0, 1, (24, 16), tmp_path / "link")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "disk" / "rgb.txt").exists()
+
+
+def test_the_folder_one_is_in_is_refused_before_anything_is_rendered(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SynthError, match="the folder you are in"):
+        write_sequence("static", 0, 1, SIZE, ".", lambda done, total: pytest.fail("rendered"))
+    assert not list(tmp_path.iterdir())
+
+
 def test_another_sequence_is_not_overwritten(folder):
     with pytest.raises(SynthError, match=r"holds the sequence 'ball' with seed 4"):
         write_sequence("ball", 5, FRAMES, SIZE, folder)
@@ -168,6 +183,13 @@ def test_known_errors_are_one_sentence_and_exit_code_1(arguments, sentence, tmp_
     printed = capsys.readouterr()
     assert sentence in printed.err and printed.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_an_error_of_the_system_without_a_text_of_its_own_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(writing, "_put_in_place", lambda *_: shutil.rmtree(tmp_path / "link"))
+    (tmp_path / "link").symlink_to(tmp_path)
+    assert main(["static", "--frames", "1", "--size", "24x16", "--out", str(tmp_path / "a")]) == 1
+    assert "symbolic link" in capsys.readouterr().err
 
 
 def test_a_missing_name_or_folder_is_a_usage_error():
