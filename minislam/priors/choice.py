@@ -124,8 +124,8 @@ def _require_some(depths: Iterable[Any], what: str, advice: str) -> None:
 
 def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:
     truth = sequence.ground_truth
-    if truth is None or truth.depth(0) is None:
-        wanted = "a sequence with true depth for --depth simulated"
-        found = f"none in {sequence.name}; use --depth none or --depth files:FOLDER"
-        raise InputError(f"expected {wanted}, found {found}")
-    return SimulatedDepth(truth.depth, seed, config)
+    depth = truth.depth if truth else lambda index: None
+    wanted = f"true depth in {sequence.name} for --depth simulated"
+    advice = "use --depth none or --depth files:FOLDER"
+    _require_some(map(depth, range(len(sequence))), wanted, advice)
+    return SimulatedDepth(depth, seed, config)

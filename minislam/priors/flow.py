@@ -112,17 +112,17 @@ class ClassicalFlow(Stateful):
         kept = zip(np.split(whole, ends), parts, strict=True)
         return MeasuredEdge(*(values.reshape(part.shape) for values, part in kept))
 
-    def start_chain(self, image: Tensor) -> "FlowChain":
+    def start_chain(self, image: Tensor) -> "ClassicalChain":
         gray = dense_flow.grayscale(image)
         zero = np.zeros((*gray.shape, 2), np.float32)
-        return FlowChain(gray, gray, zero, zero, self.config)
+        return ClassicalChain(gray, gray, zero, zero, self.config)
 
-    def restore_chain(self, state: Tree, frame_of: FrameOf) -> "FlowChain":
-        return from_tree(FlowChain, state, frame_of)
+    def restore_chain(self, state: Tree, frame_of: FrameOf) -> "ClassicalChain":
+        return from_tree(ClassicalChain, state, frame_of)
 
 
 @dataclass
-class FlowChain(Stateful):
+class ClassicalChain(Stateful):
     """The flow from one reference frame to the newest frame, updated frame by frame.
 
     The flow to the previous frame predicts the flow to the next one, so that long displacements
@@ -135,7 +135,7 @@ class FlowChain(Stateful):
     increment: np.ndarray  # (H, W, 2) px, how much of it the last frame added
     config: grid_flow.ClassicalFlowConfig
 
-    def advance(self, image: Tensor) -> tuple["FlowChain", FlowMatches]:
+    def advance(self, image: Tensor) -> tuple["ClassicalChain", FlowMatches]:
         gray, stride = dense_flow.grayscale(image), self.config.stride
         texture = grid_flow.texture_confidence(self.reference, stride)
 
@@ -153,10 +153,10 @@ class FlowChain(Stateful):
             step = dense_flow.plane_flow(self.newest, gray)
             measured.append(follow(self.flow + dense_flow.warp(step, self.flow)))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
-        chain = FlowChain(self.reference, gray, flow, flow - self.flow, self.config)
+        chain = ClassicalChain(self.reference, gray, flow, flow - self.flow, self.config)
         return chain, grid_flow.as_matches([targets], [confidence], [texture], image)
 
-    def restart(self) -> "FlowChain":
+    def restart(self) -> "ClassicalChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
         zero = np.zeros_like(self.flow)
-        return FlowChain(self.newest, self.newest, zero, self.increment, self.config)
+        return ClassicalChain(self.newest, self.newest, zero, self.increment, self.config)

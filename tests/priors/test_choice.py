@@ -1,6 +1,7 @@
 """Priors are chosen by name; what does not fit together is refused in one sentence."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
-from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepthConfig
+from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
 from minislam.priors.grid_flow import ClassicalFlowConfig
@@ -56,6 +57,14 @@ def test_priors_without_weights_are_found_by_their_names():
     assert isinstance(depth(), NoDepth) and isinstance(depth(depth="sensor"), SensorDepth)
 
 
+def test_the_truth_may_be_unknown_in_the_first_frame(monkeypatch):
+    monkeypatch.setattr(Recorded, "ground_truth", SimpleNamespace(depth=Recorded().sensor_depth))
+    assert isinstance(depth(depth="simulated"), SimulatedDepth)
+    monkeypatch.setattr(Recorded, "with_depth", None)
+    with pytest.raises(InputError, match="true depth in desk for --depth simulated, found none"):
+        depth(depth="simulated")
+
+
 # Errors
 
 
@@ -68,7 +77,7 @@ def test_priors_without_weights_are_found_by_their_names():
         (flow, {"flow": "droid"}, "expected --flow-weights FILE with --flow droid, found none"),
         (depth, {"depth_weights": "a.pth"}, "expected --depth metric3d or depth-anything with"),
         (features, {"features": "fit3d", "features_weights": "none.pth"}, "found nothing at none"),
-        (depth, {"depth": "simulated"}, "true depth for --depth simulated, found none in desk"),
+        (depth, {"depth": "simulated"}, "true depth in desk for --depth simulated, found none; u"),
         (flow, {"device": "tpu"}, "expected --device cpu or cuda, found 'tpu'"),
         (flow, {"precision": "fp16"}, "--precision fp32 or bf16 with --device cpu, found 'fp16'"),
         (flow, {"precision": "half"}, "--precision fp32 or bf16 with --device cpu, found 'half'"),

@@ -17,7 +17,7 @@ from minislam.priors.conformance import (
 )
 from minislam.priors.depth import NoDepth
 from minislam.priors.features import ClassicalFeatures
-from minislam.priors.flow import ClassicalFlow, FlowChain
+from minislam.priors.flow import ClassicalChain, ClassicalFlow
 from tests.helpers import generator
 
 
@@ -67,6 +67,7 @@ WRONG_DEPTHS = {
     "torch.float64 on cpu": lambda frame, camera: gray_depth(frame, camera).double(),
     "found ndarray": lambda frame, camera: gray_depth(frame, camera).numpy(),
     "not all finite": lambda frame, camera: gray_depth(frame, camera) / 0,
+    "on cpu, not all finite": lambda frame, camera: gray_depth(frame, camera) * torch.nan,
     "found -1": lambda frame, camera: -gray_depth(frame, camera),
     "found 0 to 0": lambda frame, camera: 0 * gray_depth(frame, camera),
     "on cpu with gradients": lambda frame, camera: gray_depth(frame, camera).requires_grad_(),
@@ -89,6 +90,13 @@ def test_depth_that_is_drawn_at_random_is_refused():
     source = generator(0)
     with pytest.raises(InputError, match=r"the same numbers, found others the second time"):
         check_depth_prior(lambda frame, camera: torch.rand(160, 224, generator=source))
+
+
+@pytest.mark.parametrize("known", [(True, True, False), (False, True, True)])
+def test_depth_that_is_known_only_at_times_is_refused(known: tuple[bool, ...]):
+    times = iter(known)
+    with pytest.raises(InputError, match=r"the same numbers, found others the second time"):
+        check_depth_prior(lambda *a: gray_depth(*a) if next(times) else None)
 
 
 # Errors: features
@@ -175,7 +183,7 @@ def test_a_flow_that_drifts_and_a_chain_that_changes_are_refused():
     with pytest.raises(InputError, match=r"match as before after restore_state"):
         check_flow_estimator(Wrong().altered(targets=lambda t: t + 0.1 * next(steps)))
 
-    class Changing(FlowChain):
+    class Changing(ClassicalChain):
         def restart(self):
             self.reference = self.newest
             return self
@@ -196,6 +204,28 @@ def test_a_flow_that_drifts_and_a_chain_that_changes_are_refused():
     flow = Wrong()
     flow.start_chain = start
     with pytest.raises(InputError, match=r"the chain of the flow to stay as it is"):
+        check_flow_estimator(flow)
+
+
+def test_answers_that_take_another_form_later_are_refused():
+    flow = Wrong()
+    matches = iter([flow.match, lambda *a: None])
+    flow.match = lambda *a: next(matches)(*a)
+    with pytest.raises(InputError, match=r"after restore_state to return FlowMatches, found None"):
+        check_flow_estimator(flow)
+
+    class Alone(ClassicalChain):
+        def advance(self, image):
+            return super().advance(image)[1]
+
+    flow = Wrong()
+    flow.start_chain = lambda image: Alone(**vars(ClassicalFlow().start_chain(image)))
+    with pytest.raises(InputError, match=r"return a chain and FlowMatches, found FlowMatches"):
+        check_flow_estimator(flow)
+
+    flow = Wrong()
+    flow.restore_chain = lambda *a: Alone(**vars(ClassicalFlow().start_chain(shifted_images()[0])))
+    with pytest.raises(InputError, match=r"return a chain and FlowMatches, found FlowMatches"):
         check_flow_estimator(flow)
 
 

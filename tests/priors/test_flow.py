@@ -9,7 +9,7 @@ import torch
 from minislam.geometry import Camera
 from minislam.priors import dense_flow
 from minislam.priors.dense_flow import composed_flow, grayscale, pixel_positions
-from minislam.priors.flow import FlowChain
+from minislam.priors.flow import ClassicalChain
 from minislam.state import memory, threads
 from minislam.state.memory import SHELF
 from tests.priors.patterns import (
@@ -178,7 +178,8 @@ def test_a_wrong_expectation_that_looks_less_different_is_not_followed():
     second[:, :4] = 0.5
     into_the_grey = constant(-WIDTH, 0)
     assert (second[:, :1] - first).abs().mean() < (second - first).abs().mean()
-    chain = FlowChain(grayscale(first), grayscale(first), constant(0, 0), into_the_grey, CONFIG)
+    gray = grayscale(first)
+    chain = ClassicalChain(gray, gray, constant(0, 0), into_the_grey, CONFIG)
     _, matches = chain.advance(second)
     error = (on_grid(matches.targets)[0] - GRID - torch.tensor([6.0, 0.0])).norm(dim=-1)
     assert error.median() < 0.1

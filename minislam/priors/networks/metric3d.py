@@ -1,4 +1,4 @@
-"""Metric3D v2: the metric depth of the paper (D~ in Eq. (3), Eq. (4) and Eq. (5)).
+"""Metric3D v2: the metric depth of the paper (D~ in Eq. (3), Eq. (5) and Eq. (8)).
 
 A near small object and a far large one look the same; only the focal length tells them apart. So
 the network answers as if every image came from one "canonical" camera of 1000 px, and the answer
