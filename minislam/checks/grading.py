@@ -22,7 +22,7 @@ SINGLE = (torch.float32, torch.float16, torch.bfloat16)
 ARRAYS = (np.float64, np.float32, np.float16)  # torch knows no other real numbers
 NO_NUMBERS = (TypeError, ValueError, OverflowError)  # of `as_numbers`
 SMALLEST = 1e-3  # an expected number below this counts as this: it may be a rounded zero
-SECONDS = 10.0  # of the student's function, all cases together
+SECONDS = 10.0  # of the student's function, all cases together; each case has at least 1
 
 Function = Callable[..., Any]  # answers with numbers in any form, or with a tuple of such
 
@@ -69,6 +69,7 @@ def check_function(
             return _verdict(NOT_YET, "write the body of the function and run both cells again.")
         except Stopped as stop:
             return _verdict(WRONG, f"for {case.description} it {stop}.")
+        seconds = max(seconds - (time.process_time() - begin), 1.0)
         if answer is None:
             return _verdict(NOT_YET, f"for {case.description} the function returns nothing.")
         expected, smallest, allowed = right(*case.arguments), SMALLEST, tolerance
@@ -84,7 +85,6 @@ def check_function(
             named = (h for x, h in others if not difference(answer, x, allowed, (), smallest))
             hint = next(named, "") or relation(answer, expected, allowed)
             return _verdict(WRONG, f"for {case.description} {found}. {hint}".rstrip(), hint)
-        seconds = max(seconds - (time.process_time() - begin), 1.0)
     return _verdict(PASSED, f"{len(cases)} of {len(cases)} cases agree with the package.")
 
 

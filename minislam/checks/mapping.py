@@ -8,7 +8,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from minislam.checks.cases import CAMERA, Case, doubles, drawn, normals
+from minislam.checks.cases import CAMERA, Case, any_pose, doubles, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.geometry import Camera, se3_exp, se3_inverse, transform_points
 from minislam.mapping import pose_refinement
@@ -121,11 +121,20 @@ def check_insertion(student: Function) -> Verdict:
         far = transform_points(T, new.means)[:, 2:] if flaw == "one size" else 1
         return torch.cat([new.means, new.scales[:, :1] / far, new.colors], -1)
 
-    shape, source = (CAMERA.height, CAMERA.width), torch.Generator().manual_seed(0)
-    values = torch.rand(7, *shape, generator=source, dtype=torch.float64)
-    image, weight, opacity = values[:3].permute(1, 2, 0), values[3], values[4]
-    depth = torch.where(values[5] < 0.1, 0, 1 + 2 * values[6])
-    weight[20:40, 50:80] = 0
+    shape = CAMERA.height, CAMERA.width
+
+    def seen(seed: int) -> tuple[Tensor, ...]:
+        """Return image, depth with holes, static weight with a dynamic object, and opacity."""
+        source = torch.Generator().manual_seed(seed)
+        values = torch.rand(7, *shape, generator=source, dtype=torch.float64)
+        values[3, 20:40, 50:80] = 0
+        depth = torch.where(values[5] < 0.1, 0, 1 + 2 * values[6])
+        return values[:3].permute(1, 2, 0), depth, values[3], values[4]
+
+    def draw(seed: int) -> Case:
+        return Case((*seen(seed + 1), CAMERA, any_pose(seed), 3 + seed % 4), "a drawn scene")
+
+    image, depth, weight, opacity = seen(0)
     T = se3_exp(doubles(0.3, -0.1, 0.2, 0.1, -0.2, 0.05))
     start, one, zero = torch.eye(4, dtype=torch.float64), torch.ones(shape), torch.zeros(shape)
     cases = [
@@ -134,6 +143,7 @@ def check_insertion(student: Function) -> Verdict:
         Case((image, depth, one, zero, CAMERA, T, 4), "depth that is unknown (0) in places"),
         Case((image, depth, weight, zero, CAMERA, T, 4), "a dynamic object, where the weight is 0"),
         Case((image, depth, weight, opacity, CAMERA, T, 3), "a map that covers a part"),
+        *drawn(draw),
     ]
     corner = replace(CAMERA, cx=0.0, cy=0.0)
     mistakes = [
@@ -152,7 +162,7 @@ def check_insertion(student: Function) -> Verdict:
 def check_map_loss(student: Function) -> Verdict:
     """Check (colour, depth, image, reference depth, weight, scales) -> Eq. (6) without SSIM.
 
-    The answer is compared together with its derivative by the colour.
+    The answer is compared together with its derivatives by colour, depth and scales.
     """
 
     def reference(*a: Tensor, shares: Any = (0.8, 0.2, 10.0), flaw: str = "") -> Tensor:
@@ -166,27 +176,35 @@ def check_map_loss(student: Function) -> Verdict:
         of_scales = spread.abs().mean() if flaw == "one mean" else isotropic_loss(scales)
         return shares[0] * of_color.mean() + shares[1] * of_depth.mean() + shares[2] * of_scales
 
-    def outcome(loss: Function, color: Tensor, *rest: Tensor) -> Any:
-        """Return the loss and its derivative by the colour, 0 if it has none."""
-        leaf = color.clone().requires_grad_()
-        value = loss(leaf.clone(), *rest)
+    def outcome(loss: Function, *inputs: Tensor) -> Any:
+        """Return the loss and its derivatives by what is optimised, 0 where it has none."""
+        leaves = [values.clone().requires_grad_() for values in inputs]
+        value = loss(*(leaf.clone() for leaf in leaves))
         if isinstance(value, Tensor) and value.requires_grad:
             value.sum().backward()
             value = value.detach()
-        gradient = torch.zeros_like(color) if leaf.grad is None else leaf.grad
-        return None if value is None else (value, gradient)
+        color, depth, *_, scales = leaves
+        slopes = [torch.zeros_like(x) if x.grad is None else x.grad for x in (color, depth, scales)]
+        return None if value is None else (value, *slopes)
 
-    random = partial(torch.rand, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    (color, image), (weight, hidden) = random(2, 5, 6, 3), random(2, 5, 6)
-    depth, full = 1 + random(2, 5, 6)
-    holes = torch.where(hidden < 0.3, 0, full)
-    needles, one = 0.1 * random(4, 3), torch.ones_like(depth)
-    scales = needles[:, :1].expand(4, 3)
+    def seen(seed: int, what: str) -> Case:
+        source = torch.Generator().manual_seed(seed)
+        random = partial(torch.rand, generator=source, dtype=torch.float64)
+        (color, image), (weight, hidden) = random(2, 5, 6, 3), random(2, 5, 6)
+        depth, full = 1 + random(2, 5, 6)
+        holes = torch.where(hidden < 0.3, 0, full)
+        return Case((color, depth, image, holes, weight, 0.1 * random(4, 3)), what)
+
+    thin = seen(1, "thin Gaussians")
+    color, depth, image, holes, weight, needles = thin.arguments
+    full, one = holes.clamp_min(1.5), torch.ones_like(depth)
+    scales = (64 * needles[:, :1]).ceil().expand(4, 3) / 64  # their mean is exact: no slope
     cases = [
         Case((color, depth, image, full, one, scales), "round Gaussians and equal weights"),
         Case((color, depth, image, full, weight, scales), "weights that differ"),
         Case((color, depth, image, holes, weight, scales), "depth that is unknown in places"),
-        Case((color, depth, image, holes, weight, needles), "thin Gaussians"),
+        thin,
+        *drawn(lambda seed: seen(seed + 2, "drawn images")),
     ]
     mistakes = [
         (lambda *a: reference(*a[:4], one, a[5]), "Each pixel has its weight."),
@@ -200,7 +218,7 @@ def check_map_loss(student: Function) -> Verdict:
         ("with unknown", "Depth 0 is unknown and costs nothing."),
         (lambda *a: reference(*a).detach(), "Return a tensor that autograd can differentiate."),
     ]
-    returns = "the loss", "its derivative by the colour"
+    returns = "the loss", *(f"its derivative by the {of}" for of in ("colour", "depth", "scales"))
     return check_function(student, reference, cases, 1e-7, mistakes, returns, outcome)
 
 
@@ -233,12 +251,16 @@ def check_followed_pose(student: Function) -> Verdict:
         gaussians = gaussians.keep(pixels[:, 0] < last)
         return Case((gaussians, camera, first, image, weight, 12), what)
 
+    def draw(seed: int) -> Case:
+        return case(0.2, (0.03 * normals(seed, 6).clamp(-2, 2)).tolist(), "a drawn motion")
+
     cases = [
         case(0.2, [0.12, -0.09, 0.09, 0, 0, 0], "a camera that has moved"),
         case(0.8, [0.12, 0, 0, 0, 0, 0.09], "a camera that has turned"),
         case(0.2, [-0.03, 0.03, 0, 0, 0, 0], "an object that moves in the image", mover=True),
         case(0.2, [0.04, -0.03, 0.03, 0, 0, 0], "a map of half of the image", last=14.0),
         case(2.5, [0.12, -0.09, 0.09, 0, 0, 0], "a camera that looks back"),
+        *drawn(draw),
     ]
 
     def true_pose(*a: Any) -> Tensor:

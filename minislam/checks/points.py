@@ -29,7 +29,7 @@ EXERCISES = tuple(
 # here, less what is refused. Names as Python prints them: "Camera.resized".
 MAY_CALL = {
     "ex04_3": "UncertaintyMLP.forward",
-    "ex05_3": "BundleState relative_transforms reproject reproject_with_jacobians",
+    "ex05_3": "relative_transforms reproject reproject_with_jacobians",
     "ex06_1": "relative_transforms reproject",
     "ex06_3": "composed_flow reverse_flow warp",
     "ex06b_2": "reproject filled_from_nearest",

@@ -24,6 +24,7 @@ def check_gains(student: Function) -> Verdict:
         second = first * doubles(gain, 1, 1 / gain) * (1 + 0.02 * noise)
         second[:5] = doubles(0.97, 0.6, 0.01)  # something moves there
         second[5], first[6], second[7] = 0.99, 0.98, 0.01
+        first[9] = 0.01
         second[8, 0] = 0.96  # of this point, green and blue can still be used
         return Case((first, second), what)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from minislam.checks.cases import Case, drawn
+from minislam.checks.cases import Case, drawn, normals
 from minislam.checks.grading import Function, Verdict, check_function
 from minislam.evaluation.images import auroc
 from minislam.geometry.alignment import umeyama
@@ -99,8 +99,10 @@ def check_alignment(student: Function) -> Verdict:
         A[:3, 3] = t.mean(0) - (e.mean(0) if flaw == "unturned" else A[:3, :3] @ e.mean(0))
         return A
 
-    def case(scale: float, noise: float, mirror: float, count: int, description: str) -> Case:
-        source = np.random.default_rng(4)
+    def case(
+        scale: float, noise: float, mirror: float, count: int, description: str, seed: int = 4
+    ) -> Case:
+        source = np.random.default_rng(seed)
         truth = np.cumsum(source.normal(size=(count, 3)), axis=0) * [1.0, 0.6, 0.2]
         seen = (truth + noise * source.normal(size=truth.shape)) * [1, 1, mirror]
         return Case((scale * seen[:, [2, 0, 1]] + [3.0, -1.0, 2.0], truth), description)
@@ -111,6 +113,7 @@ def check_alignment(student: Function) -> Verdict:
         case(0.25, 0.3, 1.0, 20, "an estimate with errors"),
         case(2.0, 0.1, -1.0, 20, "points that a reflection would fit better"),
         case(2.0, 0.1, 1.0, 3, "three points"),
+        *drawn(lambda seed: case(0.5 + seed % 3, 0.2, 1.0, 9, "a drawn path", seed)),
     ]
     mistakes = [
         ("1", "Monocular: the scale is unknown."),
@@ -143,7 +146,12 @@ def check_sign_test(student: Function) -> Verdict:
         "a single clip": [[2.0], [1.0]],
         "no difference at all": [[1.0, 2.0, 1.5], [1.0, 2.0, 1.5]],
     }
+
+    def draw(seed: int) -> Case:
+        return Case((*normals(seed, 2, 3 + seed % 5).abs().numpy(),), "drawn errors")
+
     cases = [Case((*np.array(errors),), name) for name, errors in of_clips.items()]
+    cases += drawn(draw)
     mistakes = [
         (lambda a, b: reference(a, b, sided=1), "A difference the other way is as surprising."),
         (lambda a, b: reference(a, b, -1e-12), "At least as far: the measured one counts as well."),

@@ -68,14 +68,20 @@ def check_plane_cost(student: Function) -> Verdict:
         total = np.where(inside, ordered, 0).sum(0)
         return np.where(number > 0, total / taken, float(flaw != "unseen"))
 
-    source = np.random.default_rng(0)
-    gray, warped = source.random((12, 15)), source.random((4, 12, 15))
-    partly = np.where(source.random((4, 12, 15)) < 0.5, -1.0, warped)
+    def pictures(seed: int) -> np.ndarray:
+        return np.random.default_rng(seed).random((9, 12, 15))
+
+    def partly(seed: int) -> Case:
+        gray, unseen, warped = np.split(pictures(seed), [1, 5])
+        views = np.where(unseen < 0.5, -1.0, warped)
+        return Case((gray[0], views), "views that do not see every pixel")
+
+    gray, *warped = pictures(0)
     cases = [
         Case((gray, gray[None] + 0.1), "one view, everywhere a little brighter"),
-        Case((gray, warped), "four views"),
-        Case((gray, warped[:3]), "three views, of which two are the better half"),
-        Case((gray, partly), "views that do not see every pixel"),
+        Case((gray, np.stack(warped[:4])), "four views"),
+        Case((gray, np.stack(warped[:3])), "three views, of which two are the better half"),
+        *drawn(partly),
     ]
     mistakes = [
         ("every", "Only the better half of the views is averaged."),

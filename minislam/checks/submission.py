@@ -102,5 +102,5 @@ def _only(text: str, nodes: list[ast.stmt]) -> list[str]:
     for node in nodes:
         first = min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", []))])
         kept |= set(range(first, (node.end_lineno or first) + 1))
-    lines = text.splitlines()
+    lines = re.split(r"\r\n?|\n", text)  # as Python counts; splitlines() cuts elsewhere as well
     return [line if number in kept else "" for number, line in enumerate(lines, start=1)]

@@ -172,6 +172,7 @@ def check_keyframes(student: Function) -> Verdict:
         Case((shown(slide[:6], blinking=True), 6.9, 20), "a screen that blinks"),
         Case(([*closer, leap[-1]], 500.0, 20), "a camera that comes closer, then leaps"),
         Case((closer[:3], 9.2, 20), "cells that leave the image"),
+        Case((closer[:2], 4.857, 20), "a flow near the limit, 4.864 px at every eighth pixel"),
         Case((shown([0.0, 12.0, 24.0, *[36.0] * 4]), 30.0, 20), "a camera that stops"),
         *drawn(draw),
     ]

@@ -32,12 +32,12 @@ def check_mapping_weight(student: Function) -> Verdict:
     cases = [
         Case((doubles([0.2, 0.471, 0.6], [0.7, 0.9, 1.2]),), "small beta"),
         Case((doubles([0.5, 1.3, 1.5], [2.0, 3.0, 4.0]),), "large beta"),
-        Case((doubles([0.0, 0.05, 0.1], [0.5, 0.5, 0.5]),), "beta below the floor"),
+        Case((doubles([0.0, 0.05, 0.1], [0.5, 0.5, 0.5]),), "tiny beta"),
         *drawn(lambda seed: Case((1.2 * normals(seed, 2, 3).abs(),), "any beta")),
     ]
     mistakes = [
         (lambda b: uncapped(b).clamp_max(5), "Weights below 0.1 must be 0: little adds up."),
-        (lambda b: cut(uncapped(b), 1e9), "No weight is above 5, that of a beta of a quarter."),
+        (lambda b: cut(uncapped(b), 1e9), "No weight is above 5, that of a beta of 0.23."),
         (lambda b: uncapped(b).clamp(0.1, 5), "Weights below 0.1 become 0, not 0.1."),
         (lambda b: cut(uncapped(b.clamp_min(0.1) + 0.1)), "Take off 0.1 first."),
         (lambda beta: cut(0.5 / beta**2), "This is 0.5 / beta^2: beta is adjusted first."),

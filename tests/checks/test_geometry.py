@@ -3,6 +3,7 @@
 from functools import partial
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -86,6 +87,7 @@ def sampled(
     return image[0].permute(1, 2, 0)
 
 
+@pytest.mark.ex01_3
 def test_a_warped_photo_is_told_from_a_wrong_one():
     wrong = {
         "inverse motion": lambda *a: warped(*a[:3], se3_inverse(a[3])),

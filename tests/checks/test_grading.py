@@ -1,12 +1,13 @@
 """Grading: what is wrong with an answer is said in words, whatever it returns."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from minislam.checks import PASSED, WRONG, Case, check_function, is_written
+from minislam.checks import PASSED, WRONG, Case, check_function, grading, is_written
 from minislam.checks.cases import normals
 from minislam.checks.grading import WrongAnswer, as_numbers, difference, real_tensors, relation
 from tests.helpers import unfinished
@@ -57,6 +58,23 @@ def test_a_stub_is_not_written_and_any_body_is(capsys):
 
 def double(x):
     return 2 * x
+
+
+def test_the_time_of_the_reference_is_not_the_students(monkeypatch):
+    clock, limits = [0.0], []
+
+    def taking(seconds: float):
+        return lambda x: clock.append(clock[-1] + seconds) or x
+
+    def timed(function, arguments, seconds):
+        limits.append(seconds)
+        return function(*arguments), arguments
+
+    monkeypatch.setattr(grading, "time", SimpleNamespace(process_time=lambda: clock[-1]))
+    monkeypatch.setattr(grading, "call", timed)
+    cases = [Case((torch.ones(3),), "three ones")] * 5
+    assert check_function(taking(3.0), taking(60.0), cases).status == PASSED
+    assert limits == [10, 7, 4, 1, 1]
 
 
 def test_strict_mode_raises(monkeypatch):

@@ -14,7 +14,6 @@ def mine(count, window, weight):
     return [weight / len(window) if k in window else rest for k in range(count)]
 
 """
-PASSED_AND = "from minislam.mapping.window import sampling_probabilities\n" + MINE
 
 
 def judged(folder: Path, *texts: str, alone: bool = False) -> list[tuple[str, str]]:

@@ -76,8 +76,8 @@ def loss_in_a_loop(c, d, i, r, w, s):
     for v in range(d.shape[0]):
         for u in range(d.shape[1]):
             total = total + 0.8 * w[v, u] * sum((c[v, u] - i[v, u]).abs()) / 3
-            total = total + 0.2 * w[v, u] * abs(float(d[v, u] - r[v, u])) * float(r[v, u] > 0)
-    spread = [abs(float(x) - float(row.mean())) for row in s for x in row]
+            total = total + 0.2 * w[v, u] * (d[v, u] - r[v, u]).abs() * float(r[v, u] > 0)
+    spread = [(x - row.mean()).abs() for row in s for x in row]
     return total / d.numel() + 10 * sum(spread) / len(spread)
 
 
@@ -95,6 +95,8 @@ def test_map_loss():
         "squares": lambda c, d, i, r, w, s: of_parts(c**2, d, i**2, r, w, s),
         "a float": lambda *a: of_parts(*a).item(),
         "detached": lambda *a: of_parts(*a).detach(),
+        "depth detached": lambda c, d, *rest: of_parts(c, d.detach(), *rest),
+        "scales detached": lambda *a: of_parts(*a[:5], a[5].detach()),
         "a new tensor": lambda *a: torch.tensor(of_parts(*a).item(), requires_grad=True),
     }
     assert_variants(check_map_loss, {"mean": of_parts, "loop": loss_in_a_loop}, wrong)

@@ -11,7 +11,7 @@ import pytest
 
 from minislam import checks
 from minislam.checks.points import EXERCISES, Exercise
-from tests.notebook_files import NOTEBOOKS, ROOT, is_exercise, load, source
+from tests.notebook_files import NOTEBOOKS, ROOT, each_notebook, is_exercise, load, source
 
 SYLLABUS = ROOT / "notebooks/SYLLABUS.md"
 GENERATED = re.compile(r"(<!-- points: [^\n]+ -->\n).*?(<!-- end of points -->)", re.S)
@@ -31,6 +31,12 @@ def test_each_exercise_has_its_own_key_and_a_check():
         assert callable(getattr(checks, exercise.check))
 
 
+def test_each_exercise_has_marked_tests():
+    texts = [path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py")]
+    marked = set(re.findall(r"^@pytest\.mark\.(ex\w+)$", "\n".join(texts), re.M))
+    assert marked == {exercise.key for exercise in EXERCISES}
+
+
 def exercises_in(path: Path) -> list[tuple[Exercise, int]]:
     """Return the exercises of a notebook and their minutes, as their headings say."""
     found = []
@@ -47,7 +53,7 @@ def exercises_in(path: Path) -> list[tuple[Exercise, int]]:
     return found
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@each_notebook
 def test_headings_say_what_the_table_says(path):
     rows = [e for e in EXERCISES if e.notebook == path.stem]
     assert [exercise for exercise, _ in exercises_in(path)] == rows

@@ -49,11 +49,13 @@ WRONG_GAINS = [
 ]
 
 
+@pytest.mark.ex09_1
 @pytest.mark.parametrize("answer", [gains_of_numpy, gains_of_nan])
 def test_right_gains_pass(answer):
     assert check_gains(answer).status == PASSED
 
 
+@pytest.mark.ex09_1
 @pytest.mark.parametrize("answer, words", WRONG_GAINS)
 def test_wrong_gains_are_refused(answer, words):
     verdict = check_gains(answer)
@@ -136,11 +138,13 @@ WRONG_STRIDES = [
 ]
 
 
+@pytest.mark.ex09_2
 @pytest.mark.parametrize("answer", [stride_of_torch, stride_of_numpy])
 def test_right_strides_pass(answer):
     assert check_stride(answer).status == PASSED
 
 
+@pytest.mark.ex09_2
 @pytest.mark.parametrize("answer, words", WRONG_STRIDES)
 def test_wrong_strides_are_refused(answer, words):
     verdict = check_stride(answer)

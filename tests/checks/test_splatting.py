@@ -119,6 +119,7 @@ def rendered_by_pixels(means, covariances, opacities, colors, pose, camera) -> n
     return image
 
 
+@pytest.mark.ex02_3
 def test_a_rendered_image_is_told_from_a_wrong_one():
     wrong = {
         "the list has no order": partial(rendered, flaw="unsorted"),
@@ -140,6 +141,7 @@ def test_a_rendered_image_is_told_from_a_wrong_one():
     assert "not by z in the world" in verdict.sentence
 
 
+@pytest.mark.ex02_3
 @pytest.mark.parametrize("seed", [106, 125, 132])
 def test_no_drawn_pose_is_so_far_that_the_package_limits_the_jacobian(seed: int, monkeypatch):
     monkeypatch.setenv("MINISLAM_SEED", str(seed))

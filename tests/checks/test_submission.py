@@ -1,5 +1,7 @@
 """Of a student's notebook, what an exercise needs is kept, line by line, and nothing else."""
 
+import ast
+
 import pytest
 
 from minislam.checks.points import EXERCISES
@@ -34,6 +36,13 @@ def test_an_exercise_keeps_its_lines_and_what_it_gives_to_the_check():
     assert lines[4] == "scale = math.sqrt(4.0)" and lines[9] == "    return scale * V"
     assert "print" not in part.text and "timeit" not in part.text and "checks" not in part.text
     assert lines[-1] == "submitted_to_the_check = mine"
+
+
+def test_only_what_python_calls_a_line_is_one():
+    for separator in ("\u2028", "\x0c", "\x85", "\r"):
+        text = EXERCISE.replace("Return V.", f"Return V.{separator}No more.")
+        [part] = parts_of(notebook(text), TWO)
+        assert "return scale * V" in part.text and ast.parse(part.text)
 
 
 def test_other_cells_keep_imports_definitions_constants_and_the_dtype():

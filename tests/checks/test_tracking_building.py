@@ -15,7 +15,7 @@ from tests.helpers import assert_variants
 def kept(
     images, max_flow, interval,
     weighted=True, restart=True, matched=0.2, forced=True, stride=8, by_remap=False,
-    warped=True, half=0.5, masked=True, zero=True, warm=True,
+    warped=True, half=0.5, masked=True, zero=True, warm=True, first=0,
 ):  # fmt: skip
     height, width = images[0].shape
     u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -33,8 +33,8 @@ def kept(
         sure = np.exp(-half * ((flow + home) ** 2).sum(-1) / 0.36)
         if masked:
             sure *= (to_u >= 0) & (to_u <= width - 1) & (to_v >= 0) & (to_v <= height - 1)
-        sure, length = sure[::stride, ::stride], np.hypot(*np.moveaxis(flow, -1, 0))
-        length = length[::stride, ::stride]
+        sure, length = sure[first::stride, first::stride], np.hypot(*np.moveaxis(flow, -1, 0))
+        length = length[first::stride, first::stride]
         mean = np.average(length, weights=sure if weighted else None)
         if mean > max_flow or sure.mean() < matched or (forced and n - chosen[-1] >= interval):
             chosen.append(n)
@@ -61,6 +61,8 @@ def test_keyframes():
         "back flow not warped": lambda *a: kept(*a, warped=False),
         "no half in the exponent": lambda *a: kept(*a, half=1.0),
         "twice the matched ratio": lambda *a: kept(*a, matched=0.4),
+        "every pixel": lambda *a: kept(*a, stride=1),
+        "the middles of the cells": lambda *a: kept(*a, first=4),
         "also outside of the image": lambda *a: kept(*a, masked=False),
     }
     assert_variants(check_keyframes, right, wrong)

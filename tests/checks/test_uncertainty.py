@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -83,6 +84,7 @@ def trained_cell_by_cell(mlp, optimizer, features, ssim, depth, opacity, steps) 
     return losses
 
 
+@pytest.mark.ex04_3
 def test_a_training_is_told_from_a_wrong_one():
     wrong = {
         "L_depth is missing": partial(trained, flaw="no depth"),

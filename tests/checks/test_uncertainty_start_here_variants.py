@@ -34,9 +34,13 @@ def in_place(beta):
     return cut(0.5 / adjusted(beta) ** 2)
 
 
+def without_floor(beta):
+    return cut(0.5 / (1.63158 * (beta - 0.099) + 0.1) ** 2)
+
+
 @pytest.mark.ex00_1
 def test_mapping_weight():
-    right = {"loop": as_loop, "numpy": with_numpy, "in place": in_place}
+    right = {"loop": as_loop, "numpy": with_numpy, "in place": in_place, "no floor": without_floor}
     wrong = {
         "0.1 not taken off": lambda b: cut(0.5 / (adjusted(b) + 0.163158) ** 2),
         "uncut": lambda b: (0.5 / adjusted(b) ** 2).clamp_max(5),
