@@ -23,11 +23,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "eval",
         help="compare an estimated trajectory with the truth",
         description="Absolute trajectory error (ATE) of an estimate, or with --rpe its relative "
-        "pose error (RPE); both files in TUM format. Without -a, -s and --no_align a Sim(3) is "
-        "fitted first, since a monocular estimate has no scale of its own.",
+        "pose error (RPE); both files in TUM format; evo's word for it, tum, may come first. "
+        "Without -a, -s and --no_align a Sim(3) is fitted first, since a monocular estimate has no "
+        "scale of its own.",
     )
     add = parser.add_argument
-    add("format", nargs="?", choices=["tum"], help="as evo asks for, or nothing")
     add("reference", help="ground truth, TUM format")
     add("estimate", help="estimated trajectory, TUM format, or a run folder")
     add("-a", "--align", action="store_true", help="fit rotation and translation")

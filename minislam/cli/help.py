@@ -38,11 +38,12 @@ minislam run --resume -o FOLDER
   to the same bytes. Other settings are refused. Checkpoints are written before each of the
   last stages, on Ctrl-C, and between steps in --checkpoint_fraction of the time (1 %).
 
-exit codes: 0 finished; 1 what was given cannot be used, in one sentence; 2 an unknown command or
-  option, or an option without a readable value; 3 finished but not to be trusted as a whole:
-  frames were lost or left out, the trajectory is broken (motion and depth contradict the images;
-  run.json lists the breaks and the segments between them, and the map shows the longest), the map
-  has large holes or most bundle adjustments failed; 130 interrupted with everything so far written
+exit codes: 0 finished; 1 what was given cannot be used, in one sentence; 2 wrong usage: an unknown
+  command or option, a missing value, or no number where an option that is no setting needs one;
+  3 finished but not to be trusted as a whole: frames were lost or left out, the trajectory is
+  broken (motion and depth contradict the images; run.json lists the breaks and the segments between
+  them, and the map shows the longest), the map has large holes or most bundle adjustments failed;
+  130 interrupted with everything so far written
 
 settings: each is an option, like --tracking.window 8; minislam settings lists them.
   Ablations of the paper:
@@ -50,7 +51,7 @@ settings: each is an option, like --tracking.window 8; minislam settings lists t
   --uncertainty.lambda_depth 0           no depth term in L_uncer, Eq. (4)
   --uncertainty.given_masks on           the sequence's own masks instead of the learned beta
   --tracking.lambda_disparity_prior .01  disparity prior in Eq. (5), else with learned flow only
-  --tracking.prior_mask off              no mask M
+  --tracking.prior_mask off              no mask M, where there is a disparity prior
   --tracking.final_prior on              disparity prior also in the final adjustment
   --mapping.pose_refinement.enabled on   poses between keyframes refined by re-rendering
   --mapping.keyframe_stride 5            map optimised every 5 keyframes (fast mode)

@@ -86,6 +86,8 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     commands = parser.get_default("commands")
     if arguments[:1] == ["help"]:
         arguments = [*arguments[1:], "-h"]
+    if arguments[:2] == ["eval", "tum"]:  # evo asks for the format
+        arguments = ["eval", *arguments[2:]]
     if not arguments[0].startswith("-") and arguments[0] not in commands:
         hint = nearest(arguments[0], commands, f"choose one of {', '.join(commands)}")
         raise UsageError(f"expected a command, found {arguments[0]!r}; {hint}")

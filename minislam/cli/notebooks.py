@@ -17,9 +17,7 @@ SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$
 def add_parser(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("notebooks", help="copy the course's notebooks into a folder")
     parser.add_argument("folder", metavar="DIR", help="where to; made if it does not exist")
-    kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--student", action="store_true", help="without solutions and outputs")
-    kind.add_argument("--solutions", action="store_true", help="with solutions, as without a flag")
+    parser.add_argument("--student", action="store_true", help="without solutions and outputs")
     parser.set_defaults(run=_notebooks)
 
 

@@ -77,7 +77,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--preset", help=f"{', '.join(PRESETS)}; laptop")
     add("--config", help="JSON file of settings; config.json of a run repeats it")
-    add("--seed", type=int, help="seed of every random draw, 0")
+    add("--seed", help="seed of every random draw, 0")
     add("--threads", help="threads of torch, 1")
     add("--checkpoint_fraction", help="see minislam settings checkpoint; 0.01")
     add("--no-uncertainty", action="store_true", help="all weights 1, no second adjustment")

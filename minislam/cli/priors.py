@@ -18,6 +18,7 @@ from minislam.cli.help import add_command
 from minislam.data.files import atomic_file, make_folder, read_text, write_text
 from minislam.errors import require
 from minislam.parameters import user_path
+from minislam.priors.names import PriorChoice
 from minislam.runs.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
     from minislam.config import SlamConfig
     from minislam.data.sequence import RecordedSequence
-    from minislam.priors.choice import PriorChoice
     from minislam.records import Frame
 
 
@@ -47,7 +47,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def _priors(args: argparse.Namespace) -> None:
     source, inputs = options.source_of(args), options.input_options(args)
     choice = options.prior_choice(args, "none")
-    is_named = args.features is not None or choice.depth != "none"
+    with_features = args.features is not None or choice.features != PriorChoice.features
+    is_named = with_features or choice.depth != "none"
     require(is_named, "--features or --depth", "neither; name at least one to write")
     import torch
 
@@ -58,7 +59,7 @@ def _priors(args: argparse.Namespace) -> None:
     sequence = open_sequence(source, inputs, partial(progress.show, "making frames"))
     print(sequence.description)
     out = user_path(args.out)
-    kinds = list(_kinds(choice, args.features is not None, sequence, config))
+    kinds = list(_kinds(choice, with_features, sequence, config))
     for kind, origin, compute in kinds:
         _write_kind(out / kind, origin, sequence, compute, progress)
     print(f"use them with {' '.join(f'--{kind} files:{out}' for kind, *_ in kinds)}")

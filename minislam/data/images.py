@@ -196,7 +196,7 @@ def _off_screen(pattern: re.Pattern[bytes]) -> Iterator[list[bytes]]:
             os.dup2(before, 2)
             os.close(before)
             os.close(writer)
-            with suppress(BlockingIOError):
+            with suppress(OSError):  # nothing was said, or standard error takes nothing
                 lines = os.read(reader, 1 << 16).splitlines(keepends=True)
                 kept += filter(pattern.search, lines)
                 os.write(2, b"".join(line for line in lines if not pattern.search(line)))

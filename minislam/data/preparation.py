@@ -10,7 +10,8 @@ from minislam.data.picture import Window
 from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion, Camera
 
-# The tracker's grid, classical or DROID's, has cells of 8 px, so both sides are multiples of it.
+# The tracker's grid, classical or DROID's, has cells of 8 px, so sides that are chosen here are
+# multiples of it; those of --size may be any.
 SIZE_MULTIPLE = 8  # px
 
 

@@ -80,9 +80,10 @@ class RecordedSequence:
 
         image = images.read(self._chosen[0])
         (height, width), largest = image.shape[:2], int(image.max())
-        picture = barless = picture_window(images.glances, width, height)
+        glances = images.glances  # reads files
+        picture = barless = picture_window(glances, width, height)
         if not (recording.calibration or options.calibration):
-            picture = first_of_two(barless, images.glances, width, height)
+            picture = first_of_two(barless, glances, width, height)
         calibration = _calibration(recording, options, width, height, picture)
         camera, distortion = calibration.camera_for(width, height), calibration.distortion
         self.prepare = ImagePreparation(camera, distortion, options.size, options.pixels, picture)
@@ -229,6 +230,8 @@ def _calibration(
     found = recording.calibration
     if options.calibration:
         found = read_calibration(Path(options.calibration))
+    knows_fx = found is not None or options.fx is not None
+    require(knows_fx or options.fy is None, "--fx with --fy", "--fy alone; give both")
     calibration = found or rough_calibration(picture, recording.noted_focal_length)
     fy = options.fx if options.fy is None else options.fy
     given = {"fx": options.fx, "fy": fy, "cx": options.cx, "cy": options.cy}

@@ -37,8 +37,9 @@ def run(
     """Run SLAM on a sequence, write its folder and return the run, as `minislam run` does.
 
     The process is left as it was. Raises `MinislamError` where the command would end with a
-    sentence; an interrupt (Ctrl-C, the square of a notebook) ends after the present step, and
-    what is known by then is returned.
+    sentence. An interrupt (Ctrl-C, the square of a notebook) ends after the present step, and
+    what is known by then is returned; before there is a map (without a depth prior, until the
+    last stages), KeyboardInterrupt is raised and says how to go on.
     """
     given = {n: str(value) if isinstance(value, Path) else value for n, value in options.items()}
     inputs = {name: value for name, value in given.items() if name in _INPUTS}

@@ -176,7 +176,7 @@ class Run:
         """Draw the run: a frame (by default the middle keyframe) and the path."""
         index = self.keyframes[len(self.keyframes) // 2] if frame_index is None else frame_index
         if index not in self.poses:
-            raise InputError(f"expected a frame of the map, found {index}; see run.json")
+            raise InputError(f"expected a frame of the map, found {index}; choose one of run.poses")
         image = self.sequence.frame(index).image.numpy()
         color = self.render(self.poses[index], exposure=self.frames[index].exposure)
         stamps, breaks = [f.timestamp for f in self.frames], self.folder.read_run()["breaks"]

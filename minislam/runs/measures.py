@@ -104,11 +104,11 @@ def shown_static(slam: Slam) -> float | None:
     return float(np.mean(slam.mapper.shown)) if slam.mapper.shown else None
 
 
-def left_out(slam: Slam) -> float:
-    """Return the fraction of the map's images that beta leaves out [-]; 0 before the end."""
+def left_out(slam: Slam) -> float | None:
+    """Return the fraction of the map's images that beta leaves out [-]; None before the end."""
     images = slam.mapper.images if slam.mapper.shown else []
     moving = [float((~_is_static(slam.mapper, image)).float().mean()) for image in images]
-    return float(np.mean(moving or 0.0))
+    return float(np.mean(moving)) if moving else None
 
 
 def guessed_depth(slam: Slam) -> float | None:

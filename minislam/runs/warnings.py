@@ -112,7 +112,13 @@ def _map_warnings(slam: Slam) -> Iterator[str]:
             f"{least}: no depth was confirmed elsewhere. The camera hardly moved, its path is "
             "wrong, or the scene has no texture; move the camera sideways, or give a depth prior"
         )
-    if (hidden := left_out(slam)) > MOST_LEFT_OUT:
+    hidden = left_out(slam) or 0.0
+    if hidden > MOST_LEFT_OUT and slam.config.uncertainty.takes_masks:
+        yield (
+            f"the masks cover {hidden:.0%} of all pixels, which are neither in the map nor "
+            "measured; check that they are white only where something moves"
+        )
+    elif hidden > MOST_LEFT_OUT:
         yield (
             f"beta takes {hidden:.0%} of all pixels for moving, so they are neither in the map nor "
             "measured. Look at the pictures of beta; if they are bright on what stands still, crop "
@@ -260,4 +266,4 @@ def has_large_holes(slam: Slam) -> bool:
 
 def leaves_nearly_all_out(slam: Slam) -> bool:
     """Tell whether the map holds too little of the images; given masks may be as large."""
-    return slam.config.uncertainty.is_learned and left_out(slam) > NEARLY_ALL
+    return slam.config.uncertainty.is_learned and (left_out(slam) or 0.0) > NEARLY_ALL

@@ -59,9 +59,10 @@ def build_report(report: Report) -> str:
     pages = [(frame, list(map(picture_url, jpegs))) for frame, jpegs in report.keyframes.items()]
     depths = np.linspace(*report.depth_limits, _STOPS)
     betas = np.geomspace(*report.beta_limits, _STOPS)  # they are coloured by their logarithm
+    is_flawed = report.state.startswith("finished,")  # the flaw's own words may name other classes
     return Template(template("report.html")).substitute(
         {name: escape(getattr(report, name)) for name in _TEXTS},
-        kind=report.state.partition(":")[0].replace(",", ""),
+        kind="finished flawed" if is_flawed else report.state.partition(":")[0],
         warnings="\n".join(f'<p class="warning">{escape(text)}</p>' for text in report.warnings),
         overview=picture_url(report.overview),
         summary="\n".join(_row(*line) for line in report.summary),
@@ -109,7 +110,7 @@ def build_viewer(
     gaussians: Mapping[str, np.ndarray],  # raw values by name, as in GaussianArrays
     camera: Camera,  # of the images that the map was made from
     background: np.ndarray,  # (3,) RGB in [0, 1]
-    poses: Mapping[int, np.ndarray],  # frame_index: T_world_camera (4, 4), without lost frames
+    poses: Mapping[int, np.ndarray],  # frame_index: T_world_camera (4, 4), of the frames in the map
     frame_count: int,
     keyframes: Mapping[int, tuple[bytes, bytes, bytes]],  # frame_index: JPEG of input, beta, render
 ) -> str:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from minislam.cli.evaluate import add_parser, run_eval
+from minislam.cli.evaluate import run_eval
+from minislam.cli.main import parsed
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.geometry.alignment import Similarity
@@ -35,9 +36,7 @@ def files(tmp_path: Path) -> tuple[str, str]:
 
 
 def parse(*arguments: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="minislam")
-    add_parser(parser.add_subparsers())
-    return parser.parse_args(["eval", *arguments])
+    return parsed(["eval", *arguments])
 
 
 # Known answers
@@ -132,10 +131,17 @@ def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path: P
     (tmp_path / "run").mkdir()
     (tmp_path / "run/trajectory.txt").write_text(Path(files[1]).read_text())
     said = []
-    for names in (files, ("tum", *files), (files[0], str(tmp_path / "run"))):
-        run_eval(parse(*names, "-as"))
+    truth, estimate = files
+    for words in (
+        [truth, estimate, "-as"],
+        ["tum", truth, estimate, "-as"],
+        ["tum", "-as", truth, estimate],
+        ["tum", truth, "-as", estimate],
+        [truth, str(tmp_path / "run"), "-as"],
+    ):
+        run_eval(parse(*words))
         said.append(capsys.readouterr().out)
-    assert said[0] == said[1] == said[2]
+    assert said == 5 * said[:1]
 
 
 # Errors

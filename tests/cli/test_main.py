@@ -209,6 +209,7 @@ def test_a_wrong_depth_costs_no_earlier_run_its_files(depth: str, tmp_path: Path
         (["--start", "5"], "at least two frames, found 0 among 2 images of input"),
         (["--fx", "nan"], "fx to be a finite number, found nan"),
         (["--preset", ""], "a preset among laptop"),
+        (["--seed", "x"], "seed to be of type int like 0, found 'x'"),
         (["--seed", "-1"], "seed of at least 0"),
         (["--seed", "9" * 23], "seed of at least 0 and at most"),
         (["--threads", "100000"], "threads of at least 1 and at most 256, found 100000"),

@@ -12,9 +12,8 @@ from tests.notebook_files import NOTEBOOKS, ROOT, is_exercise, load
 pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy")
 
 
-@pytest.mark.parametrize("flags", [[], ["--solutions"]])
-def test_copies_are_the_notebooks(tmp_path: Path, capsys: pytest.CaptureFixture[str], flags):
-    assert main(["notebooks", str(tmp_path / "course"), *flags]) == 0
+def test_copies_are_the_notebooks(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["notebooks", str(tmp_path / "course")]) == 0
     assert f"jupyter lab {tmp_path / 'course'}" in capsys.readouterr().out
     copies = sorted((tmp_path / "course").glob("*.ipynb"))
     assert [path.name for path in copies] == [path.name for path in NOTEBOOKS]
@@ -33,12 +32,6 @@ def test_copies_for_students_have_no_solution(tmp_path: Path):
         assert ("NotImplementedError" in text) == any(map(is_exercise, solved))
         cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
         assert not any(cell["outputs"] or cell["execution_count"] for cell in cells)
-
-
-def test_it_is_either_with_or_without_solutions(tmp_path: Path, capsys):
-    with pytest.raises(SystemExit):
-        main(["notebooks", str(tmp_path), "--student", "--solutions"])
-    assert "not allowed with" in capsys.readouterr().err
 
 
 def test_files_that_a_notebook_names_come_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

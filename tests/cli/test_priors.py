@@ -257,6 +257,10 @@ def test_priors_without_anything_to_write_and_files_of_another_sequence(
     assert "expected --features or --depth, found neither" in the_sentence(capsys)
     short = ["synth:ball", "--max-frames", "3", "--size", SIZE, "--preset", "test"]
     assert main(["priors", *short, "--features", "classical", "--out", made]) == 0
+    file = tmp_path / "choice.json"  # may name them as well
+    file.write_text(json.dumps({"priors": {"features": f"files:{made}"}}))
+    assert main(["priors", *short, "--config", str(file), "--out", str(tmp_path / "again")]) == 0
+    assert len(list((tmp_path / "again/features").glob("*.npy"))) == 3
     capsys.readouterr()
     taken = ["--features", f"files:{made}", "-o", str(tmp_path / "out")]
     assert main(["run", *CLIP, *taken]) == 1

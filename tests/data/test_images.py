@@ -197,6 +197,15 @@ def test_images_are_read_where_a_pipe_always_waits(tmp_path: Path, monkeypatch):
     assert read_color(tmp_path / "0.jpg").dtype == np.uint8
 
 
+def test_images_are_read_where_standard_error_takes_nothing(tmp_path: Path, monkeypatch):
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    jpeg(tmp_path)
+    monkeypatch.setattr("os.write", full)
+    assert read_color(tmp_path / "0.jpg").dtype == np.uint8
+
+
 def png_chunk(kind: bytes, data: bytes, checksum: int | None = None) -> bytes:
     checksum = zlib.crc32(kind + data) if checksum is None else checksum
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)

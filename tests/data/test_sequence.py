@@ -237,6 +237,14 @@ def test_one_pixel_images_are_refused(tmp_path: Path):
         open_sequence(str(tmp_path))
 
 
+def test_fy_without_fx_makes_no_pixels_of_two_lengths(tmp_path: Path):
+    folder = tum_folder(tmp_path)
+    assert open_sequence(str(folder), InputOptions(fy=50.0)).camera.fx == 40
+    (folder / "calibration.txt").unlink()
+    with pytest.raises(InputError, match="expected --fx with --fy, found --fy alone; give both"):
+        open_sequence(str(folder), InputOptions(fy=50.0))
+
+
 @pytest.mark.parametrize(
     ("options", "count"), [({"start": 6}, 0), ({"start": 5}, 1), ({"stride": 50}, 1)]
 )

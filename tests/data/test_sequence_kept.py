@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from minislam.data.raw_images import FileImages
 from minislam.data.sequence import RecordedSequence, open_sequence
 from tests.recordings import picture, save
 
@@ -33,6 +34,15 @@ def test_each_image_is_prepared_once_and_comes_back_in_any_order(sequence, reads
         np.testing.assert_array_equal(pixels, picture(number))
         pixels[:] = 0  # what is returned is the caller's
     assert reads == [7, 0, 3]
+
+
+def test_opening_reads_each_sampled_image_once(tmp_path: Path, monkeypatch, reads: list[int]):
+    for number in range(8):
+        save(tmp_path / f"{number}.png", picture(number))
+    read = FileImages.read
+    monkeypatch.setattr(FileImages, "read", lambda self, k: reads.append(k) or read(self, k))
+    open_sequence(str(tmp_path))
+    assert reads == [0, 0, 1, 2, 4]  # the first one for its size, too
 
 
 def test_a_full_disk_costs_time_only(sequence, reads: list[int], monkeypatch):

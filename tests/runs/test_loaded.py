@@ -99,7 +99,7 @@ def test_a_broken_run_maps_the_longest_piece_and_marks_the_break(tmp_path: Path,
     assert len(run.trajectory) == 20 and "20 of 20 frames with a pose" in repr(run)
     (warning,) = run.warnings_of_breaks
     assert f"the map shows frames {min(piece)} to {max(piece)} alone" in warning
-    with pytest.raises(InputError, match=r"expected a frame of the map, found 2; see run\.json"):
+    with pytest.raises(InputError, match=r"a frame of the map, found 2; choose one of run\.poses"):
         run.plot(2)
 
 

@@ -28,6 +28,10 @@ def test_what_beta_leaves_out_and_what_is_guessed_is_measured(monkeypatch: pytes
     assert measures.measure(run, 1.0, None)["guessed_depth"] == pytest.approx(0.5)
 
 
+def test_what_beta_leaves_out_is_unknown_before_the_end():
+    assert measures.left_out(finished(shown=[])) is None
+
+
 def test_the_visible_surface_has_the_mean_depth_and_a_gap_has_none():
     # Rendered depth is a sum over blending weights: 1.8 at an opacity of 0.9 is a surface at 2.
     depth, opacity = torch.tensor([[1.8, 0.4]]), torch.tensor([[0.9, 0.2]])

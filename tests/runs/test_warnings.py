@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from minislam.config import with_settings
 from minislam.records import TrackingStatus
 from minislam.runs.warnings import warnings
 from minislam.tracking.keyframes import KeyframeStore
@@ -110,6 +111,13 @@ def test_each_fault_is_one_warning(parts: dict, words: str):
     assert not list(warnings(finished()))
     (warning,) = warnings(finished(**parts))
     assert words in warning
+
+
+def test_masks_that_cover_much_are_not_blamed_on_beta():
+    run = finished(left_out=0.5)
+    run.config = with_settings(run.config, {"uncertainty.given_masks": True})
+    (warning,) = warnings(run)
+    assert "the masks cover 50% of all pixels" in warning and "beta" not in warning
 
 
 def test_a_lens_that_was_found_is_not_said_to_be_given():
