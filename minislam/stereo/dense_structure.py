@@ -34,9 +34,9 @@ LARGEST_QUANTILE = 0.98  # of the inverse depths: the few beyond it are taken fo
 PLANES = (48, 96)  # fewest and most
 FARTHEST = 0.5  # planes: what matches farther away, even at infinity, is put here
 ALIKE = 0.1  # planes whose costs exceed the least one by less tell a pixel's depth no better
-MOST_ALIKE = 0.5  # fraction of such planes: what matches well at more is a line along the motion
-LEAST_PARALLAX = 24.0  # px of the nearest plane; with less, a window matches at most planes
-LEAST_KNOWN = 0.5  # fraction of the pixels of all keyframes: with less, a pan's holes are filled
+MOST_ALIKE = 0.5  # fraction of such planes: with more, a pixel lies on a line along the motion
+LEAST_PARALLAX = 24.0  # px of the nearest plane; with less, a window matches at nearly all planes
+LEAST_KNOWN = 0.5  # fraction of the pixels of all images: with less, a pan's holes are filled
 LEAST_COMMON = 100  # px that have both depths; with fewer their scales are not compared
 EDGE_RATIO = 1.15  # neighbouring pixels whose depths differ more lie on different surfaces
 
@@ -169,7 +169,7 @@ def swept_view(
     reference: PosedImage,
     others: list[PosedImage],
     planes: np.ndarray,  # (D,) 1/world unit, evenly spaced from 0
-    drops_lines: bool = False,  # what lies along the motion and matches at most depths
+    drops_lines: bool = False,  # lines along the motion: they match at more than half of the planes
 ) -> votes.SweptView:
     """Sweep one image; without others nothing is found. Any process can compute it."""
     step, pose = float(planes[1]), reference.T_camera_world
@@ -262,11 +262,11 @@ def full_size(depth: votes.ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tens
     Inverse depth is interpolated on a surface; at its edge each pixel takes the nearest value.
     """
     size = (camera.width, camera.height)
-    methods, square = (cv2.INTER_LINEAR, cv2.INTER_NEAREST), np.ones((3, 3), np.uint8)
+    methods, square = (cv2.INTER_LINEAR, cv2.INTER_NEAREST_EXACT), np.ones((3, 3), np.uint8)
     smooth, nearest = (cv2.resize(depth.inverse_depth, size, None, 0, 0, m) for m in methods)
     largest, smallest = (f(depth.inverse_depth, square) for f in (cv2.dilate, cv2.erode))
     surface = (largest < EDGE_RATIO * smallest) & (depth.inverse_depth > 0)
-    inside = cv2.resize(surface.astype(np.uint8), size, None, 0, 0, cv2.INTER_NEAREST) > 0
+    inside = cv2.resize(surface.astype(np.uint8), size, None, 0, 0, cv2.INTER_NEAREST_EXACT) > 0
     inverse = np.where(inside, smooth, nearest)
     full = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-6), 0).astype(np.float32)
     confirmation = cv2.resize(depth.confirmation, size, None, 0, 0, cv2.INTER_LINEAR)

@@ -205,6 +205,15 @@ def test_a_slope_is_interpolated_and_an_edge_is_not():
     assert all(allowed)  # nothing between the two surfaces
 
 
+def test_an_edge_stays_in_its_place_at_any_size():
+    for column in range(6, 15):  # where the far surface begins, of 20 columns
+        edge = np.where(np.arange(20) < column, 2, 1).astype(np.float32) * np.ones((12, 1), "f4")
+        wide = Camera(40.0, 40.0, 22.5, 13.5, 46, 28)
+        depth, _ = full_size(ConfirmedDepth(edge, np.ones_like(edge)), wide)
+        begins = int((depth[14] > 0.75).int().argmax())
+        assert abs(begins - 46 / 20 * column) <= 0.5  # px, of the borders between two pixels
+
+
 def test_the_swept_camera_sees_what_the_camera_sees():
     small = planner({}).camera
     assert (small.width, small.height) == SIZE and small.fx == clip().intrinsics.fx
