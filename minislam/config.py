@@ -44,6 +44,7 @@ _PAPER: dict[str, Any] = {
     "tracking.learned.keyframe_flow_without_prior": 15.0,
     "tracking.learned.warmup_rounds": 8 + 8,
     "tracking.learned.warmup_rounds_with_beta": 8,
+    "tracking.loop_min_gap": 21,
     "tracking.learned.window": 25,
     "tracking.learned.rounds": 8 + 4,
     "tracking.learned.active_edges": 75,
@@ -66,7 +67,7 @@ _PAPER: dict[str, Any] = {
     "mapping.log_scales_rate": 6e-3,
     "mapping.colors_rate": 7.05e-4,
     "mapping.refine_rate_end": 1.0,
-    "mapping.insertion.cell": 4,
+    "mapping.insertion.cell": 4,  # officially 1/16 of the pixels, online 1/32
     "mapping.insertion.plain": 0.0,
     "mapping.insertion.footprint": 0.22,  # officially of the distance between neighbours
     "mapping.insertion.opacity": 0.5,
@@ -118,7 +119,7 @@ def preset(name: str) -> SlamConfig:
 
 def with_settings(config: SlamConfig, settings: Mapping[str, Any]) -> SlamConfig:
     """Return the configuration with values replaced; they are given by their names with dots."""
-    # With a learned flow tracking.learned.X replaces tracking.X. Whoever gives only one means both.
+    # With a learned flow tracking.learned.X replaces tracking.X. Given alone, tracking.X is both.
     known = settings_of(config)
     also = {n.replace("tracking.", "tracking.learned.", 1): v for n, v in settings.items()}
     also = {n: v for n, v in also.items() if n in known and n not in settings}

@@ -17,7 +17,6 @@ MOST_PAIRS = 111  # of parts of which one imports the other
 # A part may import what stands before it and nothing that stands after it.
 FOUNDATION = ["errors", "parameters", "geometry", "images", "records", "state", "workers"]
 ALGORITHMS = ["splatting", "priors", "uncertainty", "tracking", "mapping", "stereo"]
-EDGE = ["data", "evaluation", "viz"]  # import the foundation only, and nothing imports them ...
 ALLOWED = {
     "errors": [],
     "parameters": ["errors"],
@@ -38,7 +37,7 @@ ALLOWED = {
     "viz": FOUNDATION,
     "checks": [*FOUNDATION, *ALGORITHMS, "evaluation"],
 }
-# ... but these, which put the system together.
+# What puts the system together.
 TOP = ["slam", "runs", "cli", "__main__"]
 RUN_TIME_LIBRARIES = {"numpy", "scipy", "torch", "matplotlib", "cv2"}
 

@@ -5,15 +5,7 @@ import contextlib
 import io
 from pathlib import Path
 
-import pytest
-
-from tests.notebook_files import NOTEBOOKS, load, source
-
-each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-
-
-def code_cells(path: Path) -> list[dict]:
-    return [cell for cell in load(path)["cells"] if cell["cell_type"] == "code"]
+from tests.notebook_files import NOTEBOOKS, code_cells, each_notebook, source
 
 
 def names(node: ast.AST, context: type) -> set[str]:

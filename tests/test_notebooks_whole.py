@@ -18,7 +18,17 @@ from minislam.checks.judge import judge
 from minislam.checks.points import EXERCISES
 from minislam.checks.submission import exercises_of, parts_of
 from minislam.cli.notebooks import as_text, without_solutions
-from tests.notebook_files import NOTEBOOKS, ROOT, cleaned, is_exercise, load, prose, source
+from tests.notebook_files import (
+    NOTEBOOKS,
+    ROOT,
+    cleaned,
+    code_cells,
+    each_notebook,
+    is_exercise,
+    load,
+    prose,
+    source,
+)
 
 LARGEST = 2_000_000  # bytes
 MOST_CELLS = 40
@@ -37,11 +47,6 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy"),
 ]
-each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-
-
-def code_cells(path: Path) -> list[dict]:
-    return [cell for cell in load(path)["cells"] if cell["cell_type"] == "code"]
 
 
 @each_notebook

@@ -72,12 +72,12 @@ class MappingConfig:
         0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1
     )
     freeze_iterations: int = parameter(
-        5, "iterations without MLP training after a change of density; official 20 of 450"
+        5, "iterations without MLP training after a change of density; official 20, at the end 200"
     )
 
     window_size: int = parameter(10, "most keyframes in the local window, official", 3)
     window_probability: float = parameter(
-        0.5, "probability that an iteration takes a keyframe of the window, paper 3.4", most=1
+        0.5, "probability that an iteration takes a keyframe of the window, Sec. 3.4", most=1
     )
 
     color_weight: float = parameter(

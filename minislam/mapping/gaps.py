@@ -57,7 +57,7 @@ def is_refuted(
 ) -> Tensor:  # (N,) bool
     """Tell which points that fill gaps are refuted, by the depths or by the colours of other views.
 
-    Depths refute only a guess, a point that its own image has no depth for. Either more views
+    Depths refute only a guess, a point where its own image has no depth. Either more views
     know a surface behind it, which it would hide, than one at its depth. Or a view sees it from
     less than half the distance: it would cover much there, and that view can guess the place
     itself. Colours refute any point, such as a rim with the depth of another surface, if most views

@@ -24,7 +24,7 @@ from minislam.state.memory import release
 from minislam.uncertainty import RenderingError
 from minislam.uncertainty.losses import FAR_FACTOR
 
-MOST_FAR = 0.99  # of the largest depth that is inserted: what fills a gap lies no farther [-]
+MOST_FAR = 0.99  # of the largest depth that is inserted: farther gaps, and the sky, get this [-]
 VISIBLE = 0.5  # px: a view sees the Gaussians whose blending weights in it sum to more than this
 
 
@@ -34,7 +34,7 @@ class Mapper(JointOptimisation):
     def initialise(
         self, images: list[MapImage], progress: Progress | None = None, online: bool = False
     ) -> None:
-        """Begin a map with images, online the first keyframes of more; train the MLP on it."""
+        """Begin a map, online with the first keyframes, else with all images; train the MLP."""
         assert images, "a map starts from at least one image"
         self.median_depth = median_depth(images)
         self.images = list(images)
@@ -162,8 +162,8 @@ class Mapper(JointOptimisation):
             return
         asked = slice(None, None, math.ceil(len(swept) / safeguards.ASKED))
         calls = (self._view_arguments(i, self._online_camera, trains=True) for i in swept[asked])
-        errors = [vars(v.error).values() for v in self._workers.stream(view_gradients, calls)]
-        error = RenderingError(*map(torch.stack, zip(*errors, strict=True)))
+        views = self._workers.stream(view_gradients, calls)
+        error = RenderingError.stacked(view.error for view in views)
         beta = beta[asked]
         if safeguards.is_wrong(error, beta, least, self.uncertainty):
             self.least_weight = least

@@ -107,8 +107,8 @@ class JointOptimisation(Stateful):
 
     def renderings(self, images: list[MapImage]) -> Iterator[Rendering]:
         """Yield what the map shows of each image; the workers render side by side."""
-        fixed, unused = (self.gaussians, self.camera), (self.background, None, None)
-        calls = ((*fixed, image.T_camera_world, *unused) for image in images)
+        first, last = (self.gaussians, self.camera), (self.background, None, None)
+        calls = ((*first, image.T_camera_world, *last) for image in images)
         return (Rendering(*found) for found in self._workers.stream(render, calls))
 
     def predict_beta(self, features: Tensor) -> Tensor:
@@ -208,8 +208,8 @@ class JointOptimisation(Stateful):
         nearby = {k for at in positions for k in every[max(0, at - reach) : at + reach + 1]}
         around = torch.cat([self.images[k].features.flatten(0, 1) for k in sorted(nearby)])
         features = torch.stack([self.images[position].features for position in positions])
-        errors = zip(*(vars(view.error).values() for view in views), strict=True)
-        return self._trainer.step(features, RenderingError(*map(torch.stack, errors)), around)
+        error = RenderingError.stacked(view.error for view in views if view.error is not None)
+        return self._trainer.step(features, error, around)
 
     def _reset_gradients(self) -> None:
         self._gradients = self.gaussians.means.new_zeros(2, len(self.gaussians))

@@ -75,7 +75,8 @@ def without_acquitted(
     """Return the confirmation with 0 where the map shows rightly what other views look through.
 
     The depth there is wrong, because something moves or because it was mistaken. The map has
-    learned the place from other images alone: if it looks the same in this one, nothing moves.
+    learned the place from other images alone: if it looks the same in this one, nothing moves. A
+    hole has no error either: views that truly look through a thing would have filled it.
     """
     if confirmation is None:
         return None

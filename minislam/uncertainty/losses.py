@@ -15,7 +15,7 @@ SSIM_WINDOW = 7  # px, official; NeRF On-the-go uses a 5x5 box
 SSIM_C3 = SSIM_C2 / 2  # the usual choice, with which l c s is the classic SSIM
 STRUCTURE_CAP = 0.98  # of c and s: one perfect factor must not hide the two others
 SURFACE_OPACITY = 0.9  # a rendering less opaque than this shows a hole, not a surface, official
-FAR_FACTOR = 10.0  # median depths: farther reference depths are not used, official: at most 50 m
+FAR_FACTOR = 10.0  # median depths: farther reference depths are not used, official: nor beyond 50 m
 
 
 def ssim_components(
@@ -111,7 +111,7 @@ def cell_loss(
     opacity: Tensor,  # (h', w') in [0, 1]
     config: UncertaintyConfig,
 ) -> Tensor:  # (h', w')
-    """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell.
+    """Return (L'_SSIM + lambda_1 L_depth) / beta^2 + lambda_3 log beta per cell, of Eq. (4).
 
     Without L_reg_U = log beta an infinite beta would be the minimum. With lambda_3 = 0.5 and error
     L it is at beta = 2 sqrt(L). Cells not covered yet give 0: a hole is not a dynamic object.

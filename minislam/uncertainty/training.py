@@ -1,6 +1,7 @@
 """Train the MLP on the rendering error of the map: L_uncer and its optimiser."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -26,6 +27,12 @@ class RenderingError:
     def total(self, lambda_depth: float) -> Tensor:
         """Return the numerator of L_uncer, L'_SSIM + lambda_1 L_depth, of each cell. Eq. (4)."""
         return self.ssim + lambda_depth * self.depth
+
+    @classmethod
+    def stacked(cls, errors: Iterable["RenderingError"]) -> "RenderingError":
+        """Return the errors of n images as one."""
+        fields = zip(*(vars(error).values() for error in errors), strict=True)
+        return cls(*map(torch.stack, fields))
 
 
 @torch.no_grad()

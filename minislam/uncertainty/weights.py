@@ -25,10 +25,17 @@ TRACKING_CAP = 1.0  # beta may lower the weight that the flow confidence gives, 
 BETA_OF_MASK = 2.0 * 5.0**0.5  # of moving pixels in a given mask: what the capped SSIM alone gives
 # A smaller weight is set to 0: in many iterations it would paint a dynamic object into the map.
 MAPPING_CUT = 0.1
-BETA_CUT = 1.41  # the beta_raw of that weight
-UNIT_BETA = (WEIGHT_SCALE**0.5 - BETA_FLOOR) / DATA_RATE + BETA_FLOOR - BETA_OFFSET  # of weight 1
 STATIC_FRACTION = 0.1  # ours: so much of a frame counts fully in tracking, whatever its beta [-]
 MAPPING_CAP = 5.0  # ours: else plain walls, of least beta, take the weight of all fine detail
+
+
+def _beta_of(weight: float) -> float:
+    """Return the raw beta above the floor that has this weight."""
+    beta_adj = (WEIGHT_SCALE / weight) ** 0.5
+    return (beta_adj - BETA_FLOOR) / DATA_RATE + BETA_FLOOR - BETA_OFFSET
+
+
+BETA_CUT, UNIT_BETA = _beta_of(MAPPING_CUT), _beta_of(1.0)
 
 
 def clipped_beta(beta_raw: Tensor) -> Tensor:

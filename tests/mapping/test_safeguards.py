@@ -45,11 +45,12 @@ def test_the_rendering_error_of_what_is_confirmed_fades():
 
 
 def test_what_views_look_through_is_acquitted_where_the_map_shows_it_rightly():
-    # At lambda_3 = .5 the best beta is 2 sqrt(L): .4 and .56 for these errors.
-    error = RenderingError(torch.tensor([[0.04, 0.08, 0.04]]), *torch.tensor([[[0.0]], [[1.0]]]))
-    confirmation = torch.tensor([[-1.0, -0.5, 0.7]])
+    # At lambda_3 = .5 the best beta is 2 sqrt(L): .4 and .56 for these errors. A hole has none.
+    ssim, opacity = torch.tensor([[[0.04, 0.08, 0.04, 0.0]], [[1.0, 1.0, 1.0, 0.0]]])
+    error = RenderingError(ssim, torch.zeros_like(ssim), opacity)
+    confirmation = torch.tensor([[-1.0, -0.5, 0.7, -0.6]])
     left = without_acquitted(confirmation, error, UncertaintyConfig())
-    torch.testing.assert_close(left, torch.tensor([[0.0, -0.5, 0.7]]))
+    torch.testing.assert_close(left, torch.tensor([[0.0, -0.5, 0.7, 0.0]]))
     assert without_acquitted(None, error, UncertaintyConfig()) is None
 
 
