@@ -1,7 +1,9 @@
 """The command line: write one sequence, or list them."""
 
 import argparse
+import os
 import re
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +20,17 @@ BAR_WIDTH = 40  # characters
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name) or open(os.devnull, "w")  # None: closed by the caller
+        if hasattr(stream, "reconfigure"):  # so that every file name can be printed
+            stream.reconfigure(errors="backslashreplace")
+        setattr(sys, name, stream)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # leave nothing half written
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.list:
         for name, summary in SUMMARIES.items():
-            print(f"{name:<12}{summary}")
+            _say(f"{name:<12}{summary}")
         return 0
     if options.name is None or options.out is None:
         parser.error("name a sequence and a folder: python -m data_synth crowd --out data/crowd")
@@ -39,17 +47,25 @@ def main(arguments: list[str] | None = None) -> int:
             phone_of(options),
         )
     except SynthError as error:
-        print(f"error: {error}", file=sys.stderr)
+        _say(f"error: {error}", "stderr")
         return EXIT_KNOWN_ERROR
     except OSError as error:
         cause = error.strerror or error
-        print(f"error: could not write {options.out}: {cause}", file=sys.stderr)
+        _say(f"error: could not write {options.out}: {cause}", "stderr")
         return EXIT_KNOWN_ERROR
     except KeyboardInterrupt:
-        print("interrupted: nothing was written", file=sys.stderr)
+        _say("interrupted: nothing was written", "stderr")
         return EXIT_INTERRUPTED
-    print(f"{options.name}, seed {options.seed}, {frames} frames: {folder}")
+    _say(f"{options.name}, seed {options.seed}, {frames} frames: {folder}")
     return 0
+
+
+def _say(text: str, stream: str = "stdout", end: str = "\n") -> None:
+    """Print; a reader that ends, or a full disk, ends only the printing."""
+    try:
+        print(text, end=end, file=getattr(sys, stream), flush=True)
+    except OSError:
+        setattr(sys, stream, open(os.devnull, "w"))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -101,8 +117,8 @@ def progress_printer() -> Progress:
         if on_terminal:
             bar = "#" * (BAR_WIDTH * done // total)
             end = "\n" if done == total else ""
-            print(f"\r[{bar:<{BAR_WIDTH}}] {done}/{total}", end=end, file=sys.stderr, flush=True)
+            _say(f"\r[{bar:<{BAR_WIDTH}}] {done}/{total}", "stderr", end)
         elif 10 * done // total > 10 * (done - 1) // total:
-            print(f"{100 * done // total} % ({done} of {total} frames)", file=sys.stderr)
+            _say(f"{100 * done // total} % ({done} of {total} frames)", "stderr")
 
     return show

@@ -101,6 +101,8 @@ def cached_sequence(
     The cache is $MINISLAM_CACHE, or ~/.cache/minislam.
     """
     root = Path(os.path.expanduser(os.environ.get("MINISLAM_CACHE") or "~/.cache/minislam"))
+    if str(root).startswith("~"):
+        raise SynthError(f"there is no home folder for {root}")
     filmed = "" if phone is None else f"-phone-{zlib.crc32(repr(phone).encode()):08x}"
     folder = root / "synth" / f"{name}-{seed}-{frames}-{size[0]}x{size[1]}{filmed}"
     for scratch in root.glob("synth/.*-*-*-*x*-????????"):  # left by a killed process

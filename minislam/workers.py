@@ -5,8 +5,8 @@ output: the name of a function of this package, plain values, and the bytes of t
 imports the script of the user, as `multiprocessing` does under spawn.
 
 A helper keeps nothing between two calls, so the result never depends on the helpers: a call whose
-helper has ended is computed in this process. A helper ends when its input does, at the latest with
-this process.
+helper has ended is computed in this process. A helper ends when its input does; if this process is
+killed, after the call that it computes.
 """
 
 import importlib
@@ -38,9 +38,11 @@ _START = "import sys; sys.path[:] = sys.argv[2:]; from minislam.workers import s
 
 def idle_cores() -> int:
     """Return how many workers the idle cores can feed, at most 4; MINISLAM_WORKERS replaces it."""
-    given = os.environ.get("MINISLAM_WORKERS", "")
-    if given.isdecimal():
-        return max(1, int(given))
+    if given := os.environ.get("MINISLAM_WORKERS"):
+        wanted = "MINISLAM_WORKERS of at least 1 and at most 256"  # as --workers
+        is_count = given in map(str, range(1, 257))
+        require(is_count, wanted, f"{given!r}; choose a whole number between")
+        return int(given)
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     busy = 0.0

@@ -179,8 +179,13 @@ def test_one_worker_per_idle_core(monkeypatch):
         assert idle_cores() == expected
     monkeypatch.setenv("MINISLAM_WORKERS", "3")
     assert idle_cores() == 3
-    monkeypatch.setenv("MINISLAM_WORKERS", "3²")
+    monkeypatch.setenv("MINISLAM_WORKERS", "")
     assert idle_cores() == 1  # as if it were not set
+    for given in ("3²", "-3", "0", "257", "many"):
+        monkeypatch.setenv("MINISLAM_WORKERS", given)
+        with pytest.raises(InputError, match=f"at most 256, found '{given}'; choose"):
+            idle_cores()
+    monkeypatch.delenv("MINISLAM_WORKERS")
 
     def unknown() -> tuple[float, float, float]:
         raise OSError("Load averages are unobtainable")

@@ -8,7 +8,7 @@ from pathlib import Path
 from minislam.data.files import atomic_write, require_free, require_new
 from minislam.data.run_folder import MAP, MAP_SH
 from minislam.errors import require
-from minislam.runs.progress import ProgressLine, say
+from minislam.runs.progress import ProgressLine, quoted, say
 
 EPILOG = """\
 The world has the axes of the first camera, so y points down; the unit of length is printed.
@@ -73,4 +73,4 @@ def _export(args: argparse.Namespace) -> None:
         atomic_write(padded, encode_ply(run.gaussians, args.sh_degree))
         say(f"{padded}: the map with zeros up to degree {args.sh_degree}")
     if args.nerfstudio:
-        say(f"to go on: ns-train splatfacto --data {args.nerfstudio}")
+        say(f"to go on: ns-train splatfacto --data {quoted(args.nerfstudio)}")

@@ -29,7 +29,7 @@ class Log:
         """Take what is printed. Of a progress line on a terminal, the last state is kept."""
         *lines, self._begun = (self._begun + text).split("\n")
         now = time.strftime("%Y-%m-%d %H:%M:%S")
-        states = (line.rpartition("\r")[2].replace("\033[K", "") for line in lines)
+        states = (line.rpartition("\r")[2].rstrip() for line in lines)
         self._lines += [f"{now}  {state}\n" for state in states]
         if self._folder and self._lines and _written(self._folder) not in (None, self._earlier):
             with contextlib.suppress(OSError):  # a full disk ends no run

@@ -27,6 +27,10 @@ MALLOC = {"ARENA_MAX": (-8, 1), "MMAP_THRESHOLD_": (-3, 4 << 20), "TRIM_THRESHOL
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     set_malloc()
+    # Descriptors 0 to 2 that the caller has closed: a pipe must not get the number of a stream.
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
     # OpenCV and FFmpeg would print messages about a damaged file beside our own error message.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

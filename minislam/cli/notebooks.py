@@ -10,6 +10,7 @@ import minislam
 from minislam.data.files import atomic_write, make_folder, read_bytes
 from minislam.errors import InputError, require
 from minislam.parameters import user_path
+from minislam.runs.progress import quoted
 
 SOLUTION = re.compile(r"^([ \t]*)### BEGIN SOLUTION\n.*?^[ \t]*### END SOLUTION$", re.S | re.M)
 
@@ -46,7 +47,7 @@ def _notebooks(args: argparse.Namespace) -> None:
     for name, content in copies.items():
         make_folder((folder / name).parent)
         atomic_write(folder / name, content)
-    print(f"{count} notebooks in {folder}; open them with: jupyter lab {folder}")
+    print(f"{count} notebooks in {folder}; open them with: jupyter lab {quoted(str(folder))}")
 
 
 def without_solutions(notebook: dict) -> dict:

@@ -9,7 +9,6 @@ import argparse
 import os
 import re
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from minislam.cli.help import UsageError, unknown_option
@@ -119,11 +118,12 @@ def config_file(args: argparse.Namespace) -> dict[str, Any]:
     """Return the file given with --config, or config.json of the run that --resume goes on with."""
     tree: Any = {}
     if args.config:
-        path, is_folder = Path(args.config), os.path.isdir(args.config)
+        path = user_path(args.config)
+        is_folder = os.path.isdir(path)  # a name of any length
         wanted = (path if is_folder else path.parent) / CONFIG
         if (is_folder or path.name in (RUN, METRICS)) and wanted.is_file():
             raise InputError(f"expected a file of settings, found {path} of a run; give {wanted}")
-        tree = read_json(args.config)
+        tree = read_json(path)
     elif getattr(args, "resume", False):
         tree = RunFolder(args.output).read_config()
     flattened(tree)  # refuses what is no JSON object

@@ -19,7 +19,7 @@ from minislam.data.files import atomic_file, make_folder, read_text, write_text
 from minislam.errors import require
 from minislam.parameters import user_path
 from minislam.priors.names import PriorChoice
-from minislam.runs.progress import ProgressLine
+from minislam.runs.progress import ProgressLine, quoted
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -62,7 +62,8 @@ def _priors(args: argparse.Namespace) -> None:
     kinds = list(_kinds(choice, with_features, sequence, config))
     for kind, origin, compute in kinds:
         _write_kind(out / kind, origin, sequence, compute, progress)
-    print(f"use them with {' '.join(f'--{kind} files:{out}' for kind, *_ in kinds)}")
+    flags = (f"--{kind} {quoted(f'files:{out}')}" for kind, *_ in kinds)
+    print(f"use them with {' '.join(flags)}")
 
 
 def _kinds(
@@ -75,7 +76,7 @@ def _kinds(
 
     # Everything the result depends on, so that files of another command are not taken for these.
     tree = asdict(config)
-    constants = {name: tree[name] for name in ("seed", "simulated_depth", "networks")}
+    constants = {name: tree[name] for name in ("seed", "networks")}
     conditions = (
         f"{choice.precision} on {choice.device}; {sequence.description}; {sequence.camera}; "
         f"{sequence.opened_as}; {constants}"
@@ -86,7 +87,7 @@ def _kinds(
         origin = f"{choice.features} {choice.features_weights}, grid {factor}; {conditions}"
         yield FEATURES, origin, HighResolutionFeatures(features, factor)
     if choice.depth != "none":
-        depth = choose_depth(choice, sequence, config.seed, config.simulated_depth, config.networks)
+        depth = choose_depth(choice, sequence, config.seed, config.networks)
         origin = f"{choice.depth} {choice.depth_weights}; {conditions}"
         yield DEPTH, origin, lambda frame: depth(frame, sequence.camera)
 

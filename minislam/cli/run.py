@@ -1,7 +1,6 @@
 """The sub-commands `minislam demo` and `minislam run`."""
 
 import argparse
-import shlex
 from contextlib import closing
 from functools import partial
 from os.path import expanduser
@@ -15,7 +14,7 @@ from minislam.data.options import default_depth, require_source
 from minislam.data.run_folder import CHECKPOINT, REPORT
 from minislam.errors import InputError, require
 from minislam.parameters import require_bounds
-from minislam.runs.progress import ProgressLine, ending_signals, say
+from minislam.runs.progress import ProgressLine, ending_signals, quoted, say
 
 DEMO = {"sequence": "synth:crowd", "max_frames": 60, "output": "output/demo"}
 
@@ -97,5 +96,5 @@ def _run(args: argparse.Namespace) -> int:
         if facts["state"] == "interrupted":
             say(way_on(output) or NO_WAY_ON)
         else:
-            say(f"next: minislam render {shlex.quote(output)} -o fly.webm, or minislam export -h")
+            say(f"next: minislam render {quoted(output)} -o fly.webm, or minislam export -h")
         return facts["exit_code"]

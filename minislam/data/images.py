@@ -42,6 +42,11 @@ def is_number(name: str) -> bool:
     return re.fullmatch(r"\d+(\.\d+)?", name, re.ASCII) is not None
 
 
+def is_text(name: str) -> bool:
+    """Tell whether a file name is text: OpenCV crashes at one with other bytes."""
+    return re.search("[\ud800-\udfff]", name) is None
+
+
 def list_images(folder: Path) -> list[Path]:
     """Return the images of a folder in their order; none of a folder that is not there."""
     entries = folder.iterdir() if folder.is_dir() else ()
@@ -100,6 +105,8 @@ def write_animation(path: Path | str, images: Iterable[np.ndarray], rate: float)
     found = f"{kind or 'neither'}; write .webm, and convert that with ffmpeg if you need .mp4"
     require(kind in encoders, "a file that ends in .webm or .webp", found)
     with tempfile.TemporaryDirectory() as folder:
+        found = f"{folder!a}; set TMPDIR to another folder"
+        require(is_text(folder), "a temporary folder whose name is text", found)
         file = Path(folder) / f"animation{kind}"
         encoders[kind](file, map(_bgr, images), rate)
         _require_room(folder)

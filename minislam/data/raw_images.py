@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from minislam.data.images import read_color
+from minislam.data.images import is_text, read_color
 from minislam.data.metadata import noted_size
 from minislam.data.picture import Glance, glance_at
-from minislam.errors import InputError, MinislamError
+from minislam.errors import InputError, MinislamError, require
 
 SIMILAR = 0.03  # of a side: images that differ by less are resized [-]
 _MOST_FAILURES = 300  # calls of grab() in a row, behind which no frame is looked for
@@ -133,10 +133,9 @@ class VideoImages:
 
     def _rewind(self) -> None:
         # FFmpeg, because other back ends may take the name for a camera or a pattern.
-        # It takes what precedes a colon for a protocol, and crashes at a name that is no text.
+        # It takes what precedes a colon for a protocol.
         name = os.path.abspath(self.path)
-        if re.search("[\ud800-\udfff]", name):
-            raise InputError(f"expected a video whose name is text, found {name!a}; rename it")
+        require(is_text(name), "a video whose name is text", f"{name!a}; rename it")
         self._capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
         self._grabbed = 0  # calls of grab() since the start
         codec = self._capture.get(cv2.CAP_PROP_FOURCC)

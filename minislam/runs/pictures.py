@@ -1,6 +1,5 @@
 """The pictures of a run folder: keyframe images, plots, the viewer and the report."""
 
-import shlex
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,6 +17,7 @@ from minislam.evaluation import absolute_trajectory_error
 from minislam.evaluation.metrics import MAX_DIFFERENCE
 from minislam.mapping.mapper import surface_depth
 from minislam.runs.loaded import Run
+from minislam.runs.progress import quoted
 from minislam.runs.resume import NO_WAY_ON, way_on
 from minislam.runs.summary import summarise
 from minislam.slam import Slam
@@ -101,15 +101,16 @@ def _write_report(folder: RunFolder, slam: Slam, metrics: Json, facts: Json, **s
     """Write what is shown, by the names of viz.Report, and what the run tells of itself."""
     program, *arguments = facts["command"]
     by_hand = Path(program).stem in ("minislam", "__main__")  # or else by a program of the user
+    words = ["minislam", *arguments] if by_hand else ["python", program]
     report = viz.Report(
         title=f"minislam: {slam.sequence.name}",
-        folder=shlex.quote(str(folder.path)),
+        folder=quoted(str(folder.path)),
         state=facts["state"],
         description=slam.sequence.description,
         warnings=facts["warnings"],
         summary=summarise(metrics, facts),
         unit=facts["unit"],
-        command=shlex.join(["minislam", *arguments] if by_hand else ["python", program]),
+        command=" ".join(map(quoted, words)),
         settings=named_settings(slam.config),
         next_step=way_on(folder.path) or NO_WAY_ON,
         **shown,

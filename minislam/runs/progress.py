@@ -1,7 +1,9 @@
 """What a long command shows while it works, and how a signal ends it between two steps."""
 
 import os
+import shlex
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -26,6 +28,11 @@ def say(text: str, stream: str = "stdout", end: str = "\n") -> None:
         print(text, end=end, file=getattr(sys, stream), flush=True)
     except (OSError, ValueError):  # ValueError: a closed file
         setattr(sys, stream, open(os.devnull, "w"))
+
+
+def quoted(argument: str) -> str:
+    """Return an argument of a command that is printed, as a shell of this system takes it."""
+    return subprocess.list2cmdline([argument]) if os.name == "nt" else shlex.quote(argument)
 
 
 @contextmanager
@@ -88,7 +95,11 @@ class ProgressLine:
         text += in_all
         if self._terminal:
             self._is_open = fraction < 1
-            say(f"\r\033[K{text}", "stderr", end="" if self._is_open else "\n")
+            if self._is_open:  # what has filled a row cannot be written over
+                width = _width()
+                say(f"\r{text[:width]:<{width}}", "stderr", end="")
+            else:
+                self.tell(text)
         elif fraction >= 1 or fraction >= self._shown[stage] + self._plain_step:
             self._shown[stage] = fraction % 1  # 0 when it is done, since it may come again
             say(text, self._stream)
@@ -135,7 +146,7 @@ class ProgressLine:
     def tell(self, text: str) -> None:
         """Print a line of its own in place of an open one."""
         self._is_open = False
-        say(("\r\033[K" if self._terminal else "") + text, "stderr")
+        say(f"\r{text:<{_width()}}" if self._terminal else text, "stderr")
 
     def close(self) -> None:
         """End an open line, so that nothing else is printed behind it."""
@@ -163,6 +174,13 @@ class SilentProgress(ProgressLine):
 
     def tell(self, text: str) -> None:
         """Say nothing, of a warning neither; run.json has it."""
+
+
+def _width() -> int:
+    """Return how many characters of a line that is written over fit on the terminal."""
+    with suppress(OSError):  # standard error is none
+        return (os.get_terminal_size(2).columns or 80) - 1  # 0: unknown
+    return 79
 
 
 def _duration(seconds: float) -> str:

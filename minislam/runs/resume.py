@@ -2,7 +2,6 @@
 
 import functools
 import json
-import shlex
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +15,7 @@ from minislam.errors import InputError, MinislamError, require
 from minislam.parameters import flattened
 from minislam.priors.choice import PriorChoice
 from minislam.records import Sequence
+from minislam.runs.progress import quoted
 from minislam.slam import Slam
 
 NO_WAY_ON = "no checkpoint was written (--checkpoint_fraction 0); start again with --overwrite"
@@ -23,7 +23,7 @@ NO_WAY_ON = "no checkpoint was written (--checkpoint_fraction 0); start again wi
 
 def way_on(folder: Path | str) -> str:
     """Return how to go on with a run, or nothing where it has no checkpoint."""
-    command = f"go on with: minislam run --resume -o {shlex.quote(str(folder))}"
+    command = f"go on with: minislam run --resume -o {quoted(str(folder))}"
     return command if (Path(folder) / CHECKPOINT).is_file() else ""
 
 
@@ -74,7 +74,7 @@ class Checkpoints:
             self.problem = None
         except InputError as error:
             reason = str(error).partition("; ")[0]  # another folder does not help this run
-            self.problem = f"the last checkpoint is older than this state: {reason}; free space"
+            self.problem = f"no checkpoint of this state: {reason}; free space"
         ended = time.perf_counter()
         self._due = ended + (ended - begun) / self._fraction
         self.seconds += ended - begun

@@ -26,18 +26,18 @@ def export(folder: Path, *arguments: object) -> int:
 
 
 def test_all_targets_at_once(folder: Path, tmp_path: Path, capsys):
-    names = ["colmap", "nerfstudio", "depth", "masks"]
-    targets = [word for name in names for word in (f"--{name}", tmp_path / name)]
+    names = ["colmap", "my nerfstudio", "depth", "masks"]
+    targets = [word for name in names for word in (f"--{name.split()[-1]}", tmp_path / name)]
     assert export(folder, *targets, "--points", tmp_path / "p.ply", "--sh-degree", 3) == 0
     said = capsys.readouterr().out
-    assert "to go on: ns-train splatfacto --data" in said
+    assert f"to go on: ns-train splatfacto --data '{tmp_path}/my nerfstudio'" in said
     assert f"{tmp_path}/depth: 2 frames, lengths in" in said and "/masks: 2 frames\n" in said
     made = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     pictures = {f"{kind}/{n:06d}.png" for kind in ("images", "masks") for n in range(2)}
     both = {f"{name}/{picture}" for name in names[:2] for picture in pictures}
     model = {f"colmap/sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")}
     assert made == both | model | {
-        "nerfstudio/transforms.json", "nerfstudio/points.ply", "p.ply", "depth/camera.json",
+        "my nerfstudio/transforms.json", "my nerfstudio/points.ply", "p.ply", "depth/camera.json",
         "depth/000000.npy", "depth/000001.npy", "masks/000000.png", "masks/000001.png",
     }  # fmt: skip
     assert np.load(tmp_path / "depth/000001.npy").shape == (72, 96)

@@ -57,7 +57,7 @@ def test_the_log_of_an_earlier_run_gets_no_line_of_one_that_replaces_it_or_is_re
 def test_of_a_line_that_is_written_over_the_last_state_counts(tmp_path: Path):
     log = Log()
     begin(log, tmp_path)
-    for text in ("\r\033[Kwalking 1/2", "\r\033[Kwalking 2/2", "\n"):
+    for text in ("\rwalking 1/2 (9 s left) ", "\rwalking 2/2            ", "\n"):
         log.add(text)
     assert texts(tmp_path / "log.txt") == ["walking 2/2"]
 

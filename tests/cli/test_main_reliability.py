@@ -46,7 +46,7 @@ def test_on_a_terminal_the_last_sentence_is_not_behind_an_open_progress_line(mon
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr("minislam.cli.main._command", interrupted)
     assert main(["run"]) == 130
-    assert capsys.readouterr().err == "\r\033[Kminislam: interrupted\n"
+    assert capsys.readouterr().err.rstrip() == "\rminislam: interrupted"
 
 
 @pytest.mark.parametrize("source", ["~nouserhere/x", "a" * 5000, "a\0b"])
@@ -65,6 +65,16 @@ def full_device() -> io.TextIOWrapper:
 def test_the_end_of_a_reader_is_no_error():
     command = f"{sys.executable} -m minislam weights list | true"
     assert subprocess.run(["bash", "-c", command], capture_output=True).stderr == b""
+
+
+def test_a_stream_that_the_caller_has_closed_gives_its_number_to_nothing_else():
+    code = (
+        "import os, sys; from minislam.cli import main as module\n"
+        "module._command = lambda _: [os.fstat(number) for number in range(3)] and 0\n"
+        "sys.exit(module.main(['run']))"
+    )
+    command = f'{sys.executable} -c "{code}" <&- >&- 2>&-'
+    assert subprocess.run(["bash", "-c", command]).returncode == 0
 
 
 def test_numbers_that_cannot_be_printed_are_an_error(tmp_path: Path, monkeypatch, capsys):

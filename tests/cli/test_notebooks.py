@@ -13,13 +13,13 @@ pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks in this copy
 
 
 def test_copies_are_the_notebooks(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["notebooks", str(tmp_path / "course")]) == 0
-    assert f"jupyter lab {tmp_path / 'course'}" in capsys.readouterr().out
-    copies = sorted((tmp_path / "course").glob("*.ipynb"))
+    assert main(["notebooks", str(tmp_path / "my course")]) == 0
+    assert f"jupyter lab '{tmp_path / 'my course'}'" in capsys.readouterr().out
+    copies = sorted((tmp_path / "my course").glob("*.ipynb"))
     assert [path.name for path in copies] == [path.name for path in NOTEBOOKS]
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(copies, NOTEBOOKS, strict=True))
     for name in ("notebooks/SYLLABUS.md", "LICENSE"):
-        copy = tmp_path / "course" / Path(name).name
+        copy = tmp_path / "my course" / Path(name).name
         assert copy.read_bytes() == (ROOT / name).read_bytes()
 
 

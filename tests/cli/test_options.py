@@ -147,6 +147,12 @@ def test_what_is_not_the_settings_of_a_run_names_them(name: str, file: str, tmp_
     assert parse("--config", file).config == file and settings(parse("--config", file)).seed == 7
 
 
+def test_the_file_may_be_named_from_the_home(file: str, tmp_path: Path, monkeypatch):
+    for name in ("HOME", "USERPROFILE"):  # the second is that of Windows
+        monkeypatch.setenv(name, str(tmp_path))
+    assert settings(parse(f"--config=~/{Path(file).name}")).seed == 7
+
+
 def test_masks_from_files_are_used_unless_that_is_switched_off():
     assert settings(parse("a", "--masks", "files:m")).uncertainty.given_masks
     assert input_options(parse("a", "--masks", "files:m")).masks == "files:m"

@@ -112,10 +112,10 @@ def test_priors_written_to_files_give_the_same_run(files: Path, tmp_path: Path, 
     clip = ["synth:ball", "--size", SIZE, "--preset", "test"]
     every, second = ["--max-frames", "6"], ["--stride", "2", "--max-frames", "3"]
     priors = located(files, FRONT_END[4:12])
-    made = tmp_path / "made"
+    made = tmp_path / "my priors"
     assert main(["priors", *clip, *every, *priors, "--out", str(made)]) == 0
     said = capsys.readouterr()
-    assert f"--features files:{made} --depth files:{made}" in said.out
+    assert f"--features 'files:{made}' --depth 'files:{made}'" in said.out
     assert "writing features: 6/6" in said.err and "writing depth: 6/6" in said.err
     assert len(list(made.glob("features/*.npy"))) == len(list(made.glob("depth/*.npy"))) == 6
     assert np.load(made / "features/00005.npy").shape == (6, 8, 384)

@@ -1,6 +1,7 @@
 """Animations are read back by OpenCV: as many images, their size, order and colours."""
 
 import errno
+import os
 import tempfile
 from pathlib import Path
 
@@ -60,3 +61,11 @@ def test_a_full_disk_leaves_no_film_that_is_cut_short(tmp_path: Path, monkeypatc
         with pytest.raises(InputError, match=r"expected space for an animation in .*TMPDIR"):
             write_animation(tmp_path / f"a{kind}", images(), 10.0)
     assert (tmp_path / f"a{kind}").read_text(encoding="utf-8") == "before"
+
+
+@pytest.mark.parametrize("kind", [".webm", ".webp"])
+def test_a_temporary_folder_whose_name_is_no_text_is_said(tmp_path: Path, monkeypatch, kind: str):
+    (tmp_path / os.fsdecode(b"\xe9")).mkdir()  # no UTF-8
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / os.fsdecode(b"\xe9")))
+    with pytest.raises(InputError, match=r"whose name is text, found .*udce9.*; set TMPDIR"):
+        write_animation(tmp_path / f"a{kind}", images(), 10.0)

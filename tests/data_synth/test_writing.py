@@ -1,8 +1,11 @@
 """The folder on disk: layout, values, caching, refusal, and the command line."""
 
+import io
 import json
 import os
 import shutil
+import signal
+import sys
 from pathlib import Path
 
 import cv2
@@ -155,6 +158,13 @@ def test_the_cache_follows_its_environment_variable(tmp_path, monkeypatch):
     assert calls == [(1, 1)]  # the second call rendered nothing
 
 
+def test_without_a_home_the_cache_must_be_named(monkeypatch):
+    monkeypatch.delenv("MINISLAM_CACHE", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # nobody's process has no home
+    with pytest.raises(SynthError, match=r"no home folder for ~"):
+        cached_sequence("static", 1, 1, SIZE)
+
+
 def test_the_command_lists_the_sequences(capsys):
     assert main(["--list"]) == 0
     assert "umbrella" in capsys.readouterr().out
@@ -190,6 +200,29 @@ def test_an_error_of_the_system_without_a_text_of_its_own_is_told(tmp_path, monk
     (tmp_path / "link").symlink_to(tmp_path)
     assert main(["static", "--frames", "1", "--size", "24x16", "--out", str(tmp_path / "a")]) == 1
     assert "symbolic link" in capsys.readouterr().err
+
+
+def test_streams_that_cannot_print_do_not_end_the_command(tmp_path, monkeypatch):
+    letters = io.TextIOWrapper(io.BytesIO(), "ascii")
+    full = io.TextIOWrapper(open("/dev/full", "wb", buffering=0), write_through=True)
+    for number, streams in enumerate([(letters, letters), (None, None), (full, full)]):
+        out = tmp_path / f"wörk{number}"
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stdout", streams[0])
+            patch.setattr(sys, "stderr", streams[1])
+            arguments = ["static", "--frames", "1", "--size", "24x16", "--out", str(out)]
+            assert main(arguments) == 0 and (out / "synth.json").exists()
+    assert b"rk0\n" in letters.buffer.getvalue()
+
+
+def test_a_scheduler_that_ends_the_command_leaves_nothing(tmp_path, monkeypatch, capsys):
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    monkeypatch.setattr(writing, "_write_lists", lambda *_: signal.raise_signal(signal.SIGTERM))
+    try:
+        assert main(["static", "--frames", "1", "--size", "24x16", "--out", f"{tmp_path}/a"]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert "nothing was written" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_a_missing_name_or_folder_is_a_usage_error():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from minislam.errors import InputError
 from minislam.priors.names import find_weights, published_files
 from minislam.priors.networks.table import NETWORKS
 
@@ -31,13 +32,14 @@ def test_every_network_has_a_file_that_is_called_like_it():
     assert len({row.file for row in ROWS.values()}) == len(ROWS)
 
 
-def test_the_cache_may_be_named_from_the_home_and_needs_none(monkeypatch: pytest.MonkeyPatch):
+def test_the_cache_may_be_named_from_a_home_that_there_is(monkeypatch: pytest.MonkeyPatch):
     row = ROWS["dinov2"]
     monkeypatch.setenv("MINISLAM_CACHE", "~/weights of mine")
     assert row.path == Path.home() / "weights of mine" / "weights" / row.file
     monkeypatch.delenv("MINISLAM_CACHE")
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # nobody's process has no home
-    assert row.path == Path("~/.cache/minislam/weights") / row.file
+    with pytest.raises(InputError, match=r"found no home for ~.*minislam; set MINISLAM_CACHE"):
+        _ = row.path
 
 
 def test_a_network_finds_what_was_fetched_and_what_is_named(cache: Path):

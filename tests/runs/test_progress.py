@@ -1,6 +1,7 @@
 """Progress lines, and how Ctrl-C ends a command between two steps."""
 
 import io
+import os
 import re
 import signal
 import sys
@@ -10,7 +11,13 @@ from itertools import count, pairwise
 
 import pytest
 
-from minislam.runs.progress import ENDING, ProgressLine, ending_signals, say
+from minislam.runs.progress import ENDING, ProgressLine, ending_signals, quoted, say
+
+
+def terminal(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+    """Make standard error a terminal."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((columns, 24)))
 
 
 def test_off_a_terminal_a_stage_prints_a_line_every_tenth(monkeypatch, capsys):
@@ -45,23 +52,40 @@ def test_a_warning_has_a_line_of_its_own(capsys):
 
 
 def test_on_a_terminal_an_open_line_is_ended_once_and_a_signal_takes_its_place(monkeypatch, capsys):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    terminal(monkeypatch, columns=80)
     progress = ProgressLine()
     progress.show("walking", 1, 10)
-    assert capsys.readouterr().err == "\r\033[Kwalking: 1/10"
+    assert capsys.readouterr().err == f"\r{'walking: 1/10':<79}"
     progress.interrupt(2, None)
     progress.close()  # nothing is open
-    stopping = "\r\033[Kstopping after this step; Ctrl-C again stops at once\n"
-    assert capsys.readouterr().err == stopping
+    stopping = "stopping after this step; Ctrl-C again stops at once"
+    assert capsys.readouterr().err == f"\r{stopping:<79}\n"
     later = time.perf_counter() + 1
     monkeypatch.setattr("time.perf_counter", lambda: later)
     progress.show("walking", 2, 10)
     progress.close()
-    assert capsys.readouterr().err.endswith("/s, 8 s left)\n")
+    assert capsys.readouterr().err.rstrip().endswith("/s, 8 s left)")
     progress.show("walking", 10, 10)
-    assert capsys.readouterr().err.endswith(" s)\n")
+    assert capsys.readouterr().err.rstrip(" \n").endswith(" s)")
     progress.close()
     assert capsys.readouterr().err == ""
+
+
+def test_on_a_narrow_terminal_a_line_fills_no_row_until_it_ends(monkeypatch, capsys):
+    terminal(monkeypatch, columns=20)
+    progress = ProgressLine()
+    for done in range(1, 10):
+        progress.show("adjusting the poses", done, 10)
+    assert capsys.readouterr().err == 9 * "\radjusting the poses"
+    progress.show("adjusting the poses", 10, 10)
+    assert capsys.readouterr().err == "\radjusting the poses: 10/10 (0 s)\n"
+
+
+def test_a_printed_command_can_be_pasted(monkeypatch):
+    assert quoted("C:/a b/it's") == "'C:/a b/it'\"'\"'s'" and quoted("a/b") == "a/b"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "name", "nt")
+        assert quoted("C:\\a b") == '"C:\\a b"' and quoted("C:\\ab") == "C:\\ab"
 
 
 def test_a_signal_in_the_middle_of_a_print_ends_nothing(monkeypatch):

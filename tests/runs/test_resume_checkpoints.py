@@ -77,7 +77,7 @@ def test_a_full_disk_ends_no_run(root: Path, folder: Folder):
     kept = checkpoints(folder, "0.01")
     folder.is_full = True
     kept.save(SLAM, True)
-    assert "the last checkpoint is older" in kept.problem and "; free space" in kept.problem
+    assert "no checkpoint of this state: " in kept.problem and "; free space" in kept.problem
     assert "the disk is full" in kept.problem and "choose another" not in kept.problem
     folder.is_full = False
     kept.save(SLAM, True)

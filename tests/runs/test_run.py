@@ -141,7 +141,7 @@ def test_on_a_full_disk_the_way_on_is_said(root: Path, monkeypatch, capsys):
     out = root / "full"
     assert main([*COMMAND, "--checkpoint_fraction", "1e9", "-o", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()
-    warned = [line for line in said if "the last checkpoint is older" in line]
+    warned = [line for line in said if "no checkpoint of this state" in line]
     assert len(warned) == 1 and warned[0].endswith("No space left on device; free space")
     command = f"go on with: minislam run --resume -o {out}"
     space = f"minislam: expected space in {out}, found none; free space, then {command}"
