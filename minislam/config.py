@@ -7,8 +7,6 @@ from typing import Any
 from minislam.errors import require
 from minislam.mapping.config import MappingConfig
 from minislam.parameters import flattened, leaves, parameter, with_values
-from minislam.priors.depth import SimulatedDepthConfig
-from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.networks.table import NetworksConfig
 from minislam.tracking.config import TrackingConfig
 from minislam.uncertainty.config import UncertaintyConfig
@@ -26,8 +24,6 @@ class SlamConfig:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
-    flow: ClassicalFlowConfig = field(default_factory=ClassicalFlowConfig)
-    simulated_depth: SimulatedDepthConfig = field(default_factory=SimulatedDepthConfig)
     networks: NetworksConfig = field(default_factory=NetworksConfig)
 
 

@@ -190,7 +190,7 @@ def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):
         ("seed", -1), ("seed", 10**22), ("threads", 0), ("threads", 100_000),
         ("checkpoint_fraction", -1), ("tracking.window", 0), ("tracking.window", -3),
         ("tracking.window", 10**22), ("tracking.learned.window", 0),
-        ("mapping.init_iterations", -1), ("mapping.color_weight", 1.1), ("flow.stride", 0),
+        ("mapping.init_iterations", -1), ("mapping.color_weight", 1.1),
         ("networks.metric3d.size", "28,0"),
         ("uncertainty.dropout", 1), ("uncertainty.grid_factor", 0), ("uncertainty.neighbours", 0),
         ("mapping.insertion.footprint", 0.0), ("tracking.warmup_keyframes", 1),

@@ -15,11 +15,10 @@ from minislam.errors import InputError, require
 from minislam.geometry import Camera
 from minislam.parameters import user_path
 from minislam.priors import conformance, names
-from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
+from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.files import DEPTH, FEATURES, FileDepth, FileFeatures, folder_of
 from minislam.priors.flow import ClassicalFlow
-from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior, FeatureExtractor, FlowEstimator
 from minislam.priors.names import FILES, FOLDER, PYTHON, PriorChoice, plugins, require_prior
 from minislam.priors.networks.table import NETWORKS, NetworksConfig, load_network
@@ -34,11 +33,9 @@ _CHECKS = {
 }
 
 
-def choose_flow(
-    choice: PriorChoice, classical: ClassicalFlowConfig, networks: NetworksConfig
-) -> FlowEstimator:
+def choose_flow(choice: PriorChoice, networks: NetworksConfig) -> FlowEstimator:
     """Return the flow: classical, a network, or a plugin."""
-    return _choose("flow", choice, networks, {"classical": lambda: ClassicalFlow(classical)})
+    return _choose("flow", choice, networks, {"classical": ClassicalFlow})
 
 
 def choose_features(
@@ -53,16 +50,12 @@ def choose_features(
 
 
 def choose_depth(
-    choice: PriorChoice,
-    sequence: Sequence,
-    seed: int,
-    simulated: SimulatedDepthConfig,
-    networks: NetworksConfig,
+    choice: PriorChoice, sequence: Sequence, seed: int, networks: NetworksConfig
 ) -> DepthPrior:
     """Return the depth: none, simulated, sensor, a network, a plugin, or files:FOLDER."""
     makers: Makers = {
         "none": NoDepth,
-        "simulated": lambda: _simulated_depth(sequence, seed, simulated),
+        "simulated": lambda: _simulated_depth(sequence, seed),
         "sensor": lambda: _sensor_depth(sequence),
         FOLDER: lambda: _depth_files(sequence, folder_of(choice.depth, DEPTH)),
     }
@@ -122,10 +115,10 @@ def _require_some(depths: Iterable[Any], what: str, advice: str) -> None:
     require(is_known, what, f"none; {advice}")
 
 
-def _simulated_depth(sequence: Sequence, seed: int, config: SimulatedDepthConfig) -> SimulatedDepth:
+def _simulated_depth(sequence: Sequence, seed: int) -> SimulatedDepth:
     truth = sequence.ground_truth
     depth = truth.depth if truth else lambda index: None
     wanted = f"true depth in {sequence.name} for --depth simulated"
     advice = "use --depth none or --depth files:FOLDER"
     _require_some(map(depth, range(len(sequence))), wanted, advice)
-    return SimulatedDepth(depth, seed, config)
+    return SimulatedDepth(depth, seed)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from minislam.errors import InputError, require
 from minislam.geometry import Camera
-from minislam.parameters import parameter
 from minislam.records import Frame, FramePicture
 
 _FIELD_CELLS = 4  # bumps of the smooth error along the shorter image side
@@ -20,24 +19,17 @@ _ASPECT_TOLERANCE = 0.02  # relative; rounding a resized image to whole pixels s
 
 
 @dataclass(frozen=True)
-class SimulatedDepthConfig:
-    """Errors of a simulated depth network, as large as those of good metric networks."""
-
-    scale_error: float = parameter(0.03, "standard deviation of one log factor per frame")
-    field_error: float = parameter(0.06, "standard deviation of a smooth log factor in the image")
-    gross_errors: int = parameter(2, "places per frame with an error of 30 %")
-
-
-@dataclass(frozen=True)
 class SimulatedDepth:
-    """The true depth of a synthetic scene with the errors of a monocular metric network.
+    """The true depth of a synthetic scene with errors as large as those of good metric networks.
 
     The errors of a frame depend on the seed and the frame index alone, not on the order of calls.
     """
 
     truth: FramePicture  # (H, W) world units, 0 unknown
     seed: int
-    config: SimulatedDepthConfig = SimulatedDepthConfig()
+    scale_error: float = 0.03  # standard deviation of one log factor per frame
+    field_error: float = 0.06  # standard deviation of a smooth log factor in the image
+    gross_errors: int = 2  # places per frame with an error of 30 %
 
     def __call__(self, frame: Frame, camera: Camera) -> Tensor | None:
         """Return the disturbed truth of a frame."""
@@ -46,8 +38,8 @@ class SimulatedDepth:
             return None
         source = np.random.default_rng([self.seed, frame.frame_index])
         height, width = truth.shape
-        of_scale = self.config.scale_error * source.standard_normal()
-        of_field = self.config.field_error * _smooth_noise(width, height, source)
+        of_scale = self.scale_error * source.standard_normal()
+        of_field = self.field_error * _smooth_noise(width, height, source)
         log_factor = of_scale + of_field + self._gross(width, height, source)
         return as_depth(truth * np.exp(log_factor), frame, "the simulated depth")
 
@@ -56,7 +48,7 @@ class SimulatedDepth:
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         radius = _GROSS_RADIUS * min(width, height)
         total = np.zeros((height, width))
-        for _ in range(self.config.gross_errors):
+        for _ in range(self.gross_errors):
             centre_u, centre_v = source.uniform(0, width), source.uniform(0, height)
             sign = source.choice([-1.0, 1.0])
             distance = np.hypot(u - centre_u, v - centre_v) / radius

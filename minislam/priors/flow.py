@@ -15,6 +15,8 @@ from minislam.state.threads import side_by_side
 
 Edge = tuple[int, int]  # keyframe index of source and target
 
+STRIDE = 8  # px between grid cells, as DROID-SLAM
+START_TOLERANCE = 2.0  # px: an edge is measured again if its start has moved by this (median)
 # Matched ratio; with less, the motion may be too fast for a chain, and corners give one more start.
 # With 0.4 and more, they would follow an umbrella that fills the view. [-]
 WEAK = 0.2
@@ -34,14 +36,13 @@ class ClassicalFlow(Stateful):
     An edge is measured again only if its start has moved, because flow is half the tracking time.
     """
 
+    stride = STRIDE
     learned_confidence = False
 
-    def __init__(self, config: grid_flow.ClassicalFlowConfig | None = None) -> None:
+    def __init__(self) -> None:
         # DIS splits the image in one stripe per OpenCV thread and does not propagate matches
         # across them: with more than one, the result would depend on the machine.
         cv2.setNumThreads(1)
-        self.config = config or grid_flow.ClassicalFlowConfig()
-        self.stride = self.config.stride
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[int, np.ndarray] = {}
         self._measured: dict[Edge, MeasuredEdge] = {}
@@ -86,7 +87,7 @@ class ClassicalFlow(Stateful):
         if edge not in self._measured:
             return True
         distance = np.median(np.linalg.norm(start - self._measured[edge].start, axis=0))
-        return bool(distance >= self.config.start_tolerance)
+        return bool(distance >= START_TOLERANCE)
 
     def _measure(self, starts: dict[Edge, np.ndarray]) -> dict[Edge, MeasuredEdge]:
         """Measure the one direction of a pair of keyframes, or both: each checks the other."""
@@ -115,7 +116,7 @@ class ClassicalFlow(Stateful):
     def start_chain(self, image: Tensor) -> "ClassicalChain":
         gray = dense_flow.grayscale(image)
         zero = np.zeros((*gray.shape, 2), np.float32)
-        return ClassicalChain(gray, gray, zero, zero, self.config)
+        return ClassicalChain(gray, gray, zero, zero)
 
     def restore_chain(self, state: Tree, frame_of: FrameOf) -> "ClassicalChain":
         return from_tree(ClassicalChain, state, frame_of)
@@ -133,10 +134,9 @@ class ClassicalChain(Stateful):
     newest: np.ndarray  # (H, W) uint8
     flow: np.ndarray  # (H, W, 2) px, reference to newest
     increment: np.ndarray  # (H, W, 2) px, how much of it the last frame added
-    config: grid_flow.ClassicalFlowConfig
 
     def advance(self, image: Tensor) -> tuple["ClassicalChain", FlowMatches]:
-        gray, stride = dense_flow.grayscale(image), self.config.stride
+        gray, stride = dense_flow.grayscale(image), STRIDE
         texture = grid_flow.texture_confidence(self.reference, stride)
 
         def follow(start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -153,10 +153,10 @@ class ClassicalChain(Stateful):
             step = dense_flow.plane_flow(self.newest, gray)
             measured.append(follow(self.flow + dense_flow.warp(step, self.flow)))
         flow, targets, confidence = max(measured, key=lambda m: m[2].sum())
-        chain = ClassicalChain(self.reference, gray, flow, flow - self.flow, self.config)
+        chain = ClassicalChain(self.reference, gray, flow, flow - self.flow)
         return chain, grid_flow.as_matches([targets], [confidence], [texture], image)
 
     def restart(self) -> "ClassicalChain":
         """Return a chain that starts at the newest frame and expects the same motion to go on."""
         zero = np.zeros_like(self.flow)
-        return ClassicalChain(self.newest, self.newest, zero, self.increment, self.config)
+        return ClassicalChain(self.newest, self.newest, zero, self.increment)

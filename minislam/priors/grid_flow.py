@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minislam.parameters import parameter
 from minislam.priors.dense_flow import pixel_positions, sample, warp
 from minislam.priors.interfaces import FlowMatches
 
@@ -22,16 +21,6 @@ MAX_REMAINDER = 1.0  # px: the error of DIS is smaller; a larger remainder is a 
 LEAST_VARIANCE = 1e-5  # of brightness in [0, 1]: below it there is nothing to correlate
 CONSISTENCY_SCALE = 0.6  # px, forward-backward error at which confidence falls to exp(-1/2)
 TEXTURE_SCALE = 2e-4  # 1/px^2, smaller eigenvalue of the structure tensor that halves confidence
-
-
-@dataclass(frozen=True)
-class ClassicalFlowConfig:
-    """Settings of the classical flow."""
-
-    stride: int = parameter(8, "distance between grid cells [px], as DROID-SLAM", least=1)
-    start_tolerance: float = parameter(
-        2.0, "an edge is measured again if its start has moved by this (median) [px]; 0: always"
-    )
 
 
 @dataclass(frozen=True)

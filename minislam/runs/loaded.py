@@ -24,9 +24,11 @@ from minislam.mapping.mapper import surface_depth
 from minislam.parameters import with_values
 from minislam.priors.choice import PriorChoice, choose_features
 from minislam.priors.features import HighResolutionFeatures
+from minislam.priors.flow import STRIDE
 from minislam.priors.interfaces import FeatureExtractor
 from minislam.records import Trajectory
 from minislam.runs.facts import unit_of
+from minislam.runs.progress import quoted
 from minislam.runs.resume import way_on
 from minislam.runs.summary import Line, summarise
 from minislam.runs.warnings import BROKEN
@@ -88,7 +90,7 @@ class Run:
         if not path.is_file():
             advice, config = "give the --output of a finished run", self.folder.path / CONFIG
             if config.is_file():
-                advice += f", or repeat it: minislam run --config {config}"
+                advice += f", or repeat it: minislam run --config {quoted(str(config))}"
             found = f"expected a run with a map in {folder}, found no camera.json"
             raise InputError(f"{found}; {way_on(folder) or advice}")
         scene = read_json(path)
@@ -223,7 +225,7 @@ class Run:
 
     @cached_property
     def _motion(self) -> ImageMotion:
-        motion = ImageMotion(Grid.of(self.camera, self.config.flow.stride))
+        motion = ImageMotion(Grid.of(self.camera, STRIDE))
         for frame in self.frames:
             motion.see(self.sequence.frame(frame.index))
         return motion

@@ -46,9 +46,9 @@ def choose_priors(choice: PriorChoice, sequence: Sequence, config: SlamConfig) -
     advice = "a finer grid needs the network: give the factor to minislam priors"
     require(not choice.features.startswith(FILES) or factor == 1, wanted, f"{factor}; {advice}")
     return Priors(
-        choose_flow(choice, config.flow, networks),
+        choose_flow(choice, networks),
         choose_features(choice, sequence.camera, networks, sequence),
-        choose_depth(choice, sequence, config.seed, config.simulated_depth, networks),
+        choose_depth(choice, sequence, config.seed, networks),
     )
 
 

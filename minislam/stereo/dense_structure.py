@@ -54,7 +54,7 @@ def with_swept_depth(
     stays empty. With `fills`, if less than half is known, holes take the nearest known depth.
     """
     small, judging, result = _small(camera, WIDTH), dict[int, votes.SweptView](), []
-    judges = votes.judges(len(images))
+    judges = votes.evenly(len(images))
     for index, (image, (depth, confirmation)) in enumerate(zip(images, swept, strict=True)):
         SHELF.put([depth])
         if index in judges:
@@ -252,8 +252,7 @@ class SweepPlanner:
         chosen = [k for k in near if distances[k] <= limit]
         if len(chosen) < 2:
             chosen = sorted(near, key=lambda k: abs(k - frame))[:2]
-        spread = np.linspace(0, len(chosen) - 1, min(VIEWS, len(chosen))).round().astype(int)
-        return {chosen[k]: distances[chosen[k]] for k in spread}
+        return {chosen[k]: distances[chosen[k]] for k in votes.evenly(len(chosen), VIEWS)}
 
 
 def full_size(depth: votes.ConfirmedDepth, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -75,7 +75,7 @@ def keep_what_stays(
         inverse_depth = np.where(inverse_depth > 0, inverse_depth, np.nan)
         return replace(views[index], inverse_depth=inverse_depth, cost=cost)
 
-    judging = {index: confirmed_view(index) for index in judges(len(views))}
+    judging = {index: confirmed_view(index) for index in evenly(len(views))}
     for index in wanted:
         depth = depths[index]
         others = [view for judge, view in judging.items() if judge != index]
@@ -120,9 +120,9 @@ def _is_looked_through(
     return result
 
 
-def judges(count: int) -> list[int]:
-    """Return the positions of the views, of all times, that vote on what stays in `count` views."""
-    return np.unique(np.linspace(0, count - 1, JUDGES).round().astype(int)).tolist()
+def evenly(count: int, most: int = JUDGES) -> list[int]:
+    """Return at most `most` of `count` positions, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
 
 
 def count_votes(

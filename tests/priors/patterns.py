@@ -1,19 +1,15 @@
 """A texture that is a formula, seen at any position: the flow between two views is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from minislam.geometry import Camera
-from minislam.priors.flow import ClassicalFlow
-from minislam.priors.grid_flow import ClassicalFlowConfig
+from minislam.priors.flow import STRIDE, ClassicalFlow
 
 HEIGHT, WIDTH = 96, 128
 SIZE = (HEIGHT, WIDTH)
-CONFIG = ClassicalFlowConfig()
-GRID = Camera(100, 100, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT).pixel_grid(CONFIG.stride)
+GRID = Camera(100, 100, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT).pixel_grid(STRIDE)
 INNER = (slice(20, -20), slice(20, -20))  # px that short displacements do not lose
 WAVES = 60
 SHORTEST, LONGEST = 9.0, 70.0  # px, wavelengths: shorter than DIS can follow, and longer
@@ -48,8 +44,8 @@ def shifted(du: float, dv: float, size: tuple[int, int]) -> Tensor:
     return view(np.eye(2), np.array([-du, -dv]), size)
 
 
-def flow_of(images: list[Tensor], **settings: float) -> ClassicalFlow:
-    flow = ClassicalFlow(replace(CONFIG, **settings))
+def flow_of(images: list[Tensor]) -> ClassicalFlow:
+    flow = ClassicalFlow()
     for index, image in enumerate(images):
         flow.add_frame(index, image)
     return flow

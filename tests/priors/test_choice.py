@@ -11,10 +11,9 @@ from minislam.data.sequence import open_sequence
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.priors.choice import PriorChoice, choose_depth, choose_features, choose_flow
-from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
+from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth
 from minislam.priors.features import ClassicalFeatures
 from minislam.priors.flow import ClassicalFlow
-from minislam.priors.grid_flow import ClassicalFlowConfig
 from minislam.priors.interfaces import DepthPrior
 from minislam.priors.networks.table import NetworksConfig
 from tests.recordings import tum_folder
@@ -37,7 +36,7 @@ class Recorded:
 
 
 def flow(**flags: str):
-    return choose_flow(PriorChoice(**flags), ClassicalFlowConfig(), NETWORKS)
+    return choose_flow(PriorChoice(**flags), NETWORKS)
 
 
 def features(**flags: str):
@@ -45,7 +44,7 @@ def features(**flags: str):
 
 
 def depth(**flags: str):
-    return choose_depth(PriorChoice(**flags), Recorded(), 0, SimulatedDepthConfig(), NETWORKS)
+    return choose_depth(PriorChoice(**flags), Recorded(), 0, NETWORKS)
 
 
 # Known answers
@@ -108,7 +107,7 @@ def test_files_that_know_nothing_of_any_frame_are_no_prior(tmp_path: Path):
 
     def choose() -> DepthPrior:
         choice = PriorChoice(depth=f"files:{folder}")
-        return choose_depth(choice, sequence, 0, SimulatedDepthConfig(), NETWORKS)
+        return choose_depth(choice, sequence, 0, NETWORKS)
 
     np.save(folder / "0.npy", np.full((64, 80), np.nan))
     np.save(folder / "1.npy", np.zeros((64, 80)))

@@ -14,7 +14,8 @@ from minislam.priors.dense_flow import (
     reverse_flow,
     warp,
 )
-from tests.priors.patterns import CONFIG, HEIGHT, INNER, SIZE, WIDTH, constant, shifted, view
+from minislam.priors.flow import STRIDE
+from tests.priors.patterns import HEIGHT, INNER, SIZE, WIDTH, constant, shifted, view
 
 
 def affine(matrix: list[list[float]], offset: list[float]) -> np.ndarray:
@@ -78,7 +79,7 @@ def test_warping_brings_the_target_back():
 
 def test_grid_targets_become_a_dense_flow():
     flow = affine([[0.02, -0.05], [0.04, 0.03]], [7.0, -3.0])
-    stride = CONFIG.stride
+    stride = STRIDE
     targets = (pixel_positions(SIZE) + flow)[::stride, ::stride]
     dense = dense_from_grid(targets, SIZE, stride)
     assert dense.shape == flow.shape

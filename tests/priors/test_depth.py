@@ -12,7 +12,7 @@ import torch
 from minislam.data.images import encode_png, read_depth
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth, SimulatedDepthConfig
+from minislam.priors.depth import NoDepth, SensorDepth, SimulatedDepth
 from minislam.priors.files import FileDepth
 from minislam.records import Frame
 
@@ -32,8 +32,8 @@ def flat(depth: float):
 
 
 def test_without_errors_the_simulation_returns_the_truth():
-    config = SimulatedDepthConfig(scale_error=0, field_error=0, gross_errors=0)
-    depth = SimulatedDepth(flat(3.0), seed=0, config=config)(frame(4), CAMERA)
+    simulated = SimulatedDepth(flat(3.0), 0, scale_error=0, field_error=0, gross_errors=0)
+    depth = simulated(frame(4), CAMERA)
     torch.testing.assert_close(depth, torch.full((60, 80), 3.0))
 
 
@@ -43,15 +43,15 @@ def test_the_errors_have_the_declared_size():
     medians = log_ratios.flatten(1).median(dim=1).values
     # The median of a frame is its scale error, up to the field's own median.
     assert 0.025 < medians.std() < 0.05
-    config = SimulatedDepthConfig(scale_error=0, gross_errors=0)
-    field = SimulatedDepth(flat(2.0), seed=1, config=config)(frame(0), CAMERA).div(2.0).log()
+    smooth = SimulatedDepth(flat(2.0), seed=1, scale_error=0, gross_errors=0)
+    field = smooth(frame(0), CAMERA).div(2.0).log()
     assert abs(float(field.std(correction=0)) - 0.06) < 1e-4
     assert (field[:, 1:] - field[:, :-1]).abs().max() < 0.03  # smooth: no jump between pixels
 
 
 def test_gross_errors_are_of_thirty_percent_and_local():
-    config = SimulatedDepthConfig(scale_error=0, field_error=0, gross_errors=1)
-    wrong = [SimulatedDepth(flat(1.0), 2, config)(frame(k), CAMERA) for k in range(40)]
+    simulated = SimulatedDepth(flat(1.0), 2, scale_error=0, field_error=0, gross_errors=1)
+    wrong = [simulated(frame(k), CAMERA) for k in range(40)]
     errors = torch.stack(wrong) - 1
     worst = errors.flatten(1).abs().max(dim=1).values
     assert worst.max() <= 0.3 + 1e-6

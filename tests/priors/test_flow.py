@@ -9,11 +9,10 @@ import torch
 from minislam.geometry import Camera
 from minislam.priors import dense_flow
 from minislam.priors.dense_flow import composed_flow, grayscale, pixel_positions
-from minislam.priors.flow import ClassicalChain
+from minislam.priors.flow import STRIDE, ClassicalChain
 from minislam.state import memory, threads
 from minislam.state.memory import SHELF
 from tests.priors.patterns import (
-    CONFIG,
     GRID,
     HEIGHT,
     SIZE,
@@ -179,7 +178,7 @@ def test_a_wrong_expectation_that_looks_less_different_is_not_followed():
     into_the_grey = constant(-WIDTH, 0)
     assert (second[:, :1] - first).abs().mean() < (second - first).abs().mean()
     gray = grayscale(first)
-    chain = ClassicalChain(gray, gray, constant(0, 0), into_the_grey, CONFIG)
+    chain = ClassicalChain(gray, gray, constant(0, 0), into_the_grey)
     _, matches = chain.advance(second)
     error = (on_grid(matches.targets)[0] - GRID - torch.tensor([6.0, 0.0])).norm(dim=-1)
     assert error.median() < 0.1
@@ -214,7 +213,7 @@ def test_corners_are_asked_only_where_the_chain_is_weak(monkeypatch: pytest.Monk
 def test_a_size_that_is_no_multiple_of_the_stride():
     size = (61, 83)
     flow = flow_of([shifted(0, 0, size), shifted(2, 1, size)])
-    grid = Camera(80, 80, 41, 30, 83, 61).pixel_grid(CONFIG.stride)
+    grid = Camera(80, 80, 41, 30, 83, 61).pixel_grid(STRIDE)
     matches = flow.match([0], [1], grid.flatten(0, 1).T[None])
     assert matches.targets.shape == (1, 2, 8 * 11) == matches.confidences.shape
     sure = on_grid(matches.confidences, grid.shape)[0, ..., 0] > 0.5

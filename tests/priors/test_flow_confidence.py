@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from minislam.priors.dense_flow import grayscale
+from minislam.priors.flow import STRIDE
 from minislam.priors.grid_flow import as_matches, grid_matches, texture_confidence
 from tests.priors.patterns import (
-    CONFIG,
     HEIGHT,
     SIZE,
     WIDTH,
@@ -19,7 +19,6 @@ from tests.priors.patterns import (
     view,
 )
 
-STRIDE = CONFIG.stride
 NOTHING_LEFT = np.zeros((HEIGHT // 8, WIDTH // 8, 2), np.float32)
 
 # Confidence

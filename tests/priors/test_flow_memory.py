@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from minislam.priors import dense_flow
-from tests.priors.patterns import CONFIG, SIZE, flow_of, shifted, still
+from minislam.priors import flow as classical
+from tests.priors.patterns import SIZE, flow_of, shifted, still
 
 
 def aside(tolerances: float) -> Tensor:
     """Return two starts that lie to the right by so many tolerances."""
-    return still(2) + torch.tensor([[tolerances * CONFIG.start_tolerance], [0]])
+    return still(2) + torch.tensor([[tolerances * classical.START_TOLERANCE], [0]])
 
 
 def counting(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -49,7 +50,8 @@ def test_small_steps_of_a_start_add_up(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_without_tolerance_everything_is_measured_again(monkeypatch: pytest.MonkeyPatch):
-    flow = flow_of([shifted(d, 0, SIZE) for d in (0, 3)], start_tolerance=0)
+    monkeypatch.setattr(classical, "START_TOLERANCE", 0.0)
+    flow = flow_of([shifted(d, 0, SIZE) for d in (0, 3)])
     calls = counting(monkeypatch)
     for _ in range(3):
         flow.match([0, 1], [1, 0], still(2))

@@ -5,10 +5,10 @@ import pytest
 
 from minislam.priors import grid_flow
 from minislam.priors.dense_flow import grayscale
+from minislam.priors.flow import STRIDE
 from minislam.priors.grid_flow import lucas_kanade, match_exposure, measure_on_grid, windows_of
-from tests.priors.patterns import CONFIG, HEIGHT, SIZE, WIDTH, constant, shifted, view
+from tests.priors.patterns import HEIGHT, SIZE, WIDTH, constant, shifted, view
 
-STRIDE = CONFIG.stride
 INNER_CELLS = (slice(2, -2), slice(2, -2))
 SURE = np.ones((HEIGHT // STRIDE, WIDTH // STRIDE), np.float32)
 

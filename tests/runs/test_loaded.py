@@ -18,6 +18,7 @@ from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.geometry import Camera
 from minislam.mapping import Mapper
+from minislam.priors.flow import STRIDE
 from minislam.records import Trajectory
 from minislam.runs import api, loaded
 from minislam.tracking.grid import Grid
@@ -159,7 +160,7 @@ def test_how_far_a_rolling_shutter_displaces_a_frame_is_measured_again(run: mini
     again, facts = minislam.load(run.folder.path), run.folder.read_run()
     readout = (0.0, 0.05)
     again.folder.read_run = lambda: facts | {"readout_seconds": list(readout)}
-    tracked = ImageMotion(Grid.of(run.camera, run.config.flow.stride))
+    tracked = ImageMotion(Grid.of(run.camera, STRIDE))
     for index in range(6):
         tracked.see(run.sequence.frame(index))
     moved = again.displacement(4)
@@ -180,10 +181,11 @@ def test_what_a_notebook_shows(run: minislam.Run):
 
 
 def test_a_damaged_or_missing_camera_is_said(run: minislam.Run, tmp_path: Path):
+    (tmp_path := tmp_path / "my run").mkdir()
     with pytest.raises(InputError, match=r"expected a run with a map.*of a finished run$"):
         minislam.load(tmp_path)
     write_json(tmp_path / "config.json", {})
-    with pytest.raises(InputError, match=r"or repeat it: minislam run --config .*config.json$"):
+    with pytest.raises(InputError, match=r"or repeat it: minislam run --config '.*config.json'$"):
         minislam.load(tmp_path)
     (tmp_path / "checkpoint.npz").touch()
     with pytest.raises(InputError, match=r"json; go on with: minislam run --resume -o .*$"):
