@@ -65,7 +65,7 @@ def _bench(args: argparse.Namespace) -> int:
         if code == INTERRUPTED_EXIT:
             break
         ours[name] = ate_cm
-        tables = _write_tables(given.output, ours)
+        tables = _write_tables(given.output, ours, options)
     if tables:
         say(f"\n{tables}\nin {given.output}/bench.md and {given.output}/bench.csv")
     return code if len(ours) < len(sequences) else int("F" in ours.values())
@@ -84,6 +84,8 @@ def find_sequences(folders: list[str]) -> dict[str, Path]:
         require(bool(paths), wanted, "none; check the path")
         for path in paths:
             name = path.resolve().name
+            if (path / "synth.json").exists():  # it may be called as one of theirs, and is not
+                name = f"synthetic-{name}"
             two = f"two called {name}; bench them in two commands, each with its own -o"
             is_new = plain_name(name) not in map(plain_name, found)  # in the tables, too
             require(is_new, "sequences of different names", two)
@@ -121,7 +123,7 @@ def _wait_for(arguments: list[str]) -> int:
     return INTERRUPTED_EXIT if caught else code
 
 
-def _write_tables(output: Path, ours: dict[str, str]) -> str:
+def _write_tables(output: Path, ours: dict[str, str], options: list[str]) -> str:
     """Write bench.csv and bench.md; return the latter."""
     from minislam.evaluation.published import compare
 
@@ -133,5 +135,6 @@ def _write_tables(output: Path, ours: dict[str, str]) -> str:
         lines = [f"| {' | '.join(map(str.ljust, row, widths))} |" for row in rows]
         text += "\n".join([f"{dataset}:\n", *lines, "\n"])
     write_text(output / "bench.csv", file.getvalue())
-    write_text(output / "bench.md", text + LEGEND + "\n")
-    return text + LEGEND
+    text += LEGEND + (f"\nOptions: {' '.join(options)}" if options else "")
+    write_text(output / "bench.md", text + "\n")
+    return text

@@ -26,6 +26,7 @@ def trajectory_plot(
     figure = new_figure()
     for axes, second in zip(figure.subplots(1, 2), (2, 1), strict=True):
         _draw_path(axes, estimate, truth, second, unit, broken)
+    figure.draw_without_rendering()  # equal scales change the ticks, for which there must be room
     return figure
 
 

@@ -148,7 +148,7 @@ def build_viewer(
 class Page:
     """A whole HTML page, shown inside a notebook's cell."""
 
-    html: str
+    html: str = field(repr=False)
     height: int  # px
 
     def _repr_html_(self) -> str:

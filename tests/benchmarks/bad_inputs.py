@@ -182,6 +182,8 @@ def main() -> None:
                 print(f"{found:10s} {case.group}: {case.label}: {code} {said.strip()[-300:]}")
             shutil.rmtree(folder)
             sys.stdout.flush()
+    if not score:
+        raise SystemExit(f"no case is in the groups {words}")
     for group, counts in score.items():
         print(f"{group:12s} {sum(counts.values()):4d}  {dict(counts)}")
     print(sum(score.values(), Counter()))

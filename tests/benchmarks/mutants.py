@@ -78,6 +78,8 @@ def main() -> None:
         for change in changes
         if not words or any(word in name for word in words)
     ]
+    if not chosen:
+        raise SystemExit(f"no module has {words} in its name")
     sys.dont_write_bytecode = True  # the files change faster than their times
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     score: Counter[str] = Counter()

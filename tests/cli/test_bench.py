@@ -78,6 +78,7 @@ def test_every_sequence_is_run_and_stands_in_the_tables(made: Bench, capsys):
     assert "| minislam       | Monocular | 1.23* | 1.23  | 1.23  |" in out
     assert "| WildGS-SLAM    | Monocular | 0.2   | 0.3   | 0.25  |" in out
     assert (made.out / "bench.md").read_text() in f"{out}\n"
+    assert "\nOptions: --preset test --stride 2\n" in out
     table = (made.out / "bench.csv").read_text().splitlines()
     assert table[:2] == ["Bonn", "ATE [cm],input,Crowd,mean"]
     assert "minislam,Monocular,1.23*,1.23,1.23" in table
@@ -174,6 +175,14 @@ def test_two_folders_of_one_published_sequence_are_not_one_column(made: Bench, c
     made.sequence("rgbd_dataset_freiburg3_walking_xyz")
     assert made.run() == 1
     assert "found two called rgbd_dataset_freiburg3_walking_xyz; bench" in capsys.readouterr().err
+
+
+def test_a_synthetic_sequence_is_not_set_beside_the_papers_numbers(made: Bench, capsys):
+    made.sequence("crowd")
+    (made.data / "crowd" / "synth.json").touch()
+    assert made.run() == 0
+    out = capsys.readouterr().out
+    assert "synthetic-crowd" in out and "WildGS-SLAM" not in out
 
 
 def test_an_output_that_is_a_file_is_one_sentence(made: Bench, capsys):
