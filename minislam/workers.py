@@ -31,7 +31,7 @@ from minislam.records import Frame
 from minislam.state.stateful import Tree, from_tree, hints_of, to_tree
 
 MOST_WORKERS = 4  # by default
-AT_ONCE = 8  # calls of a stream
+AT_ONCE = 16  # calls of a stream: with fewer, cores wait for the longest of them more often
 _TENSOR = "tensor"  # key of what stands for a tensor in the JSON of a message
 _START = "import sys; sys.path[:] = sys.argv[2:]; from minislam.workers import serve; serve()"
 

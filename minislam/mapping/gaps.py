@@ -8,6 +8,7 @@ the wall behind it, that is the depth of neither and would float in other views,
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -75,7 +76,8 @@ def is_refuted(
         depth_votes -= (inside & (beyond.abs() <= SAME_DEPTH)).long()
         is_near |= inside & (z < MUCH_NEARER * own_z)
         is_seen = inside & ((known == 0) | (beyond >= -SAME_DEPTH))
-        differs = (image.levelled[row, column] - colors).abs().amax(1) > SAME_COLOR
+        seen = replace(image, pixels=image.pixels[row, column]).levelled
+        differs = (seen - colors).abs().amax(1) > SAME_COLOR
         differing += (is_seen & differs).long()
         color_votes += (is_seen & differs).long() - (is_seen & ~differs).long()
     looks_otherwise = (color_votes > 0) & (differing >= LEAST_DIFFERING)

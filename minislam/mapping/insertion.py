@@ -68,7 +68,7 @@ def draw_pixels(
     height, width = known.shape
     priority = torch.rand(height, width, generator=generator).to(known.device)
     drawn = []
-    for side in sides.unique().tolist():
+    for side in sides.flatten().bincount().nonzero()[:, 0].tolist():
         here = torch.where(known & (sides == side), priority, -1)[None]
         highest, where = functional.max_pool2d_with_indices(here, (side, side), ceil_mode=True)
         drawn.append(where[highest >= 0])

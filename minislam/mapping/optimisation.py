@@ -4,7 +4,7 @@ import math
 import operator
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import torch
@@ -174,8 +174,9 @@ class JointOptimisation(Stateful):
         calls = [self._view_arguments(self.images[k], camera, trains) for k in positions]
         views: list[ViewGradients] = self._workers.map(view_gradients, calls)
         for name, values in self._optimizer.gaussians.parameters.items():
-            values.grad = torch.stack([view.by_parameter[name] for view in views]).mean(0)
-        self._gradients += torch.stack([view.screen for view in views]).sum(0)
+            gradients = [view.by_parameter[name] for view in views]
+            values.grad = reduce(torch.add, gradients) / len(views)
+        self._gradients += reduce(torch.add, [view.screen for view in views])
         factor = rate_factor * math.sqrt(len(views))  # the mean of n gradients is less noisy
         self._optimizer.rates = self.config.rates_at(self._iteration, self.median_depth, factor)
         learn = partial(self._train_mlp, positions, views) if trains else lambda: math.nan

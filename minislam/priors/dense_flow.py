@@ -4,6 +4,9 @@ Dense inverse search (DIS) finds small displacements well, large ones badly. So 
 warped by the expected displacement, DIS finds the rest, and both are composed ("warp-compose").
 """
 
+from functools import lru_cache
+from typing import Any
+
 import cv2
 import numpy as np
 from torch import Tensor
@@ -18,16 +21,17 @@ def grayscale(image: Tensor) -> np.ndarray:
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
 
 
-def pixel_positions(shape: tuple[int, int]) -> np.ndarray:  # (H, W, 2) float32
-    """Return the column and row of every pixel of an image."""
-    sides = (np.arange(side, dtype=np.float32) for side in (shape[1], shape[0]))
+@lru_cache(maxsize=8)  # to build it takes half as long as to warp by it
+def pixel_positions(shape: tuple[int, int], stride: int = 1) -> np.ndarray:  # (h, w, 2) float32
+    """Return column and row of every pixel, or of each `stride`-th; not to be changed."""
+    sides = (np.arange(0, side, stride, dtype=np.float32) for side in (shape[1], shape[0]))
     return np.stack(np.meshgrid(*sides), -1)
 
 
 def sample(image: np.ndarray, positions: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:
     """Return the image at positions (h, w, 2) [px]; outside, the nearest border pixel counts."""
-    column, row = cv2.split(positions)
-    return cv2.remap(image, column, row, method, borderMode=cv2.BORDER_REPLICATE)
+    rows: Any = None  # they stand beside the columns
+    return cv2.remap(image, positions, rows, method, borderMode=cv2.BORDER_REPLICATE)
 
 
 def warp(image: np.ndarray, flow: np.ndarray, method: int = cv2.INTER_LINEAR) -> np.ndarray:

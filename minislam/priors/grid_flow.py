@@ -83,7 +83,7 @@ def lucas_kanade(source: np.ndarray, warped: np.ndarray, stride: int) -> np.ndar
     DIS blends overlapping patches. Its errors, some hundredths of a pixel, have one direction over
     large parts of an image and so rotate the camera. Those of one window per cell are independent.
     """
-    cells = pixel_positions(source.shape)[::stride, ::stride]
+    cells = pixel_positions(source.shape, stride)
     points = cells.reshape(-1, 1, 2)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         source, warped, points, points.copy(), winSize=LK_WINDOW, maxLevel=0, criteria=LK_STOP,
@@ -103,7 +103,7 @@ def grid_matches(
 ) -> tuple[np.ndarray, np.ndarray]:  # (h, w, 2) px, (h, w) in [0, 1)
     """Sample a flow at the cells; confidence: texture times forward-backward agreement."""
     height, width = forward.shape[:2]
-    moved = pixel_positions((height, width))[::stride, ::stride] + remainder
+    moved = pixel_positions((height, width), stride) + remainder
     flow = sample(forward, moved)
     targets = moved + flow
     returned = sample(backward, targets)

@@ -1,7 +1,7 @@
 """The pictures of a run folder: keyframe images, plots, the viewer and the report."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ class Preview:
 def write_preview(folder: RunFolder, slam: Slam, facts: Json) -> None:
     """Write the report of what is known so far; a failure to write it does not end the run."""
     with suppress(Exception):
-        panels = _panels(slam, len(slam.mapper.images) - 1)
+        (panels,) = _panels(slam, [len(slam.mapper.images) - 1])
         strip = [panels["input"], viz.beta_to_rgb(panels["beta"]), panels["render"]]
         jpeg = encode_jpeg(np.concatenate(strip, axis=1), 3 * LONGEST_SIDE)
         _write_report(folder, slam, {}, facts, overview=jpeg)
@@ -86,7 +86,7 @@ def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) ->
         folder.write_image(f"{PLOTS}/{name}.png", figures[-1][1])
 
     shown = _write_keyframes(folder, slam)
-    middle = _panels(slam, len(slam.mapper.images) // 2)
+    (middle,) = _panels(slam, [len(slam.mapper.images) // 2])
     panels = middle["input"], middle["beta"], middle["render"]
     overview = figure_png(viz.overview(*panels, estimate, true_path, unit, broken))
     folder.write_image(f"{PLOTS}/overview.png", overview)
@@ -133,16 +133,17 @@ def _spread(count: int, most: int) -> list[int]:
     return sorted(set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()))
 
 
-def _panels(slam: Slam, index: int) -> dict[str, np.ndarray]:
-    """Return what is shown of an image of the map, depth and beta as numbers."""
-    image = slam.mapper.images[index]
-    rendering = slam.mapper.render(image.T_camera_world)
-    return {
-        "input": image.image.cpu().numpy(),
-        "depth": surface_depth(rendering).cpu().numpy(),
-        "beta": slam.beta_image(index),
-        "render": image.exposed(rendering.color).cpu().numpy(),
-    }
+def _panels(slam: Slam, indices: list[int]) -> Iterator[dict[str, np.ndarray]]:
+    """Yield what is shown of images of the map, depth and beta as numbers."""
+    images = [slam.mapper.images[index] for index in indices]
+    shown = zip(indices, images, slam.mapper.renderings(images), strict=True)
+    for index, image, rendering in shown:
+        yield {
+            "input": image.image.cpu().numpy(),
+            "depth": surface_depth(rendering).cpu().numpy(),
+            "beta": slam.beta_image(index),
+            "render": image.exposed(rendering.color).cpu().numpy(),
+        }
 
 
 def _write_keyframes(folder: RunFolder, slam: Slam) -> dict[str, Any]:
@@ -152,12 +153,14 @@ def _write_keyframes(folder: RunFolder, slam: Slam) -> dict[str, Any]:
     """
     views, jpegs = slam.mapper.images, dict[int, list[bytes]]()
     keyframes = [index for index, view in enumerate(views) if view.inserts]
-    sampled = [_panels(slam, keyframes[k]) for k in _spread(len(keyframes), COLOUR_SAMPLES)]
+    sample = [keyframes[k] for k in _spread(len(keyframes), COLOUR_SAMPLES)]
+    sampled = list(_panels(slam, sample))
     of_depth = viz.depth_limits(np.array([panels["depth"] for panels in sampled]))
     of_beta = viz.beta_limits(np.array([panels["beta"] for panels in sampled]))
     shown = set(_spread(len(keyframes), MAX_SHOWN))
-    for number, index in enumerate(keyframes):
-        panels, frame_index = _panels(slam, index), views[index].frame_index
+    each = zip(keyframes, _panels(slam, keyframes), strict=True)
+    for number, (index, panels) in enumerate(each):
+        frame_index = views[index].frame_index
         panels["depth"] = viz.depth_to_rgb(panels["depth"], of_depth)
         panels["beta"] = viz.beta_to_rgb(panels["beta"], of_beta)
         for kind, panel in panels.items():

@@ -21,21 +21,22 @@ def aggregate(
     gray: np.ndarray,  # (h, w) float32 in [0, 1]
 ) -> np.ndarray:  # (D, h, w) float32
     """Return the sum of L over eight directions."""
-    total, transposed = np.zeros_like(cost), np.ascontiguousarray(cost.transpose(0, 2, 1))
-    across = np.zeros_like(transposed)
+    # Row by row, and column by column: what a step along a path reads lies in one place.
+    rows, columns = (np.ascontiguousarray(cost.transpose(axes)) for axes in ((1, 0, 2), (2, 0, 1)))
+    total, across = np.zeros_like(rows), np.zeros_like(columns)
     for flip in (slice(None), slice(None, None, -1)):
         for shift in (-1, 0, 1):
-            _add_paths_down(total[:, flip], cost[:, flip], gray[flip], shift)
-        _add_paths_down(across[:, flip], transposed[:, flip], gray.T[flip], 0)
-    return total + across.transpose(0, 2, 1)
+            _add_paths_down(total[flip], rows[flip], gray[flip], shift)
+        _add_paths_down(across[flip], columns[flip], gray.T[flip], 0)
+    return np.ascontiguousarray(total.transpose(1, 0, 2) + across.transpose(1, 2, 0))
 
 
 def _add_paths_down(total: np.ndarray, cost: np.ndarray, gray: np.ndarray, shift: int) -> None:
     """Add L along paths from the row above, `shift` columns to the left; at a border they start."""
     width = gray.shape[1]
     to, come_from = (slice(max(s, 0), width + min(s, 0)) for s in (shift, -shift))
-    paths = cost[:, 0].copy()
-    total[:, 0] += paths
+    paths = cost[0].copy()
+    total[0] += paths
     for row in range(1, len(gray)):
         before, shade = paths[:, come_from], gray[row - 1, come_from]
         edge = 1 + np.abs(gray[row, to] - shade) / EDGE_SCALE
@@ -44,9 +45,9 @@ def _add_paths_down(total: np.ndarray, cost: np.ndarray, gray: np.ndarray, shift
         best = np.minimum(before, lowest + jump)
         np.minimum(best[1:], stepped[:-1], out=best[1:])
         np.minimum(best[:-1], stepped[1:], out=best[:-1])
-        paths = cost[:, row].copy()
+        paths = cost[row].copy()
         paths[:, to] += best - lowest
-        total[:, row] += paths
+        total[row] += paths
 
 
 def refined_minimum(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
