@@ -76,7 +76,7 @@ def sequence(root: Path) -> Iterator[Sequence]:
 
 
 def finished(sequence: Sequence, config: SlamConfig) -> Slam:
-    depth = SimulatedDepth(sequence.ground_truth.depth, config.seed, config.simulated_depth)
+    depth = SimulatedDepth(sequence.ground_truth.depth, config.seed)
     slam = Slam(sequence, config, Priors(ClassicalFlow(), ClassicalFeatures(), depth))
     slam.run()
     return slam
