@@ -53,7 +53,7 @@ class Slam(Stateful):
     focal_length: FocalLengthFit | None = None  # what the checks at the end have found
     lens: LensFit | None = None
     undone_lens: LensFit | None = None  # by which images are straightened since the run began anew
-    poses: dict[int, Tensor]  # T_camera_world of every frame, once known
+    poses: dict[int, Tensor]  # T_camera_world of the frames that are not lost, once known
 
     def __init__(
         self,
@@ -191,6 +191,7 @@ class Slam(Stateful):
         self.mapper.refine(iterations, partial(self.steps.finish, stage), self.steps.done(stage))
 
     def _pose_all_frames(self) -> None:
+        """Check the focal length by the adjusted keyframes, then pose the frames between them."""
         if not self.tracker.watch.only_turned:
             self.focal_length = check_focal_length(self.tracker.graph, self.workers)
         progress = self.steps.on_progress("posing all frames")

@@ -1,4 +1,4 @@
-"""Answers to the exercises of the notebooks: each check takes the student's function.
+"""Checks of the exercises of the notebooks: each takes the student's function.
 
 A check calls the function with a few inputs, compares the answers with the package, and returns a
 sentence that names the first wrong number. It never raises, so that a notebook with open exercises

@@ -35,7 +35,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "repeated, an interrupted one is resumed. OUT (output/bench) gets a run folder for each "
         "sequence, bench.csv and bench.md.",
     )
-    parser.add_argument("folders", nargs="+", metavar="FOLDER", help="a sequence, or its parents")
+    parser.add_argument(
+        "folders", nargs="+", metavar="FOLDER", help="sequences, or what holds them"
+    )
     parser.add_argument("options", nargs=argparse.REMAINDER, help="-o OUT, options of minislam run")
     parser.set_defaults(run=_bench, hint="folders come first, then the options")
 

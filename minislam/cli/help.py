@@ -77,7 +77,8 @@ class Help(argparse.Action):
         elif parser.epilog is RUN_EPILOG:
             from data_synth import SEQUENCES  # only here: it needs numpy
 
-            text = f"synthetic clips, synth:NAME[:SEED][?phone]: {', '.join(SEQUENCES)}"
+            clips = ", ".join(SEQUENCES)
+            text = f"synthetic clips, synth:NAME[:SEED][?phone, as one films it]: {clips}"
             parser.epilog = f"{textwrap.fill(text, 96, subsequent_indent='  ')}\n\n{RUN_EPILOG}"
         parser.print_help()
         parser.exit()

@@ -147,7 +147,7 @@ def _found(folder: Path) -> str:
 
 
 def mask_files(images: ImageSource, masks: str, chosen: list[int]) -> dict[int, Path]:
-    """Return the mask of each chosen image in files:FOLDER: of its name, or of its number."""
+    """Return masks of files:FOLDER by number of the image; refuse it if a chosen image has none."""
     folder = mask_folder(masks)
     files = {_stem(path): path for path in list_images(folder)}
     named = {k: files[_stem(path)] for k, path in enumerate(images.paths) if _stem(path) in files}

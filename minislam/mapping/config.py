@@ -66,10 +66,10 @@ class MappingConfig:
     keyframe_stride: int = parameter(1, "optimise at every n-th keyframe only; fast mode 5", 1)
     refine_iterations: int = parameter(400, "iterations at the end; official 20000, fast 3000")
     refine_images: int = parameter(
-        100, "images of the map for which these are enough; more get more in proportion, 0: never"
+        100, "images for which refine_iterations are enough; more get more in proportion, 0: never"
     )
     refine_full_fraction: float = parameter(
-        0.4, "fraction of them, the last ones, at full image size [0, 1]; official 1", most=1
+        0.4, "last fraction of the refinement at full image size [0, 1]; official 1", most=1
     )
     freeze_iterations: int = parameter(
         5, "iterations without MLP training after a change of density; official 20, at the end 200"
@@ -93,7 +93,7 @@ class MappingConfig:
     means_rate_end: float = parameter(
         0.1, "last step of the means over the first, log-linear in `rate_iterations`; official 0.01"
     )
-    rate_iterations: int = parameter(1500, "iterations of that decay; official 30000", 1)
+    rate_iterations: int = parameter(1500, "iterations of means_rate's decay; official 30000", 1)
     quats_rate: float = parameter(2e-2, "Adam step of the quaternions; official 1e-3")
     log_scales_rate: float = parameter(2e-2, "Adam step of the log-scales; official 6e-3")
     opacity_rate: float = parameter(5e-2, "Adam step of the opacity logits, official")

@@ -85,7 +85,7 @@ def is_refuted(
 
 
 def plate(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the plate (h, w) through the known values that bends least (Terzopoulos 1983)."""
+    """Return the plate (h, w) that bends least, sprung to the known values (Terzopoulos 1983)."""
     # It has the least sum of f_xx^2 + f_yy^2 + 2 f_xy^2, by differences of cells.
     height, width = values.shape
     across, down = (partial(differences, n) for n in (width, height))

@@ -118,7 +118,7 @@ class JointOptimisation(Stateful):
     def beta_of(self, image: MapImage) -> Tensor:
         """Return the raw beta (h', w') of an image: from its mask, or from the MLP and the votes.
 
-        Where views of other times look through the image, the map would learn to show what moves.
+        Where views of other times look through the image, it is that of a mask: something moves.
         """
         release()  # all that goes from image to image passes here
         if image.moving_mask is not None:
@@ -129,7 +129,7 @@ class JointOptimisation(Stateful):
         return torch.where(image.confirmation < 0, BETA_OF_MASK, beta)
 
     def learned_beta(self, image: MapImage) -> Tensor:
-        """Return the raw beta (h', w') by the MLP, less where other views confirm."""
+        """Return the MLP's raw beta (h', w'), less where views confirm; of weight 1 at first."""
         beta = confirmed_beta(self.predict_beta(image.features), image.confirmation)
         is_trained = self._iteration >= self._weighted_from
         return beta if is_trained else torch.full_like(beta, UNIT_BETA)

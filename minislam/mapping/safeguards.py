@@ -36,7 +36,7 @@ OPAQUE = 0.5  # opacity: a less opaque pixel shows a gap rather than a surface [
 
 
 def confirmed_beta(beta: Tensor, confirmation: Tensor | None) -> Tensor:
-    """Return the raw beta (h', w') of the MLP, less where other views confirm (h', w')."""
+    """Return the raw beta (h', w'), less where other views confirm; one above the cut is kept."""
     if confirmation is None:
         return beta
     lowered = beta * (1 - CONFIRMED_BETA * confirmation.clamp_min(0))
@@ -92,7 +92,7 @@ def optimal_beta(error: RenderingError, config: UncertaintyConfig) -> Tensor:  #
 def is_wrong(
     error: RenderingError, beta_raw: Tensor, least: float, config: UncertaintyConfig
 ) -> bool:
-    """Tell whether the map is wrong in most cells (..., h', w') that a least weight would exclude.
+    """Tell whether the map is wrong in most cells (..., h', w') below a least weight, or none is.
 
     The MLP sees features, not places: a dark wall, rendered well, gets the beta of a dark dog in
     front of it.

@@ -22,12 +22,12 @@ def update_window(
     T_camera_world: Tensor,  # (K, 4, 4) of all keyframes
     size: int,  # most keyframes in a window
 ) -> list[int]:
-    """Prepend the new keyframe; drop at most one keyframe that no longer overlaps it."""
+    """Prepend the new keyframe; drop the oldest that hardly overlaps it, and what is too many."""
     window = [new, *window]
     overlaps = {k: overlap_coefficient(seen[new], seen[k]) for k in window[PROTECTED:]}
-    non_overlapping = [k for k, overlap in overlaps.items() if overlap <= LEAST_OVERLAP]
-    if non_overlapping:
-        window.remove(non_overlapping[-1])  # the oldest
+    leaving = [k for k, overlap in overlaps.items() if overlap <= LEAST_OVERLAP]
+    if leaving:
+        window.remove(leaving[-1])  # the oldest
     while len(window) > size:  # the keyframe far from the new one and close to others (DSO's rule)
         window.remove(_most_redundant(window, T_camera_world))
     return window

@@ -166,7 +166,7 @@ def _run(
     facts_of: Callable[[str, int | None], Json],  # run.json by state and exit code
     lpips: Lpips | None,
 ) -> tuple[Json, Json]:
-    """Run SLAM, or what is left of it, and write the folder, however the run ends."""
+    """Run SLAM, or what is left, and write the folder however it ends; return metrics, run.json."""
     interrupted = False
     try:
         try:

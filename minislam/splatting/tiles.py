@@ -31,7 +31,7 @@ class TileGroup(NamedTuple):
     """Tiles with lists of similar length, the shortest first; a slot holds one Gaussian."""
 
     tiles: Tensor  # (B,) int64, tile index, row by row
-    # (S,) int64, chunk by chunk, slot by slot, tile by tile; N, one past the last, pads a list.
+    # (S,) int64 place among the V visible Gaussians (V pads a list), by chunk, then slot, then tile
     gaussians: Tensor
     chunks: list[Chunk]
 
@@ -63,13 +63,13 @@ def from_tiles(tiled: Tensor, camera: Camera) -> Tensor:  # (tiles, C, P) -> (C,
 
 
 def build_tile_lists(
-    means2d: Tensor,  # (2, N) px, front to back
-    conics: Tensor,  # (3, N) px^-2
-    covariances2d: Tensor,  # (3, N) px^2
-    opacities: Tensor,  # (N,) above MIN_ALPHA
+    means2d: Tensor,  # (2, V) px, front to back
+    conics: Tensor,  # (3, V) px^-2
+    covariances2d: Tensor,  # (3, V) px^2
+    opacities: Tensor,  # (V,) above MIN_ALPHA
     camera: Camera,
 ) -> list[TileGroup]:
-    """List the Gaussians of every tile, keeping their order from front to back."""
+    """List the visible Gaussians of every tile, keeping their order from front to back."""
     gaussian, tile = _entries(means2d, conics, covariances2d, opacities, camera)
     rows, columns = tile_grid(camera)
     gaussian = gaussian.index_select(0, stable_argsort(tile))
@@ -133,12 +133,12 @@ def _entries(
 
 
 def _column_spans(
-    means2d: Tensor,  # (2, N)
-    conics: Tensor,  # (3, N)
-    covariances2d: Tensor,  # (3, N)
-    level: Tensor,  # (N,)
-    top: Tensor,  # (N,) first and
-    bottom: Tensor,  # (N,) last pixel row of the ellipse
+    means2d: Tensor,  # (2, V)
+    conics: Tensor,  # (3, V)
+    covariances2d: Tensor,  # (3, V)
+    level: Tensor,  # (V,)
+    top: Tensor,  # (V,) first and
+    bottom: Tensor,  # (V,) last pixel row of the ellipse
     gaussian: Tensor,  # (R,) int64, for each (Gaussian, row of tiles)
     row: Tensor,  # (R,) int64
 ) -> tuple[Tensor, Tensor]:  # (R,), (R,) px
@@ -166,11 +166,10 @@ def _column_spans(
 
 
 def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (index, value) of first[i], first[i] + 1, ... with count[i] values for each i."""
+    """Return, for each i in turn, count[i] pairs (i, value): value = first[i], first[i] + 1, ..."""
     index = torch.repeat_interleave(count)
-    starts = count.cumsum(0) - count
-    within = torch.arange(len(index), device=index.device) - (starts - first).index_select(0, index)
-    return index, within
+    offset = first - (count.cumsum(0) - count)  # of the values from their places in the list
+    return index, torch.arange(len(index), device=index.device) + offset.index_select(0, index)
 
 
 def stable_argsort(keys: Tensor) -> Tensor:  # (N,) integers in [0, 2^31) -> (N,) int64

@@ -54,7 +54,7 @@ def with_swept_depth(
     stays empty. With `fills`, if less than half is known, holes take the nearest known depth.
     """
     small, judging, result = _small(camera, WIDTH), dict[int, votes.SweptView](), []
-    judges = votes.evenly(len(images))
+    judges = votes.evenly(len(images), votes.JUDGES)
     for index, (image, (depth, confirmation)) in enumerate(zip(images, swept, strict=True)):
         SHELF.put([depth])
         if index in judges:

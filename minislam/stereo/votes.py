@@ -75,7 +75,7 @@ def keep_what_stays(
         inverse_depth = np.where(inverse_depth > 0, inverse_depth, np.nan)
         return replace(views[index], inverse_depth=inverse_depth, cost=cost)
 
-    judging = {index: confirmed_view(index) for index in evenly(len(views))}
+    judging = {index: confirmed_view(index) for index in evenly(len(views), JUDGES)}
     for index in wanted:
         depth = depths[index]
         others = [view for judge, view in judging.items() if judge != index]
@@ -120,7 +120,7 @@ def _is_looked_through(
     return result
 
 
-def evenly(count: int, most: int = JUDGES) -> list[int]:
+def evenly(count: int, most: int) -> list[int]:
     """Return at most `most` of `count` positions, the first and the last among them."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
 

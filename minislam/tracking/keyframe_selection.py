@@ -45,7 +45,7 @@ def needs_keyframe(
         threshold -= step / 2
     if flow > threshold or float(matches.matched_ratios) < KEYFRAME_MATCHED_RATIO:
         return True
-    # Without a depth prior the first keyframes need parallax, so a camera at rest makes none.
+    # Without a depth prior the first keyframes need motion, so a camera at rest makes none.
     may_rest = is_initialised or graph.keyframes.has_prior
     due = graph.keyframes.frames[-1].frame_index + graph.config.keyframe_interval
     return frame.frame_index >= due and (may_rest or flow > graph.least_parallax)

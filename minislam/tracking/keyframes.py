@@ -18,7 +18,7 @@ class KeyframeStore(Stateful):
     disparities: Tensor  # (K, N) 1/world unit
     prior_disparities: Tensor  # (K, N) 1/D~, 0 where unknown
     prior_masks: Tensor  # (K, N) M; False: prior off
-    static_weights: Tensor  # (K, N) in [0, 1], from beta
+    static_weights: Tensor  # (K, N) in [0, 1], from beta; in the end times confirmation
     motion_weights: Tensor  # (K, N) in [0, 1], how well a cell's flow has fitted the camera motion
     overlay: Tensor | None = None  # (N,) 0 on what covers every image, such as a logo
 

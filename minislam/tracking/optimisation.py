@@ -28,7 +28,7 @@ ENOUGH_EDGES = 8  # that tell it
 def local_ba(graph: KeyframeGraph) -> None:
     """Link the newest keyframe, then adjust the newest `window` keyframes together.
 
-    Its pose may be wrong, so a classical flow is first started from composed flow instead, and
+    A new pose may be wrong, so a classical flow is first started from composed flow instead, and
     adjusted. Then further edges are added, and flow and BA alternate.
     """
     config, newest = graph.config, len(graph.keyframes) - 1

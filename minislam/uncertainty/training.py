@@ -58,10 +58,10 @@ def rendering_error(
 
 
 def uncertainty_loss(
-    beta_raw: Tensor,  # (h', w') of the view or (n, h', w'), with gradient to the MLP
+    beta_raw: Tensor,  # (h', w') of a view, or (n, h', w') of n, with gradient to the MLP
     error: RenderingError,
-    sample_beta_raw: Tensor,  # (n,) of cells drawn from the view and its neighbours
-    sample_features: Tensor,  # (n, C) of the same cells
+    sample_beta_raw: Tensor,  # (m,) of cells drawn from the views and their neighbours
+    sample_features: Tensor,  # (m, C) of the same cells
     config: UncertaintyConfig,
 ) -> Tensor:  # ()
     """Return L_uncer: the mean cell loss plus lambda_2 L_reg_V. Eq. (4)."""

@@ -6,8 +6,8 @@ follow here, first stretches beta, then caps the weight in tracking and cuts it 
     beta_adj = (max(beta_raw, 0.1) + 0.001 - 0.1) * 1.6316 + 0.1,     w = 0.5 / beta_adj^2,
     tracking: w capped at 1,        mapping: w below 0.1 set to 0, and (ours) capped at 5.
 
-So a cell has weight 1 in tracking below beta_raw = 0.47, and weight 0 in mapping above 1.41. Where
-the betas of a clip have two modes, mapping cuts at a smaller beta (ours, `mapping/safeguards.py`).
+So w is 1 in tracking below beta_raw = 0.47, then taken relative to the most static tenth of a frame
+(ours). In mapping w is 0 above 1.41, or above less if betas have two modes (mapping/safeguards.py).
 """
 
 import torch

@@ -29,7 +29,9 @@ def test_the_long_help_of_run_has_every_option_and_the_files(monkeypatch, capsys
     assert "--stride" in short and "--depth-scale" not in short and "exit codes: 0" not in short
     assert all(name in long for name in ("--depth-scale", "--lpips-heads", "--threads"))
     assert long.endswith(RUN_EPILOG) and "minislam settings" in short + long
-    clips = " ".join(long.partition("synthetic clips, synth:NAME[:SEED][?phone]: ")[2].split())
+    clips = " ".join(
+        long.partition("synthetic clips, synth:NAME[:SEED][?phone, as one films it]: ")[2].split()
+    )
     assert clips.startswith(", ".join(SEQUENCES)) and "synthetic clips" not in short
 
 

@@ -7,6 +7,7 @@ Where everything is matched, five measurements tell broken keyframes from health
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -128,12 +129,10 @@ class Watch(Stateful):
     @property
     def segments(self) -> list[tuple[int, int]]:
         """Return the first and last frame of each segment: the keyframes between two breaks."""
-        segments: dict[int, tuple[int, int]] = {}
-        for frame in (keyframe.frame_index for keyframe in self.diagnostics):
-            if not any(b.first_frame <= frame <= b.last_frame for b in self.breaks):
-                after = sum(b.last_frame < frame for b in self.breaks)
-                segments[after] = segments.get(after, (frame, frame))[0], frame
-        return list(segments.values())
+        breaks, frames = self.breaks, [keyframe.frame_index for keyframe in self.diagnostics]
+        healthy = [i for i in frames if not any(b.first_frame <= i <= b.last_frame for b in breaks)]
+        runs = groupby(healthy, lambda frame: sum(b.last_frame < frame for b in breaks))
+        return [(run[0], run[-1]) for run in (list(members) for _, members in runs)]
 
     def longest_piece(self, poses: dict[int, Tensor]) -> dict[int, Tensor]:
         """Return, of the poses by frame index, those of the longest of the `pieces`.

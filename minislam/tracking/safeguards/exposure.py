@@ -41,7 +41,7 @@ def keyframe_exposures(
     """Return each keyframe's exposure (3,) by frame index, with median 1; {} if all are alike."""
     edges, keyframes, frames = graph.edges, graph.keyframes, graph.keyframes.frames
     standing = static_weights * keyframes.standing_weights
-    ends = torch.stack([standing, keyframes.cell_weights], -1)
+    cells = torch.stack([standing, keyframes.cell_weights], -1)
     # A row is a pair of keyframes, its weight, and how much brighter the second is (log, 3).
     neighbours = [(pair, STEADY, [0.0] * 3) for pair in pairwise(range(len(frames)))]
     linked = []
@@ -58,10 +58,10 @@ def keyframe_exposures(
         there = torch.from_numpy(cv2.remap(blurred(target), u, v, cv2.INTER_LINEAR).reshape(-1, 3))
         both = torch.cat([here, there], 1)
         visible = ((both > DARKEST) & (both < BRIGHTEST)).all(1)
-        stands, static = (ends[source] * graph.grid.sample(ends[target], targets.T)).unbind(-1)
+        stands, weighs = (cells[source] * graph.grid.sample(cells[target], targets.T)).unbind(-1)
         ratio = (there.clamp_min(DARKEST) / here.clamp_min(DARKEST)).log()
         step = [weighted_median(channel, visible * stands.cpu()) for channel in ratio.T]
-        weight = visible * (edges.confidences[edge][0] * static).cpu()
+        weight = visible * (edges.confidences[edge][0] * weighs).cpu()
         linked.append(((source, target), float(weight.mean()), step))
     least = LEAST_WEIGHT * max((weight for _, weight, _ in linked), default=0.0)
     rows = [*neighbours, *(row for row in linked if row[1] > least)]

@@ -118,7 +118,7 @@ def fit_focal_length(
     workers: Workers | None = None,  # adjust side by side
     start: BundleState | None = None,  # of the search; None: from the state
 ) -> tuple[FocalLengthFit, BundleState]:
-    """Return the focal length at which the adjusted cost is lowest, and the state there."""
+    """Return the fit of lowest adjusted cost and its state; if unobservable, `state` itself."""
     workers, free = workers or Workers(), replace(problem, free_focal=True)
     starts = [(*pair, WIDENINGS, ITERATIONS) for pair in ((problem, state), (free, start or state))]
     (_, present), (found, best) = workers.map(adjust_narrowing, starts)

@@ -85,8 +85,8 @@ def update_motion_weight(
     squared = (positions[0] - matches.targets[0]).square().sum(0)
     # Parallax has the relative error of the depth, so it widens the tolerance.
     turned, _ = reproject(motion, torch.zeros_like(disparities)[None], grid.rays, grid.camera)
-    parallax = (positions[0] - turned[0]).square().sum(0)
-    agreement = (1 + squared / (scale**2 + DEPTH_ERROR**2 * parallax)) ** -2
+    parallax2 = (positions[0] - turned[0]).square().sum(0)
+    agreement = (1 + squared / (scale**2 + DEPTH_ERROR**2 * parallax2)) ** -2
     rate = torch.where(agreement < weight, LOSS_RATE, RECOVERY_RATE)
     return torch.where(valid[0] & _is_matched(matches), weight.lerp(agreement, rate), weight)
 

@@ -63,7 +63,7 @@ def in_parts(problem: BundleProblem) -> Iterator[tuple[Tensor, BundleProblem]]:
 
 
 def joined(parts: Iterable[tuple[Tensor, ...]]) -> list[Tensor]:
-    """Return each column of the rows (positions of edges, values, values, ...) for all edges."""
+    """Return the values of all edges, column by column, from parts (positions, values, ...)."""
     edges, *columns = zip(*parts, strict=True)
     order = torch.cat(edges).argsort()
     return [torch.cat(column)[order] for column in columns]

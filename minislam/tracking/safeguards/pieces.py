@@ -39,23 +39,19 @@ def pieces(
 ) -> list[list[Span]]:
     """Return the groups of stretches that edges tie. An edge that only spans a break ties none."""
     stretches: list[Span] = []
-    segment_of: list[int] = []  # by stretch
-    stretch_of: dict[int, int] = {}  # by keyframe
-    for number, (first, last) in enumerate(segments):
+    place: dict[int, tuple[int, int]] = {}  # stretch and segment, by keyframe
+    for segment, (first, last) in enumerate(segments):
         inside = [k for k, frame in enumerate(frames) if first <= frame <= last]
-        for k in inside:
-            if k == inside[0] or k in lost:
-                if k != inside[0]:
-                    stretches[-1] = stretches[-1][0], frames[k] - 1
-                stretches.append((frames[k], last))
-                segment_of.append(number)
-            stretch_of[k] = len(stretches) - 1
+        starts = [k for k in inside if k == inside[0] or k in lost]
+        ends = [*(frames[k] - 1 for k in starts[1:]), last]
+        for start, end in zip(starts, ends, strict=False):
+            stretches.append((frames[start], end))
+            place |= {k: (len(stretches) - 1, segment) for k in inside if k >= start}
     group = list(range(len(stretches)))
-    for ends in edges:
-        a, b = (stretch_of.get(end) for end in ends)
-        if a is None or b is None:
-            continue
-        if abs(a - b) > 1 or segment_of[a] == segment_of[b]:
-            group = [group[a] if one == group[b] else one for one in group]
+    for i, j in edges:
+        if i in place and j in place:
+            (a, segment_a), (b, segment_b) = place[i], place[j]
+            if abs(a - b) > 1 or segment_a == segment_b:
+                group = [group[a] if one == group[b] else one for one in group]
     tied = {one: [s for s, g in zip(stretches, group, strict=True) if g == one] for one in group}
     return list(tied.values())

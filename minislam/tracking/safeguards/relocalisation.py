@@ -25,7 +25,7 @@ MAX_RATIO = 0.8  # of the distance to the best over the second-best descriptor (
 PNP_ERROR = 3.0  # px at 320x240, inlier distance
 PNP_ITERATIONS = 300
 MIN_INLIERS = 20
-MIN_STATIC_WEIGHT = 0.5  # a point on a dynamic object gives a wrong pose
+MIN_CELL_WEIGHT = 0.5  # a point on a dynamic object gives a wrong pose
 
 Keypoints = tuple[np.ndarray, np.ndarray | None]  # (P, 2) px, (P, 128) uint8; None: no descriptors
 
@@ -71,7 +71,7 @@ class Relocaliser:
         # From here on on the CPU, where OpenCV finds the pose.
         sampled = grid.sample(structure[None].cpu(), positions[None])
         disparities, cell_weights = sampled[0].unbind(-1)
-        usable = (disparities > 0) & (cell_weights > MIN_STATIC_WEIGHT)
+        usable = (disparities > 0) & (cell_weights > MIN_CELL_WEIGHT)
         if int(usable.sum()) < MIN_INLIERS:
             return None
         points = grid.camera.rays(positions) / disparities[:, None]

@@ -19,9 +19,9 @@ MOST_DRIFT = 0.1  # of the way walked, and of the angle turned: more is another 
 
 
 def undo_drift(graph: KeyframeGraph, relocaliser: Relocaliser) -> bool:
-    """Move the keyframes since the newest one's place was first seen; return False if it never was.
+    """If the newest keyframe shows an earlier place, move those since then; tell whether it did.
 
-    The caller checks what the flow says of the new poses.
+    Only every second keyframe is asked. The caller checks what the flow says of the new poses.
     """
     keyframes, newest = graph.keyframes, len(graph.keyframes) - 1
     older = newest - graph.config.loop_min_gap

@@ -79,7 +79,7 @@ class Settling(Stateful):
 
 
 def measured_information(graph: KeyframeGraph, keyframe: int) -> Tensor:  # (N,) px^2
-    """Return the information that the flow of its edges gives to a keyframe's disparities."""
+    """Return the information I above on the disparities of a keyframe, from its edges' flow."""
     disparities = graph.keyframes.disparities[keyframe]
     positions = [p for p, edge in enumerate(graph.edges.ends) if edge[0] == keyframe]
     if not positions:
