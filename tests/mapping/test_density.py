@@ -99,3 +99,8 @@ def test_an_empty_map_stays_empty():
     densify(optimizer, torch.zeros(2, 0), 1.0, CONFIG, generator(0))
     assert len(optimizer.gaussians) == 0
     assert useful_rows(optimizer.gaussians, HERE, 1.0).tolist() == []
+
+
+def test_children_are_those_of_the_generator_given():
+    first, second = (split(map_of([1.0] * 3), generator(1)).means for _ in range(2))
+    assert torch.equal(first, second)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from minislam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform_points
-from minislam.mapping import Mapper, MappingConfig
+from minislam.mapping import Mapper, MappingConfig, pose_refinement
 from minislam.mapping.config import PoseRefinementConfig
 from minislam.mapping.pose_refinement import (
     curvature,
@@ -199,3 +199,13 @@ def test_where_the_picture_says_nothing_the_pose_stays(case: str):
     pose = refine_pose(wall, CAMERA, start, TRUE_IMAGE, weight, BLACK, CONFIG)
     assert torch.isfinite(pose).all()
     assert distance(pose, start) < 1e-9 or case == "uniform picture"
+
+
+def test_a_step_moves_the_image_by_its_slide_over_the_mean_depth_and_by_its_turn():
+    half = torch.full((5, 6), 0.5)
+    rendering = Rendering(
+        color=torch.zeros(5, 6, 3), depth=4 * half, opacity=half, weight_sums=half
+    )
+    for step, moved in (([0, 0.2, 0, 0, 0, 0], 0.05), ([0, 0, 0, 0, 0.01, 0], 0.01)):
+        found = pose_refinement._motion(torch.tensor(step), rendering, CAMERA)
+        assert found == pytest.approx(moved * CAMERA.fx)

@@ -200,3 +200,10 @@ def test_sensor_depth_passes_the_reader_on_and_cleans_it():
 
 def test_no_depth_is_none():
     assert NoDepth()(frame(0), CAMERA) is None
+
+
+def test_depths_in_another_unit_are_refused_although_some_pixels_are_unknown():
+    depth = np.full((60, 80), 1e6)
+    depth[0, :5] = 0
+    with pytest.raises(InputError, match="write metres"):
+        SensorDepth(lambda index: depth)(frame(0), CAMERA)

@@ -2,14 +2,16 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from minislam.config import with_settings
 from minislam.mapping.mapper import surface_depth
-from minislam.records import MapImage, Pictured
+from minislam.records import MapImage, Pictured, Trajectory
 from minislam.runs import measures
 from minislam.splatting import Rendering
+from tests.helpers import random_transforms
 from tests.runs.finished import CAMERA, finished
 
 
@@ -109,3 +111,16 @@ def test_the_map_is_compared_with_some_frames_that_it_was_not_fitted_to():
     assert measures.unseen_psnr(run) is not None and asked == [3, 4, 5]
     tracker.watch.longest_piece = lambda poses: [0]
     assert measures.unseen_psnr(run) is None
+
+
+def test_each_piece_of_a_broken_run_is_aligned_by_itself():
+    truth = Trajectory(np.arange(20) / 30, random_transforms(20, "normal", 1).numpy())
+    poses = truth.T_world_camera.copy()
+    poses[10:, 0, 3] += 5  # the second piece is elsewhere
+    run = finished(breaks=[None], segments=[(0, 9), (10, 19)], truth=[0.0])
+    run.sequence.ground_truth.trajectory = truth
+    run.trajectory = lambda: Trajectory(truth.timestamps, poses)
+    found = measures._segment_errors(run)
+    assert found == pytest.approx({"ate_0_to_9_cm": 0, "ate_10_to_19_cm": 0}, abs=1e-6)
+    run.tracker.watch.breaks = []
+    assert measures._segment_errors(run) == {}

@@ -10,6 +10,7 @@ from minislam.state.memory import SHELF
 from minislam.tracking import frame_graph, keyframe_graph
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import FrameGraph
+from tests.tracking.scene import CAMERA
 from tests.tracking.wall import TrueFlow, true_graph, true_poses, wall_frame
 
 # What is refused
@@ -87,3 +88,26 @@ def test_the_flow_of_links_lies_on_the_shelf_also_when_it_is_restored(
     for edges in (graph.edges, again):
         assert all(map(SHELF.holds, (*edges.targets, *edges.confidences)))
     assert all(a.equal(b) for a, b in zip(again.targets, graph.edges.targets, strict=True))
+
+
+def test_long_after_the_start_only_keyframes_of_the_horizon_are_looked_at():
+    graph = true_graph(list(range(12)), TrackingConfig(window=3))
+    assert graph.proximity_edges(11) == [(11, 3), (3, 11)]  # 12 - 3 * 3 = 3 is the first of them
+
+
+def test_thresholds_in_px_grow_with_the_image():
+    small, config = true_graph([0]), TrackingConfig(robust_scale=3.0)
+    large = keyframe_graph.KeyframeGraph(CAMERA.resized(640, 480), config, TrueFlow())
+    assert large.robust.scale == 2 * 3.0  # px; 320x240 has the scale 1
+    for graph in (small, large):
+        assert graph.least_parallax == keyframe_graph.MIN_PARALLAX * graph.pixel_scale
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
+def test_how_far_a_global_edge_may_reach_is_said_in_px_of_a_reference_image(
+    monkeypatch: pytest.MonkeyPatch, ratio: float
+):
+    graph = true_graph([0, 4])
+    distance = ratio * float(graph.distances()[1, 0]) / graph.pixel_scale
+    monkeypatch.setattr(keyframe_graph, "GLOBAL_DISTANCE", distance)
+    assert bool(graph.global_edges()) == (ratio > 1)

@@ -1,11 +1,14 @@
 """Loops: which pairs close one, what an adjustment does with it, and when it is undone."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
+import pytest
 import torch
 
 from minislam.geometry import se3_exp, se3_inverse, se3_log
 from minislam.priors.interfaces import FlowMatches
+from minislam.tracking import loop_closure
 from minislam.tracking.config import TrackingConfig
 from minislam.tracking.frame_graph import neighbourhood_edges
 from minislam.tracking.keyframe_graph import KeyframeGraph
@@ -101,3 +104,11 @@ def test_a_loop_whose_flow_is_not_confirmed_is_no_loop():
 
 def test_a_short_sequence_has_no_loops():
     assert not close_loops(drifted(TrueFlow(), ROUND[:4]))
+
+
+@pytest.mark.parametrize("ratio", [0.8, 1.2])
+def test_how_near_a_loop_must_be_is_said_in_px_of_a_reference_image(ratio: float):
+    graph = drifted(TrueFlow())
+    nearest = float(graph.distances(rows=range(8, 9))[8, : 8 - CONFIG.loop_min_gap + 1].min())
+    graph.config = replace(CONFIG, loop_distance=ratio * nearest / graph.pixel_scale)
+    assert bool(loop_closure._loop_edges(graph)) == (ratio > 1)

@@ -248,7 +248,7 @@ def test_adjustments_that_all_fail_are_counted_and_keep_the_state(monkeypatch: p
     monkeypatch.setattr(torch.linalg, "cholesky_ex", singular)
     adjust(graph, first_free=2, iterations=3)
     final_global_ba(graph)
-    assert graph.failed_adjustments == 1 + graph.config.final_rounds
+    assert graph.adjustments == graph.failed_adjustments == 1 + graph.config.final_rounds
     assert_same_bits(graph.state, before)
 
 

@@ -64,3 +64,14 @@ def test_of_many_keyframes_some_are_compared(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(depth_agreement, "_measured", noted)
     assert depth_difference(matched_graph([0, 3, 6, 9])) < 1e-3
     assert asked == [{2}, {0, 2}]
+
+
+def test_cells_that_hardly_any_flow_tells_are_not_compared():
+    graph, exact = changed(matched_graph([0, 3, 6, 9]), 1.1), matched_graph([0, 3, 6, 9])
+    group = torch.arange(len(graph.grid.rays)) % 20
+    agree, faint = group < 7, group >= 12  # of the others, which the flow tells well, most agree
+    for edge, confidences in enumerate(graph.edges.confidences):
+        targets = exact.edges.targets[edge], graph.edges.targets[edge]
+        graph.edges.targets[edge] = torch.where(agree, *targets)
+        graph.edges.confidences[edge] = torch.where(faint, 0.01 * confidences, confidences)
+    assert depth_difference(graph) < 1e-3

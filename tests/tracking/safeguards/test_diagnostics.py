@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -286,3 +287,10 @@ def test_the_longest_piece_is_that_with_most_poses():
     assert list(watch.longest_piece(poses)) == [*range(0, 11, 2)]
     assert watch.longest_piece(few := {frame: poses[frame] for frame in range(0, 9, 2)}) is few
     assert watch.longest_piece({}) == {}  # an interrupted run
+
+
+def test_what_fits_is_said_in_px_of_a_reference_image_and_no_less_than_of_that():
+    residual = diagnostics.EXPLAINED * torch.tensor([[[0.9, 1.1, 1.9, 2.1], [0.0] * 4]])
+    for scale, count in ((0.5, 1), (1.0, 1), (2.0, 3)):
+        graph = SimpleNamespace(pixel_scale=scale)
+        assert int(diagnostics.fitting(graph, residual).sum()) == count

@@ -120,9 +120,9 @@ def store_of(count: int) -> KeyframeStore:
 
 def graph_of(store: KeyframeStore, flow: list, scale: float = SCALE) -> SimpleNamespace:
     """Return the part of a keyframe graph that the motion memory sees."""
-    config = SimpleNamespace(motion_memory=scale)
+    config = SimpleNamespace(motion_memory=scale / 2)  # px at 320x240
     known = {"grid": GRID, "keyframes": store, "flow_to_next": flow}
-    return SimpleNamespace(config=config, pixel_scale=1.0, **known)
+    return SimpleNamespace(config=config, pixel_scale=2.0, **known)
 
 
 def test_all_keyframes_are_judged_anew_from_the_first_on():

@@ -195,3 +195,11 @@ def test_one_step_or_none_tells_nothing():
     ratios, information = steps_with(bend(0.2), every=KEYFRAMES)
     assert not told_drift(ratios, information).any()
     assert not told_drift(ratios, torch.zeros_like(information)).any()
+
+
+def test_a_step_whose_prior_has_gaps_tells_as_much():
+    graph = wall_with_prior([1.1, 1.1, 1.1])
+    graph.keyframes.prior_disparities[:, ::3] = 0  # sky, glass
+    ratios, information = step_ratios(graph)
+    torch.testing.assert_close(ratios.exp(), torch.full_like(ratios, 1.1), atol=0.02, rtol=0)
+    assert (information > 0).all()
