@@ -18,11 +18,13 @@ __version__ = "0.2.0"
 __all__ = ["InputOptions", "Run", "__version__", "load", "open_sequence", "run"]
 
 
-def __getattr__(name: str) -> Any:
-    """Import the interface when it is used first: torch alone takes seconds."""
-    if name not in __all__:
-        raise AttributeError(f"module 'minislam' has no attribute {name!r}")
-    return getattr(import_module("minislam.runs.api"), name)
+if not TYPE_CHECKING:  # a type checker would take it for a promise of every name
+
+    def __getattr__(name: str) -> Any:
+        """Import the interface when it is used first: torch alone takes seconds."""
+        if name not in __all__:
+            raise AttributeError(f"module 'minislam' has no attribute {name!r}")
+        return getattr(import_module("minislam.runs.api"), name)
 
 
 def __dir__() -> list[str]:

@@ -17,6 +17,7 @@ from tests.notebook_files import NOTEBOOKS, ROOT, cleaned, load
 def execute(path: Path) -> None:
     """Run a notebook in a fresh kernel and store it in place."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    environment.pop("MPLBACKEND", None)  # another one draws no pictures into the notebook
     command = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--inplace"]
     subprocess.run([*command, "--log-level=WARN", str(path)], check=True, env=environment)
     store(path, cleaned(load(path)))

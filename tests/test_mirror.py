@@ -16,7 +16,6 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "tracking/config": "test_config.py",
     "tracking/bundle_problem": "tracking/test_bundle_adjustment.py",
     "tracking/reference": "tracking/test_bundle_adjustment.py",
-    "runs/api": "runs/test_loaded.py",
     "priors/interfaces": "priors/test_flow.py",  # protocols and two records
 }
 

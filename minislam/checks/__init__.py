@@ -52,3 +52,17 @@ from minislam.priors.conformance import (
     check_feature_extractor,
     check_flow_estimator,
 )
+
+__all__ = [
+    "NOT_YET", "PASSED", "WRONG", "Case", "Verdict", "check_alignment", "check_ate",
+    "check_best_beta", "check_bounded_loss", "check_bundle_adjustment", "check_conic_vjp",
+    "check_deformed_means", "check_depth_prior", "check_feature_extractor",
+    "check_feature_variance", "check_flow_distance", "check_flow_estimator", "check_followed_pose",
+    "check_function", "check_gains", "check_insertion", "check_keyframes", "check_map_loss",
+    "check_mapping_weight", "check_motion_memory", "check_picture_gradient", "check_pixel_color",
+    "check_plane_cost", "check_plane_homography", "check_prior_mask", "check_projected_covariance",
+    "check_rendered_image", "check_reproject", "check_resized_intrinsics", "check_robust_weight",
+    "check_sampling", "check_schur_step", "check_separability", "check_sign_test", "check_stride",
+    "check_suppressed", "check_target_jacobian", "check_training", "check_twist_vjp",
+    "check_warped_photo", "is_written",
+]  # fmt: skip

@@ -19,7 +19,7 @@ from minislam.tracking.safeguards.robust import RobustKernel
 
 def check_target_jacobian(student: Function) -> Verdict:
     """Check (points X (N, 3), disparities (N,), camera) -> dp / d(rho, phi) (N, 2, 6) in px."""
-    rays = CAMERA.rays(doubles([0.0, 0.0], [100.0, 52.0], [60.5, 10.25]))
+    rays = CAMERA.rays(doubles([0.0, 0.0], [100.0, 52.0], [60.5, 10.25], [20.0, 40.0]))
 
     def reference(X: Tensor, d: Tensor, c: Camera, *, slide: Any = 1, turn: Any = 1) -> Tensor:
         # A camera that stands still sees each cell where its ray points: X = ray of the cell.
@@ -34,10 +34,10 @@ def check_target_jacobian(student: Function) -> Verdict:
         return Case((points, disparities, CAMERA), description)
 
     cases = [
-        case(doubles(1.0, 1.0, 1.0), "disparities of 1"),
-        case(doubles(0.5, 0.25, 0.8), "any disparities"),
-        case(doubles(0.0, 0.0, 0.0), "points at infinity"),
-        *drawn(lambda seed: case(normals(seed, 3).abs(), "another motion", seed)),
+        case(doubles(1.0, 1.0, 1.0, 1.0), "disparities of 1"),
+        case(doubles(0.5, 0.25, 0.8, 0.6), "any disparities"),
+        case(doubles(0.0, 0.0, 0.0, 0.0), "points at infinity"),
+        *drawn(lambda seed: case(normals(seed, 4).abs(), "another motion", seed)),
     ]
     mistakes = [
         (lambda X, d, c: reference(X, d**0, c), "X is d times the point: it moves by d rho."),
@@ -118,7 +118,9 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         is_whole = isinstance(state, BundleState)
         return (state.T_camera_world, state.disparities) if is_whole else state
 
-    def case(steps: int, held: int, weights: Tensor, description: str, seed: int = 1) -> Case:
+    def case(
+        steps: int, held: int, weights: Tensor, what: str, seed: int = 1, damping: float = 10.0
+    ) -> Case:
         xi, start, noise, scatter = normals(seed, 4, 3, len(rays)).clamp(-2, 2)
         truth = BundleState(se3_exp(0.1 * xi[:, :6]), 0.5 + 0.1 * scatter.abs())
         motion = reprojection.relative_transforms(truth.T_camera_world, source, target)
@@ -127,7 +129,7 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         edges, free = (source, target, flow + noise[:2], weights), (number >= held, number >= 0)
         problem = BundleProblem(CAMERA, rays, *edges, none, none, *free)
         nudged = se3_exp(0.02 * start[:, :6]) @ truth.T_camera_world
-        return Case((problem, BundleState(nudged, none + 0.5), steps, 10.0), description)
+        return Case((problem, BundleState(nudged, none + 0.5), steps, damping), what)
 
     size = 6, 2, len(rays)
     ones, differing = torch.ones(size).double(), normals(5, *size).abs()
@@ -137,7 +139,7 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         case(1, 2, differing, "one step, two poses held, weights that differ"),
         case(1, 1, hidden, "two cells that no other view sees"),
         case(3, 2, differing, "three steps"),
-        *drawn(lambda n: case(1 + n % 2, 1, normals(n, *size).abs(), "drawn weights", n)),
+        *drawn(lambda n: case(1 + n % 2, 1, normals(n, *size).abs(), "a damping of 30", n, 30.0)),
     ]
     mistakes = [
         ("weights", "Each residual counts with its weight: J^T W J and J^T W r."),
@@ -148,6 +150,7 @@ def check_bundle_adjustment(student: Function) -> Verdict:
         ("of H", "The diagonal of C is damped as well, not H's alone."),
         ("of C", "The diagonal of H is damped as well, not C's alone."),
         ("one", "Repeat the step: each one linearises at the state the last one left."),
+        (lambda *a: loop(*a[:-1], 10.0), "10 is one damping of many: use the argument."),
         (lambda *a: (loop(*a)[0], a[1].disparities), "The disparities move as well: + delta."),
         (lambda *a: (a[1].T_camera_world, loop(*a)[1]), "The poses move as well: exp(xi) T."),
     ]
@@ -179,11 +182,10 @@ def check_robust_weight(student: Function) -> Verdict:
 
 def check_prior_mask(student: Function) -> Verdict:
     """Check (depth, [(depth, T_this_other)], camera, stride, epsilon) -> M (h, w) bool."""
-    camera, stride = Camera(60.0, 60.0, 31.3, 22.6, 64, 48), 4
-    grid = Grid.of(camera, stride)
+    camera = Camera(60.0, 60.0, 31.3, 22.6, 64, 48)
 
     def reference(depth: Tensor, others: list, *rest: Any, seen: int = 2, agree: int = 2) -> Tensor:
-        same = torch.ones(1, 1, 1).double()
+        grid, same = Grid.of(camera, rest[-2]), torch.ones(1, 1, 1).double()
         this = DepthView(depth, same, torch.eye(4).double())
         views = [DepthView(there, same, se3_inverse(T)) for there, T in others]
         corresponding, consistent = depth_consistency(grid, this, views, rest[-1], -2.0)
@@ -194,7 +196,9 @@ def check_prior_mask(student: Function) -> Verdict:
         rays = camera.rays(camera.pixel_grid(1, torch.float64)) @ T_this_other[:3, :3].T
         return (3 - T_this_other[2, 3]) / rays[..., 2]
 
-    def case(count: int, patched: float, description: str, seed: int = 2) -> Case:
+    def case(
+        count: int, patched: float, what: str, seed: int = 2, stride: int = 4, most: float = 0.02
+    ) -> Case:
         poses = se3_exp(0.08 * normals(seed, count, 6).clamp(-2, 2))
         poses[-1, 2, 3] = -0.5
         poses[0, :3, 3] = doubles(0.0117, 0.0233, 1) * 0.5  # its centre falls on a cell
@@ -205,7 +209,7 @@ def check_prior_mask(student: Function) -> Verdict:
             seen[8 * number : 8 * number + 20, 30:50] *= 0.6  # in front of the wall, for one view
         others[-1][0][:20, 40:] = 0.3  # behind this view
         others[0][0][::2] = 0  # unknown
-        return Case((depth, others, camera, stride, 0.02), description)
+        return Case((depth, others, camera, stride, most), what)
 
     cases = [
         case(4, 0.7, "a region whose depth is 30 % too small"),
@@ -213,22 +217,24 @@ def check_prior_mask(student: Function) -> Verdict:
         case(4, 1.0202, "a region whose depth is 2.02 % too large"),
         case(4, 0.0, "a region without depth"),
         case(1, 0.7, "a single other view"),
-        *drawn(lambda seed: case(3, 0.8, "three drawn views", seed)),
+        *drawn(lambda seed: case(3, 1.035, "drawn views, an epsilon of 0.05", seed, 3, 0.05)),
     ]
     unknown = "Without a depth, M stays 1."
     back = "T_this_other takes points of the other view to this one, not back."
     known = "A depth of 0 is unknown in the other views, too."
     relative = "Divide the difference by the other's depth."
     mistakes = [
+        (lambda *a: reference(*a[:-1], 0.02), "0.02 is one epsilon of many: use the argument."),
+        (lambda *a: reference(*a[:-2], 4, a[-1]), "4 is one stride of many: use the argument."),
         (lambda *a: reference(*a, seen=0), "Where fewer than two views have a depth, M stays 1."),
         (lambda *a: 1 - reference(*a), "M is 1 where the prior counts, 0 where views contradict."),
         (lambda d, o, *a: reference(d, [(x, se3_inverse(T)) for x, T in o], *a), back),
         (lambda *a: reference(*a, agree=1), "Two views must agree, not one."),
-        (lambda d, *a: reference(d, *a) * (d > 0)[::stride, ::stride], unknown),
+        (lambda d, *a: reference(d, *a) * (d > 0)[:: a[-2], :: a[-2]], unknown),
         # Where all depths are near 3 m, an absolute error is a third of it, relatively.
-        (lambda *a: reference(*a[:2], a[-1] / 3), relative),
+        (lambda *a: reference(*a[:-1], a[-1] / 3), relative),
         # An error relative to the own depth, where that is the larger of the two.
-        (lambda *a: reference(*a[:2], a[-1] / (1 - a[-1])), relative),
+        (lambda *a: reference(*a[:-1], a[-1] / (1 - a[-1])), relative),
         (lambda d, o, *a: reference(d, [(x.clamp_min(1e-9), T) for x, T in o], *a), known),
     ]
     return check_function(student, reference, cases, 1e-9, mistakes)

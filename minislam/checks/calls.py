@@ -20,6 +20,7 @@ from minislam.geometry import Camera
 
 # Code that is not the student's.
 LIBRARIES = (
+    "<string>",  # the methods that dataclasses write
     "<frozen ",  # modules of Python itself, like runpy
     str(Path(__file__).parents[1]),
     *map(sysconfig.get_path, ("stdlib", "purelib", "platlib")),
@@ -46,11 +47,11 @@ def call(
         try:
             with time_limit(seconds):
                 return function(*given), given
-        except NotImplementedError:
-            raise
         except TimeoutError:
             raise Stopped(f"has no answer after {seconds:.1f} seconds (an endless loop?)") from None
         except (Exception, SystemExit) as error:  # any mistake is an answer, not a crash
+            if isinstance(error, NotImplementedError) and not error.args:
+                raise  # a stub; what torch cannot do, it says
             mixes = isinstance(error, RuntimeError) and "type" in str(error)  # "dtype", "type"
             if dtype is None or not mixes:
                 raise Stopped(_story(error)) from None

@@ -44,5 +44,6 @@ def drawn(draw: Callable[[int], Case]) -> list[Case]:
     `minislam grade` sets it. `draw` makes a case of a seed.
     """
     hidden = os.environ.get("MINISLAM_SEED", "")
-    starts = [0, 1000 * (int(hidden) + 1)] if hidden.isdecimal() else [0]
+    # A prime number, so that the seeds leave all remainders: some checks draw by `seed % 5`.
+    starts = [0, 1009 * (int(hidden) + 1)] if hidden.isdecimal() else [0]
     return [draw(seed) for start in starts for seed in range(start, start + 3)]

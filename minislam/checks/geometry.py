@@ -73,6 +73,7 @@ def check_warped_photo(student: Function) -> Verdict:
     """Check (photo, depth, camera, T_source_target) -> the photo as the target sees it."""
     photo, depth = normals(0, 13, 17, 3).abs(), 1 + normals(1, 13, 17).abs()
     scene = photo, depth, Camera(20.0, 24.0, 8.3, 5.8, 17, 13)
+    exact = photo, 0 * depth + 2, Camera(16.0, 16.0, 8.0, 6.0, 17, 13)  # no number is rounded
 
     def warped(*view: Any, flaw: str = "") -> Tensor:
         photo, depth, camera, pose = view
@@ -96,6 +97,7 @@ def check_warped_photo(student: Function) -> Verdict:
         Case((*scene, se3_exp(doubles(0.2, -0.07, 0.1, 0, 0, 0))), "a small step"),
         Case((*scene, se3_exp(doubles(0.1, -0.2, 0.3, 0.1, 0.2, -0.1))), "any motion"),
         Case((*scene, se3_exp(doubles(0.1, 0, 0, 0, 3.0, 0))), "a source camera that looks back"),
+        Case((*exact, torch.eye(4).double()), "a source camera in the same place"),
         *drawn(lambda seed: Case((*scene, any_pose(seed)), f"motion {seed}")),
     ]
     mistakes = [

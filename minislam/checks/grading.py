@@ -5,6 +5,7 @@ import inspect
 import os
 import sys
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -65,8 +66,9 @@ def check_function(
         begin = time.process_time()
         try:
             answer, given = call(student, case.arguments, seconds)
-        except NotImplementedError:
-            return _verdict(NOT_YET, "write the body of the function and run both cells again.")
+        except NotImplementedError as stub:
+            name = traceback.extract_tb(stub.__traceback__)[-1].name  # may be one that it calls
+            return _verdict(NOT_YET, f"write the body of {name} and run its cell again.")
         except Stopped as stop:
             return _verdict(WRONG, f"for {case.description} it {stop}.")
         seconds = max(seconds - (time.process_time() - begin), 1.0)

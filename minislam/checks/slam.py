@@ -143,6 +143,7 @@ def check_sign_test(student: Function) -> Verdict:
     of_clips = {
         "three clips that all get better": [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]],
         "four clips, two get worse": [[0.6, 0.9, 0.3, 0.8], [0.5, 0.6, 0.7, 2.8]],
+        "four clips, sums that are rounded": [[0.1, 0.2, 0.0, 0.6], [0.0, 0.0, 0.3, 0.0]],
         "a single clip": [[2.0], [1.0]],
         "no difference at all": [[1.0, 2.0, 1.5], [1.0, 2.0, 1.5]],
     }

@@ -21,7 +21,7 @@ DEFINITIONS = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.ClassDef)
 
 @dataclass(frozen=True)
 class Part:
-    """What is kept of one cell, as Python text whose line numbers are the cell's."""
+    """What is kept of one cell, as Python text; an exercise keeps the line numbers of its cell."""
 
     text: str  # the whole cell where Python cannot read it
     key: str = ""  # of the exercise, "" for another cell

@@ -126,18 +126,19 @@ def _relative_errors(
     if len(result.truth) < 2:
         raise InputError("expected at least 2 pairs of poses for --rpe, found 1; give longer paths")
     delta, unit = 1.0 if args.delta is None else args.delta, args.delta_unit or "s"
-    step, most = delta, len(result.truth) - 1  # poses
-    wanted = f"as a whole number of frames, 1 to {most}"
+    stamps, most = result.truth.timestamps, float(len(result.truth) - 1)  # frames
+    wanted = f"as a whole number of frames, 1 to {most:g}"
     if unit == "s":
-        seconds = float(np.median(np.diff(result.truth.timestamps)))  # between poses
         found = "one for most of them; give a smaller --t_max_diff, or --delta_unit f"
-        require(seconds > 0, "estimated poses that pair with different true ones", found)
-        wanted = f"of more than 0 and at most {most * seconds:g} s, the length of the paths"
-        step = max(1, round(delta / seconds)) if 0 < delta < 1e9 else 0
-    is_possible = 1 <= step <= most and step == int(step)  # not NaN either
+        are_apart = bool(np.median(np.diff(stamps)) > 0)
+        require(are_apart, "estimated poses that pair with different true ones", found)
+        most = stamps[-1] - stamps[0]
+        wanted = f"of more than 0 and at most {most:g} s, the length of the paths"
+    is_possible = 0 < delta <= most and (unit == "s" or delta == int(delta))  # not NaN either
     require(is_possible, f"a --delta {wanted}", f"{delta:g} {unit}; give a value between")
-    shifts, angles = relative_pose_error(result.estimate, result.truth, int(step))
-    over = f"over {delta:g} {unit} ({int(step)} poses)"
+    step, seconds = (1, delta) if unit == "s" else (int(delta), None)
+    shifts, angles = relative_pose_error(result.estimate, result.truth, step, seconds)
+    over = f"over {delta:g} {unit} ({len(shifts)} motions)"
     return {
         f"RPE w.r.t. translation part (m) {over}": statistics(shifts),
         f"RPE w.r.t. rotation angle (deg) {over}": statistics(np.rad2deg(angles)),

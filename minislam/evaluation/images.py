@@ -21,7 +21,7 @@ def psnr(
     mask: ArrayLike | None = None,  # (H, W) bool, True where pixels count; None: everywhere
 ) -> float:  # dB, infinite for equal images
     """Return the peak signal-to-noise ratio, -10 log10 of the mean squared difference."""
-    image, reference = _checked(image, reference)
+    image, reference = checked_images(image, reference)
     squared = (image - reference) ** 2
     if mask is not None:
         mask = np.asarray(mask, dtype=bool)
@@ -33,7 +33,7 @@ def psnr(
 
 def ssim(image: ArrayLike, reference: ArrayLike) -> float:  # both (H, W, 3) or (H, W) in [0, 1]
     """Return the mean structural similarity, at most 1, over all windows inside the image."""
-    x, y = _checked(image, reference)
+    x, y = checked_images(image, reference)
     assert min(x.shape[:2]) > 2 * _SSIM_RADIUS, x.shape
     mean_x, mean_y = _window_mean(x), _window_mean(y)
     variance_x = _window_mean(x * x) - mean_x**2
@@ -81,14 +81,18 @@ def auroc(scores: ArrayLike, mask: ArrayLike) -> float:  # 1: perfect, 0.5: chan
     return float(u / (positives * negatives))
 
 
+def checked_images(image: ArrayLike, reference: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Return two images of one shape, (H, W, 3) or (H, W), as float64 in [0, 1]."""
+    image, reference = np.asarray(image), np.asarray(reference)
+    for kind in (image.dtype, reference.dtype):
+        found = f"{kind}; divide values in [0, 255] by 255"
+        require(np.issubdtype(kind, np.floating), "images of floats in [0, 1]", found)
+    assert image.shape == reference.shape and image.ndim in (2, 3), (image.shape, reference.shape)
+    # A renderer may overshoot; what is shown and stored is clipped, so that is compared.
+    return np.clip(image, 0, 1, dtype=np.float64), np.clip(reference, 0, 1, dtype=np.float64)
+
+
 def _window_mean(values: np.ndarray) -> np.ndarray:
     """Return Gaussian means of (H, W, ...), for the (H-10, W-10, ...) windows that fit."""
     mean = gaussian_filter(values, _SSIM_SIGMA, radius=_SSIM_RADIUS, axes=(0, 1))
     return mean[_SSIM_RADIUS:-_SSIM_RADIUS, _SSIM_RADIUS:-_SSIM_RADIUS]
-
-
-def _checked(image: ArrayLike, reference: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
-    assert image.shape == reference.shape and image.ndim in (2, 3), (image.shape, reference.shape)
-    # A renderer may overshoot; what is shown and stored is clipped, so that is compared.
-    return np.clip(image, 0, 1), np.clip(reference, 0, 1)

@@ -13,13 +13,13 @@ torchvision, the heads from the authors' repository (weights/v0.1). SLAM papers 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
 from minislam.errors import InputError, require
+from minislam.evaluation.images import checked_images
 
 # Mean and spread of natural images, for values in [-1, 1]: RGB, from the authors' code.
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -59,9 +59,9 @@ class Lpips:
 
     def __call__(self, image: ArrayLike, reference: ArrayLike) -> float:
         """Return the distance of two images (H, W, 3) RGB in [0, 1], 0 for equal ones."""
-        both = [torch.from_numpy(np.asarray(x, np.float32)).clamp(0, 1) for x in (image, reference)]
-        height, width, _ = shape = both[0].shape
-        assert both[1].shape == shape and shape[2] == 3, (shape, both[1].shape)
+        both = [torch.from_numpy(x).float() for x in checked_images(image, reference)]
+        height, width, channels = both[0].shape
+        assert channels == 3, both[0].shape
         self.require_size(width, height)
         total = 0.0
         with torch.no_grad():

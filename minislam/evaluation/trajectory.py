@@ -53,21 +53,40 @@ def absolute_trajectory_error(
 
 
 def relative_pose_error(
-    estimate: Trajectory, truth: Trajectory, step: int = 1
+    estimate: Trajectory, truth: Trajectory, step: int = 1, seconds: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:  # one per motion: world units, rad
     """Return the errors of the motions between paired poses `step` apart (RPE), without overlap.
 
     With Q = truth_i^-1 truth_(i+step), P likewise of the estimate and E = Q^-1 P, these are
     |translation of E| and the angle of E [rad]. Where the scale is unknown, align it first.
+    Given `seconds`, the motions last so long instead; where poses are lost there may be none.
     """
+    counts = f"{len(estimate)} estimated and {len(truth)} true ones; pair them with `paired`"
+    require(len(estimate) == len(truth), "paired poses", counts)
     wanted = f"a step of 1 to {len(truth) - 1} of {len(truth)} paired poses"
     require(1 <= step < len(truth), wanted, f"{step}; choose a step between")
     first = np.arange(0, len(truth) - step, step)
+    last = first + step
+    if seconds is not None:
+        first, last = _motions(truth.timestamps, seconds)
     true, found = truth.T_world_camera, estimate.T_world_camera
-    true_motion = np.linalg.inv(true[first]) @ true[first + step]
-    error = np.linalg.inv(true_motion) @ (np.linalg.inv(found[first]) @ found[first + step])
+    true_motion = np.linalg.inv(true[first]) @ true[last]
+    error = np.linalg.inv(true_motion) @ (np.linalg.inv(found[first]) @ found[last])
     angles = Rotation.from_matrix(error[:, :3, :3]).magnitude()
     return np.linalg.norm(error[:, :3, 3], axis=1), angles
+
+
+def _motions(timestamps: np.ndarray, seconds: float) -> np.ndarray:  # (2, K) int, first and last
+    """Return the poses that are about `seconds` apart, to half the time between most poses."""
+    motions, end = [], 0
+    tolerance = float(np.median(np.diff(timestamps))) / 2
+    for first, last in zip(*associate(timestamps + seconds, timestamps, tolerance), strict=True):
+        if end <= first < last:
+            motions.append((first, last))
+            end = last
+    found = "none; give another --delta, or --delta_unit f"
+    require(bool(motions), f"poses that are {seconds:g} s apart", found)
+    return np.transpose(motions)
 
 
 def straight_line_error(truth: Trajectory) -> float:

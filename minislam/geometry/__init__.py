@@ -35,3 +35,8 @@ from minislam.geometry.se3 import (
     so3_log,
     transform_points,
 )
+
+__all__ = [
+    "BrownDistortion", "Camera", "se3_adjoint", "se3_exp", "se3_interpolate", "se3_inverse",
+    "se3_left_jacobian", "se3_log", "se3_normalised", "so3_exp", "so3_log", "transform_points",
+]  # fmt: skip

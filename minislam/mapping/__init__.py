@@ -18,3 +18,5 @@ Read the files in this order:
 
 from minislam.mapping.config import InsertionConfig, MappingConfig
 from minislam.mapping.mapper import Mapper
+
+__all__ = ["InsertionConfig", "Mapper", "MappingConfig"]

@@ -78,7 +78,9 @@ def load_plugin(kind: str, name: str, device: str, weights: str | None) -> Any:
     """Return the prior that --KIND NAME names in a module or an installed package, checked."""
     if name.startswith(PYTHON):
         if "" not in sys.path:
-            sys.path.append("")  # the current folder, which `minislam` alone does not look into
+            # The current folder, which `minislam` alone does not look into. It stays: what was
+            # loaded may import more when it is called.
+            sys.path.append("")
         entry = EntryPoint(name, name.removeprefix(PYTHON), f"minislam.{kind}")
     else:
         entry = plugins(kind)[name]

@@ -40,8 +40,8 @@ class ClassicalFlow(Stateful):
     learned_confidence = False
 
     def __init__(self) -> None:
-        # DIS splits the image in one stripe per OpenCV thread and does not propagate matches
-        # across them: with more than one, the result would depend on the machine.
+        # Flow is measured side by side in threads of ours: those of OpenCV would compete with
+        # them, and take cores that the run was not given. The flow is the same with any number.
         cv2.setNumThreads(1)
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[int, np.ndarray] = {}

@@ -5,9 +5,11 @@ and the files of a run folder. Everything else may move.
 """
 
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
+
+import cv2
 
 from minislam.config import preset as preset_of
 from minislam.config import settings_of, with_settings
@@ -36,10 +38,11 @@ def run(
 ) -> Run:
     """Run SLAM on a sequence, write its folder and return the run, as `minislam run` does.
 
-    The process is left as it was. Raises `MinislamError` where the command would end with a
-    sentence. An interrupt (Ctrl-C, the square of a notebook) ends after the present step, and
-    what is known by then is returned; before there is a map (without a depth prior, until the
-    last stages), KeyboardInterrupt is raised and says how to go on.
+    The process is left as it was, but for the current folder in sys.path, where `python:` priors
+    are found. Raises `MinislamError` where the command would end with a sentence. An interrupt
+    (Ctrl-C, the square of a notebook) ends after the present step, and what is known by then is
+    returned; before there is a map (without a depth prior, until the last stages),
+    KeyboardInterrupt is raised and says how to go on.
     """
     given = {n: str(value) if isinstance(value, Path) else value for n, value in options.items()}
     inputs = {name: value for name, value in given.items() if name in _INPUTS}
@@ -56,9 +59,13 @@ def run(
     output = user_path(output or default_output(sequence))
     progress = SilentProgress() if quiet else ProgressLine()
     progress.plan = plan_of(config, choice, sequence)
-    with closing(progress), ending_signals(progress.interrupt):
+    with closing(progress), ending_signals(progress.interrupt), ExitStack() as after:
+        after.callback(cv2.setNumThreads, cv2.getNumThreads())  # the flow sets it
         parts = sequence, config, choice, output, progress
-        run_in_folder(*parts, overwrite=overwrite, workers=workers)
+        _, facts = run_in_folder(*parts, overwrite=overwrite, workers=workers)
+        for warning in facts["warnings"]:
+            if warning not in progress.warned:
+                progress.warn(warning)
     return Run(output)
 
 

@@ -156,6 +156,8 @@ class Run:
 
     def beta(self, frame_index: int) -> np.ndarray:  # (H, W)
         """Return the uncertainty of any frame by the final MLP; without uncertainty it is 1."""
+        wanted = f"a frame of the run, 0 to {len(self.frames) - 1}"
+        require(frame_index in range(len(self.frames)), wanted, f"{frame_index}; choose one")
         height, width = self.camera.height, self.camera.width
         settings, sequence = self.config.uncertainty, self.sequence
         if not settings.enabled:

@@ -21,3 +21,7 @@ from minislam.splatting.constants import Rendering
 from minislam.splatting.gaussians import GaussianMap, LearningRates, MapOptimizer
 from minislam.splatting.reference import render_reference
 from minislam.splatting.renderer import render
+
+__all__ = [
+    "GaussianMap", "LearningRates", "MapOptimizer", "Rendering", "render", "render_reference",
+]  # fmt: skip

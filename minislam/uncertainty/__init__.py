@@ -13,3 +13,8 @@ from minislam.uncertainty.config import UncertaintyConfig
 from minislam.uncertainty.mlp import UncertaintyMLP
 from minislam.uncertainty.training import RenderingError, UncertaintyTrainer, rendering_error
 from minislam.uncertainty.weights import beta_of_mask, mapping_weight, tracking_weight
+
+__all__ = [
+    "RenderingError", "UncertaintyConfig", "UncertaintyMLP", "UncertaintyTrainer", "beta_of_mask",
+    "mapping_weight", "rendering_error", "tracking_weight",
+]  # fmt: skip

@@ -23,3 +23,10 @@ from minislam.viz.style import (
     show_image,
     show_map,
 )
+
+__all__ = [
+    "Figure", "Page", "Report", "ate_over_time", "beta_limits", "beta_to_rgb", "build_report",
+    "build_viewer", "colour_bar", "depth_limits", "depth_to_rgb", "figure_picture", "figure_png",
+    "flipbook", "keyframe_health", "loss_curves", "map_growth", "new_figure", "overview",
+    "set_notebook_style", "show_image", "show_map", "summary_html", "trajectory_plot",
+]  # fmt: skip

@@ -35,7 +35,7 @@ def ate_over_time(timestamps: np.ndarray, errors: np.ndarray, unit: str = "world
     figure, axes = _one_panel("time [s]", f"position error [{unit}]")
     axes.plot(timestamps - timestamps[0], errors, color=ESTIMATE_STYLE["color"])
     rmse = float(np.sqrt(np.mean(np.square(errors))))
-    axes.axhline(rmse, color="tab:red", linewidth=1, label=f"rmse {rmse:.4g}")
+    axes.axhline(rmse, color="tab:red", linewidth=1, label=f"rmse {rmse:.3g} {unit}")
     axes.set_ylim(0, 1.1 * float(np.max(errors, initial=np.finfo(float).eps)))
     axes.legend(frameon=False)
     return figure
@@ -103,7 +103,7 @@ def keyframe_health(
     mark: dict[str, Any] = {"color": "tab:red", "markersize": 14, "markeredgewidth": 3}
     axes.plot(lost, np.zeros(len(lost)), "|", label="lost" if len(lost) else None, **mark)
     axes.set(xlim=(-0.5, max([1, *frames, *lost]) + 0.5), ylim=(-0.05, 1.05))
-    axes.legend(loc="lower left")
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, frameon=False, fontsize=8)
     return figure
 
 
@@ -116,13 +116,18 @@ def overview(
     unit: str = "world units",
     broken: Breaks = (),
 ) -> Figure:
-    """Draw a run in one picture: input, uncertainty, static render, trajectory."""
+    """Draw a run in one picture: input, uncertainty, static render, trajectory from above.
+
+    The ground is x-z for an estimate, and x-y where a truth turns it upright: the wider plane.
+    """
     figure = new_figure((12.0, 2.6))
     axes = figure.subplots(1, 4)
     show_image(axes[0], image, "input frame")
     show_image(axes[1], beta_to_rgb(beta), "uncertainty beta", image.shape[:2])
     show_image(axes[2], render, "static map, same view")
-    _draw_path(axes[3], estimate, truth, 2, unit, broken)
+    centres = (truth or estimate).centres
+    _, y, z = np.abs(centres - centres[:1]).max(axis=0, initial=0)  # how far the path goes
+    _draw_path(axes[3], estimate, truth, 2 if z >= y else 1, unit, broken)
     return figure
 
 

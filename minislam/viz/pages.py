@@ -193,6 +193,7 @@ def flipbook(
         html = Template(template("flipbook.html")).substitute(
             book=escape(book), width=max(images[0].shape[1], _LEAST_WIDTH), picture=urls[0],
             caption=escape(texts[0]), last=len(urls) - 1, interval=round(1000 / frames_per_second),
+            most=max(map(len, texts)),
         )  # fmt: skip
         if len(urls) == count and len(html.encode()) < LARGEST:
             return FlipBook(html)

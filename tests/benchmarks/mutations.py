@@ -33,7 +33,7 @@ MUTANTS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     ("mapping/window.py", "mapping/test_window.py"): [
         ("min(int(seen_a.sum()), ", "max(int(seen_a.sum()), "),
-        ("non_overlapping[-1]", "non_overlapping[0]"),
+        ("leaving[-1]", "leaving[0]"),
         ("crowding = candidates.sum(-1)", "crowding = -candidates.sum(-1)"),
         ("(1 - window_probability) / (", "window_probability / ("),
     ],

@@ -81,6 +81,7 @@ def test_bundle_adjustment():
         "source as target": with_change(source_sign=1),
         "H alone is damped": with_change(of_cells=1e-10),
         "C alone is damped": with_change(of_poses=1e-10),
+        "one damping": lambda p, s, n, damping: adjusted(p, s, n, 10.0),
         "no damping": lambda p, s, n, damping: adjusted(p, s, n, 1e-9),
         "poses alone": lambda p, s, n, m: BundleState(
             adjusted(p, s, n, m).T_camera_world, s.disparities
@@ -90,6 +91,7 @@ def test_bundle_adjustment():
         ),
     }
     assert_variants(check_bundle_adjustment, right, wrong)
+    assert "use the argument" in check_bundle_adjustment(wrong["one damping"]).hint
     two = check_bundle_adjustment(lambda *a: adjusted(*a).T_camera_world)
     assert "expected 2: poses, disparities" in two.sentence
 
@@ -142,9 +144,12 @@ def test_prior_mask():
         "unknown depth as well": lambda *a: voted(*a, known=False),
         "behind the camera": lambda *a: voted(*a, before=False),
         "no prior without a depth": lambda d, o, c, n, e: voted(d, o, c, n, e) & (d[::n, ::n] > 0),
+        "one stride": lambda d, o, c, n, e: voted(d, o, c, 4, e),
+        "one epsilon": lambda *a: voted(*a[:-1], 0.02),
         "relative to the own depth": lambda *a: voted(*a, by_own=True),
     }
     assert_variants(check_prior_mask, right, wrong, named=0.7)
+    assert "one epsilon of many" in check_prior_mask(wrong["one epsilon"]).hint
 
 
 def robust(r, c, p):

@@ -44,6 +44,7 @@ def test_target_jacobian():
             [jacobian(X, d, c)[..., :3], d[:, None, None] * jacobian(X, d, c)[..., 3:]], -1
         ),
         "no rotation": lambda *a: jacobian(*a, turn=0.0),
+        "of three points": lambda *a: jacobian(*a)[:3],
         "transposed": lambda *a: jacobian(*a).mT,
         "without the camera": lambda X, d, c: jacobian(X, d, c) / c.fx,
         "of X": lambda X, d, c: torch.cat([d[:, None, None] * torch.eye(3).to(X), -hat(X)], -1),

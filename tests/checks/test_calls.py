@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from minislam.checks.calls import Stopped, call, time_limit
+from minislam.geometry import Camera
 
 
 def test_changes_in_place_do_not_reach_the_case():
@@ -41,8 +42,17 @@ def test_a_stop_tells_the_line_of_the_student():
     assert ", in line " in str(stop.value)
     with pytest.raises(Stopped, match="stops with SystemExit: 3, in line"):
         call(lambda: sys.exit(3), (), 5.0)
+    with pytest.raises(Stopped, match=r"fx=-1.*, in line \d+: camera = Camera"):
+        call(with_a_wrong_camera, (), 5.0)
     with pytest.raises(NotImplementedError):
         call(unwritten, (), 5.0)
+    with pytest.raises(Stopped, match=r"NotImplementedError: .*Bool.*, in line .*mask @ mask"):
+        call(lambda mask: mask @ mask, (torch.ones(2, 2) > 0,), 5.0)
+
+
+def with_a_wrong_camera():
+    camera = Camera(-1.0, 1.0, 1.0, 1.0, 2, 2)
+    return camera.fx
 
 
 def unwritten():

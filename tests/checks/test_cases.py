@@ -26,3 +26,12 @@ def test_cases_are_drawn_and_others_under_a_seed(monkeypatch):
     assert seen[:4] == seen[4:8] and len(set(seen)) == 7
     monkeypatch.setenv("MINISLAM_SEED", "a word")
     assert "4 of 4 cases" in verdict().sentence
+
+
+def test_hidden_seeds_leave_every_remainder(monkeypatch):
+    seeds = []
+    for hidden in range(5):
+        monkeypatch.setenv("MINISLAM_SEED", str(hidden))
+        drawn(lambda seed: seeds.append(seed) if seed > 2 else None)
+    for divisor in range(2, 8):  # many checks take a size from one
+        assert {seed % divisor for seed in seeds} == set(range(divisor))

@@ -50,6 +50,8 @@ def warped(photo: Tensor, depth: Tensor, camera: Camera, pose: Tensor, flaw: str
     u = camera.fx * points[..., 0] / z + camera.cx
     v = camera.fy * points[..., 1] / z + camera.cy
     seen = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    if flaw == "open":
+        seen = (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
     seen &= (z > 0) | (flaw == "behind")
     left, top = u.floor().clamp(0, width - 2).long(), v.floor().clamp(0, height - 2).long()
     a, b = (u - left)[..., None], (v - top)[..., None]
@@ -96,6 +98,7 @@ def test_a_warped_photo_is_told_from_a_wrong_one():
         "mix the four": partial(warped, flaw="rounded"),
         "weights are exchanged": partial(warped, flaw="turned"),
         "upside down": lambda *a: warped(*a).flip(0),
+        "without the border": partial(warped, flaw="open"),
         "not masked": partial(warped, flaw="unmasked"),
     }
     assert_variants(check_warped_photo, {"one": warped, "other": warped_in_loops}, wrong)

@@ -56,6 +56,14 @@ def test_a_stub_is_not_written_and_any_body_is(capsys):
         assert is_written(decorator(identity)) and not is_written(decorator(stub))
 
 
+def test_a_function_that_calls_an_unwritten_one_names_it():
+    def first(x):
+        raise NotImplementedError  # your code here
+
+    verdict = check_function(lambda x: first(x), double, [Case((torch.ones(3),), "ones")])
+    assert repr(verdict) == "Not yet: write the body of first and run its cell again."
+
+
 def double(x):
     return 2 * x
 

@@ -78,6 +78,17 @@ def test_calls_of_the_package_are_refused_where_they_are_not_allowed(tmp_path: P
     assert {status for status, _ in judged(tmp_path, *texts)} == {"passed"}
 
 
+def test_a_refused_function_is_refused_in_its_exercise_alone(tmp_path: Path):
+    text = (
+        "def mine(X, d, camera):\n    x, y, z = X.T\n"
+        "    return camera.twist_jacobian(x / z, y / z, d / z).permute(2, 1, 0)\n"
+        "submitted_to_the_check = mine"
+    )
+    rows: list[dict] = []
+    judge([Part(text, "ex05_1")], tmp_path, ["ex05_1"], True, rows.append)
+    assert rows[-1]["status"] == "refused" and "Camera.twist_jacobian" in rows[-1]["sentence"]
+
+
 def test_a_notebook_that_replaces_the_packages_functions_is_refused(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(mapping, "sampling_probabilities", mapping.sampling_probabilities)
     text = (

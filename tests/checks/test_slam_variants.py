@@ -137,6 +137,7 @@ def test_sign_test():
     wrong = {
         "one-sided": lambda a, b: chance(a, b, one_sided=True),
         "farther": lambda a, b: chance(a, b, slack=-1e-9),
+        "not up to rounding": lambda a, b: chance(a, b, slack=0.0),
         "the others": lambda a, b: 1 - chance(a, b),
         "a count": lambda a, b: chance(a, b) * 2 ** len(a),
         "mean difference": lambda a, b: float(np.mean(a - b)),

@@ -15,7 +15,7 @@ from tests.helpers import assert_variants
 def kept(
     images, max_flow, interval,
     weighted=True, restart=True, matched=0.2, forced=True, stride=8, by_remap=False,
-    warped=True, half=0.5, masked=True, zero=True, warm=True, first=0,
+    by_number=False, warped=True, half=0.5, masked=True, zero=True, warm=True, first=0,
 ):  # fmt: skip
     height, width = images[0].shape
     u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -36,7 +36,8 @@ def kept(
         sure, length = sure[first::stride, first::stride], np.hypot(*np.moveaxis(flow, -1, 0))
         length = length[first::stride, first::stride]
         mean = np.average(length, weights=sure if weighted else None)
-        if mean > max_flow or sure.mean() < matched or (forced and n - chosen[-1] >= interval):
+        late = n % interval == 0 if by_number else n - chosen[-1] >= interval
+        if mean > max_flow or sure.mean() < matched or (forced and late):
             chosen.append(n)
             if restart:
                 start, flow = image, np.zeros_like(flow) if zero else flow
@@ -56,6 +57,7 @@ def test_keyframes():
         "the old flow from a new frame": lambda *a: kept(*a, zero=False),
         "matched or not": lambda *a: kept(*a, matched=-1),
         "never forced": lambda *a: kept(*a, forced=False),
+        "every so many frames": lambda *a: kept(*a, by_number=True),
         "without the first": lambda *a: kept(*a)[1:],
         "every frame": lambda *a: list(range(len(a[0]))),
         "back flow not warped": lambda *a: kept(*a, warped=False),
@@ -72,7 +74,7 @@ def test_keyframes():
 def remembered(
     grid, matches, disparities, motion, weight, scale,
     fall=0.9, rise=0.1, parallax_part=0.01, confident=0.1, hand_on=True, fill=True, smallest=True,
-    behind=False,
+    behind=False, confidence_of=lambda both: both.mean(0),
 ):  # fmt: skip
     T = motion[None].to(disparities)
     seen, valid = reproject(T, disparities[None], grid.rays, grid.camera)
@@ -80,7 +82,7 @@ def remembered(
     squared = (seen - matches.targets)[0].square().sum(0)
     parallax = (seen - turned)[0].square().sum(0)
     agreement = (1 + squared / (scale**2 + parallax_part * parallax)) ** -2
-    matched = matches.confidences[0].mean(0) > confident
+    matched = confidence_of(matches.confidences[0]) > confident
     rate = torch.where(agreement < weight, fall, rise)
     updated = matched & (valid[0] | behind)
     moved = torch.where(updated, (1 - rate) * weight + rate * agreement, weight)
@@ -120,6 +122,9 @@ def test_motion_memory():
         "one rate": lambda *a: remembered(*a, rise=0.9),
         "no parallax": lambda *a: remembered(*a, parallax_part=0),
         "all cells": lambda *a: remembered(*a, confident=-1),
+        "another threshold": lambda *a: remembered(*a, confident=0.5),
+        "the larger confidence": lambda *a: remembered(*a, confidence_of=lambda c: c.amax(0)),
+        "the confidence of v": lambda *a: remembered(*a, confidence_of=lambda c: c[1]),
         "not handed on": lambda *a: remembered(*a, hand_on=False),
         "holes": lambda *a: remembered(*a, fill=False),
         "last instead of smallest": lambda *a: remembered(*a, smallest=False),

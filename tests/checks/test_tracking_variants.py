@@ -76,6 +76,13 @@ def as_lists(newer, older, count, suppression):
     return suppressed(newer, older, count, suppression).astype(int).tolist()
 
 
+def inner(newer, older, count, suppression):
+    """Return the same, but nothing where the diamond goes beyond the table."""
+    chosen = suppressed(newer, older, count, suppression)
+    radius = max(min(newer - older - 2, suppression), 0)
+    return chosen & (radius <= min(older, count - 1 - newer))
+
+
 @pytest.mark.ex06_2
 def test_suppressed():
     right = {"numpy": suppressed, "lists of 0 and 1": as_lists}
@@ -88,6 +95,8 @@ def test_suppressed():
         "no limit": lambda i, j, n, s: suppressed(i, j, n, s, max(i - j - 2, 0)),
         "no 0": lambda i, j, n, s: suppressed(i, j, n, s, min(i - j - 2, s)),
         "less than": lambda i, j, n, s: suppressed(i, j, n, s, max(min(i - j - 2, s), 0) - 1),
+        "at most 2": lambda i, j, n, s: suppressed(i, j, n, min(s, 2)),
+        "not at the border": inner,
         "the pair alone": lambda i, j, n, s: suppressed(i, j, n, s, 0),
         "kept ones": lambda i, j, n, s: np.tril(~suppressed(i, j, n, s), -1),
         "transposed": lambda *a: suppressed(*a).T,

@@ -94,8 +94,8 @@ def test_relative_errors_are_those_of_a_drift_that_is_known(tmp_path: Path, caps
     write_trajectory(names[0], Trajectory(times, truth))
     write_trajectory(names[1], Trajectory(times, estimate))
     for flags, over, poses in [
-        ([], "1 s (2 poses)", 2),
-        (["--delta", "3", "--delta_unit", "f"], "3 f (3 poses)", 3),
+        ([], "1 s (9 motions)", 2),
+        (["--delta", "3", "--delta_unit", "f"], "3 f (6 motions)", 3),
     ]:
         results = tmp_path / "rpe.json"
         save = ["--save_results", str(results), "--overwrite"]

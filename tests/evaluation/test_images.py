@@ -1,9 +1,12 @@
 """PSNR and SSIM on constructed images."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 
+from minislam.errors import InputError
 from minislam.evaluation.images import psnr, ssim
 
 
@@ -71,6 +74,14 @@ def test_tensors_are_accepted():
 
 
 # Errors
+
+
+@pytest.mark.parametrize("measure", [psnr, ssim])
+def test_integers_up_to_255_are_refused(measure: Callable[..., float]):
+    grey, words = np.full((16, 16, 3), 100, np.uint8), r"of floats in \[0, 1\], found uint8; divide"
+    for pair in ((grey, grey / 255), (grey / 255, torch.from_numpy(grey))):
+        with pytest.raises(InputError, match=words):
+            measure(*pair)
 
 
 def test_other_sizes_empty_masks_and_tiny_images_are_refused():

@@ -148,6 +148,8 @@ def test_small_and_unlike_images_are_refused():
         metric("vgg")(rebuilt.image(15, 40), rebuilt.image(15, 40))
     with pytest.raises(AssertionError):
         metric("alex")(rebuilt.image(32, 40), rebuilt.image(40, 32))
+    with pytest.raises(InputError, match=r"images of floats in \[0, 1\], found uint8; divide"):
+        metric("alex")(rebuilt.image(32, 32), torch.full((32, 32, 3), 100, dtype=torch.uint8))
 
 
 def test_files_that_do_not_fit_are_refused():

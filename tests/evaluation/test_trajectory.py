@@ -98,6 +98,18 @@ def test_rpe_of_a_known_step():
     np.testing.assert_allclose(angles, [0.1, 0], atol=1e-12)
 
 
+def test_motions_last_as_asked_where_poses_are_lost_and_not_evenly_spaced():
+    # At 0.2 m/s too fast, the error of every second is 0.2 m. Of 4.1 to 7.9 s there are no poses.
+    every, seldom = np.arange(120) / 10, np.cumsum(np.tile([0.1, 0.1, 0.4], 20))
+    for times, count in ((every[(every <= 4) | (every >= 8)], 4 + 3), (seldom, 10)):
+        truth, estimate = (Trajectory(times, np.tile(np.eye(4), (len(times), 1, 1))) for _ in "12")
+        truth.T_world_camera[:, 0, 3], estimate.T_world_camera[:, 0, 3] = times, 1.2 * times
+        distances, _ = relative_pose_error(estimate, truth, seconds=1.0)
+        np.testing.assert_allclose(distances, count * [0.2], atol=1e-9)
+    with pytest.raises(InputError, match=r"expected poses that are 30 s apart, found none; give"):
+        relative_pose_error(estimate, truth, seconds=30.0)
+
+
 def test_a_straight_walk_is_explained_by_the_line_and_a_circle_is_not():
     straight = spiral(50)
     straight.T_world_camera[:, :3, 3] = np.outer(straight.timestamps, [1, 2, 3]) + 5
@@ -214,6 +226,11 @@ def test_times_in_milliseconds_are_told_from_a_truth_of_few_poses():
         assert doubt_of_units(estimate, Trajectory(np.arange(10.0), truth.T_world_camera))
     rare = Trajectory(truth.timestamps[[0, 9]], truth.T_world_camera[[0, 9]])
     assert not doubt_of_units(truth, rare) and not doubt_of_units(truth, spiral(1))
+
+
+def test_unpaired_paths_have_no_relative_error():
+    with pytest.raises(InputError, match="paired poses, found 9 estimated and 10 true ones; pair"):
+        relative_pose_error(spiral(9), spiral(10))
 
 
 @pytest.mark.parametrize("step", [0, 10])

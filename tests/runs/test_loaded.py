@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +16,9 @@ from minislam.data.sequence import open_sequence
 from minislam.data.trajectory import write_trajectory
 from minislam.errors import InputError
 from minislam.geometry import Camera
-from minislam.mapping import Mapper
 from minislam.priors.flow import STRIDE
 from minislam.records import Trajectory
-from minislam.runs import api, loaded
+from minislam.runs import loaded
 from minislam.tracking.grid import Grid
 from minislam.tracking.safeguards import diagnostics
 from minislam.tracking.safeguards.rolling_shutter import ImageMotion
@@ -154,6 +152,9 @@ def test_beta_is_larger_on_the_person_than_elsewhere(run: minislam.Run):
     moving, beta = truth.moving_mask(index), run.beta(index)
     assert moving is not None and beta.shape == moving.shape
     assert np.median(beta[moving]) > np.median(beta[~moving])
+    for wrong in (10, -1):
+        with pytest.raises(InputError, match=f"a frame of the run, 0 to 9, found {wrong}; choose"):
+            run.beta(wrong)
 
 
 def test_how_far_a_rolling_shutter_displaces_a_frame_is_measured_again(run: minislam.Run):
@@ -254,43 +255,3 @@ def test_unknown_options_and_outputs_in_use_are_refused(run: minislam.Run):
         minislam.run("synth:person", resume=True)
     with pytest.raises(InputError, match="expected a new or empty output folder"):
         minislam.run("synth:person", run.folder.path, max_frames=4, size=(96, 72), preset="test")
-
-
-def test_masks_of_the_user_are_used_as_on_the_command_line(root: Path, tmp_path: Path):
-    for frame in range(30):  # of the source
-        cv2.imwrite(str(tmp_path / f"{frame:05d}.png"), np.full((72, 96), 255 * (frame > 2), "u1"))
-    done = minislam.run(
-        "synth:person", root / "masked", preset="test", stride=3, max_frames=10, size=(96, 72),
-        masks=f"files:{tmp_path}", depth="simulated", quiet=True,
-    )  # fmt: skip
-    assert done.config.uncertainty.given_masks
-    with pytest.raises(InputError, match="either --masks or --no-uncertainty, found both; leave"):
-        minislam.run(
-            "synth:person", stride=3, max_frames=10, size=(96, 72), masks=f"files:{tmp_path}",
-            settings={"uncertainty.enabled": False},
-        )  # fmt: skip
-    assert done.beta(5).min() > 1 > done.beta(0).max()
-
-
-def test_the_door_shows_what_is_stable():
-    assert set(minislam.__all__) - {"__version__"} == set(api.__all__) and dir(minislam)
-    with pytest.raises(AttributeError):
-        minislam.Slam  # noqa: B018
-
-
-def test_ctrl_c_ends_a_quiet_run_after_the_present_step(root: Path, monkeypatch, capsys):
-    refine = Mapper.refine
-
-    def interrupted(*arguments):
-        signal.raise_signal(signal.SIGINT)
-        return refine(*arguments)
-
-    monkeypatch.setattr(Mapper, "refine", interrupted)
-    done = minislam.run(
-        "synth:person", root / "quiet", preset="test", stride=3, max_frames=10, size=(96, 72),
-        quiet=True,
-    )  # fmt: skip
-    assert done.folder.read_run()["state"] == "interrupted"
-    html = (root / "quiet/report.html").read_text(encoding="utf-8")
-    assert f"<pre>go on with: minislam run --resume -o {root}/quiet</pre>" in html
-    assert capsys.readouterr() == ("", "")

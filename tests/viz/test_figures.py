@@ -46,6 +46,7 @@ FIGURES = {
     "empty map": lambda: map_growth([]),
     "no losses": lambda: loss_curves({}),
     "overview": lambda: overview(IMAGE, BETA, IMAGE, path(9), path(9)),
+    "overview without pose": lambda: overview(IMAGE, BETA, IMAGE, path(0)),
 }
 
 
@@ -63,6 +64,26 @@ def test_axes_carry_units_and_truth_is_black_dashed():
     truth = figure.axes[0].lines[0]
     assert (truth.get_color(), truth.get_linestyle()) == ("black", "--")
     assert FIGURES["ate"]().axes[0].get_xlabel() == "time [s]"
+    (rmse,) = FIGURES["ate"]().axes[0].get_legend().get_texts()
+    assert rmse.get_text() == "rmse 2.45 world units"
+
+
+@pytest.mark.parametrize(("height", "ground"), [(1, "z"), (2, "y")])
+def test_an_overview_shows_the_path_from_above(height: int, ground: str):
+    level = path(9)
+    level.T_world_camera[:, height, 3] *= 0.1
+    for estimate, truth in ((level, None), (path(9), level)):
+        panel = overview(IMAGE, BETA, IMAGE, estimate, truth).axes[3]
+        assert panel.get_ylabel() == f"{ground} [world units]"
+        places = level.centres[:, [0, "xyz".index(ground)]]
+        np.testing.assert_array_equal(panel.lines[0].get_xydata(), places)
+
+
+def test_the_legend_of_the_health_hides_no_frame():
+    figure = FIGURES["health"]()
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1
 
 
 def test_losses_of_both_signs_have_a_linear_panel_of_their_own():

@@ -76,6 +76,11 @@ def test_all_that_can_be_used_has_a_name():
     assert re.search(r'<img[^>]*alt="door"', html)
 
 
+def test_the_longest_caption_has_room_so_that_the_slider_keeps_its_length():
+    html = flipbook(PICTURES, ["a", "a door", "", "b"]).html
+    assert '<output aria-live="off" style="flex: 0 1 6ch' in html
+
+
 # Degenerate input
 
 

@@ -36,7 +36,7 @@ def test_a_report_shows_its_pictures_without_the_rest_of_the_folder():
     assert html.count("data:image/png;base64,") == 1
     # Viewer and clip are files of their own, asked for by the script and shown when they are there.
     assert re.findall(r'src="(?!data:)([^"]*)"', html) == []
-    assert html.count('class="waiting ended"') == 2 and 'viewer.src = "viewer.html"' in html
+    assert html.count('class="waiting ended"') == 3 and 'viewer.src = "viewer.html"' in html
     assert html == report(
         summary=[("ATE", "1 & 2 cm", "good", "a < b", "")],
         warnings=["focal length <guessed>"],
@@ -49,6 +49,14 @@ def test_a_part_that_is_not_known_is_not_shown():
     html = report()
     assert 'id="pictures">[]</script>' in html
     assert 'else document.getElementById("keyframes").remove();' in html
+    # Plots come last: without them a run has ended early, and has neither viewer nor clip.
+    assert "main:not(:has(#figures img)) .ended" in html and '<details class="ended">' in html
+    assert ".failed .resume" in html
+
+
+def test_long_names_and_plots_fit_a_phone():
+    assert "overflow-wrap: anywhere" in report()
+    assert ".wide, #figures figure { overflow-x: auto; }" in report()
 
 
 def test_the_slider_reaches_every_keyframe():
@@ -56,7 +64,8 @@ def test_the_slider_reaches_every_keyframe():
     pages = json.loads(re.search(r'id="pictures">(.*?)</script>', html)[1])
     assert [frame for frame, _ in pages] == [0, 7] and all(len(urls) == 4 for _, urls in pages)
     assert "slider.max = keyframes.length - 1" in html
-    assert html.rstrip().count("showKeyframe();") == 1  # the first is shown before the slider moves
+    # The first is shown before the slider moves, and no empty picture without scripts.
+    assert html.count("  showKeyframe();\n  reveal(slider);") == 1
 
 
 def test_the_scales_say_their_numbers_in_the_colours_of_the_pictures():
@@ -87,7 +96,6 @@ def test_the_end_of_the_run_decides_what_is_shown():
     for state, kind in states.items():
         html = report(state=state)
         assert f'<main class="{kind}">' in html and f'<span class="state">{state}</span>' in html
-    assert ".running .ended, .failed .ended" in html and ".failed .resume" in html
 
 
 def test_a_summary_escapes_whatever_it_is_given():

@@ -62,7 +62,7 @@ def test_the_page_is_one_file_that_may_load_nothing():
     assert html.startswith("<!DOCTYPE html>")
     assert not re.search(r"https?:|//\w+\.\w+/|<link|<iframe|\bsrc=|@import|url\(|fetch\(", html)
     assert "default-src 'none'" in html  # the browser itself refuses whatever is not in the page
-    assert html == viewer()
+    assert html == viewer() and "<noscript>This page needs JavaScript." in html
 
 
 def test_the_script_stays_readable():
@@ -167,6 +167,45 @@ def test_the_browser_draws_what_our_renderer_draws(tmp_path: Path):
         theirs = shot[:height, place * width : (place + 1) * width]
         error = ((color.clamp(0, 1).numpy() - theirs) ** 2).mean()
         assert -10 * np.log10(error) > 38, place  # dB, 45 when this was written
+
+
+SCRIPTS = {  # what they say
+    "quick clicks leave one animation": (
+        """for (const on of [true, false, true]) setPlaying(on);
+        const ask = requestAnimationFrame;
+        let steps = 0;
+        window.requestAnimationFrame = call => { steps += call.name === "step"; return ask(call); };
+        ask(() => console.log(`says ${steps}`));""",
+        "1",
+    ),
+    "space presses the button in focus, else it plays": (
+        """const space = { key: " ", bubbles: true, cancelable: true };
+        const presses = [$("path"), document.body].map(
+          on => [on.dispatchEvent(new KeyboardEvent("keydown", space)), playing]);
+        console.log(`says ${presses}`);""",
+        "true,false,false,true",
+    ),
+    "the slider keeps its length where a frame is lost": (
+        """const lengthAt = when => { time = when; showState(); return $("slider").offsetWidth; };
+        console.log(`says ${lengthAt(1) - lengthAt(0)}`);""",
+        "0",
+    ),
+    "a long name ends before the pictures": (
+        """$("title").textContent = "a_".repeat(99);
+        const [left, right] = ["title", "pictures"].map(id => $(id).getBoundingClientRect());
+        console.log(`says ${left.right < right.left && left.bottom < 50}`);""",
+        "true",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("kind", SCRIPTS)
+def test_the_page_behaves(kind: str, tmp_path: Path):
+    script, words = SCRIPTS[kind]
+    _, said = screenshot(tmp_path, f"{viewer()}<script>{script}</script>")
+    assert f'"says {words}"' in said[-1]
 
 
 @pytest.mark.slow
