@@ -90,8 +90,9 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     commands = parser.get_default("commands")
     if arguments[:1] == ["help"]:
         arguments = [*arguments[1:], "-h"]
-    if arguments[:2] == ["eval", "tum"]:  # evo asks for the format
-        arguments = ["eval", *arguments[2:]]
+    words = [word for word in arguments if not word.startswith("-")]
+    if words[:2] == ["eval", "tum"]:  # evo asks for the format
+        arguments = ["eval", *(word for word in arguments[1:] if word != "tum")]
     if not arguments[0].startswith("-") and arguments[0] not in commands:
         hint = nearest(arguments[0], commands, f"choose one of {', '.join(commands)}")
         raise UsageError(f"expected a command, found {arguments[0]!r}; {hint}")

@@ -41,6 +41,8 @@ def _fetch(args: argparse.Namespace) -> None:
         hint = nearest(name, known, "see which there are")
         require(name in known, "names of minislam weights list", f"{name!r}; {hint}")
     rows, progress = [known[name] for name in args.names], ProgressLine()
+    found = f"no home for {rows[0].path.parent}; set MINISLAM_CACHE to a writable folder"
+    require(not found.startswith("no home for ~"), "a folder for what is fetched", found)
 
     def show(file: str, done: int, total: int) -> None:  # bytes
         progress.show(f"fetching {file} [kB]", done // 1000, total // 1000)

@@ -136,12 +136,13 @@ def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path: P
         [truth, estimate, "-as"],
         ["tum", truth, estimate, "-as"],
         ["tum", "-as", truth, estimate],
+        ["-as", "tum", truth, estimate],
         ["tum", truth, "-as", estimate],
         [truth, str(tmp_path / "run"), "-as"],
     ):
         run_eval(parse(*words))
         said.append(capsys.readouterr().out)
-    assert said == 5 * said[:1]
+    assert said == 6 * said[:1]
 
 
 # Errors

@@ -1,6 +1,7 @@
 """Published checkpoints: listed, fetched from a server on the loopback address, and checked."""
 
 import hashlib
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +46,14 @@ def said(capsys: pytest.CaptureFixture[str]) -> tuple[str, str]:
 
 
 # List and fetch
+
+
+def test_who_has_no_home_is_asked_for_a_folder_before_anything_is_fetched(monkeypatch, capsys):
+    monkeypatch.delenv("MINISLAM_CACHE", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # nobody's process has none
+    assert main(["weights", "list"]) == 0 and main(["weights", "fetch", "dinov2"]) == 1
+    error = said(capsys)[1]
+    assert "found no home for ~" in error and "set MINISLAM_CACHE" in error
 
 
 def test_the_list_says_size_licence_and_what_is_there(server: Server, tmp_path: Path, capsys):

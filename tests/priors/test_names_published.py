@@ -1,12 +1,10 @@
 """The list of published files: complete, and found where `minislam weights` puts them."""
 
-import os
 import re
 from pathlib import Path
 
 import pytest
 
-from minislam.errors import InputError
 from minislam.priors.names import find_weights, published_files
 from minislam.priors.networks.table import NETWORKS
 
@@ -32,14 +30,10 @@ def test_every_network_has_a_file_that_is_called_like_it():
     assert len({row.file for row in ROWS.values()}) == len(ROWS)
 
 
-def test_the_cache_may_be_named_from_a_home_that_there_is(monkeypatch: pytest.MonkeyPatch):
+def test_the_cache_may_be_named_from_a_home(monkeypatch: pytest.MonkeyPatch):
     row = ROWS["dinov2"]
     monkeypatch.setenv("MINISLAM_CACHE", "~/weights of mine")
     assert row.path == Path.home() / "weights of mine" / "weights" / row.file
-    monkeypatch.delenv("MINISLAM_CACHE")
-    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # nobody's process has no home
-    with pytest.raises(InputError, match=r"found no home for ~.*minislam; set MINISLAM_CACHE"):
-        _ = row.path
 
 
 def test_a_network_finds_what_was_fetched_and_what_is_named(cache: Path):
