@@ -22,6 +22,7 @@ NOVEL_VIEWS = 12
 NOVEL_OFFSET = (0.1, 0.3)  # m, distance of a novel view from the path, at least and at most
 NOVEL_ANGLE = 0.07  # rad, largest turn of a novel view about each axis
 NOVEL_CLEARANCE = 0.5  # m, a novel view keeps this distance from everything
+MAXIMUM_FRAMES = 100_000  # nearly an hour; a mistyped number must not fill the disk
 MAXIMUM_WORKERS = 4  # more threads than that wait for each other
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
@@ -147,6 +148,8 @@ def check_request(frames: int, size: tuple[int, int]) -> None:
     """Raise SynthError where a sequence cannot be generated as asked."""
     if frames < 1:
         raise SynthError(f"a sequence needs at least 1 frame, not {frames}")
+    if frames > MAXIMUM_FRAMES:
+        raise SynthError(f"a sequence has at most {MAXIMUM_FRAMES:,} frames, not {frames:,}")
     if min(size) < 16 or max(size) > 4096:
         raise SynthError(f"width and height must be 16 to 4096 pixels, not {size[0]}x{size[1]}")
 

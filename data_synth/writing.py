@@ -102,7 +102,7 @@ def cached_sequence(
     """
     root = Path(os.path.expanduser(os.environ.get("MINISLAM_CACHE") or "~/.cache/minislam"))
     if str(root).startswith("~"):
-        raise SynthError(f"there is no home folder for {root}")
+        raise SynthError(f"there is no home folder for {root}: set MINISLAM_CACHE to a folder")
     filmed = "" if phone is None else f"-phone-{zlib.crc32(repr(phone).encode()):08x}"
     folder = root / "synth" / f"{name}-{seed}-{frames}-{size[0]}x{size[1]}{filmed}"
     for scratch in root.glob("synth/.*-*-*-*x*-????????"):  # left by a killed process

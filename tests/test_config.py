@@ -194,6 +194,11 @@ def test_a_wrong_type_is_named_with_what_was_found(name: str, value: object):
         ("networks.metric3d.size", "28,0"),
         ("uncertainty.dropout", 1), ("uncertainty.grid_factor", 0), ("uncertainty.neighbours", 0),
         ("mapping.insertion.footprint", 0.0), ("tracking.warmup_keyframes", 1),
+        ("uncertainty.learning_rate", 1.1), ("uncertainty.median_size", 0),
+        ("mapping.insertion.cell", 1001), ("mapping.means_rate", 1.1),
+        ("mapping.means_rate_end", 1.1), ("mapping.quats_rate", 1.1),
+        ("mapping.log_scales_rate", 1.1), ("mapping.opacity_rate", 1.1),
+        ("mapping.colors_rate", 1.1), ("mapping.refine_rate_end", 1.1),
     ],
 )  # fmt: skip
 def test_a_value_that_means_nothing_is_refused_with_its_bounds(name: str, value: object):

@@ -5,8 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from minislam.data.files import data_rows, finite_numbers, read_text
+from minislam.data.options import FOCAL_BOUNDS
 from minislam.errors import InputError, require
 from minislam.geometry import BrownDistortion, Camera
+from minislam.parameters import require_bounds
 
 # Focal length over the longer image side when nothing is known: phone and consumer cameras film
 # with 0.75 to 0.95 (a 26-30 mm equivalent lens, a little cropped by stabilisation).
@@ -72,6 +74,7 @@ def read_calibration(path: Path) -> Calibration:
     found = f"{len(fields)} in {path}; add or remove numbers"
     require(len(fields) in (4, 6, 11), wanted, found)
     fx, fy, cx, cy, *optional = finite_numbers(fields, str(path))
+    require_bounds(f"fx and fy, in pixels, in {path}", (fx, fy), *FOCAL_BOUNDS)
     size = (int(optional[0]), int(optional[1])) if optional else None
     is_whole = size is None or (size == tuple(optional[:2]) and min(size) >= 1)
     found = f"{' and '.join(fields[4:6])} in {path}; correct them"

@@ -74,5 +74,5 @@ def read_checkpoint(path: Path | str, gpu: str = "cpu") -> Any:
 
         return json.loads(arrays.pop(_TREE).tobytes(), object_hook=whole)
     except Exception as error:  # damaged bytes fail inside zipfile and numpy in many ways
-        found = "a damaged or another file; start again with --overwrite"
+        found = "a damaged or another file; remove it, and start again with --overwrite"
         raise InputError(f"expected a checkpoint in {path}, found {found}") from error

@@ -12,6 +12,7 @@ SYNTHETIC = "synth:"  # before the name of a synthetic sequence
 PHONE = "?phone"  # behind one that a phone films
 MINIMUM_SIDE = 16  # px; smaller images hold no pair of grid cells
 FOCAL_MODES = ("fixed", "refine", "auto")
+FOCAL_BOUNDS = 1, 5e4  # px; refinement tries 20 times as much, and a camera has up to 1e6
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,8 @@ class InputOptions:
     pixels: int = parameter(
         320 * 240, "about width * height of the chosen working size [px]", MINIMUM_SIDE**2
     )
-    fx: float | None = parameter(None, "focal length of the raw images, x [px]", 1, 1e6)
-    fy: float | None = parameter(None, "focal length of raw images, y; default fx [px]", 1, 1e6)
+    fx: float | None = parameter(None, "focal length of the raw images, x [px]", *FOCAL_BOUNDS)
+    fy: float | None = parameter(None, "the same in y; default fx [px]", *FOCAL_BOUNDS)
     cx: float | None = parameter(None, "principal point of raw images, x; default centre [px]", -1)
     cy: float | None = parameter(None, "principal point of raw images, y; default centre [px]", -1)
     k1: float | None = parameter(

@@ -30,10 +30,12 @@ _FILES = (
     CHECKPOINT, LOG, REPORT, VIEWER, CLIP,
 )  # fmt: skip
 KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
+_HALF = r"\.[0-9a-f]{8}\.tmp"  # behind the name of a file that is being written
+_BEGUN = re.compile(f"{KEYFRAMES}|{PLOTS}|{CONFIG}{_HALF}")  # what a folder holds at first
 _OURS = re.compile(  # every path that a run writes, inside its folder, also half-written
     rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_(input|render|depth|beta)\.png|"
     rf"{PLOTS}/(ate_over_time|trajectory|losses|gaussians|health|overview)\.png)"
-    r"(\.[0-9a-f]{8}\.tmp)?"
+    rf"({_HALF})?"
 )
 _CONFIG_PARTS = {"sequence", "input", "priors", "tracking", "mapping"}  # of every config.json
 
@@ -73,12 +75,15 @@ class RunFolder:
         inputs: Sequence[Path] = (),  # images that the run reads
         keeps_log: bool = False,  # the same run begins anew
     ) -> RunFolder:
-        """Make a run folder; `overwrite` removes what an earlier run wrote there, and only that."""
+        """Make a run folder; `overwrite` removes what an earlier run wrote there, and only that.
+
+        config.json stays until the run replaces it: it tells that the folder is one of a run.
+        """
         path = Path(path)
         files.require_free(path, overwrite)
         for file in _files_of_a_run(path, inputs) if os.path.isdir(path) else ():
-            if not (keeps_log and file.name == LOG):
-                file.unlink()
+            if file.name != CONFIG and not (keeps_log and file.name == LOG):
+                _remove(file)
         for folder in (KEYFRAMES, PLOTS):
             files.make_folder(path / folder)
         return cls(path)
@@ -100,6 +105,14 @@ class RunFolder:
         """Write a plot, plots/NAME.png, or what a keyframe shows, keyframes/000123_KIND.png."""
         assert _OURS.fullmatch(name), name
         files.atomic_write(self.path / name, png)
+
+    def remove_other_keyframes(self, written: set[str]) -> None:
+        """Remove the pictures of keyframes that a run gave up, after it was resumed."""
+        for file in self.path.glob(f"{KEYFRAMES}/*"):
+            name = f"{KEYFRAMES}/{file.name}"
+            is_link = file.resolve() != self.path.resolve() / name
+            if _OURS.fullmatch(name) and name not in written and not is_link:
+                _remove(file)
 
     def remove_checkpoint(self) -> None:
         """Remove the checkpoint, which a finished run does not need, and half-written files."""
@@ -138,10 +151,18 @@ class RunFolder:
             raise InputError(f"expected {wanted}, found other content; repeat the run") from error
 
 
+def _remove(file: Path) -> None:
+    try:
+        file.unlink()
+    except OSError as error:
+        advice = "choose another --output, or change its permissions"
+        raise InputError(f"expected to remove {file}, but: {error.strerror}; {advice}") from error
+
+
 def _files_of_a_run(path: Path, inputs: Sequence[Path]) -> list[Path]:
     """Return the files that a run wrote into a folder, or refuse a folder that may be another's."""
     entries = [*path.iterdir(), *path.glob(f"{KEYFRAMES}/*"), *path.glob(f"{PLOTS}/*")]
-    is_ours = {entry.name for entry in entries} <= {KEYFRAMES, PLOTS}
+    is_ours = all(_BEGUN.fullmatch(entry.name) for entry in entries)
     with suppress(InputError, TypeError):
         is_ours = is_ours or _CONFIG_PARTS <= set(files.read_json(path / CONFIG))
     wrong = [e for e in entries if e.is_symlink() and e.name in (*_FILES, KEYFRAMES, PLOTS)]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from minislam.data.calibration import Calibration, read_calibration, rough_calibration
+from minislam.data.files import read_bytes
 from minislam.data.images import read_color, read_depth, read_mask
 from minislam.data.options import SYNTHETIC, InputOptions, require_source, synthetic_parts
 from minislam.data.picture import Window, first_of_two, picture_window
@@ -19,7 +20,7 @@ from minislam.data.raw_images import FileImages
 from minislam.data.sources import Recording, mask_files, read_image_folder, read_video
 from minislam.data.tum import is_tum_folder, read_tum_folder
 from minislam.errors import InputError, require
-from minislam.parameters import absolute_path, user_path
+from minislam.parameters import absolute_path, user_path, with_values
 from minislam.records import Frame, GroundTruth, Progress
 from minislam.state.memory import Shelf, release
 
@@ -28,13 +29,13 @@ _SYNTHETIC_SIZE = (320, 240)  # px
 
 
 def open_sequence(
-    source: str, options: InputOptions | None = None, progress: Progress | None = None
+    source: str | Path, options: InputOptions | None = None, progress: Progress | None = None
 ) -> "RecordedSequence":
     """Open a video, an image folder, a TUM RGB-D folder, or `synth:NAME[:SEED][?phone]`.
 
     A folder is recognised by its content. `progress` is called while a scene is rendered.
     """
-    options = options or InputOptions()
+    source, options = str(source), with_values(InputOptions(), vars(options or InputOptions()))
     require_source(source, options.masks)
     if source.startswith(SYNTHETIC):
         return _synthetic(source, options, progress)
@@ -61,13 +62,15 @@ class RecordedSequence:
         self.name, images, stamps = recording.name, recording.images, recording.timestamps
         asked = range(options.start, len(images), options.stride)[: options.max_frames]
         self._chosen = [index for index in asked if index not in images.odd]
+        sizes = [*self._doubtful_sizes(asked)]
         found = f"{len(self._chosen)} among {len(images)} images of {recording.name}"
         advice = "after --start, --stride and --max-frames; change these, or give more images"
+        if len(self._chosen) < 2 <= len(asked):
+            advice = f"as {sizes[0]}"
         require(len(self._chosen) >= 2, "at least two frames", f"{found} {advice}")
-        left_out = [index for index in asked if index in images.odd]
         first, last = stamps[asked[0]], stamps[asked[-1]]
         self.unread = [row for row in recording.unread if first < row[0] < last]
-        self.unread += [(float(stamps[index]), images.odd[index]) for index in left_out]
+        self.unread += [(float(stamps[k]), images.odd[k]) for k in asked if k in images.odd]
         self._step = float(np.median(np.diff(stamps)))
         self._masks = recording.mask_paths
         if options.masks is not None:
@@ -94,7 +97,7 @@ class RecordedSequence:
         self.focal_origin = "" if is_guess else calibration.origin
         knows_nothing = calibration.is_rough and options.k1 is None and options.k2 is None
         self.seeks_lens = knows_nothing and options.focal == "auto"
-        self.warnings = [*recording.warnings, *self._doubts(calibration, largest, left_out)]
+        self.warnings = [*recording.warnings, *sizes, *self._doubts(calibration, largest)]
         if picture != barless:
             self.warnings.append(
                 "the images show two pictures that are alike, as of two eyes: the left or upper "
@@ -112,25 +115,30 @@ class RecordedSequence:
         has_truth = recording.trajectory is not None or files  # a sensor's depth is an input
         self.ground_truth = truth if has_truth else None
 
-    def _doubts(self, calibration: Calibration, largest: int, left_out: list[int]) -> Iterator[str]:
-        """Yield what is likely a mistake in the first raw image, the focal length or the sizes."""
-        images, raw = self._recording.images, self.prepare.raw_camera
-        label, resized = images.labels[self._chosen[0]], images.resized
+    def _doubtful_sizes(self, asked: range) -> Iterator[str]:
+        """Yield how many of the images asked for are left out or resized, with one of each."""
+        said = self._recording.images.odd, self._recording.images.resized
+        odd, resized = ([of[index] for index in asked if index in of] for of in said)
+        if odd:
+            text = f"{len(odd)} of {len(asked)} images are left out because of their size"
+            yield f"{text}, such as {odd[0]}; crop, turn or resize them"
+        if resized:
+            text = f"{len(resized)} of {len(asked)} images are resized to the size of most"
+            yield f"{text}, such as {resized[0]}"
+
+    def _doubts(self, calibration: Calibration, largest: int) -> Iterator[str]:
+        """Yield what is likely a mistake in the first raw image or the focal length."""
+        raw, label = self.prepare.raw_camera, self._recording.images.labels[self._chosen[0]]
         if label.lower().endswith(".png") and 0 < largest < 16:
             what = f"{label} is almost black, its largest value {largest} of 255"
             yield f"{what}: if it holds 10 or 12 bits in 16, multiply all images by 64 or 16"
-        angle = 60 if calibration.is_rough else 2 * np.degrees(np.arctan(raw.width / 2 / raw.fx))
-        if not 15 <= angle <= 130:  # degree
-            means = f"fx {raw.fx:g} px means a field of view of {angle:.0f} degrees"
-            unit = "in millimetres" if angle > 130 else "for larger images"
-            yield f"{means}: check if it is {unit}"
-        every = len(self) + len(left_out)
-        if left_out:
-            text = f"{len(left_out)} of {every} images are left out because of their size"
-            yield f"{text}, such as {images.odd[left_out[0]]}; crop, turn or resize them"
-        if similar := [resized[index] for index in self._chosen if index in resized]:
-            text = f"{len(similar)} of {every} images are resized to the size of most"
-            yield f"{text}, such as {similar[0]}"
+        for name, focal in (("fx", raw.fx), ("fy", raw.fy)):
+            angle = np.degrees(2 * np.arctan(max(raw.width, raw.height) / 2 / focal))
+            if not (calibration.is_rough or 15 <= angle <= 130):  # degree
+                means = f"{name} {focal:g} px means a field of view of {angle:.0f} degrees"
+                unit = "in millimetres" if angle > 130 else "for larger images"
+                yield f"{means}: check if it is {unit}"
+                break
         if calibration.is_rough and not self.refines_focal:
             unknown = f"the focal length is unknown: {calibration.fx:.0f} px, {calibration.origin}"
             advice = "give --fx, a calibration file, or --focal refine"
@@ -168,8 +176,10 @@ class RecordedSequence:
             image = self._kept[frame_index].copy()
         else:
             raw = self._recording.images.read(index)
-            self.checksums[frame_index] = crc32(raw.tobytes())
             image = self.prepare.pixels(raw, self._recording.images.labels[index])
+            files = (paths.get(index) for paths in (self._masks, self._recording.depth_paths))
+            beside = b"".join(map(read_bytes, filter(None, files)))
+            self.checksums[frame_index] = crc32(image.tobytes() + beside)
             with suppress(OSError):  # of a full disk: the image is prepared again next time
                 place = self._shelf.reserve(image.nbytes).reshape(image.shape)
                 place[:] = image
@@ -267,8 +277,9 @@ def _synthetic(source: str, options: InputOptions, progress: Progress | None) ->
     try:
         folder = data_synth.cached_sequence(name, int(seed or 0), frames, size, progress, phone)
     except (data_synth.SynthError, OSError) as error:
-        reason = f"{error}; set MINISLAM_CACHE to a writable folder with space left"
-        raise InputError(f"expected to render {source} into the cache, but: {reason}") from error
+        cache = "; set MINISLAM_CACHE to a writable folder with space left"
+        advice = cache * isinstance(error, OSError)
+        raise InputError(f"expected to render {source}, but: {error}{advice}") from error
     recording = replace(
         read_tum_folder(folder),
         name=f"{name}-{seed or 0}{'-phone' if is_filmed else ''}",

@@ -56,6 +56,9 @@ def read_tum_folder(folder: Path) -> sources.Recording:
     stamps, paths = _images(folder, "rgb")
     require(len(paths) > 0, f"images in {folder}/rgb.txt", "none; check the list")
     depth_stamps, depths = _images(folder, "depth")
+    depth_paths = _nearest(stamps, depth_stamps, depths)
+    if not (folder / "depth.txt").is_file():  # names like those of the images need be no times
+        depth_paths = max(_beside(folder / "depth", paths), depth_paths, key=len)
     camera, truth_path = _named_camera(folder), truth_beside(folder)
     size = noted_size(paths[0])
     fits = camera is not None and size is not None and camera.fits(*size)
@@ -72,7 +75,7 @@ def read_tum_folder(folder: Path) -> sources.Recording:
         timestamps=stamps,
         calibration=calibration_beside(folder) or (camera if fits else None),
         trajectory=trajectory,
-        depth_paths=_nearest(stamps, depth_stamps, depths),
+        depth_paths=depth_paths,
         mask_paths=_beside(folder / "masks", paths),
         static_paths=_beside(folder / "static", paths),
         novel_views=_novel_views(folder / "novel"),

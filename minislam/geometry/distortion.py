@@ -24,10 +24,21 @@ class BrownDistortion:
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     def undistortion_maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the two maps of cv2.remap that turn a raw image into that of `camera`."""
+        """Return the two maps (H, W) [px] of cv2.remap from a raw image to that of `camera`.
+
+        The seen radius r (1 + k1 r^2 + k2 r^4 + k3 r^6) may shrink again from some true radius r
+        on, where the model mirrors the image: there the first map is -1, outside the raw image.
+        """
         # OpenCV, like this package, puts the centre of the first pixel at (0, 0).
         K, size = camera_matrix(camera), (camera.width, camera.height)
-        return cv2.initUndistortRectifyMap(K, self.coefficients, None, K, size, cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(K, self.coefficients, None, K, size, cv2.CV_32FC1)
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = (np.arange(camera.height) - camera.cy) / camera.fy
+        squared = x**2 + y[:, None] ** 2
+        with np.errstate(over="ignore", invalid="ignore"):  # of absurd coefficients
+            slope = np.polyval([7 * self.k3, 5 * self.k2, 3 * self.k1, 1], squared)
+        maps[0][squared >= squared[slope <= 0].min(initial=np.inf)] = -1
+        return maps
 
 
 def camera_matrix(camera: Camera) -> np.ndarray:

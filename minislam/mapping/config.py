@@ -11,7 +11,7 @@ from minislam.splatting import LearningRates
 class InsertionConfig:
     """How densely an image adds Gaussians, and how they start."""
 
-    cell: int = parameter(2, "one Gaussian per square cell of this side [px of the full image]", 1)
+    cell: int = parameter(2, "one Gaussian per cell of this side [px of the full image]", 1, 1000)
     plain: float = parameter(
         0.12, "largest range of each colour in a cell of 2 or 4 times the side; 0, official: none"
     )
@@ -89,16 +89,20 @@ class MappingConfig:
         True, "what no image shows has the mean colour of those it begins with; off: official black"
     )
 
-    means_rate: float = parameter(2e-3, "first step of means [median depths]; official 9.6e-4 m")
+    means_rate: float = parameter(
+        2e-3, "first step of means [median depths]; official 9.6e-4 m", most=1
+    )
     means_rate_end: float = parameter(
-        0.1, "last step of the means over the first, log-linear in `rate_iterations`; official 0.01"
+        0.1, "last step of the means over the first, log-linear; official 0.01", most=1
     )
     rate_iterations: int = parameter(1500, "iterations of means_rate's decay; official 30000", 1)
-    quats_rate: float = parameter(2e-2, "Adam step of the quaternions; official 1e-3")
-    log_scales_rate: float = parameter(2e-2, "Adam step of the log-scales; official 6e-3")
-    opacity_rate: float = parameter(5e-2, "Adam step of the opacity logits, official")
-    colors_rate: float = parameter(5e-3, "Adam step of the colours; official 7.05e-4")
-    refine_rate_end: float = parameter(0.2, "last step over the first in refinement; official 1")
+    quats_rate: float = parameter(2e-2, "Adam step of the quaternions; official 1e-3", most=1)
+    log_scales_rate: float = parameter(2e-2, "Adam step of the log-scales; official 6e-3", most=1)
+    opacity_rate: float = parameter(5e-2, "Adam step of the opacity logits, official", most=1)
+    colors_rate: float = parameter(5e-3, "Adam step of the colours; official 7.05e-4", most=1)
+    refine_rate_end: float = parameter(
+        0.2, "last step over the first in refinement; official 1", most=1
+    )
 
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
     density: DensityConfig = field(default_factory=DensityConfig)

@@ -21,7 +21,7 @@ class UncertaintyConfig:
     hidden_units: int = parameter(64, "width of the two hidden layers [units], official", 1)
     dropout: float = parameter(0.2, "hidden units dropped in training [-], official", most=0.99)
     learning_rate: float = parameter(
-        2e-3, "Adam step of the MLP [1]; official 4e-4 for some 10^4 iterations, ours run 10^3"
+        2e-3, "Adam step of the MLP [1]; official 4e-4 for 10^4 iterations, ours 10^3", most=1
     )
     weight_decay: float = parameter(1e-5, "L2 pull on the weights [1]; official on half the loss")
 
@@ -37,7 +37,7 @@ class UncertaintyConfig:
         668.42, "factor of (1-l)(1-s)(1-c) [1]: 100 + 900 b(0.3; 0.8), NeRF On-the-go"
     )
     loss_cap: float = parameter(5.0, "cap of SSIM and depth term [1], official: beta <= 2 sqrt(6)")
-    median_size: int = parameter(3, "median window [cells], odd; official 5 on about 1,100 cells")
+    median_size: int = parameter(3, "median window [cells], odd; official 5 on 1,100 cells", 1)
 
     similarity: float = parameter(0.75, "least cosine of similar features [1], official", most=1)
     neighbours: int = parameter(128, "most similar cells that enter L_reg_V [cells], official", 1)

@@ -68,9 +68,13 @@ def test_a_noted_focal_length_comes_before_the_guess(tmp_path: Path):
         ("500 500 320 240 640 480 0.1", "found 7"),
         ("500 abc 320 240", "finite"),
         ("500 nan 320 240", "finite"),
-        ("-500 500 320 240", "positive focal"),
-        ("500 0 320 240", "positive focal"),
-        ("1e300 1e300 320 240", r"positive focal lengths up to 1e\+06"),
+        (
+            "-500 500 320 240",
+            r"of at least 1 and at most 50000, found \(-500.0, 500.0\)",
+        ),
+        ("500 0.99 320 240", "in pixels"),
+        ("0.85 1.13 0.5 0.5", "in pixels"),  # over the sides of the image
+        ("500 1e300 320 240", "in pixels"),
         ("500 500 320 240 640.5 480", "whole"),
         ("500 500 320 240 0 480", "whole"),
     ],

@@ -130,3 +130,7 @@ def test_a_disk_that_fills_up_later_keeps_what_was_written(server, tmp_path: Pat
     assert names(tmp_path) == ["w.pth.part"]
     fetch(server, tmp_path / "w.pth")
     assert (tmp_path / "w.pth").read_bytes() == CONTENT
+
+
+def test_the_progress_tells_the_whole_length_from_the_start(server, tmp_path: Path):
+    assert {total for _, total in fetch(server, tmp_path / "w.pth")} == {1_000_000}

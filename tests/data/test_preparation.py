@@ -127,3 +127,9 @@ def test_a_distortion_that_leaves_nothing_is_refused():
     maps = np.full((48, 64), -1, np.float32), np.full((48, 64), -1, np.float32)
     with pytest.raises(InputError, match="check k1 k2 p1 p2 k3"):
         seen_window(*maps, WHOLE)
+
+
+@pytest.mark.parametrize("k3", [1e308, -1e308])
+def test_an_absurd_distortion_is_refused(k3: float):
+    with pytest.raises(InputError, match="check k1 k2 p1 p2 k3"):
+        ImagePreparation(FR1, BrownDistortion(k1=0.1, k3=k3), None, 100)

@@ -101,8 +101,15 @@ def test_results_are_replaced_only_when_asked_and_foreign_files_never(tmp_path: 
         RunFolder.create(tmp_path / "out")
     assert (tmp_path / "out" / "map.ply").is_file()
     RunFolder.create(tmp_path / "out", overwrite=True)
-    left = [path.name for path in (tmp_path / "out").rglob("*") if path.is_file()]
-    assert left == ["notes.txt"]
+    left = {path.name for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    assert left == {"config.json", "notes.txt"}
+
+
+def test_a_folder_whose_run_was_killed_as_it_began_is_taken(tmp_path: Path):
+    begun = RunFolder.create(tmp_path / "out").path / "config.json.0123abcd.tmp"
+    begun.write_text('{"sequ')
+    RunFolder.create(tmp_path / "out", overwrite=True)
+    assert not begun.exists()
 
 
 def picture_of_mine(folder: Path) -> None:
@@ -162,7 +169,17 @@ def test_only_names_that_a_run_writes_are_removed(tmp_path: Path):
         (run.path / name).write_text("x")
     RunFolder.create(run.path, overwrite=True)
     left = {path.relative_to(run.path).as_posix() for path in run.path.rglob("*.*")}
-    assert left == set(mine)
+    assert left == {"config.json", *mine}
+
+
+def test_pictures_of_keyframes_that_were_given_up_are_removed_and_no_others(tmp_path: Path):
+    pictures = RunFolder.create(tmp_path / "out").path / "keyframes"
+    kept = {"000012_input.png", "holiday.png"}
+    for name in [*kept, "000007_input.png", "000007_beta.png.0123abcd.tmp"]:
+        (pictures / name).write_text("x")
+    (pictures / "000009_beta.png").symlink_to(pictures / "holiday.png")
+    RunFolder(tmp_path / "out").remove_other_keyframes({"keyframes/000012_input.png"})
+    assert {path.name for path in pictures.iterdir()} == kept | {"000009_beta.png"}
 
 
 def test_a_folder_is_locked_for_one_run_and_unlocked_by_its_end(tmp_path: Path):
@@ -204,6 +221,16 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(name: str, words: str, tmp
     with pytest.raises(InputError, match=words), locked(tmp_path / name):
         RunFolder.create(tmp_path / name)
     assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_file_that_cannot_be_removed_is_one_sentence(tmp_path: Path, monkeypatch):
+    def refuse(file: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    fill(RunFolder.create(tmp_path / "out"))
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(InputError, match=r"expected to remove .*out/.*, but: Perm.*; choose"):
+        RunFolder.create(tmp_path / "out", overwrite=True)
 
 
 def test_a_file_or_a_missing_folder_is_no_run(tmp_path: Path):

@@ -31,6 +31,16 @@ def test_the_size_of_most_images_counts_not_that_of_the_first(tmp_path: Path):
     assert len(sequence) == 2 and len(sequence.unread) == 1
 
 
+def test_sizes_and_not_options_are_blamed_where_they_leave_less_than_two_images(tmp_path: Path):
+    for number, size in enumerate(((48, 32), (32, 48), (48, 48))):
+        save(tmp_path / f"{number}.png", picture(1, *size))
+    left_out = "as 2 of 3 images are left out because of their size, such as 1.png is 32x48 px"
+    with pytest.raises(InputError, match=rf"found 1 among 3 images of \w+ {left_out}, others"):
+        open_sequence(str(tmp_path))
+    with pytest.raises(InputError, match=r"0 among 3 images of \w+ after --start, --stride"):
+        open_sequence(str(tmp_path), InputOptions(start=2))
+
+
 def test_a_size_of_zero_is_no_size(tmp_path: Path):
     for name in "12":
         save(tmp_path / f"{name}.png", picture(1))

@@ -43,6 +43,18 @@ def test_depth_is_associated_by_nearest_stamp(tmp_path: Path):
     assert paths == {0: tmp_path / near}
 
 
+def test_without_a_list_depth_is_found_by_the_names_of_the_images_or_by_stamp(tmp_path: Path):
+    for number in range(3):
+        save(tmp_path / f"rgb/{number}.png", picture(number))
+        save(tmp_path / f"depth/{number}.png", picture(number)[..., 0])
+    (tmp_path / "rgb.txt").write_text("1 rgb/0.png\n2 rgb/1.png\n3 rgb/2.png\n")
+    stems = {index: path.stem for index, path in read_tum_folder(tmp_path).depth_paths.items()}
+    assert stems == {0: "0", 1: "1", 2: "2"}
+    (tmp_path / "depth/0.png").rename(tmp_path / "depth/3.01.png")  # now most are near in time
+    stems = {index: path.stem for index, path in read_tum_folder(tmp_path).depth_paths.items()}
+    assert stems == {0: "1", 1: "2", 2: "3.01"}
+
+
 @pytest.mark.parametrize("where", ["README.md", "rgb.txt", "folder"])
 def test_the_camera_is_known_by_name(tmp_path: Path, where: str):
     name = "rgbd_freiburg2_xyz" if where == "folder" else "desk"

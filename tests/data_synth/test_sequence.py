@@ -216,6 +216,7 @@ def test_the_rooms_have_texture_and_the_bare_one_has_little():
         (("parade", 0, 2, SMALL), "no sequence is called 'parade'"),
         (("crowd", -1, 2, SMALL), "a seed is a whole number"),
         (("crowd", 0, 0, SMALL), "at least 1 frame"),
+        (("crowd", 0, 10**9, SMALL), "at most 100,000 frames, not 1,000,000,000"),
         (("crowd", 0, 2, (8, 60)), "width and height"),
     ],
 )

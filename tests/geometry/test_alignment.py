@@ -129,3 +129,12 @@ def test_nan_is_refused():
     source[2, 1] = np.nan
     with pytest.raises(InputError, match="finite"):
         umeyama(source, random_points(5, 1))
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_what_is_on_one_line_does_not_depend_on_the_unit(unit: float):
+    points, truth = unit * random_points(10, 0), random_similarity(0, 2.0)
+    assert umeyama(points, truth.transform_points(points)).scale == pytest.approx(2.0)
+    line = unit * np.arange(10)[:, None] * np.array([[1.0, 2.0, -0.5]])
+    with pytest.raises(InputError, match="on one line"):
+        umeyama(line, truth.transform_points(line))

@@ -58,3 +58,14 @@ def test_the_principal_point_does_not_move():
     camera = Camera(250.0, 250.0, 160.0, 120.0, 320, 240)
     map_u, map_v = LENS.undistortion_maps(camera)
     assert abs(map_u[120, 160] - 160) < 1e-4 and abs(map_v[120, 160] - 120) < 1e-4
+
+
+def test_beyond_the_fold_of_a_lens_the_maps_point_outside():
+    # 1 - 0.9 r^2 is zero at r = 1.054: 168.7 px from the centre.
+    camera = Camera(160, 160, 159.5, 119.5, 320, 240)
+    map_u, _ = BrownDistortion(k1=-0.3).undistortion_maps(camera)
+    v, u = np.meshgrid(np.arange(240) - 119.5, np.arange(320) - 159.5, indexing="ij")
+    np.testing.assert_array_equal(map_u == -1, np.hypot(u, v) > 168.7)
+    # Near the centre, this lens shows the more the farther out; so does that of TUM everywhere.
+    assert (np.diff(map_u[:, 101:219]) > 0).all()
+    assert (np.diff(LENS.undistortion_maps(CAMERA)[0]) > 0).all()

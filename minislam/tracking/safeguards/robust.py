@@ -24,7 +24,7 @@ class RobustKernel:
     """A robust loss of squared residuals."""
 
     scale: float  # c, px
-    power: float = 2.0  # k >= 1
+    power: float = 2.0  # k >= 0; 0: least squares
 
     def weight(self, squared: Tensor) -> Tensor:
         """Return d loss / d r^2, in (0, 1], of squared residuals [px^2]."""
