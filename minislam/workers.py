@@ -22,6 +22,7 @@ from itertools import islice
 from threading import Lock, Thread
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -94,7 +95,8 @@ class Workers(AbstractContextManager["Workers"]):
                 for number in left:
                     answers[number] = answer(function, arguments[number])
 
-        helpers = self._helpers[: max(0, len(calls) - 1)]
+        idle = [helper for helper in self._helpers if not helper.lock.locked()]
+        helpers = idle[: max(0, len(calls) - 1)]
         threads = [Thread(target=compute, args=(h.answer,), daemon=True) for h in helpers]
         for thread in threads:
             thread.start()
@@ -156,12 +158,12 @@ class _Helper:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )
         self.runs = True
-        self._lock = Lock()  # while it computes a call
+        self.lock = Lock()  # while it computes a call
 
     def answer(self, function: Callable[..., Any], arguments: Tree) -> Tree:
         """Return what `_answer` returns, or raise _HelperLost."""
         try:
-            with self._lock:
+            with self.lock:
                 _send(self._process.stdin, [function.__module__, function.__name__, arguments])
                 return _receive(self._process.stdout)
         except (EOFError, OSError, ValueError) as error:
@@ -182,6 +184,7 @@ def serve() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints must not get among the answers
     torch.set_num_threads(int(sys.argv[1]))
+    cv2.setNumThreads(1)  # as in the process that asks: others need the cores
     try:
         while True:
             module, name, arguments = _receive(sys.stdin.buffer)

@@ -49,8 +49,10 @@ def _bench(args: argparse.Namespace) -> int:
     own = argparse.ArgumentParser(prog="minislam bench", usage=USAGE, allow_abbrev=False)
     own.add_argument("-o", "--output", default="output/bench", type=user_path)
     given, options = own.parse_known_args(args.options)
-    if "--resume" in options:
-        raise UsageError("expected no --resume, found it; leave it out, bench resumes by itself")
+    for flag in ("--overwrite", "--resume"):
+        if flag in options:
+            advice = "leave it out, bench resumes by itself, and begins anew with another -o"
+            raise UsageError(f"expected no {flag}, found it; {advice}")
     sequences, noted = find_sequences(args.folders), given.output / "options.json"
     run = parsed(["run", args.folders[0], "--overwrite", *options])
     settings(run), input_options(run), prior_choice(run, "none"), lpips_of(run)  # or refuse them

@@ -31,7 +31,7 @@ _FILES = (
 )  # fmt: skip
 KEYFRAMES, PLOTS = "keyframes", "plots"  # folders
 _HALF = r"\.[0-9a-f]{8}\.tmp"  # behind the name of a file that is being written
-_BEGUN = re.compile(f"{KEYFRAMES}|{PLOTS}|{CONFIG}{_HALF}")  # what a folder holds at first
+_BEGUN = re.compile(f"{KEYFRAMES}|{PLOTS}|{re.escape(CONFIG)}{_HALF}")  # its first entries
 _OURS = re.compile(  # every path that a run writes, inside its folder, also half-written
     rf"({'|'.join(map(re.escape, _FILES))}|{KEYFRAMES}/\d{{6,}}_(input|render|depth|beta)\.png|"
     rf"{PLOTS}/(ate_over_time|trajectory|losses|gaussians|health|overview)\.png)"

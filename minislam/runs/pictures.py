@@ -75,9 +75,10 @@ def write_pictures(folder: RunFolder, slam: Slam, metrics: Json, facts: Json) ->
     path = viz.trajectory_plot(estimate, true_path, unit, broken)
     history = slam.mapper.history
     curves = {name: values for name, values in history.items() if name != "Gaussians"}
+    rise = "the first two may rise where beta begins to weigh them and at full image size"
     plots += [
         ("trajectory", "Path of the camera, in the planes x-z and x-y", path),
-        ("losses", "Losses while the map was optimised", viz.loss_curves(curves)),
+        ("losses", f"Losses while the map was optimised; {rise}", viz.loss_curves(curves)),
         ("gaussians", "Size of the map", viz.map_growth(history["Gaussians"])),
     ]
     figures = []
@@ -151,7 +152,7 @@ def _write_keyframes(folder: RunFolder, slam: Slam) -> dict[str, Any]:
 
     All have the same limits. The names are those of viz.Report.
     """
-    views, jpegs = slam.mapper.images, dict[int, list[bytes]]()
+    views, jpegs, written = slam.mapper.images, dict[int, list[bytes]](), set[str]()
     keyframes = [index for index, view in enumerate(views) if view.inserts]
     sample = [keyframes[k] for k in _spread(len(keyframes), COLOUR_SAMPLES)]
     sampled = list(_panels(slam, sample))
@@ -164,7 +165,9 @@ def _write_keyframes(folder: RunFolder, slam: Slam) -> dict[str, Any]:
         panels["depth"] = viz.depth_to_rgb(panels["depth"], of_depth)
         panels["beta"] = viz.beta_to_rgb(panels["beta"], of_beta)
         for kind, panel in panels.items():
-            folder.write_image(f"{KEYFRAMES}/{frame_index:06d}_{kind}.png", encode_png(panel))
+            written.add(name := f"{KEYFRAMES}/{frame_index:06d}_{kind}.png")
+            folder.write_image(name, encode_png(panel))
         if number in shown:
             jpegs[frame_index] = [encode_jpeg(panel, LONGEST_SIDE) for panel in panels.values()]
+    folder.remove_other_keyframes(written)
     return {"keyframes": jpegs, "depth_limits": of_depth, "beta_limits": of_beta}

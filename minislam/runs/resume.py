@@ -38,8 +38,8 @@ class Checkpoints:
         self._folder = folder
         self._fraction = config.checkpoint_fraction
         origin = {
+            "version": minislam.__version__,  # another one may have other options
             "input": sequence.opened_as["input"],  # an option says more than a description
-            "version": minislam.__version__,
             "sequence": {
                 "name": sequence.name,
                 "description": sequence.description,
@@ -85,23 +85,26 @@ class Checkpoints:
         What a GPU began may go on without one, no longer to the same bytes.
         """
         device, where = self._origin["priors"]["device"], self._folder.path
-        found = read_checkpoint(where / CHECKPOINT, device)
+        found, anew = read_checkpoint(where / CHECKPOINT, device), "start anew in another folder"
         try:
             present = flattened(self._origin)
             then = flattened({name: found.get(name) for name in self._origin})
             if device == "cpu" and then.get("priors.device") != "cpu":
                 then |= {name: present[name] for name in ("priors.device", "priors.precision")}
             differing = [name for name, now in present.items() if then.get(name) != now]
-            # What else of the input differs shows in the images, whose checksums are compared.
+            # What else of the input differs shows in the checksums of images, masks and sensor
+            # depth. What --depth files: and --features files: read is not compared.
             if any(n[:6] != "input." or n == "input.depth_scale" for n in differing):
                 name = differing[0]
                 wanted = f"{name} = {then.get(name)} like the interrupted run in {where}"
-                advice = "repeat its command with --resume, or start anew in another folder"
-                raise InputError(f"expected {wanted}, found {present[name]}; {advice}")
+                how = "repeat its command with --resume"
+                if name == "version":
+                    how = "resume it with that version"
+                raise InputError(f"expected {wanted}, found {present[name]}; {how}, or {anew}")
             for index, checksum in found["checksums"].items():
                 slam.sequence.frame(int(index))
                 wanted = f"frame {index} as the interrupted run in {where} read it"
-                other = "another image; restore it, or start anew in another folder"
+                other = f"another image, lens, mask or depth; restore it, or {anew}"
                 require(slam.sequence.checksums[int(index)] == checksum, wanted, other)
             slam.restore_state(found["slam"], functools.cache(slam.frame))
             self.start -= float(found["run_seconds"])
@@ -109,6 +112,6 @@ class Checkpoints:
         except MinislamError:
             raise
         except Exception as error:  # parts are missing, or have another type or shape
-            wanted = f"the whole state of a run in the checkpoint of {where}"
-            found = f"{error!r}; it is damaged or of another program: start again with --overwrite"
-            raise InputError(f"expected {wanted}, found {found}") from error
+            wanted = f"the whole state of a run in {where / CHECKPOINT}"
+            found = f"{error!r}: a damaged or another file; remove it, and start again with"
+            raise InputError(f"expected {wanted}, found {found} --overwrite") from error

@@ -132,7 +132,8 @@ def test_an_interrupted_bench_keeps_its_tables_and_goes_on(made: Bench):
         (["--seed", "2", "--depth", "laser"], 1, "expected --depth none, simulated"),
         (["--preset", "fast"], 1, "expected a preset among"),
         (["other"], 2, "found also 'other'"),
-        (["--resume"], 2, "leave it out, bench resumes by itself"),
+        (["--resume"], 2, "expected no --resume, found it; leave it out, bench resumes by itself"),
+        (["--overwrite"], 2, "expected no --overwrite, found it; leave it out"),
     ],
 )
 def test_options_of_no_run_are_refused_and_not_kept(made: Bench, capsys, options, code, words):

@@ -118,6 +118,7 @@ def test_after_a_power_cut_the_last_checkpoint_serves(step: int, whole: Path, ro
     assert RunFolder(out).read_run()["state"] == "running"
     state = read_checkpoint(out / "checkpoint.npz")["slam"]
     assert state["steps"]["_done"] == {TRACKING: step - 1}
+    (out / "keyframes/000099_beta.png").touch()  # of a keyframe that was given up
     assert run("synth:person", out, "--resume", *often) == 0
     assert_same_results(whole, out, SAME[:-1])
 
@@ -143,6 +144,8 @@ def test_without_a_depth_prior_after_a_damaged_image_was_replaced(photos: Path, 
     (photos / "12.png").write_bytes(content)
     state = read_checkpoint(root / "photos_broken/checkpoint.npz")["slam"]
     assert state["steps"]["_done"] == {TRACKING: 12}
+    assert run(photos, root / "photos_broken", "--resume", "--k1", "-.3", inputs=inputs) == 1
+    assert_one_sentence("expected frame 0 as the interrupted run .* found another image", capsys)
     assert run(photos, root / "photos_broken", "--resume", inputs=inputs) == 0
     assert_same_results(root / "photos_whole", root / "photos_broken")
 
@@ -226,14 +229,11 @@ def truncate(folder: Path) -> None:
 
 
 def grow_older(folder: Path) -> None:
-    tree = read_checkpoint(folder / "checkpoint.npz")
-    write_checkpoint(folder / "checkpoint.npz", tree | {"version": "0.0"})
+    tamper(lambda tree: tree.update(version="0.0", input={}), folder)
 
 
 def change_an_image(folder: Path) -> None:
-    tree = read_checkpoint(folder / "checkpoint.npz")
-    tree["checksums"]["1"] += 1
-    write_checkpoint(folder / "checkpoint.npz", tree)
+    tamper(lambda tree: tree["checksums"].update({"1": 0}), folder)
 
 
 def tamper(change: Callable[[dict], object], folder: Path) -> None:
@@ -260,13 +260,13 @@ def change_the_settings(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
-        (truncate, "expected a checkpoint in .*checkpoint.npz, found a damaged or another file"),
-        (grow_older, f"expected version = 0.0 .* found {minislam.__version__}"),
+        (truncate, "in .*checkpoint.npz, found a damaged or another file; remove it, and start"),
+        (grow_older, f"version = 0.0 .* found {minislam.__version__}; resume it with that version"),
         (change_an_image, "expected frame 1 as the interrupted run in .* read it, found another"),
         (change_the_settings, "expected settings.tracking.window = 10 like .* found 4"),
         (partial(remove, "checkpoint.npz"), "an interrupted run in .*, found no checkpoint.npz"),
         (partial(remove, "config.json"), "expected a readable file .*config.json"),
-        *[(partial(tamper, change), "expected the whole state of a run") for change in TAMPERED],
+        *[(partial(tamper, change), "state of a run .*; remove it, and") for change in TAMPERED],
         (shutil.rmtree, "expected a run folder, found no folder at .*"),
     ],
 )
