@@ -57,7 +57,7 @@ def write_sequence(
 ) -> Path:
     """Write a sequence into a folder; a complete one with the same parameters is kept."""
     check_request(frames, size)
-    folder = Path(folder).resolve()  # of a link, what it points to is replaced
+    folder = Path(os.path.realpath(folder))  # of a link, what it points to is replaced
     record = {
         "name": name,
         "seed": seed,

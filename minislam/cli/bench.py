@@ -17,7 +17,7 @@ from minislam.data.files import make_folder, read_json, write_json, write_text
 from minislam.data.run_folder import CHECKPOINT, METRICS, RUN
 from minislam.errors import INTERRUPTED_EXIT, LOST_EXIT, InputError, require
 from minislam.parameters import user_path
-from minislam.runs.progress import ending_signals, say
+from minislam.runs.progress import ending_signals, quoted, say
 
 USAGE = "minislam bench FOLDER... [-o OUT] [options of minislam run]"
 LEGEND = """\
@@ -139,6 +139,6 @@ def _write_tables(output: Path, ours: dict[str, str], options: list[str]) -> str
         lines = [f"| {' | '.join(map(str.ljust, row, widths))} |" for row in rows]
         text += "\n".join([f"{dataset}:\n", *lines, "\n"])
     write_text(output / "bench.csv", file.getvalue())
-    text += LEGEND + (f"\nOptions: {' '.join(options)}" if options else "")
+    text += LEGEND + (f"\nOptions: {' '.join(map(quoted, options))}" if options else "")
     write_text(output / "bench.md", text + "\n")
     return text

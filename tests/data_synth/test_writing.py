@@ -195,6 +195,12 @@ def test_known_errors_are_one_sentence_and_exit_code_1(arguments, sentence, tmp_
     assert not (tmp_path / "out").exists()
 
 
+def test_a_link_that_leads_to_itself_is_refused_in_a_sentence(tmp_path, capsys):
+    (tmp_path / "loop").symlink_to("loop")
+    assert main(["static", "--frames", "1", "--size", "24x16", "--out", f"{tmp_path}/loop"]) == 1
+    assert "could not write" in capsys.readouterr().err
+
+
 def test_an_error_of_the_system_without_a_text_of_its_own_is_told(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(writing, "_put_in_place", lambda *_: shutil.rmtree(tmp_path / "link"))
     (tmp_path / "link").symlink_to(tmp_path)

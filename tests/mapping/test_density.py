@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import torch
@@ -104,3 +105,31 @@ def test_an_empty_map_stays_empty():
 def test_children_are_those_of_the_generator_given():
     first, second = (split(map_of([1.0] * 3), generator(1)).means for _ in range(2))
     assert torch.equal(first, second)
+
+
+def test_children_lie_along_the_longest_axis_of_their_parent():
+    parents = map_of([1.0] * 4000)
+    parents.means.zero_()
+    parents.log_scales[:, 0] = math.log(3.0)
+    turn = math.pi / 8  # half the angle about z
+    parents.quats_wxyz[:] = torch.tensor([math.cos(turn), 0.0, 0.0, math.sin(turn)])
+    spread = torch.cov(split(parents, generator(1)).means.T)
+    expected = torch.tensor([[5.0, 4.0, 0.0], [4.0, 5.0, 0.0], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(spread, expected, rtol=0, atol=0.3)
+
+
+def test_the_longest_axis_tells_what_is_large_beside_the_scene():
+    for unit in (1.0, 100.0):
+        gaussians = map_of([0.01 * unit] * 2)
+        gaussians.log_scales[1, 0] = math.log(unit)
+        optimizer = MapOptimizer(gaussians, LearningRates())
+        densify(optimizer, over_three_views(torch.ones(2)), unit, CONFIG, generator(0))
+        assert optimizer.gaussians.anchor_keyframe.tolist() == [0, 0, 1, 1]
+        small = torch.full((2, 3), 0.01 * unit)  # a clone, hence of the same size
+        torch.testing.assert_close(optimizer.gaussians.scales[:2], small)
+
+
+def test_a_long_needle_is_huge():
+    gaussians = map_of([0.01, 0.01])
+    gaussians.log_scales[1, 0] = 5  # 148 world units
+    assert useful_rows(gaussians, HERE, 1.0).tolist() == [True, False]

@@ -198,3 +198,13 @@ def test_black_images_and_unknown_depth_give_zero_and_finite_gradients():
     )
     loss.backward()
     assert loss == 0 and torch.isfinite(color.grad).all()
+
+
+def test_long_gaussians_weigh_the_same_in_any_world_unit():
+    black, nothing, losses = torch.zeros(13, 15, 3), torch.zeros(13, 15), []
+    for unit in (1.0, 250.0):
+        gaussians = one_gaussian()
+        gaussians.log_scales[:] = (unit * torch.tensor([0.1, 0.2, 0.9])).log()
+        given = gaussians, rendering_of(black, nothing), black, nothing, nothing
+        losses.append(float(render_loss(*given, 2.5 * unit, MappingConfig())[0]))
+    assert 0 < losses[0] == pytest.approx(losses[1], rel=1e-5)

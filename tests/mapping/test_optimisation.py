@@ -93,3 +93,22 @@ def test_what_was_read_of_the_images_before_is_released_with_every_beta(
     for count in (1, 2):
         mapper.beta_of(wall_keyframe(count))
         assert len(released) == count
+
+
+def test_the_mlp_also_looks_at_the_images_before_and_after(monkeypatch: pytest.MonkeyPatch):
+    mapper, around = make_mapper(replace(CONFIG, init_iterations=1)), []
+    mapper.initialise([wall_keyframe(k) for k in range(7)])
+    share = view_gradients(*mapper._view_arguments(mapper.images[0], CAMERA, True))
+    for k, image in enumerate(mapper.images):
+        mapper.images[k] = replace(image, features=torch.full((1, 1, 3), k))
+    monkeypatch.setattr(mapper._trainer, "step", lambda *given: around.append(given[2][:, 0]))
+    for positions in ([3], [0], [6], [0, 6]):
+        mapper._train_mlp(positions, [share])
+    assert [seen.tolist() for seen in around] == [
+        [1, 2, 3, 4, 5], [0, 1, 2], [4, 5, 6], [0, 1, 2, 4, 5, 6]
+    ]  # fmt: skip
+
+
+def test_online_images_have_the_size_of_image_scale():
+    mapper = make_mapper(replace(CONFIG, image_scale=0.5))
+    assert mapper._online_camera == CAMERA.resized(16, 12)

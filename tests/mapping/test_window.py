@@ -101,3 +101,16 @@ def test_each_round_renders_every_keyframe_once_in_an_order_of_its_own():
 def test_a_part_of_the_iterations_is_as_in_the_whole():
     assert in_turn(range(7, 23), 10, seed=3) == in_turn(range(30), 10, seed=3)[7:23]
     assert in_turn(range(4), 1, seed=0) == [0] * 4
+
+
+def test_of_two_that_stand_together_the_crowded_one_leaves_not_the_farthest():
+    # The candidates stand at 0, 5 and 5.1, the new keyframe at 10: alone, the farthest stays.
+    views = {k: seen(0, 1) for k in range(5)}
+    window = update_window([3, 2, 1, 0], 4, views, poses(0.0, 5.0, 5.1, 9.0, 10.0), 4)
+    assert window in ([4, 3, 1, 0], [4, 3, 2, 0])
+
+
+def test_of_two_that_stand_as_close_to_others_the_one_far_from_the_new_leaves():
+    views = {k: seen(0, 1) for k in range(5)}
+    window = update_window([3, 2, 1, 0], 4, views, poses(0.4, -0.5, 0.1, 5.0, 0.0), 4)
+    assert window == [4, 3, 2, 1]  # score 2.8 at 0.4, but 1.6 at 0.1, which is the most crowded

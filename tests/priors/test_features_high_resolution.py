@@ -41,6 +41,8 @@ def test_means_of_a_ramp_are_those_at_the_centres_of_the_finer_cells(factor: int
     inner = slice(factor, -factor)  # beyond the border the ramp goes on level
     expected = (column / 40)[inner]
     torch.testing.assert_close(features[factor, inner, 0], expected, rtol=0, atol=1e-5)
+    row = (torch.arange(3 * factor) + 0.5) * PATCH / factor - 0.5
+    torch.testing.assert_close(features[inner, factor, 1], (row / 24)[inner], rtol=0, atol=1e-5)
 
 
 def test_an_image_is_shifted_by_whole_and_by_half_pixels():
@@ -59,3 +61,8 @@ def test_an_odd_factor_keeps_the_coarse_features_among_the_fine_ones():
     extractor = ClassicalFeatures()
     fine = HighResolutionFeatures(extractor, 3)(frame(image))
     torch.testing.assert_close(fine[1::3, 1::3], extractor(frame(image)), rtol=0, atol=1e-3)
+
+
+def test_the_finer_stride_is_that_of_the_parts_of_a_patch():
+    strides = [HighResolutionFeatures(PatchMean(), factor).stride for factor in (1, 2, 3, 99)]
+    assert strides == [8, 4, 3, 1]

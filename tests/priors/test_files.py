@@ -197,3 +197,12 @@ def test_a_damaged_index_is_refused(tmp_path: Path):
         (tmp_path / INDEX).write_text(text)
         with pytest.raises(InputError, match=r"rows of frame index and timestamp in .*frames\.txt"):
             FrameFiles(tmp_path, "features", (".npy",))
+
+
+@pytest.mark.parametrize(("height", "width"), [(55, 168), (168, 55)])
+def test_a_grid_that_lacks_almost_a_whole_row_of_patches_covers_its_image(
+    height: int, width: int, tmp_path: Path
+):
+    files = {"0.npy": grid(1, height // 14, width // 14)}  # 3 of 3.93 patches, by 12
+    image = torch.zeros(height, width, 3)
+    assert FileFeatures(folder_with(tmp_path, files), CAMERA)(frame_of(image)).shape[2] == 6

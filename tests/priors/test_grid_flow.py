@@ -6,7 +6,13 @@ import pytest
 from minislam.priors import grid_flow
 from minislam.priors.dense_flow import grayscale
 from minislam.priors.flow import STRIDE
-from minislam.priors.grid_flow import lucas_kanade, match_exposure, measure_on_grid, windows_of
+from minislam.priors.grid_flow import (
+    lucas_kanade,
+    match_exposure,
+    measure_on_grid,
+    texture_confidence,
+    windows_of,
+)
 from tests.priors.patterns import HEIGHT, SIZE, WIDTH, constant, shifted, view
 
 INNER_CELLS = (slice(2, -2), slice(2, -2))
@@ -97,3 +103,11 @@ def test_nothing_is_changed():
     measure_on_grid(source, target, flow, -flow, SURE, STRIDE)
     for now, then in zip((source, target, flow), copies, strict=True):
         np.testing.assert_array_equal(now, then)
+
+
+def test_stripes_locate_no_cell_and_a_pattern_of_both_locates_each():
+    v, u = np.mgrid[:64, :64]
+    rows, columns, slanted = (128 + 100 * np.sin(x / 2) for x in (v, u, u + v))
+    for stripes in (rows, columns, slanted):
+        assert texture_confidence(stripes, 8)[1:, 1:].max() < 1e-3  # not at the border
+    assert texture_confidence((rows + columns) / 2, 8).min() > 0.3

@@ -3,6 +3,9 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
+
 from minislam.config import preset
 from minislam.runs import pictures
 from minislam.runs.pictures import MAX_SHOWN, Preview, named_settings
@@ -49,3 +52,27 @@ def test_a_preview_waits_for_a_map_and_then_keeps_its_share_of_the_time(monkeypa
 def test_a_preview_never_ends_a_run():
     slam = SimpleNamespace(mapper=SimpleNamespace(images=[None]))
     pictures.write_preview(None, slam, {})  # the run has no picture to show, and the folder is none
+
+
+def test_a_report_has_the_warnings_of_its_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "summarise", lambda *_: {})
+    sequence = SimpleNamespace(name="clip", description="two images")
+    slam = SimpleNamespace(sequence=sequence, config=preset("test"))
+    facts = {"command": ["minislam", "run"], "state": "finished", "unit": "m"}
+    facts["warnings"] = ["the camera hardly moved"]
+    shown = {"overview": b"", "figures": {}}
+    pictures._write_report(SimpleNamespace(path=tmp_path), slam, {}, facts, **shown)
+    assert "the camera hardly moved" in (tmp_path / pictures.REPORT).read_text(encoding="utf-8")
+
+
+def test_depth_and_beta_of_keyframes_are_written_in_colours(monkeypatch):
+    numbers, image, written = np.linspace(0.5, 2, 48).reshape(6, 8), np.zeros((6, 8, 3)), {}
+    panels = {"input": image, "depth": numbers, "beta": numbers, "render": image}
+    monkeypatch.setattr(pictures, "_panels", lambda slam, k: (dict(panels) for _ in k))
+    views = [SimpleNamespace(inserts=True, frame_index=7)]
+    folder = SimpleNamespace(write_image=written.__setitem__, remove_other_keyframes=lambda _: None)
+    pictures._write_keyframes(folder, SimpleNamespace(mapper=SimpleNamespace(images=views)))
+    for kind in ("depth", "beta"):
+        content = np.frombuffer(written[f"keyframes/000007_{kind}.png"], np.uint8)
+        blue, _, red = cv2.split(cv2.imdecode(content, cv2.IMREAD_COLOR))
+        assert (blue != red).any()

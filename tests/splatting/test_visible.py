@@ -21,3 +21,16 @@ def test_nearest_come_first_and_equal_depths_stay_in_map_order(dtype: torch.dtyp
     )  # fmt: skip
     expected = sorted(range(count), key=lambda row: float(means[row, 2]))  # stable
     assert projected.rows.tolist() == expected
+
+
+def test_what_reaches_into_the_image_is_projected_and_what_ends_beside_it_is_not():
+    camera = Camera(50.0, 50.0, 20.0, 15.0, 40, 30)
+    beside = [(-8.0, 15.0), (47.0, 15.0), (20.0, -8.0), (20.0, 37.0)]  # px
+    far = [(-60.0, 15.0), (99.0, 15.0), (20.0, -60.0), (20.0, 99.0)]
+    positions = torch.tensor([*beside, *far, (20.0, 29.0), (39.0, 15.0)])
+    means = camera.backproject(positions, torch.full((len(positions),), 2.0))
+    projected = project_gaussians(
+        means, torch.eye(4)[:1].expand(len(means), 4), torch.full((len(means), 3), 0.15),
+        torch.full((len(means),), 0.5), None, torch.eye(4), camera,
+    )  # fmt: skip
+    assert projected.rows.tolist() == [0, 1, 2, 3, 8, 9]

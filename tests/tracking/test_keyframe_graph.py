@@ -111,3 +111,9 @@ def test_how_far_a_global_edge_may_reach_is_said_in_px_of_a_reference_image(
     distance = ratio * float(graph.distances()[1, 0]) / graph.pixel_scale
     monkeypatch.setattr(keyframe_graph, "GLOBAL_DISTANCE", distance)
     assert bool(graph.global_edges()) == (ratio > 1)
+
+
+def test_a_keyframe_that_follows_a_loss_has_no_neighbours_before_it():
+    graph = true_graph(list(range(4)))
+    graph.flow_to_next[2] = None
+    assert graph.neighbour_edges(3) == []

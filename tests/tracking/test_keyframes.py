@@ -148,3 +148,10 @@ def test_freed_memory_is_given_back_with_every_keyframe(monkeypatch: pytest.Monk
     monkeypatch.setattr(keyframes, "give_back_freed", lambda: given.append(None))
     filled(3)
     assert len(given) == 3
+
+
+def test_a_prior_of_a_far_scene_gives_its_unit_of_length_too():
+    store, before = filled(3), filled(3)
+    store.prior_disparities[:] = 0.01 * store.disparities  # all beyond one unit
+    store.normalise_scale()
+    torch.testing.assert_close(store.disparities, 0.01 * before.disparities)

@@ -112,3 +112,15 @@ def test_how_near_a_loop_must_be_is_said_in_px_of_a_reference_image(ratio: float
     nearest = float(graph.distances(rows=range(8, 9))[8, : 8 - CONFIG.loop_min_gap + 1].min())
     graph.config = replace(CONFIG, loop_distance=ratio * nearest / graph.pixel_scale)
     assert bool(loop_closure._loop_edges(graph)) == (ratio > 1)
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
+def test_how_well_a_loop_must_fit_is_said_in_px_of_a_reference_image(
+    monkeypatch: pytest.MonkeyPatch, ratio: float
+):
+    graph = drifted(TrueFlow())
+    limits = loop_closure.FITTING_RESIDUAL, loop_closure.MAX_LOOP_RESIDUAL
+    told = iter([ratio * limit * graph.pixel_scale for limit in limits])
+    monkeypatch.setattr(loop_closure, "mean_residual", lambda *_: next(told))
+    assert not close_loops(graph)
+    assert ((8, 0) in graph.edges.ends) == (ratio < 1)  # it fits already, or is undone

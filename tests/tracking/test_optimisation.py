@@ -201,7 +201,7 @@ def test_the_last_adjustment_keeps_the_truth():
     graph, calls = matched(), []
     final_global_ba(graph, lambda done, of_all: calls.append((done, of_all)))
     rounds = graph.config.final_rounds
-    assert calls == [(done, rounds) for done in range(1, rounds + 1)]
+    assert calls == [(done, rounds) for done in range(1, rounds + 1)] and (3, 0) in graph.edges.ends
     assert max(pose_error(graph, keyframe) for keyframe in range(4)) < 1e-3
 
 
@@ -287,3 +287,14 @@ def test_a_sample_of_few_edges_does_not_tell_whether_all_fit(monkeypatch):
     monkeypatch.setattr(optimisation, "ENOUGH_EDGES", enough)
     online_global_ba(graph)
     assert len(graph.edges) == expected
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
+def test_how_well_new_edges_must_fit_is_said_in_px_of_a_reference_image(monkeypatch, ratio: float):
+    graph, adjusted = matched(12), []
+    told = ratio * optimisation.FITTING_RESIDUAL * graph.pixel_scale
+    monkeypatch.setattr(optimisation, "mean_residual", lambda *_: told)
+    monkeypatch.setattr(optimisation, "ENOUGH_EDGES", 1)
+    monkeypatch.setattr(optimisation, "adjust", lambda *_, **__: adjusted.append(None))
+    online_global_ba(graph)
+    assert bool(adjusted) == (ratio > 1)

@@ -71,3 +71,11 @@ def test_gradient_agrees_with_finite_differences():
 def test_beta_is_positive_and_finite_for_any_feature(scale):
     beta = make_mlp()(scale * torch.ones(3, 6))
     assert torch.isfinite(beta).all() and (beta >= 0).all()
+
+
+def test_the_first_biases_lie_on_both_sides_of_zero_within_their_bound():
+    mlp = make_mlp(4)
+    for bias, fan_in in zip(mlp.biases, (4, 64, 64), strict=True):
+        assert bias.abs().max() <= fan_in**-0.5
+    first = mlp.biases[0].detach()
+    assert abs(float(first.mean())) < 0.1 < float(first.std())

@@ -129,3 +129,14 @@ def test_each_lambda_scales_its_own_term():
     assert abs(loss(0.2, 0, 0) - alone - float((0.08 / clipped**2).mean())) < 1e-5
     assert abs(loss(0, 0, 0.5) - alone - 0.5 * float(clipped.log().mean())) < 1e-5
     assert loss(0, 1, 0) - alone > 0.01 and abs(loss(0, 2, 0) + alone - 2 * loss(0, 1, 0)) < 1e-5
+
+
+def test_a_reference_far_beyond_the_scene_is_not_used_in_any_world_unit():
+    image, ones = torch.rand(16, 16, 3, generator=generator(1)), torch.ones(16, 16)
+    for unit in (0.01, 100.0):
+        for far, is_used in ((9.0, True), (11.0, False)):  # median depths
+            reference = unit * ones
+            reference[:4] *= far
+            seen = image, reference, image, unit * ones, ones
+            error = rendering_error(*seen, (4, 4), unit, UncertaintyConfig())
+            assert bool(error.depth.any()) == is_used

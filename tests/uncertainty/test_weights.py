@@ -5,12 +5,15 @@ from minislam.geometry import Camera
 from minislam.uncertainty.weights import (
     BETA_CUT,
     DATA_RATE,
+    MAPPING_CUT,
+    UNIT_BETA,
     beta_of_mask,
     clipped_beta,
     mapping_weight,
     pixel_weight,
     relative_weight,
     tracking_weight,
+    weight_of,
 )
 
 CAMERA = Camera(20.0, 20.0, 15.5, 11.5, 32, 24)
@@ -107,3 +110,8 @@ def test_no_gradient_flows_through_a_weight_but_it_does_through_the_loss_beta():
     assert not tracking_weight(beta, CAMERA, 8).requires_grad
     clipped_beta(beta).sum().backward()
     assert torch.equal(beta.grad, torch.ones_like(beta))
+
+
+def test_the_betas_of_the_weights_one_and_of_the_cut_have_these_weights():
+    for beta, weight in ((BETA_CUT, MAPPING_CUT), (UNIT_BETA, 1.0)):
+        assert float(weight_of(clipped_beta(grid(beta))).max()) == pytest.approx(weight, rel=1e-9)

@@ -103,6 +103,7 @@ def test_a_name_cannot_break_out_of_the_data():
 
 def test_a_page_survives_its_frame():
     page = "<p title=\"a & b\">'x'</p><script>if (1 < 2) {}</script>"
+    assert page not in repr(Page(page, 300))  # which a notebook would print as well
     shown = Page(page, 300)._repr_html_()
     start = shown.index('srcdoc="') + len('srcdoc="')
     assert unescape(shown[start : shown.index('"', start)]) == page

@@ -1,8 +1,11 @@
 """Doubtful poses start again from their neighbours; without support a frame is lost."""
 
+import pytest
 import torch
 
-from minislam.tracking.safeguards.pose_support import PoseFit, retry_doubtful
+from minislam.priors.interfaces import FlowMatches
+from minislam.tracking.safeguards.pose_support import PoseFit, judged_by_pose, retry_doubtful
+from tests.tracking.wall import GRID, true_graph
 
 
 def place(index: float) -> torch.Tensor:
@@ -55,3 +58,15 @@ def test_a_worse_second_start_changes_nothing():
 def test_supported_frames_are_not_tried_again():
     assert retry_doubtful(fits_with({4: 0.2}), list(range(1, 9)), None) == []
     assert retry_doubtful({0: fit(0, 1.0)}, [], None) == []
+
+
+@pytest.mark.parametrize(("ratio", "matched"), [(0.9, 1.0), (1.1, 1 / 3)])
+def test_what_a_pose_explains_is_said_in_px_of_a_reference_image(
+    monkeypatch: pytest.MonkeyPatch, ratio: float, matched: float
+):
+    graph, targets = true_graph([0, 1]), GRID.pixels.T[None].clone()
+    monkeypatch.setattr(graph, "start_pose", lambda *_: graph.keyframes.T_camera_world[-1])
+    # The pose predicts no flow; every second cell flows 4 px, of which a quarter is free.
+    targets[:, 0, ::2] += ratio * 4 * graph.pixel_scale
+    matches = FlowMatches(targets, torch.ones_like(targets), torch.zeros(1))
+    assert float(judged_by_pose(graph, matches).matched_ratios) == pytest.approx(matched)
