@@ -77,14 +77,14 @@ def test_what_is_not_confirmed_no_longer_bends_the_poses():
 def test_confirmation_becomes_the_weight_and_swept_depth_the_start(monkeypatch):
     graph = linked_graph()
     graph.keyframes.static_weights[1] = torch.full_like(graph.keyframes.static_weights[1], 0.5)
-    images = swept(graph)
+    images = [(0.01 * depth, known) for depth, known in swept(graph)]  # all within one unit
     expected = graph.keyframes.disparities.clone()
     right = GRID.pixels[:, 0] >= HALF
     graph.keyframes.set_geometry(graph.keyframes.T_camera_world, 3 * expected)
     monkeypatch.setattr(second_adjustment, "final_global_ba", lambda graph, progress: None)
     assert adjust_confirmed(graph, images) == pytest.approx(float(right.float().mean()))
     weights, disparities = graph.keyframes.static_weights, graph.keyframes.disparities
-    assert torch.allclose(disparities[:, right], expected[:, right])
+    assert torch.allclose(disparities[:, right], 100 * expected[:, right])
     assert torch.equal(disparities[:, ~right], 3 * expected[:, ~right])  # the sweep found nothing
     assert (weights[0, right] == 1).all() and (weights[0, ~right] == UNCONFIRMED_WEIGHT).all()
     assert torch.equal(weights[1], weights[0] / 2)  # beta, or a given mask, goes on counting
