@@ -110,14 +110,14 @@ def unknown_option(found: str, parser: argparse.ArgumentParser) -> UsageError:
     name = found.partition("=")[0]
     is_of_run = name in (parser.get_default("of_run") or ())
     otherwise = "it is an option of minislam run" if is_of_run else f"see {parser.prog} --help"
-    known = {option: option for option in parser._option_string_actions}
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.75 if is_of_run else 0.6)
+    known, typed = {o.strip("-"): o for o in parser._option_string_actions}, name.strip("-")
+    near = difflib.get_close_matches(typed, known, n=1, cutoff=0.65 if is_of_run else 0.6)
     if parser.get_default("takes_settings") and not near and not is_of_run:
         from minislam.config import SlamConfig, settings_of
 
         # A name without dots may be the end of a setting's; the first setting with it comes last.
-        settings = [f"--{setting}" for setting in reversed(settings_of(SlamConfig()))]
-        known = {s if "." in name else f"--{s.rpartition('.')[2]}": s for s in settings}
-        near = difflib.get_close_matches(name, known, n=1)
+        settings = reversed(settings_of(SlamConfig()))
+        known = {s if "." in name else s.rpartition(".")[2]: f"--{s}" for s in settings}
+        near = difflib.get_close_matches(typed, known, n=1, cutoff=0.7)
     hint = f"the nearest is {known[near[0]]}" if near else parser.get_default("hint") or otherwise
     return UsageError(f"expected a known option, found {name}; {hint}")

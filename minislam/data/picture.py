@@ -34,7 +34,7 @@ class Glance:
     """What one of a few sampled images tells of the place of the picture."""
 
     lit: tuple[np.ndarray, np.ndarray]  # (W,), (H,) fraction of each column, row that is not black
-    likeness: tuple[float, float]  # of left and right half, of upper and lower, from 0 to 1
+    similarity: tuple[float, float]  # of left and right half, of upper and lower, from 0 to 1
 
 
 def glance_at(image: np.ndarray) -> Glance:  # (H, W, 3) uint8
@@ -45,11 +45,11 @@ def glance_at(image: np.ndarray) -> Glance:  # (H, W, 3) uint8
         for size in ((2 * HALF, HALF), (HALF, 2 * HALF))
     )
     halves = (wide[:, :HALF], wide[:, HALF:]), (high[:HALF], high[HALF:])
-    side_by_side, stacked = (_likeness(*pair) for pair in halves)
+    side_by_side, stacked = (_similarity(*pair) for pair in halves)
     return Glance((lit.mean(0), lit.mean(1)), (side_by_side, stacked))
 
 
-def _likeness(one: np.ndarray, other: np.ndarray) -> float:  # (HALF, HALF) each
+def _similarity(one: np.ndarray, other: np.ndarray) -> float:  # (HALF, HALF) each
     """Return the correlation of the details of two pictures at their best shift, less the next [-].
 
     So what repeats itself is not alike, such as the windows of a house, nor are bars, whose edges
@@ -71,7 +71,7 @@ def first_of_two(picture: Window, glances: list[Glance], width: int, height: int
     if not glances:
         return picture
     left, top, columns, rows = picture
-    side_by_side, stacked = np.median([glance.likeness for glance in glances], 0)
+    side_by_side, stacked = np.median([glance.similarity for glance in glances], 0)
     if side_by_side > ALIKE_PICTURES:
         columns = min(columns, width // 2 - left)
     if stacked > ALIKE_PICTURES:

@@ -82,6 +82,8 @@ def test_what_is_wrong_is_said_before_torch_is_loaded(arguments: list[str], word
         (["run", "a", "--strid=2"], "found --strid; the nearest is --stride"),
         (["run", "a", "--max_frames", "2"], "the nearest is --max-frames"),
         (["run", "a", "--quite"], "the nearest is --quiet"),
+        (["run", "a", "--end", "5"], "found --end; see minislam run --help"),
+        (["run", "a", "--fps", "5"], "found --fps; see minislam run --help"),
         (["run", "a", "--zoom", "2"], "found --zoom; see minislam run --help"),
         (["run", "a", "b"], "expected only the names that minislam run takes, found also 'b'"),
         (["run", "synth:crowd", "--window", "3"], "the nearest is --tracking.window"),

@@ -167,9 +167,15 @@ def test_only_names_that_a_run_writes_are_removed(tmp_path: Path):
     for name in [*mine, *ours]:
         (run.path / name).parent.mkdir(exist_ok=True)
         (run.path / name).write_text("x")
+    (run.path / "keyframes/link.txt").symlink_to(run.path / "notes")
     RunFolder.create(run.path, overwrite=True)
     left = {path.relative_to(run.path).as_posix() for path in run.path.rglob("*.*")}
-    assert left == {"config.json", *mine}
+    assert left == {"config.json", "keyframes/link.txt", *mine}
+    for name in ours:
+        (run.path / name).write_text("x")
+    run.remove_checkpoint()  # and what is half written
+    left = {path.relative_to(run.path).as_posix() for path in run.path.rglob("*.*")}
+    assert left == {"config.json", "keyframes/link.txt", *mine, ours[0]}
 
 
 def test_pictures_of_keyframes_that_were_given_up_are_removed_and_no_others(tmp_path: Path):

@@ -33,6 +33,8 @@ def test_a_folder_without_lists_is_recognised_by_its_stamps(tmp_path: Path):
 def test_frame_numbers_are_not_stamps(tmp_path: Path):
     save(tmp_path / "rgb/00001.png", picture(0))
     assert not is_tum_folder(tmp_path)
+    save(tmp_path / "rgb/2.5.png", picture(0))
+    assert not is_tum_folder(tmp_path)
 
 
 def test_depth_is_associated_by_nearest_stamp(tmp_path: Path):
@@ -61,7 +63,7 @@ def test_the_camera_is_known_by_name(tmp_path: Path, where: str):
     folder = tum_folder(tmp_path / name, size=(64, 48))
     (folder / "calibration.txt").unlink()
     if where == "README.md":
-        (folder / "README.md").write_text("# TUM fr2_desk\n")
+        (folder / "README.md").write_text("\nTUM fr2_desk\n")
     if where == "rgb.txt":
         text = (folder / "rgb.txt").read_text()
         (folder / "rgb.txt").write_text("# file: 'rgbd_dataset_freiburg2_desk.bag'\n" + text)

@@ -9,7 +9,7 @@ from data_synth.poses import default_intrinsics, frame_along, look_at, upright
 def test_the_reference_camera_has_a_focal_length_of_272_px():
     camera = default_intrinsics((320, 240))
     assert (camera.fx, camera.fy) == (272.0, 272.0)
-    assert abs(camera.cx - 159.5) > 1  # off the middle
+    assert 1 < abs(camera.cx - 159.5) < 16 and abs(camera.cy - 119.5) < 12  # off the middle
 
 
 def test_resizing_maps_pixel_centres_to_pixel_centres():

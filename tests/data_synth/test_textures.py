@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from data_synth import surfaces
-from data_synth.textures import LEVELS, build_texture, texel_count
+from data_synth.textures import LEVELS, build_texture, canvas, texel_count
 
 
 def ramp_texture():
@@ -75,3 +75,7 @@ def test_the_same_seed_paints_the_same_surface():
         for _ in range(2)
     ]
     assert twins[0].levels[0].tobytes() == twins[1].levels[0].tobytes()
+
+
+def test_a_white_canvas_is_white():
+    assert (canvas((0.2, 0.1), 0.01, (1.0, 1.0, 1.0)) == 255).all()

@@ -93,3 +93,17 @@ def test_a_run_does_not_end_because_there_is_no_space_for_its_clip(tmp_path, mon
     monkeypatch.setattr(tempfile, "TemporaryDirectory", full)
     flythrough.write_clip(str(tmp_path))
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_hole_in_the_map_does_not_keep_from_flying_around_it():
+    run = FakeRun()
+    depth = np.full((48, 64), 2.0)
+    depth[:30] = 0
+    run.render_depth = lambda pose: depth
+    next(flythrough.fly_around(run, CAMERA))
+    assert np.linalg.norm(run.seen[0][:3, 3] - run.poses[3][:3, 3]) == pytest.approx(0.2)
+
+
+def test_white_stays_white():
+    *_, last = flythrough.side_by_side(FakeRun(count=11), CAMERA)
+    assert last[40, 30] == pytest.approx([1.0] * 3)

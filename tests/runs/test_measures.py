@@ -122,5 +122,7 @@ def test_each_piece_of_a_broken_run_is_aligned_by_itself():
     run.trajectory = lambda: Trajectory(truth.timestamps, poses)
     found = measures._segment_errors(run)
     assert found == pytest.approx({"ate_0_to_9_cm": 0, "ate_10_to_19_cm": 0}, abs=1e-6)
+    poses[[0, 19], 1, 3] += 1  # the first and the last frame count, too
+    assert min(measures._segment_errors(run).values()) > 1
     run.tracker.watch.breaks = []
     assert measures._segment_errors(run) == {}

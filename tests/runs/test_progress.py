@@ -11,7 +11,14 @@ from itertools import count, pairwise
 
 import pytest
 
-from minislam.runs.progress import ENDING, ProgressLine, ending_signals, quoted, say
+from minislam.runs.progress import (
+    ENDING,
+    ProgressLine,
+    _duration,
+    ending_signals,
+    quoted,
+    say,
+)
 
 
 def terminal(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
@@ -207,3 +214,23 @@ def test_a_run_that_begins_anew_is_in_its_first_stage_again(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert [int(line[len("stage ")]) for line in lines] == [1, 2, 2, 1, 2]
     assert lines[3].endswith("about 30 s in all")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(1, "5 s"), (62, "60 s"), (116, "115 s"), (118, "2 min"), (330, "5.5 min"), (660, "11 min"),
+     (5399, "90 min"), (5400, "1.5 h"), (36000, "10.0 h")],
+)  # fmt: skip
+def test_a_duration_is_in_the_unit_that_people_use(seconds: int, words: str):
+    assert _duration(seconds) == words
+
+
+def test_items_are_counted_when_done_and_a_stage_that_comes_again_is_timed_anew(
+    monkeypatch, capsys
+):
+    monkeypatch.setattr("time.perf_counter", count(0, 10).__next__)
+    terminal(monkeypatch, columns=80)
+    progress = ProgressLine(is_verbose=True)  # a line each, on a terminal, too
+    for _ in range(2):
+        assert [*progress.over("copying", "ab", 2)] == ["a", "b"]
+    assert capsys.readouterr().err == 2 * "copying: 1/2\ncopying: 2/2 (10 s)\n"

@@ -66,6 +66,8 @@ def test_fog_of_guessed_depth_is_poor():
 def test_a_broken_trajectory_is_said():
     breaks = [{"first_frame": 4, "last_frame": 9}]
     assert lines(breaks=breaks)["broken at frames"] == ("4 to 9", "poor", "")
+    breaks += [{"first_frame": 12, "last_frame": 12}]
+    assert lines(breaks=breaks)["broken at frames"][0] == "4 to 9, 12"
 
 
 @pytest.mark.parametrize(("doubtful", "verdict"), [(False, "good"), (True, "poor")])
@@ -87,6 +89,7 @@ def test_the_check_of_the_focal_length_is_said(doubtful: bool, verdict: str):
         (25.0, (22.0, 18.0), "good"),
         (22.0, (22.0, 18.0), "good"),
         (20.0, (22.0, 18.0), "fair"),
+        (18.0, (22.0, 18.0), "fair"),
         (17.9, (22.0, 18.0), "poor"),
         (0.4, (0.5, 1.0), "good"),  # less is better
         (0.8, (0.5, 1.0), "fair"),

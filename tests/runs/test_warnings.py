@@ -56,6 +56,7 @@ WARNINGS = [
     ({"truth": [0.0]}, "found 1 (estimate 4 poses, 0.000 to 0.100 s, truth 1 pose, 0.000 to 0.000"),
     ({"truth": [0.0, 33.0, 67.0]}, "check that the times of both are in seconds: poses of the est"),
     ({"truth": [k / 30 for k in range(3)], "stands": True}, "or a camera that does not move"),
+    ({"truth": [0.0, 1 / 30, 1 / 15, 50.0, 90.0, 130.0]}, "check that the times of both are in se"),
     ({"breaks": [Break(2, 2)]}, "there is too little parallax to carry the scale across, or the"),
     ({"failed": 3}, "3 of 5 bundle adjustments failed"),
     ({"failed": 3}, "their poses and depths stay as first guessed, so do not trust them; try"),
@@ -87,6 +88,10 @@ WARNINGS = [
         {"seeks_focal": True, "focal_is_free": True, "fx": 1500.0},
         "times the first one, a view of 12 degrees: unless the lens has it, path and depth",
     ),
+    (
+        {"seeks_focal": True, "focal_is_free": True, "fx": 60.0},
+        "found to be 0.2 times the first one, a view of 139 degrees: unless",
+    ),
     # Half of the run tells 1.4 times 272 px of images that are half as large as the raw ones.
     (
         {"seeks_focal": True, "focal_length": ZOOMED},
@@ -97,6 +102,7 @@ WARNINGS = [
         "give --fx or a calibration file; if the lens zoomed, run each part for itself",
     ),
     ({"parallax": [0.1, 0.2, 5.0]}, "2 of 3 keyframes show hardly any parallax"),
+    ({"parallax": [0.1, 5.0]}, "1 of 2 keyframes show hardly any parallax"),
     ({"parallax": [0.1], "knows_depth": False}, "and all that the map shows is at one depth"),
     ({"focal_length": DOUBTFUL}, "If the lens zoomed while it filmed, no focal length is right"),
     ({"overlay": torch.tensor([0.0, 1, 1, 1])}, "25% of the image stand still while the rest mov"),
@@ -212,3 +218,14 @@ def test_a_piece_that_is_to_be_run_anew_ends_where_many_frames_are_lost():
 def test_guessed_depth_is_not_warned_of_where_much_is_measured_and_on_a_backdrop():
     assert not list(warnings(finished(unknown=0.7)))
     assert not list(warnings(finished(unknown=0.8, knows_depth=False)))
+
+
+def test_a_run_that_measured_nothing_gets_no_advice_from_measurements():
+    run = finished(seeks_focal=True, parallax=[])
+    run.tracker.graph.adjustments = 0
+    assert not list(warnings(run))
+
+
+def test_a_lens_is_not_said_to_zoom_where_the_whole_run_fits_one():
+    (warning,) = warnings(finished(seeks_focal=True, focal_length=DOUBTFUL))
+    assert "but the flow fits --fx 598 best" in warning and "zoom" not in warning

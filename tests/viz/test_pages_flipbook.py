@@ -38,6 +38,7 @@ def test_it_holds_every_picture_in_order_and_shows_the_first():
     np.testing.assert_allclose(shades, [0, 0.25, 0.5, 0.75], atol=0.01)
     assert f'<img src="{book["pictures"][0]}"' in html
     assert book["captions"] == ["1 of 4", "2 of 4", "3 of 4", "4 of 4"]
+    assert '<input type="range" min="0" max="3" value="0"' in html
 
 
 def test_red_stays_red_in_bytes_and_in_floats():

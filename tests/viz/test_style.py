@@ -105,3 +105,9 @@ def test_constant_maps_can_be_coloured(value: float):
     assert np.isfinite(depth_to_rgb(np.full((3, 4), value))).all()
     if np.isfinite(value):
         assert np.isfinite(beta_to_rgb(np.full((3, 4), value))).all()
+
+
+def test_the_colours_of_depth_do_not_depend_on_the_unit():
+    depth = np.linspace(0.0, 3.0, 48).reshape(6, 8)
+    for unit in (0.01, 100.0):
+        np.testing.assert_allclose(depth_to_rgb(unit * depth), depth_to_rgb(depth), atol=0.01)
