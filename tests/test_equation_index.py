@@ -22,7 +22,7 @@ DOCUMENTS += sorted((ROOT / "tests/benchmarks/diary").glob("*.md"))
 MOST_WORDS = 1300  # of README, outside tables
 MOST_LINES = 150  # of README, besides tables
 PAPER_BUDGET = 5_410
-PACKAGE_BUDGET = 22_368
+PACKAGE_BUDGET = 22_369
 PAPER_PACKAGES = ("splatting", "uncertainty", "tracking", "mapping", "slam.py")
 BESIDE_THE_PAPER = (
     "tracking/safeguards/",

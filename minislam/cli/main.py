@@ -92,7 +92,8 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
         arguments = [*arguments[1:], "-h"]
     words = [word for word in arguments if not word.startswith("-")]
     if words[:2] == ["eval", "tum"]:  # evo asks for the format
-        arguments = ["eval", *(word for word in arguments[1:] if word != "tum")]
+        arguments = [*arguments]
+        arguments.remove("tum")  # the first: a run folder may be called so
     if not arguments[0].startswith("-") and arguments[0] not in commands:
         hint = nearest(arguments[0], commands, f"choose one of {', '.join(commands)}")
         raise UsageError(f"expected a command, found {arguments[0]!r}; {hint}")

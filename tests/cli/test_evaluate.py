@@ -127,9 +127,11 @@ def test_relative_errors_are_those_of_evo(files, tmp_path: Path):
         assert statistics["rmse"] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse))
 
 
-def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path: Path, capsys):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/trajectory.txt").write_text(Path(files[1]).read_text())
+def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for folder in (tmp_path / "run", tmp_path / "tum"):
+        folder.mkdir()
+        (folder / "trajectory.txt").write_text(Path(files[1]).read_text())
     said = []
     truth, estimate = files
     for words in (
@@ -137,12 +139,13 @@ def test_evo_s_word_for_the_format_and_a_run_folder_are_taken(files, tmp_path: P
         ["tum", truth, estimate, "-as"],
         ["tum", "-as", truth, estimate],
         ["-as", "tum", truth, estimate],
+        ["tum", truth, "tum", "-as"],
         ["tum", truth, "-as", estimate],
         [truth, str(tmp_path / "run"), "-as"],
     ):
         run_eval(parse(*words))
         said.append(capsys.readouterr().out)
-    assert said == 6 * said[:1]
+    assert said == 7 * said[:1]
 
 
 # Errors
