@@ -4,8 +4,9 @@
 
 Every clip with every seed is run three times, `minislam run synth:NAME:SEED --max-frames 100
 --workers 1` with the options of MODES, each into its own folder in FOLDER: 33 runs a seed, some 90
-processor seconds each. What FOLDER holds already is not run again. Means over the seeds are
-printed, as Markdown, and which runs ended otherwise than finished and with all frames.
+processor seconds each. What FOLDER holds already is not run again, so another commit needs
+another FOLDER. Means over the seeds are printed, as Markdown, and which runs ended otherwise than
+finished and with all frames.
 """
 
 import argparse
